@@ -1,0 +1,88 @@
+"""What goes in: one checked description of a video and all that is known about it.
+
+Plain NumPy, no JAX. A `Sequence` is what the readers make and what the pipeline
+takes; every array is finite, every index is in range, missing means a flag or a
+confidence of zero, never NaN.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """A calibrated camera: OpenCV's model, with pixel (0, 0) a pixel's centre."""
+
+    params: Float[np.ndarray, " i"]
+    """`fx fy cx cy` (px), then `k1 k2 p1 p2` if distorted: 4 or 8 numbers."""
+    width: int
+    height: int
+    is_guess: bool = False
+    """Whether the focal length was guessed, so that the graph should refine it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Keypoints:
+    """Detected keypoints of `h` people in `t` frames, in BODY_25 order."""
+
+    uv: Float[np.ndarray, "h t 25 2"]
+    """Pixels; 0 where there is none."""
+    confidence: Float[np.ndarray, "h t 25"]
+    """0 is missing; larger is surer. Detectors do not agree on what 1 means."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Regressed bodies of `h` people in the camera frame, per frame."""
+
+    present: Bool[np.ndarray, "h t"]
+    poses: Float[np.ndarray, "h t 72"]
+    """Axis-angle, rad, root first; the root turns the body into the camera frame."""
+    shapes: Float[np.ndarray, "h t 10"]
+    """SMPL β."""
+    trans: Float[np.ndarray, "h t 3"]
+    """m: the pelvis joint is at `J_0(β) + trans` in the camera frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracks:
+    """Static points followed through the video: one row per observation."""
+
+    frame: Int[np.ndarray, " m"]
+    landmark: Int[np.ndarray, " m"]
+    """Index of the point, 0 to `num_landmarks - 1`."""
+    uv: Float[np.ndarray, "m 2"]
+    """px"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """One input: `t` frames and whatever is known about them."""
+
+    name: str
+    frames: Path | None
+    """Video file or folder of images; `None` if only tracks are given."""
+    timestamps: Float[np.ndarray, " t"]
+    """s"""
+    intrinsics: Intrinsics
+    keypoints: Keypoints | None = None
+    bodies: Bodies | None = None
+    tracks: Tracks | None = None
+    masks: Path | None = None
+    """Folder of person masks, one image per frame in order; non-zero is person."""
+    groundtruth: Path | None = None
+    warnings: tuple[str, ...] = ()
+    """What was guessed or dropped while reading, for the report."""
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def fps(self) -> float:
+        """Mean frame rate, 1/s."""
+        t = self.timestamps
+        return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
