@@ -1,0 +1,6 @@
+"""`python -m bodyslam_jax` is the command `bodyslam`."""
+
+from bodyslam_jax.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Stage results kept on disk, so that an interrupted run is finished, not repeated.
+
+A stage's result is a dataclass of arrays and plain values. It is stored as an `.npz`
+named after a hash of all that it was computed from: another input, other settings or
+another version of the package simply do not find it.
+"""
+
+import dataclasses
+import hashlib
+import json
+import logging
+import os
+import typing
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from bodyslam_jax import __version__
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+_EDGE = 1 << 20
+
+
+def fingerprint(*parts: Any) -> str:
+    """A hash of settings, arrays and files (by size and content of their ends)."""
+    digest = hashlib.sha256(__version__.encode())
+    for part in parts:
+        _update(digest, part)
+    return digest.hexdigest()[:16]
+
+
+def _update(digest: Any, part: Any) -> None:
+    if isinstance(part, np.ndarray):
+        digest.update(str((part.shape, part.dtype)).encode())
+        digest.update(np.ascontiguousarray(part).tobytes())
+    elif isinstance(part, Path):
+        digest.update(str(part.name).encode())
+        if part.is_dir():
+            for item in sorted(part.iterdir()):
+                if not item.name.startswith("."):
+                    _update(digest, item)
+        elif part.is_file():
+            size = part.stat().st_size
+            digest.update(str(size).encode())
+            with part.open("rb") as file:
+                digest.update(file.read(_EDGE))
+                file.seek(max(0, size - _EDGE))
+                digest.update(file.read(_EDGE))
+    elif dataclasses.is_dataclass(part) and not isinstance(part, type):
+        digest.update(type(part).__name__.encode())
+        for field in dataclasses.fields(part):
+            digest.update(field.name.encode())
+            _update(digest, getattr(part, field.name))
+    elif isinstance(part, (tuple, list)):
+        digest.update(str(len(part)).encode())
+        for item in part:
+            _update(digest, item)
+    else:
+        digest.update(repr(part).encode())
+
+
+@dataclasses.dataclass(frozen=True)
+class Cache:
+    """A folder of stage results; `folder=None` keeps nothing."""
+
+    folder: Path | None
+
+    def stage(self, name: str, key: str, kind: type[T], compute: Callable[[], T]) -> T:
+        """The result of stage `name`, from disk if `key` is the same as then."""
+        if self.folder is None:
+            return compute()
+        path = self.folder / f"{name}-{key}.npz"
+        if path.exists():
+            try:
+                found = load(path, kind)
+            except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+                log.warning("%s: not readable (%s); computed again", path, error)
+            else:
+                log.info("%s: taken from an earlier run", name)
+                return found
+        result = compute()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for old in self.folder.glob(f"{name}-*.npz"):
+            old.unlink()
+        save(path, result)
+        return result
+
+
+def save(path: Path, value: Any) -> None:
+    """Writes a dataclass of arrays and plain values; atomic."""
+    arrays: dict[str, np.ndarray] = {}
+    header = _encode(value, "", arrays)
+    blob = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        np.savez(file, __header__=blob, **arrays)  # pyright: ignore[reportArgumentType]
+    os.replace(partial, path)
+
+
+def load(path: Path, kind: type[T]) -> T:
+    """Reads what `save` wrote."""
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        header = json.loads(archive["__header__"].tobytes())
+        return _decode(header, kind, archive)
+
+
+def _encode(value: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(value, np.ndarray):
+        arrays[prefix or "value"] = value
+        return {"array": prefix or "value"}
+    if dataclasses.is_dataclass(value):
+        return {
+            "fields": {
+                f.name: _encode(getattr(value, f.name), f"{prefix}.{f.name}", arrays)
+                for f in dataclasses.fields(value)
+            }
+        }
+    if isinstance(value, Path):
+        return {"path": str(value)}
+    if isinstance(value, tuple):
+        items = [_encode(v, f"{prefix}.{i}", arrays) for i, v in enumerate(value)]
+        return {"tuple": items}
+    if isinstance(value, np.generic):
+        value = value.item()
+    return {"value": value}
+
+
+def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
+    if "array" in header:
+        return archive[header["array"]]
+    if "path" in header:
+        return Path(header["path"])
+    if "tuple" in header:
+        return tuple(_decode(item, None, archive) for item in header["tuple"])
+    if "fields" in header:
+        kinds = typing.get_type_hints(kind)
+        fields = header["fields"]
+        return kind(
+            **{n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}
+        )
+    return header["value"]
+
+
+def _class(annotation: Any) -> Any:
+    """The dataclass in `Class | None`."""
+    for option in (annotation, *typing.get_args(annotation)):
+        if dataclasses.is_dataclass(option):
+            return option
+    return annotation

@@ -1,0 +1,246 @@
+"""The command line: plain typed functions, their docstrings the help.
+
+JAX is imported inside the commands, never for `--help`. Exit codes: 0 done; 1 bad
+input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from bodyslam_jax.config import Config, MotionTraining, Simulation
+
+_Input = tyro.conf.Positional[Path]
+_Flat = Annotated[Config, tyro.conf.arg(name="")]
+log = logging.getLogger("bodyslam_jax")
+
+
+def run(
+    input: _Input,
+    /,
+    *,
+    out: Path,
+    keypoints: Path | None = None,
+    bodies: Path | None = None,
+    camera: Path | None = None,
+    tracks: Path | None = None,
+    masks: Path | None = None,
+    config: _Flat = Config(),
+) -> int:
+    """Estimates cameras, people and map, in metres, from a video or sequence folder.
+
+    Args:
+        input: Sequence folder, video file or folder of images.
+        out: Run folder to write; an interrupted one is finished.
+        keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
+        bodies: Regressed bodies of any supported tool, if not in the input.
+        camera: camera.json, if not in the input.
+        tracks: tracks.npz made elsewhere, if not in the input.
+        masks: Folder of person masks, if not in the input.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import frontend, pipeline
+
+    sequence = frontend.read_sequence(
+        input,
+        keypoints=keypoints,
+        bodies=bodies,
+        camera=camera,
+        tracks=tracks,
+        masks=masks,
+    )
+    return _finish(pipeline.run_to_folder(sequence, out, config), out)
+
+
+def demo(*, out: Path = Path("bodyslam_demo"), config: _Flat = Config()) -> int:
+    """Renders a walker filmed by a moving camera and runs the whole pipeline on it.
+
+    Args:
+        out: Run folder to write.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import pipeline
+
+    return _finish(pipeline.demo(out, config), out)
+
+
+def _finish(result: Any, out: Path) -> int:
+    for line in result.summary["headline"]:
+        print(line)
+    for warning in result.summary["warnings"]:
+        print(f"warning: {warning}")
+    print(f"{out / 'report.html'}")
+    return 0 if result.summary["status"] == "ok" else 3
+
+
+def evaluate(
+    run: _Input, groundtruth: tyro.conf.Positional[Path], /, *, json: bool = False
+) -> None:
+    """Errors of a run folder against a ground truth: cameras, people, joints, scale.
+
+    Args:
+        run: Run folder.
+        groundtruth: Folder with camera.txt (TUM) and body.npz (AMASS style).
+        json: Print JSON instead of a table.
+    """
+    import bodyslam_jax as bs
+    from bodyslam_jax import evaluation
+
+    truth = evaluation.read_groundtruth(groundtruth, bs.load_body_model())
+    found = evaluation.evaluate(evaluation.read_result(run), truth)
+    print(evaluation.to_json(found) if json else evaluation.to_table(found))
+
+
+def simulate(
+    out: _Input,
+    /,
+    *,
+    config: Annotated[Simulation, tyro.conf.arg(name="")] = Simulation(),
+) -> None:
+    """Writes a simulated sequence folder with ground truth.
+
+    Args:
+        out: Sequence folder to write.
+        config: What to simulate.
+    """
+    from bodyslam_jax import synthetic
+
+    synthetic.write_sequence(out, synthetic.simulate(config))
+    print(out)
+
+
+def train_motion(
+    data: _Input,
+    /,
+    *,
+    out: Path,
+    config: Annotated[MotionTraining, tyro.conf.arg(name="")] = MotionTraining(),
+) -> None:
+    """Trains a motion model on AMASS folders, BVH folders or CMU .npz files.
+
+    Args:
+        data: File or folder of motion.
+        out: Weights to write (.npz); training resumes from what is there.
+        config: Architecture and training.
+    """
+    from bodyslam_jax import motion
+
+    motion.train_from_data(data, out, config)
+    print(out)
+
+
+def doctor() -> None:
+    """Versions, devices, BRISK, codecs, and where body models were looked for."""
+    from bodyslam_jax import doctor as _doctor
+
+    rows = _doctor.report()
+    width = max(len(name) for name, _ in rows)
+    for name, finding in rows:
+        print(f"{name:<{width}}  {finding}")
+
+
+def body_show(
+    file: tyro.conf.Positional[Path | None] = None,
+    /,
+    *,
+    out: Path = Path("body_model.png"),
+) -> None:
+    """Draws a body model: shape components at ±2σ and a few postures.
+
+    Args:
+        file: Body model; without it the default one.
+        out: Picture to write.
+    """
+    from bodyslam_jax import body
+
+    body.save_picture(body.load_body_model(file), out)
+    print(out)
+
+
+def body_convert(file: _Input, out: tyro.conf.Positional[Path], /) -> None:
+    """Writes a body model in SMPL's own .npz layout, readable without chumpy.
+
+    Args:
+        file: Any supported body model file.
+        out: The .npz to write.
+    """
+    from bodyslam_jax import body
+
+    body.write_npz(body.load_body_model(file), out)
+    print(out)
+
+
+def body_check(file: _Input, /) -> None:
+    """Says what a body model file is, or why it is not usable.
+
+    Args:
+        file: Body model file or folder.
+    """
+    from bodyslam_jax import body
+
+    print(body.check(file))
+
+
+_BODY = {"show": body_show, "convert": body_convert, "check": body_check}
+
+
+def body_model(
+    action: tyro.conf.Positional[Literal["show", "convert", "check"]],
+) -> None:
+    """Shows, converts or checks a body model file; see `bodyslam body-model --help`."""
+    raise AssertionError(f"dispatched before tyro saw it: {action}")
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "run": run,
+    "demo": demo,
+    "evaluate": evaluate,
+    "simulate": simulate,
+    "train-motion": train_motion,
+    "body-model": body_model,
+    "doctor": doctor,
+}
+
+
+def main() -> None:
+    """Runs one command and turns its outcome into an exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("jax").setLevel(logging.WARNING)
+    argv = sys.argv[1:]
+    commands, prog = _COMMANDS, "bodyslam"
+    if argv[:1] == ["body-model"]:
+        commands, prog, argv = _BODY, "bodyslam body-model", argv[1:]
+    if not any(flag in argv for flag in ("-h", "--help")):
+        _prepare_jax()
+    try:
+        code = tyro.extras.subcommand_cli_from_dict(
+            commands, prog=prog, description=__doc__.splitlines()[0], args=argv
+        )
+    except (OSError, ValueError) as error:
+        sys.exit(f"bodyslam: {_one_line(error)}")
+    except KeyboardInterrupt:
+        sys.exit("bodyslam: interrupted; the same command continues where this one was")
+    sys.exit(code or 0)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _prepare_jax() -> None:
+    """64-bit, and compiled programs kept between runs."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    cache = os.environ.get("BODYSLAM_CACHE") or Path(
+        os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "bodyslam_jax"
+    )
+    jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -1,0 +1,67 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodyslam_jax.cache import Cache, fingerprint, load, save
+from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
+
+
+def _sequence() -> Sequence:
+    tracks = Tracks(
+        np.array([0, 1]), np.array([0, 0]), np.array([[1.0, 2.0], [3.0, 4.0]])
+    )
+    intrinsics = Intrinsics(np.array([500.0, 500.0, 319.5, 239.5]), 640, 480)
+    times = np.arange(2) / 30
+    return Sequence("made up", Path("a.mp4"), times, intrinsics, tracks=tracks)
+
+
+def test_what_was_saved_is_what_is_loaded(tmp_path):
+    save(tmp_path / "x.npz", _sequence())
+    found = load(tmp_path / "x.npz", Sequence)
+    assert found.name == "made up" and found.frames == Path("a.mp4")
+    assert found.bodies is None and found.warnings == ()
+    np.testing.assert_array_equal(found.tracks.uv, _sequence().tracks.uv)
+    assert isinstance(found.intrinsics, Intrinsics) and found.intrinsics.width == 640
+
+
+def test_a_stage_is_computed_once_per_key(tmp_path):
+    calls = []
+    compute = lambda: calls.append(1) or _sequence().tracks
+    cache = Cache(tmp_path)
+    cache.stage("tracks", "a", Tracks, compute)
+    cache.stage("tracks", "a", Tracks, compute)
+    assert len(calls) == 1
+    cache.stage("tracks", "b", Tracks, compute)
+    assert len(calls) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["tracks-b.npz"]
+
+
+def test_a_damaged_stage_is_computed_again(tmp_path, caplog):
+    cache = Cache(tmp_path)
+    cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    (tmp_path / "tracks-a.npz").write_bytes(b"PK\x03\x04 cut short")
+    found = cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    assert found.uv.shape == (2, 2) and "computed again" in caplog.text
+
+
+@pytest.mark.parametrize("change", ["name", "array", "setting"])
+def test_fingerprint_sees_every_change(change):
+    base = _sequence()
+    other = {
+        "name": dataclasses.replace(base, name="other"),
+        "array": dataclasses.replace(base, timestamps=base.timestamps + 1e-9),
+        "setting": dataclasses.replace(base, warnings=("w",)),
+    }[change]
+    assert fingerprint(base) == fingerprint(_sequence()) != fingerprint(other)
+
+
+def test_fingerprint_of_a_file_is_its_content(tmp_path):
+    first, second = tmp_path / "a" / "v.mp4", tmp_path / "b" / "v.mp4"
+    for path, content in ((first, b"one"), (second, b"two")):
+        path.parent.mkdir()
+        path.write_bytes(content)
+    assert fingerprint(first) != fingerprint(second)
+    second.write_bytes(b"one")
+    assert fingerprint(first) == fingerprint(second)
