@@ -1,0 +1,145 @@
+"""Pinhole cameras with or without OpenCV's distortion: project, unproject, triangulate.
+
+Intrinsics are one array of 4 numbers `fx fy cx cy` (px) or 8, with `k1 k2 p1 p2` at the
+end. C has x right, y down, z forward; pixel (0, 0) is the top-left pixel's centre.
+Distortion: OpenCV's `calib3d` (Brown--Conrady), two radial and two tangential terms.
+
+Every function broadcasts over leading axes. Values and derivatives are finite, also at
+and behind the camera plane, where a projection means nothing: mask it out with
+`depth_is_valid`.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+MIN_DEPTH = 1e-3
+"""Smallest depth that is divided by, in the unit of the points."""
+
+_MAX_RADIUS_SQUARED = 16.0
+"""The radial polynomial is frozen beyond 76 degrees off the axis, if not before."""
+
+
+def depth_is_valid(p_C: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
+    """Whether a point is far enough before the camera plane for a true projection."""
+    return p_C[..., 2] > MIN_DEPTH
+
+
+def project(
+    intrinsics: Float[Array, "*#b i"], p_C: Float[Array, "*#b 3"]
+) -> Float[Array, "*_ 2"]:
+    """Pixel (px) of a point in the camera frame.
+
+    The depth is held at `MIN_DEPTH` or more, so that a point behind the camera has a
+    finite pixel and derivative; which points those are, `depth_is_valid` says.
+    """
+    depth = jnp.maximum(p_C[..., 2:], MIN_DEPTH)
+    return _to_pixel(intrinsics, distort(intrinsics, p_C[..., :2] / depth))
+
+
+def unproject(
+    intrinsics: Float[Array, "*#b i"], uv: Float[Array, "*#b 2"]
+) -> Float[Array, "*_ 3"]:
+    """Ray of a pixel in the camera frame, at depth 1: inverse of `project`."""
+    distorted = (uv - intrinsics[..., 2:4]) / intrinsics[..., :2]
+    xy = undistort(intrinsics, distorted)
+    return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+
+
+def distort(
+    intrinsics: Float[Array, "*#b i"], xy: Float[Array, "*#b 2"]
+) -> Float[Array, "*_ 2"]:
+    """Applies lens distortion to coordinates on the plane at depth 1.
+
+    Equal to OpenCV up to the radius where the radial polynomial stops growing. Beyond
+    it the polynomial's factor is held: what lies far outside the image must not fold
+    back into it, as it does in OpenCV.
+    """
+    if intrinsics.shape[-1] == 4:
+        return xy + 0 * intrinsics[..., :2]
+    k1, k2, p1, p2 = (intrinsics[..., i] for i in range(4, 8))
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    held = jnp.minimum(r2, jax.lax.stop_gradient(_turning_point(k1, k2)))
+    radial = 1 + held * (k1 + held * k2)
+    # Both tangential terms are homogeneous of degree 2: scaling them by held / r2 holds
+    # them at the same radius; the double `where` keeps the derivative at r2 = 0.
+    inside = held >= r2
+    fade = jnp.where(inside, 1.0, held / jnp.where(inside, 1.0, r2))
+    dx = fade * (2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+    dy = fade * (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    return jnp.stack([x * radial + dx, y * radial + dy], axis=-1)
+
+
+def undistort(
+    intrinsics: Float[Array, "*#b i"], xy: Float[Array, "*#b 2"], iterations: int = 10
+) -> Float[Array, "*_ 2"]:
+    """Inverse of `distort`, by Newton's method from the distorted point."""
+    xy = xy + 0 * intrinsics[..., :2]
+    if intrinsics.shape[-1] == 4:
+        return xy
+    intrinsics = jnp.broadcast_to(intrinsics, (*xy.shape[:-1], 8))
+    ex, ey = jnp.zeros_like(xy).at[..., 0].set(1), jnp.zeros_like(xy).at[..., 1].set(1)
+
+    def newton(estimate: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
+        found, jvp = jax.linearize(lambda p: distort(intrinsics, p), estimate)
+        a, b = jvp(ex), jvp(ey)  # columns of the 2x2 Jacobian
+        determinant = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        determinant = jnp.where(determinant > 1e-3, determinant, 1e-3)
+        r = found - xy
+        step_x = (b[..., 1] * r[..., 0] - b[..., 0] * r[..., 1]) / determinant
+        step_y = (a[..., 0] * r[..., 1] - a[..., 1] * r[..., 0]) / determinant
+        return estimate - jnp.stack([step_x, step_y], axis=-1)
+
+    # A scan, not an unrolled loop: ten linearisations in line would be slow to compile.
+    return jax.lax.scan(lambda p, _: (newton(p), None), xy, length=iterations)[0]
+
+
+def triangulate(
+    intrinsics: Float[Array, "*#b i"],
+    T_WC: Float[Array, "*#b n 4 4"],
+    uv: Float[Array, "*#b n 2"],
+    weight: Float[Array, "*#b n"],
+) -> Float[Array, "*_ 3"]:
+    """Point of the world nearest to the rays of `n` pixels, in the least-squares sense.
+
+    Args:
+        weight: of each ray, 1/distance^2 makes distances into angles; 0 for padding.
+
+    Rays that are parallel, or fewer than two, give a finite point that means nothing:
+    look at the angle between them first. The world frame's unit is that of `T_WC`.
+    """
+    R_WC, r_WC = T_WC[..., :3, :3], T_WC[..., :3, 3]
+    ray_C = unproject(intrinsics[..., None, :], uv)
+    ray_C = ray_C / jnp.linalg.norm(ray_C, axis=-1, keepdims=True)
+    ray_W = jnp.einsum("...ij,...j->...i", R_WC, ray_C)
+    eye = jnp.eye(3, dtype=ray_W.dtype)
+    across = eye - ray_W[..., :, None] * ray_W[..., None, :]
+    across = weight[..., None, None] * across
+    total = jnp.maximum(jnp.sum(weight, axis=-1), jnp.finfo(weight.dtype).tiny)
+    # Relative to the mean centre, which a far origin would otherwise drown in rounding.
+    middle = jnp.sum(weight[..., None] * r_WC, axis=-2) / total[..., None]
+    rhs = jnp.einsum("...nij,...nj->...i", across, r_WC - middle[..., None, :])
+    tiny = 10 * jnp.finfo(weight.dtype).eps * total[..., None, None] * eye
+    tiny = tiny + jnp.where(total > 1e-30, 0.0, 1.0)[..., None, None] * eye
+    normal = jnp.sum(across, axis=-3) + tiny
+    return middle + jnp.linalg.solve(normal, rhs[..., None])[..., 0]
+
+
+def _to_pixel(intrinsics: Array, xy: Array) -> Array:
+    return intrinsics[..., :2] * xy + intrinsics[..., 2:4]
+
+
+def _turning_point(k1: Array, k2: Array) -> Array:
+    """Squared radius at which `r (1 + k1 r^2 + k2 r^4)` stops growing.
+
+    The smallest positive root of `1 + 3 k1 q + 5 k2 q^2`, written as `2 / (-b + sqrt)`
+    so that `k2 = 0` needs no case of its own.
+    """
+    b, discriminant = 3 * k1, 9 * k1 * k1 - 20 * k2
+    real = discriminant >= 0
+    denominator = -b + jnp.sqrt(jnp.where(real, discriminant, 0.0))
+    # k2 < 0 has one root of each sign; the formula gives the positive one.
+    exists = real & (denominator > 2 / _MAX_RADIUS_SQUARED)
+    root = 2 / jnp.where(exists, denominator, 1.0)
+    return jnp.where(exists, root, _MAX_RADIUS_SQUARED)
