@@ -1,0 +1,173 @@
+"""Priors, and error terms beyond the paper that can be switched on."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph._factors import AbstractFrameFactor, Touch, _log
+from bodyslam_jax.graph._robust import AbstractLoss, Squared
+
+BODY25_FEET = (19, 21, 22, 24)
+"""Big toe and heel, left and right."""
+
+
+class CameraPrior(AbstractFrameFactor):
+    """A camera known beforehand: `[Log(C̃^T C), r' - r̃'] / σ`."""
+
+    cameras: Float[Array, "t 4 4"]
+    """T̃'_WC"""
+    sigma: Float[Array, "t 6"]
+    """rad, then units of the map; `inf` where not known."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("camera", 0),)
+
+    def data(self):
+        return self.cameras, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        camera = window[0].camera
+        turn = _log(known[:3, :3].T @ camera[:3, :3])
+        return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
+
+
+class IntrinsicsPrior(AbstractFrameFactor):
+    """A calibration, as known as it is: `(intrinsics - known) / σ`."""
+
+    intrinsics: Float[Array, "1 i"]
+    sigma: Float[Array, "1 i"]
+    """px, distortion: 1; `inf` where not known."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("intrinsics", 0),)
+
+    def data(self):
+        return self.intrinsics, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        return (shared.intrinsics - known) / sigma
+
+    def map_frames(self, function, state):
+        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
+        return super().map_frames(function, first)
+
+
+class CameraSmoothness(AbstractFrameFactor):
+    """The camera keeps its velocity: turn and shift, against those before.
+
+    The shift is in units of the map: in metres, it would draw s towards 0.
+    """
+
+    sigma: Float[Array, "t 2"]
+    """Per frame squared: rad, units of the map; `inf` for the first two frames."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("camera", 0), ("camera", 1), ("camera", 2)
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        now, before, first = (f.camera for f in window)
+        turn = _log(before[:3, :3].T @ now[:3, :3])
+        turn = turn - _log(first[:3, :3].T @ before[:3, :3])
+        shift = now[:3, 3] - 2 * before[:3, 3] + first[:3, 3]
+        return jnp.concatenate([turn / data[0], shift / data[1]])
+
+
+class RootSmoothness(AbstractFrameFactor):
+    """The pelvis keeps its velocity in the world, `r_k - 2 r_{k-1} + r_{k-2}`, m."""
+
+    sigma: Float[Array, "h t"]
+    """m per frame squared; `inf` where a frame of the three is missing."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (
+            *(("camera", lag) for lag in range(3)),
+            *(("root", lag) for lag in range(3)),
+            ("scale", 0),
+        )
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        now, before, first = (
+            shared.scale * f.camera[:3, 3] + f.camera[:3, :3] @ f.root[:3, 3]
+            for f in window
+        )
+        return (now - 2 * before + first) / data
+
+
+class StanceFoot(AbstractFrameFactor):
+    """The foot that carries the weight does not move in the world, between k-1 and k.
+
+    Needs no learnt motion, and sees scale through the length of the leg.
+    """
+
+    body: Any
+    sigma: Float[Array, "h t f"]
+    """m per frame, for the points of the feet; `inf` where one does not carry."""
+    loss: AbstractLoss = Squared()
+    points: tuple[int, ...] = eqx.field(static=True, default=BODY25_FEET)
+    """Which keypoints of BODY_25 they are."""
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        frames = ("camera", "root", "pose")
+        both = tuple((name, lag) for name in frames for lag in range(2))
+        return (*both, ("scale", 0), ("shape", 0))
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        now, before = (self._feet(f, shared) for f in window)
+        return (now - before) / data[:, None]
+
+    def _feet(self, frame, shared):
+        from bodyslam_jax.body import local_keypoints
+
+        p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
+        p_C = p_H[jnp.array(self.points)] @ frame.root[:3, :3].T + frame.root[:3, 3]
+        return p_C @ frame.camera[:3, :3].T + shared.scale * frame.camera[:3, 3]
+
+
+class UpDirection(AbstractFrameFactor):
+    """The person stands up: y of the root frame, in the world, along a known up."""
+
+    up: Float[Array, " 3"]
+    """Unit vector in the world."""
+    sigma: Float[Array, "h t"]
+    """rad; `inf` where the person is not there."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("camera", 0), ("root", 0)
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        (frame,) = window
+        person = frame.camera[:3, :3] @ frame.root[:3, 1]
+        return (person - self.up) / data

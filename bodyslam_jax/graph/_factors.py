@@ -1,0 +1,328 @@
+"""Error terms of the factor graph, in the order of Section 3.6 of the paper.
+
+A residual is prediction minus measurement in standard deviations, so that
+`0.5 * sum(rho(|residual|^2))` is a negative log-likelihood. Missing is `sigma = inf` on
+a finite value. A factor over frames is written once, for one frame of one person
+(`local`), with the variables it touches; the rest (all frames at once, blocks of the
+Jacobian) follows from that. Henning et al., BodySLAM, ECCV 2022.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from bodyslam_jax.camera import project
+from bodyslam_jax.graph._robust import AbstractLoss, Squared
+from bodyslam_jax.graph._state import State
+
+Touch = tuple[str, int]
+"""A variable and how many frames back: `("camera", 1)` is the previous camera."""
+
+
+class Frame(eqx.Module):
+    """One frame of one person; people's fields are `None` for a camera's factor."""
+
+    camera: Float[Array, "4 4"]
+    root: Float[Array, "4 4"] | None
+    pose: Float[Array, "23 3"] | None
+
+
+class Shared(eqx.Module):
+    """What all frames of one person share."""
+
+    scale: Float[Array, ""]
+    shape: Float[Array, " 10"] | None
+    intrinsics: Float[Array, " i"]
+
+
+class AbstractFactor(eqx.Module):
+    """Measurements of one kind, and how far a state is from explaining them."""
+
+    loss: eqx.AbstractVar[AbstractLoss]
+
+    @abc.abstractmethod
+    def residual(self, state: State) -> Float[Array, "*m d"]:
+        """Whitened, before the loss; one measurement has the last axis."""
+
+    def cost(self, state: State) -> Float[Array, ""]:
+        """Negative log-likelihood: `0.5 sum rho(|r|^2)`."""
+        s = jnp.sum(self.residual(state) ** 2, axis=-1)
+        return 0.5 * jnp.sum(self.loss.rho(s))
+
+
+class AbstractFrameFactor(AbstractFactor):
+    """A factor for each frame of each person, or of the camera."""
+
+    of_people: eqx.AbstractClassVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def touches(self) -> tuple[Touch, ...]:
+        """Among `camera`, `root`, `pose` with a lag, and `scale`, `shape`,
+        `intrinsics` with lag 0."""
+
+    @abc.abstractmethod
+    def data(self) -> Any:
+        """Measurements, leading axes `h t` (or `t`, for a factor of the camera)."""
+
+    @abc.abstractmethod
+    def local(
+        self, data: Any, window: tuple[Frame, ...], shared: Shared
+    ) -> Float[Array, "*m d"]:
+        """The residual of one frame; `window[lag]` is the frame that far back."""
+
+    @property
+    def num_lags(self) -> int:
+        return 1 + max(lag for _, lag in self.touches)
+
+    def map_frames(self, function, state: State):
+        """`function(data, window, shared)` over frames, and over people if any.
+
+        A window repeats the first frame where there is none before; factors carry no
+        weight there.
+        """
+
+        def back(x, lag):
+            return x[jnp.maximum(jnp.arange(x.shape[0]) - lag, 0)]
+
+        def one(data, roots, poses, shape):
+            windows = tuple(
+                Frame(
+                    back(state.cameras, lag),
+                    None if roots is None else back(roots, lag),
+                    None if poses is None else back(poses, lag),
+                )
+                for lag in range(self.num_lags)
+            )
+            shared = Shared(state.scale, shape, state.intrinsics)
+            return jax.vmap(lambda d, w: function(d, w, shared))(data, windows)
+
+        if not self.of_people:
+            return one(self.data(), None, None, None)
+        return jax.vmap(one)(self.data(), state.roots, state.poses, state.shapes)
+
+    def residual(self, state: State) -> Float[Array, "*m d"]:
+        return self.map_frames(self.local, state)
+
+
+class Reprojection(AbstractFactor):
+    """Static landmarks seen by the moving camera: `u(T_WC^-1 l) - z`.
+
+    Both are in the unscaled map, so the scale s does not enter.
+    """
+
+    frame: Int[Array, " m"]
+    landmark: Int[Array, " m"]
+    pixel: Float[Array, "m 2"]
+    sigma: Float[Array, " m"]
+    """Standard deviation of each pixel coordinate, px."""
+    loss: AbstractLoss
+
+    def residual(self, state: State) -> Float[Array, "m 2"]:
+        camera = state.cameras[self.frame]
+        offset = state.landmarks[self.landmark] - camera[:, :3, 3]
+        p_C = jnp.einsum("mji,mj->mi", camera[:, :3, :3], offset)
+        return (project(state.intrinsics, p_C) - self.pixel) / self.sigma[:, None]
+
+
+class JointReprojection(AbstractFrameFactor):
+    """Keypoints of the person: `u(T_CH p_H(θ, β)) - z`."""
+
+    body: Any
+    pixel: Float[Array, "h t j 2"]
+    sigma: Float[Array, "h t j"]
+    """px; `inf` where there is no keypoint."""
+    loss: AbstractLoss
+    layout: str = eqx.field(static=True, default="body25")
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0)
+
+    def data(self):
+        return self.pixel, self.sigma
+
+    def local(self, data, window, shared):
+        pixel, sigma = data
+        (frame,) = window
+        from bodyslam_jax.body import local_keypoints
+
+        p_H = local_keypoints(self.body, frame.pose, shared.shape, self.layout)
+        p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
+        return (project(shared.intrinsics, p_C) - pixel) / sigma[:, None]
+
+
+class HumanMotion(AbstractFrameFactor):
+    """The pelvis moves as the motion model predicts.
+
+    `e_k = C_WH_{k-1}^T (r_WH_k - r_WH_{k-1}) - r̃_k` with `r_WH = s r'_WC + C_WC r_CH`,
+    so that it is linear in s. With a correlation ρ the model's errors in successive
+    frames are not taken for independent: the residual is `e_k - ρ e_{k-1}` over its
+    own standard deviation.
+    """
+
+    translation: Float[Array, "h t 3"]
+    """r̃: predicted displacement from k-1 to k, in H_{k-1}, m."""
+    whitening: Float[Array, "h t 3 3"]
+    """`W` with `W^T W` the inverse of the covariance (m^-1); 0 where not predicted."""
+    correlation: Float[Array, "h t"]
+    """ρ between the errors of k-1 and k; 0 where k-1 has no prediction."""
+    loss: AbstractLoss = Squared()
+    correlated: bool = eqx.field(static=True, default=True)
+    """Whether any correlation is used; if not, a term spans two frames, not three."""
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        lags = range(3 if self.correlated else 2)
+        return (
+            *(("camera", lag) for lag in lags),
+            *(("root", lag) for lag in lags),
+            ("scale", 0),
+        )
+
+    def data(self):
+        previous = jnp.concatenate(
+            [jnp.zeros_like(self.translation[:, :1]), self.translation[:, :-1]], axis=1
+        )
+        return self.translation, previous, self.whitening, self.correlation
+
+    def local(self, data, window, shared):
+        translation, previous, whitening, correlation = data
+        error = displacement(window[1], window[0], shared.scale) - translation
+        if self.correlated:
+            before = displacement(window[2], window[1], shared.scale) - previous
+            error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
+        return whitening @ error
+
+
+class Posture(AbstractFrameFactor):
+    """Each joint's rotation against a measured or predicted one.
+
+    `e_k = Log(C̃_k^T C(θ_k))`, the geodesic form of the paper's `θ_k - θ̃_k`. Errors of a
+    regressor last: with a correlation ρ the residual is the innovation
+    `(e_k - ρ e_{k-1}) / (σ sqrt(1 - ρ²))`, and `e_k / σ` where a run of frames begins.
+    """
+
+    rotation: Float[Array, "h t 23 3"]
+    """θ̃, axis-angle, rad"""
+    sigma: Float[Array, "h t 23"]
+    """Stationary standard deviation per axis, rad; `inf` where not measured."""
+    correlation: Float[Array, "h t"]
+    """ρ between the errors of k-1 and k; 0 at the start of a run."""
+    loss: AbstractLoss = Squared()
+    correlated: bool = eqx.field(static=True, default=True)
+    predicted: bool = eqx.field(static=True, default=False)
+    """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("pose", 0), ("pose", 1)) if self.correlated else (("pose", 0),)
+
+    def data(self):
+        t = self.rotation.shape[1]
+        previous = self.rotation[:, jnp.maximum(jnp.arange(t) - 1, 0)]
+        return self.rotation, previous, self.sigma, self.correlation
+
+    def local(self, data, window, shared):
+        rotation, previous, sigma, correlation = data
+        error = rotation_between(rotation, window[0].pose)
+        if self.correlated:
+            before = rotation_between(previous, window[1].pose)
+            error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
+        return error / sigma[:, None]
+
+
+class Shape(AbstractFrameFactor):
+    """Regressed shape: `β - β̃_k`. Regressors err alike in all frames of a video: one
+    measurement, in one frame, says as much as it knows."""
+
+    shape: Float[Array, "h t 10"]
+    """β̃"""
+    sigma: Float[Array, "h t 10"]
+    """`inf` where not measured."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("shape", 0),)
+
+    def data(self):
+        return self.shape, self.sigma
+
+    def local(self, data, window, shared):
+        shape, sigma = data
+        return (shared.shape - shape) / sigma
+
+
+class OrientationChange(AbstractFrameFactor):
+    """The person turns as the motion model predicts: `Log(C̃^T C_WH_{k-1}^T C_WH_k)`.
+
+    The paper's model predicts it; its cost leaves it out.
+    """
+
+    rotation: Float[Array, "h t 3"]
+    """Rotation vector from H_{k-1} to H_k, rad."""
+    sigma: Float[Array, "h t"]
+    """Per axis, rad; `inf` where not predicted."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("camera", 0), ("camera", 1), ("root", 0), ("root", 1)
+
+    def data(self):
+        return self.rotation, self.sigma
+
+    def local(self, data, window, shared):
+        rotation, sigma = data
+        now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
+        predicted = jaxlie.SO3.exp(rotation).as_matrix()
+        return _log(predicted.T @ before.T @ now) / sigma
+
+
+def displacement(before: Frame, now: Frame, scale: Array) -> Float[Array, " 3"]:
+    """`C_WH_{k-1}^T (r_WH_k - r_WH_{k-1})`, m."""
+    moved = scale * (now.camera[:3, 3] - before.camera[:3, 3])
+    moved = moved + now.camera[:3, :3] @ now.root[:3, 3]
+    moved = moved - before.camera[:3, :3] @ before.root[:3, 3]
+    return before.root[:3, :3].T @ (before.camera[:3, :3].T @ moved)
+
+
+def rotation_between(
+    first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]
+) -> Float[Array, "*b 3"]:
+    """`Log(Exp(first)^T Exp(second))`, at most pi long."""
+    return (jaxlie.SO3.exp(first).inverse() @ jaxlie.SO3.exp(second)).log()
+
+
+def _log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    return jaxlie.SO3.from_matrix(rotation).log()
+
+
+def runs(present: Bool[Array, "h t"], correlation: float) -> Float[Array, "h t"]:
+    """ρ where this frame and the one before are measured, 0 at the start of a run."""
+    before = jnp.concatenate([jnp.zeros_like(present[:, :1]), present[:, :-1]], axis=1)
+    return jnp.where(present & before, correlation, 0.0)
+
+
+def whitening_of(
+    covariance: Float[Array, "*b 3 3"], valid: Bool[Array, "*b"]
+) -> Float[Array, "*b 3 3"]:
+    """`W` with `W^T W` the inverse of the covariance; 0 where not valid."""
+    eye = jnp.eye(3, dtype=covariance.dtype)
+    safe = jnp.where(valid[..., None, None], covariance, eye)
+    lower = jnp.linalg.cholesky(safe)
+    inverse = jax.scipy.linalg.solve_triangular(
+        lower, jnp.broadcast_to(eye, safe.shape), lower=True
+    )
+    return jnp.where(valid[..., None, None], inverse, 0.0)

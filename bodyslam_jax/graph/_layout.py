@@ -1,0 +1,125 @@
+"""Where the observations of landmarks lie in dense blocks; NumPy, at the door.
+
+Tracks are nearly contiguous in time. So frames are cut into chunks, landmarks are put
+into groups that start in the same chunk and span as many, and each group is a dense
+table of frames by landmarks with holes: no list of pairs is ever made, and the reduced
+camera matrix is formed by a few matrix products. Shapes are rounded up, so that videos
+of about the same length compile once.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+CHUNK = 10
+"""Frames in a chunk."""
+_WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
+_MAX_BUCKETS = 3
+
+
+class Bucket(eqx.Module):
+    """`n` groups of `g` landmarks that span `width` chunks (`f` frames) each."""
+
+    first_chunk: Int[Array, " n"]
+    landmark: Int[Array, "n g"]
+    """Row in the state; the number of landmarks for padding."""
+    row: Int[Array, "n f g"]
+    """Row in the measurements; the number of measurements where there is none."""
+    width: int = eqx.field(static=True)
+
+
+class Layout(eqx.Module):
+    """How a problem of `t` frames is cut: static sizes and index tables."""
+
+    buckets: tuple[Bucket, ...]
+    num_chunks: int = eqx.field(static=True)
+    """Chunks, rounded up to a size that other videos share."""
+    bandwidth: int = eqx.field(static=True)
+    """Chunks that a landmark, or a factor over frames, can connect; 2 or more."""
+
+
+def round_up(count: int) -> int:
+    """The next of a few sizes, each at most a quarter above the one before."""
+    if count <= 4:
+        return max(count, 1)
+    step = 2 ** max(int(np.log2(count)) - 2, 0)
+    return -(-count // step) * step
+
+
+def make_layout(
+    num_frames: int,
+    num_landmarks: int,
+    frame: Int[np.ndarray, " m"],
+    landmark: Int[np.ndarray, " m"],
+) -> Layout:
+    """Groups `m` observations of landmarks; every index is known to be in range."""
+    num_chunks = round_up(-(-num_frames // CHUNK))
+    if len(frame) == 0:
+        return Layout((), num_chunks, 2)
+    first = np.full(num_landmarks, num_frames)
+    last = np.full(num_landmarks, -1)
+    np.minimum.at(first, landmark, frame)
+    np.maximum.at(last, landmark, frame)
+    seen = last >= 0
+    start = np.where(seen, first // CHUNK, 0)
+    span = np.where(seen, last // CHUNK - start + 1, 0)
+    widths = _choose_widths(span[seen], num_chunks)
+    order = np.lexsort((frame, landmark))
+    begin = np.searchsorted(landmark[order], np.arange(num_landmarks + 1))
+    buckets = []
+    lower = 0
+    for width in widths:
+        members = np.flatnonzero(seen & (span > lower) & (span <= width))
+        lower = width
+        if len(members):
+            buckets.append(
+                _fill(members, start, width, num_chunks, frame, order, begin)
+            )
+    return Layout(tuple(buckets), num_chunks, max(widths[-1], 2))
+
+
+def _choose_widths(span, num_chunks):
+    """At most three widths, so that the tables hold as few empty products as can be."""
+    allowed = [w for w in _WIDTHS if w < num_chunks] + [num_chunks]
+    top = next(w for w in allowed if w >= span.max())
+    below = [w for w in allowed if w < top]
+    best, best_cost = (top,), np.inf
+    for count in range(_MAX_BUCKETS):
+        for lower in itertools.combinations(below, count):
+            chosen = np.array((*lower, top))
+            width = chosen[np.searchsorted(chosen, span)]
+            cost = np.sum(width.astype(float) ** 2 + 2 * width) * (1 + 0.03 * count)
+            if cost < best_cost:
+                best, best_cost = tuple(chosen.tolist()), cost
+    return best
+
+
+def _fill(members, start, width, num_chunks, frame, order, begin):
+    """The tables of one bucket: landmarks by first chunk, `size` to a group."""
+    num_rows, num_landmarks = len(order), len(begin) - 1
+    chunk = np.minimum(start[members], num_chunks - width)
+    members = members[np.argsort(chunk, kind="stable")]
+    chunk = np.sort(chunk)
+    counts = np.bincount(chunk)
+    size = min(
+        (16, 32, 48, 64), key=lambda g: np.sum(-(-counts // g)) * (g * width + 8)
+    )
+    rank = np.arange(len(members)) - np.searchsorted(chunk, chunk)
+    groups_before = np.concatenate([[0], np.cumsum(-(-counts // size))])
+    group = groups_before[chunk] + rank // size
+    slot = rank % size
+    n = round_up(int(groups_before[-1]))
+    first_chunk = np.zeros(n, np.int32)
+    first_chunk[group] = chunk
+    table = np.full((n, size), num_landmarks, np.int32)
+    table[group, slot] = members
+    row = np.full((n, width * CHUNK, size), num_rows, np.int32)
+    length = begin[members + 1] - begin[members]
+    which = np.repeat(np.arange(len(members)), length)
+    within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
+    source = order[begin[members][which] + within]
+    row[group[which], frame[source] - chunk[which] * CHUNK, slot[which]] = source
+    return Bucket(jnp.asarray(first_chunk), jnp.asarray(table), jnp.asarray(row), width)

@@ -1,0 +1,229 @@
+"""A problem: factors, what may move, and the motion model that predicts.
+
+`make_problem` is the door: it checks everything that the solver relies on.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.graph._factors import (
+    AbstractFactor,
+    AbstractFrameFactor,
+    HumanMotion,
+    OrientationChange,
+    Posture,
+    Reprojection,
+)
+from bodyslam_jax.graph._layout import CHUNK, Layout, make_layout
+from bodyslam_jax.graph._state import State, Step, gauge
+
+
+class MotionPredictor(eqx.Module):
+    """The motion model as the graph sees it: a state in, predictions out."""
+
+    predict: Callable[..., Any] = eqx.field(static=True)
+    """`predict(model, body, orientation, body_pose, shape, present)` of one person,
+    with `translation`, `rotation`, `body_pose` in its result."""
+    model: Any
+    body: Any
+    present: Bool[Array, "h t"]
+
+    def __call__(self, state: State) -> Any:
+        """Predictions of all people; leading axes `h t`."""
+        orientation = state.cameras[:, :3, :3] @ state.roots[..., :3, :3]
+        one = lambda o, p, s, there: self.predict(self.model, self.body, o, p, s, there)
+        return jax.vmap(one)(orientation, state.poses, state.shapes, self.present)
+
+
+class Problem(eqx.Module):
+    """What `solve` minimises: the sum of the costs of its factors."""
+
+    factors: tuple[AbstractFactor, ...]
+    free: Step
+    """1 where a coordinate may move, 0 where it is held."""
+    motion: MotionPredictor | None
+    layout: Layout
+
+    def cost(self, state: State) -> Float[Array, ""]:
+        """Negative log-likelihood, up to a constant; predictions as they stand."""
+        return sum(self.cost_by_term(state).values(), jnp.zeros_like(state.scale))
+
+    def cost_by_term(self, state: State) -> dict[str, Float[Array, ""]]:
+        """The cost of each factor, by the name of its class."""
+        costs = [factor.cost(state) for factor in self.factors]
+        return dict(zip(self.names, costs, strict=True))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the terms: the factors' classes, numbered where one repeats."""
+        names: list[str] = []
+        for factor in self.factors:
+            name = type(factor).__name__
+            taken = sum(other.split("_")[0] == name for other in names)
+            names.append(f"{name}_{taken + 1}" if taken else name)
+        return names
+
+    def refresh(self, state: State) -> "Problem":
+        """Predicts the motion anew; the gradient does not flow through the network.
+
+        So people are not drawn to postures for which the network happens to predict
+        what the cameras want.
+        """
+        if self.motion is None:
+            return self
+        seen = self.motion(jax.lax.stop_gradient(state))
+        factors = tuple(_with_prediction(factor, seen) for factor in self.factors)
+        return eqx.tree_at(lambda p: p.factors, self, factors)
+
+
+def _with_prediction(factor, seen):
+    if isinstance(factor, HumanMotion):
+        return eqx.tree_at(lambda f: f.translation, factor, seen.translation)
+    if isinstance(factor, OrientationChange):
+        return eqx.tree_at(lambda f: f.rotation, factor, seen.rotation)
+    if isinstance(factor, Posture) and factor.predicted:
+        return eqx.tree_at(lambda f: f.rotation, factor, seen.body_pose)
+    return factor
+
+
+def make_problem(
+    factors: Sequence[AbstractFactor],
+    state: State,
+    *,
+    motion: MotionPredictor | None = None,
+    free_intrinsics: bool = False,
+    free: Step | None = None,
+) -> Problem:
+    """Checks factors against a first state, holds the gauge, and lays out the blocks.
+
+    `free` replaces the mask that follows from the factors: everything may move but the
+    gauge (first camera, one coordinate of the farthest), intrinsics unless
+    `free_intrinsics`, and s where no factor touches it.
+
+    **Raises:** `ValueError` if a measurement is not finite, an index is out of range,
+    shapes do not fit, or the problem does not fit into memory.
+    """
+    factors = tuple(factors)
+    num_frames, num_landmarks = len(state.cameras), len(state.landmarks)
+    _check_finite("state", state)
+    for factor in factors:
+        _check_factor(factor, state)
+    tracks = [f for f in factors if isinstance(f, Reprojection)]
+    if len(tracks) > 1:
+        raise ValueError(
+            f"factors: {len(tracks)} `Reprojection`, expected one with all landmarks."
+        )
+    frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
+    landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
+    layout = make_layout(num_frames, num_landmarks, frame, landmark)
+    _check_memory(layout, state)
+    if free is None:
+        touched = {
+            name
+            for factor in factors
+            if isinstance(factor, AbstractFrameFactor)
+            for name, _ in factor.touches
+        }
+        ones = jax.tree.map(jnp.ones_like, state.zero_step())
+        free = Step(
+            scale=ones.scale * ("scale" in touched),
+            cameras=gauge(state.cameras),
+            roots=ones.roots,
+            poses=ones.poses,
+            shapes=ones.shapes,
+            landmarks=ones.landmarks,
+            intrinsics=ones.intrinsics * free_intrinsics,
+        )
+    return Problem(factors, free, motion, layout)
+
+
+def _check_finite(name, tree):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
+            count = int(np.sum(~np.isfinite(leaf)))
+            where = jax.tree_util.keystr(path)
+            raise ValueError(f"{name}{where}: {count} values are not finite.")
+
+
+def _check_factor(factor, state):
+    name = type(factor).__name__
+    for path, leaf in jax.tree_util.tree_leaves_with_path(factor):
+        where = name + jax.tree_util.keystr(path)
+        if not eqx.is_array(leaf) or not jnp.issubdtype(leaf.dtype, jnp.floating):
+            continue
+        values = np.asarray(leaf)
+        if "sigma" in where:
+            if not (values > 0).all():
+                raise ValueError(f"{where}: found {values.min()}, expected above 0.")
+        elif not np.isfinite(values).all():
+            bad = int(np.sum(~np.isfinite(values)))
+            raise ValueError(f"{where}: {bad} values are not finite.")
+    if isinstance(factor, Reprojection):
+        _check_tracks(factor, state)
+    elif isinstance(factor, AbstractFrameFactor):
+        _check_frames(factor, state)
+    else:
+        raise ValueError(
+            f"factors: {name} is neither a `Reprojection` nor over frames."
+        )
+
+
+def _check_tracks(factor, state):
+    frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
+    for what, index, limit in (
+        ("frame", frame, len(state.cameras)),
+        ("landmark", landmark, len(state.landmarks)),
+    ):
+        if len(index) and not (index.min() >= 0 and index.max() < limit):
+            raise ValueError(
+                f"Reprojection.{what}: indices {index.min()} to {index.max()}, "
+                f"expected 0 to {limit - 1}."
+            )
+    if len(frame):
+        pair = np.sort(frame.astype(np.int64) * len(state.landmarks) + landmark)
+        twice = pair[1:][pair[1:] == pair[:-1]]
+        if len(twice):
+            f, l = divmod(int(twice[0]), len(state.landmarks))
+            raise ValueError(
+                f"Reprojection: landmark {l} is observed twice in frame {f} "
+                f"({len(twice)} such observations), expected once at most."
+            )
+
+
+def _check_frames(factor, state):
+    lead = (len(state.roots), len(state.cameras))
+    if not factor.of_people:
+        if factor.touches == (("intrinsics", 0),):
+            return
+        lead = lead[1:]
+    for leaf in jax.tree.leaves(factor.data()):
+        if leaf.shape[: len(lead)] != lead:
+            raise ValueError(
+                f"{type(factor).__name__}: measurements of shape {leaf.shape}, "
+                f"expected to begin with {lead} (people and frames of the state)."
+            )
+
+
+def _check_memory(layout, state):
+    """Refuses what cannot fit: bytes grow linearly with frames, and say so."""
+    item = state.scale.dtype.itemsize
+    people = len(state.roots)
+    front = CHUNK * 6 * layout.bandwidth + people * (69 + 6 * CHUNK + 10) + 16
+    pivot = 6 * CHUNK + people * (69 + 6 * CHUNK)
+    chunk = 3 * pivot * front + people * CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)
+    tables = sum(40 * bucket.row.size for bucket in layout.buckets)
+    need = item * (chunk * layout.num_chunks + tables)
+    have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if need > have:
+        fit = int(len(state.cameras) * have / need)
+        raise ValueError(
+            f"{len(state.cameras)} frames need about {need / 2**30:.0f} GiB, found "
+            f"{have / 2**30:.0f} GiB: about {fit} frames fit."
+        )

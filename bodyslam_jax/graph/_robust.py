@@ -1,0 +1,87 @@
+"""Robust losses on whitened residuals.
+
+A loss takes `s`, the squared norm of one measurement's whitened residual
+(dimensionless), and gives the cost in the same unit: `rho(s) = s` near 0. Scales are
+therefore in standard deviations; a scale `c` in pixels is `c / sigma`.
+
+Least-squares solvers see a loss through `lift`: `[sqrt(w) r, sqrt(rho - w s)]` with
+`w = rho'(s)` held constant. Its squared norm is exactly `rho`, its gradient exactly
+`rho' J^T r`, and its Gauss-Newton Hessian `rho' J^T J` is positive. The more usual
+`r sqrt(rho / s)` has a bad Hessian.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class AbstractLoss(eqx.Module):
+    """A function of the squared norm of a whitened residual."""
+
+    @abc.abstractmethod
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]: ...
+
+    @abc.abstractmethod
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        """The derivative of `rho`: 1 at 0, never negative."""
+
+
+class Squared(AbstractLoss):
+    """`rho(s) = s`"""
+
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        return s
+
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        return jnp.ones_like(s)
+
+
+class Cauchy(AbstractLoss):
+    """`rho(s) = c^2 log(1 + s / c^2)`, as in Ceres."""
+
+    scale: float | Float[Array, ""]
+    """c, standard deviations"""
+
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        c2 = self.scale**2
+        return c2 * jnp.log1p(s / c2)
+
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        return 1 / (1 + s / self.scale**2)
+
+
+class GemanMcClure(AbstractLoss):
+    """`rho(s) = c^2 s / (c^2 + s)`: saturates at `c^2`.
+
+    Bogo et al. (2016) apply it to x and y apart, with c = 100 px; here it takes the
+    length of the pixel error, which does not depend on how the image is turned.
+    """
+
+    scale: float | Float[Array, ""]
+    """c, standard deviations"""
+
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        c2 = self.scale**2
+        return s * (c2 / (c2 + s))
+
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        c2 = self.scale**2
+        return (c2 / (c2 + s)) ** 2
+
+
+def lift(loss: AbstractLoss, residual: Float[Array, "*m d"]) -> Float[Array, "*m d+1"]:
+    """Residuals whose squared norm is the robust cost (see the module)."""
+    s = jnp.sum(residual**2, axis=-1)
+    fixed = jax.lax.stop_gradient(s)
+    weight = jax.lax.stop_gradient(loss.weight(fixed))
+    rest = jnp.sqrt(jnp.maximum(loss.rho(fixed) - weight * fixed, 0))
+    return jnp.concatenate(
+        [
+            jnp.sqrt(weight)[..., None] * residual,
+            jax.lax.stop_gradient(rest)[..., None],
+        ],
+        axis=-1,
+    )
