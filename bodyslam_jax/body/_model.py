@@ -1,0 +1,55 @@
+"""A body as arrays: what SMPL's equations need, and nothing else."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class BodyModel(eqx.Module):
+    """SMPL (Loper et al., 2015) with `v` vertices and `p` pose blend shapes.
+
+    Rest pose: a T, in frame H: x to the subject's left, y up, z forward.
+    """
+
+    template: Float[Array, "v 3"]
+    """Rest vertices of the mean shape, m."""
+    shape_dirs: Float[Array, "v 3 10"]
+    """How vertices move per unit of β, m."""
+    pose_dirs: Float[Array, "v 3 p"]
+    """How vertices move per entry of `R - I` of joints 1, 2, ..., m; p may be 0."""
+    joint_template: Float[Array, "24 3"]
+    """`J_0(β=0)` and the other joints of the mean shape at rest, m."""
+    joint_shape_dirs: Float[Array, "24 3 10"]
+    """How joints at rest move per unit of β, m."""
+    joint_regressor: Float[Array, "24 v"]
+    """Joints from rest vertices; only for writing files."""
+    skin_joint: Int[Array, "v k"]
+    """The joints that each vertex follows; padded with joint 0."""
+    skin_weight: Float[Array, "v k"]
+    """How much it follows each; rows sum to 1, 0 is padding."""
+    faces: Int[Array, "f 3"]
+    picks: Int[Array, " 12"]
+    """The vertices of `SURFACE_POINTS`."""
+    name: str = eqx.field(static=True)
+    """Where the body comes from: the file's name."""
+    kind: str = eqx.field(static=True)
+    """`default`, `smpl`, `smplh` or `smplx`: what the file was."""
+
+    @property
+    def num_vertices(self) -> int:
+        return self.template.shape[0]
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.template.dtype
+
+
+def sparse_rows(
+    weights: Float[np.ndarray, "v 24"],
+) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
+    """The non-zero entries of each row, largest first, padded with weight 0."""
+    width = max(1, int((weights != 0).sum(1).max()))
+    joint = np.argsort(-np.abs(weights), axis=1, kind="stable")[:, :width]
+    weight = np.take_along_axis(weights, joint, axis=1)
+    return np.where(weight != 0, joint, 0).astype(np.int32), weight

@@ -1,0 +1,144 @@
+"""SMPL's joints, and the keypoints of 2D detectors in terms of them.
+
+Joint order and kinematic tree: Loper et al., SMPL, 2015. Keypoint orders: OpenPose
+(BODY_25), COCO (17), Halpe (26). Which joint or vertex a keypoint of BODY_25 is:
+`constants.JOINT_MAP` of SPIN (Kolotouros et al., 2019).
+"""
+
+JOINT_NAMES: tuple[str, ...] = (
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hand",
+    "right_hand",
+)
+PARENTS: tuple[int, ...] = (
+    *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8),
+    *(9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21),
+)
+MIRRORED: tuple[int, ...] = (
+    *(0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10),
+    *(12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22),
+)
+"""The joint on the other side of the body."""
+
+LEVELS: tuple[tuple[int, ...], ...] = (
+    (1, 2, 3),
+    (4, 5, 6),
+    (7, 8, 9),
+    (10, 11, 12, 13, 14),
+    (15, 16, 17),
+    (18, 19),
+    (20, 21),
+    (22, 23),
+)
+"""Joints by depth in the tree: those of one level move at the same time."""
+
+SURFACE_POINTS: tuple[str, ...] = (
+    "nose",
+    "right_eye",
+    "left_eye",
+    "right_ear",
+    "left_ear",
+    "left_big_toe",
+    "left_small_toe",
+    "left_heel",
+    "right_big_toe",
+    "right_small_toe",
+    "right_heel",
+    "head_top",
+)
+"""Keypoints that are vertices: `BodyModel.picks` has them in this order."""
+
+_LEFT_OF_COCO = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+
+KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
+    "body25": (
+        "nose",
+        "neck",
+        *(f"right_{x}" for x in ("shoulder", "elbow", "wrist")),
+        *(f"left_{x}" for x in ("shoulder", "elbow", "wrist")),
+        "mid_hip",
+        *(f"right_{x}" for x in ("hip", "knee", "ankle")),
+        *(f"left_{x}" for x in ("hip", "knee", "ankle")),
+        *("right_eye", "left_eye", "right_ear", "left_ear"),
+        *(f"left_{x}" for x in ("big_toe", "small_toe", "heel")),
+        *(f"right_{x}" for x in ("big_toe", "small_toe", "heel")),
+    ),
+    "coco17": (
+        "nose",
+        *(f"{side}_{x}" for x in _LEFT_OF_COCO for side in ("left", "right")),
+    ),
+    "halpe26": (
+        "nose",
+        *(f"{side}_{x}" for x in _LEFT_OF_COCO for side in ("left", "right")),
+        *("head_top", "neck", "mid_hip"),
+        *(
+            f"{side}_{x}"
+            for x in ("big_toe", "small_toe", "heel")
+            for side in ("left", "right")
+        ),
+    ),
+}
+"""What each keypoint of a detector's layout is, in the layout's own order."""
+
+_SPREAD = {
+    "nose": 0.026,
+    "eye": 0.025,
+    "ear": 0.035,
+    "shoulder": 0.079,
+    "elbow": 0.072,
+    "wrist": 0.062,
+    "hip": 0.107,
+    "knee": 0.087,
+    "ankle": 0.089,
+    "toe": 0.068,
+    "heel": 0.066,
+    "neck": 0.079,
+    "top": 0.035,
+}
+KEYPOINT_SPREAD: dict[str, tuple[float, ...]] = {
+    layout: tuple(_SPREAD[name.rsplit("_", 1)[-1]] for name in names)
+    for layout, names in KEYPOINT_NAMES.items()
+}
+"""How far annotators of COCO disagree, as a share of the square root of the person's
+area in pixels (the σ of COCO's and COCO-WholeBody's OKS; neck and head by analogy)."""
+
+KEYPOINT_JOINT: dict[str, int] = {
+    "mid_hip": 0,
+    **{name: j for j, name in enumerate(JOINT_NAMES) if "spine" not in name},
+}
+"""The SMPL joint of each keypoint that is one."""
+
+DETECTOR_BIAS: dict[str, tuple[float, float, float]] = {
+    "left_hip": (-0.012, -0.020, 0.018),
+    "right_hip": (0.012, -0.020, 0.018),
+    "mid_hip": (0.0, -0.035, 0.010),
+    "neck": (0.0, -0.063, 0.007),
+    "left_shoulder": (-0.017, 0.021, -0.002),
+    "right_shoulder": (0.017, 0.021, -0.002),
+}
+"""Where detectors trained on COCO put a keypoint, relative to the default body's joint
+of that name, m, in the joint's own frame at rest. Measured with anny's regressors of
+COCO keypoints on the mean adult. OpenPose's neck and middle hip are midpoints of its
+shoulders and of its hips, so not SMPL's neck and pelvis. `local_keypoints` adds `bias`
+times this."""
