@@ -4,6 +4,7 @@ The command line and `config.yaml` are generated from these classes.
 """
 
 import dataclasses
+from typing import Literal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,3 +62,141 @@ class GraphWeights:
             shape_sigma=1.0,
             shape_each_frame=True,
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class PeopleFit:
+    """Bodies from keypoints, and the cleaning of bodies that a regressor gave."""
+
+    min_keypoints: int = 6
+    """Keypoints that a frame must have for its body to be fitted."""
+    max_gap: float = 0.3
+    """Gaps up to this long are filled from the frames around them, s."""
+    start_interval: float = 0.1
+    """Distance of the frames that are fitted from many starts, s."""
+    max_steps: int = 30
+    """Gauss-Newton steps over all frames at most."""
+    robust_scale: float = 4.0
+    """Scale of the robust loss on keypoints, in their standard deviations."""
+    correlation_time: float = 0.15
+    """Keypoint errors stay the same for about this long, s."""
+    limit_sigma: float = 0.05
+    """Softness of the joints' limits, rad."""
+    upright_sigma: float = 0.4
+    """How far bodies lean towards or from the camera, sine of the angle."""
+    shape_frames: float = 3.0
+    """Frames' worth of evidence on shape in a whole clip: keypoint bias is the same in
+    all frames, so they do not add up."""
+    motion_scale: float = 1.5
+    """How much less predictable than in the motion data people move."""
+    depth_jitter: float = 0.005
+    """Change of the depth's change from frame to frame at 30 fps, m."""
+    position_jitter: float = 0.015
+    """The same across the line of sight, m; a shaking camera is in it."""
+    turn_jitter: float = 0.03
+    """The same for the orientation, rad."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionTraining:
+    """How a motion model is trained; `MotionTraining.paper()` is section 3.4."""
+
+    network: Literal["metric", "paper"] = "metric"
+    """Metric joint positions over a window, or the paper's network on joint angles."""
+    past: int = 16
+    """Frames before the predicted one that a window holds."""
+    future: int = 1
+    """1 if displacement may depend on the posture of the frame it leads to, else 0."""
+    width: tuple[int, ...] = (256, 256, 256)
+    """Units of the hidden layers."""
+    members: int = 1
+    """Networks of which displacement is the mean."""
+    seed: int = 0
+    """Initial weights and every random choice follow from it."""
+    epochs: int = 60
+    """Each has as many windows as the data have 120 Hz starting points."""
+    segments: int = 128
+    """Segments in a batch; each is of another person, speed and noise level."""
+    steps: int = 16
+    """Successive windows of a segment."""
+    learning_rate: float = 1e-3
+    """Adam's at the start; falls to nothing along a cosine if `decay`."""
+    decay: bool = True
+    """Whether the learning rate falls."""
+    weight_decay: float = 1e-4
+    """AdamW's."""
+    slope_weight: float = 10.0
+    """Penalty on the squared bias of displacement per noise level: bias is scale."""
+    segment_weight: float = 1.0
+    """Penalty on the mean error over a segment, beside that of single steps."""
+    drift_deg: float = 10.0
+    """Largest standard deviation of the slow error of joint angles, degrees."""
+    white_deg: float = 0.6
+    """Largest standard deviation of the white error of joint angles, degrees."""
+    root_drift: float = 1.0
+    """Largest error of the root's rotation as a share of the joints'."""
+    clean_share: float = 0.3
+    """Share of segments without slow errors."""
+    shape_sigma: float = 1.0
+    """Standard deviation of each component of β."""
+    strides: tuple[int, ...] = (3, 4, 4, 4, 5)
+    """Steps through 120 Hz data, one drawn per segment: 4 is real speed."""
+    mirror: bool = True
+    """Whether half of the segments are mirrored."""
+    sliding: bool = True
+    """Whether windows may overlap; the paper's do not."""
+
+    @staticmethod
+    def paper() -> "MotionTraining":
+        """Section 3.4 of the paper: two frames of exact joint angles, 100 epochs."""
+        return MotionTraining(
+            network="paper",
+            past=2,
+            width=(1024,),
+            epochs=100,
+            segments=4096,
+            steps=1,
+            decay=False,
+            weight_decay=0.0,
+            drift_deg=0.0,
+            white_deg=0.0,
+            root_drift=0.0,
+            clean_share=0.0,
+            strides=(4,),
+            mirror=False,
+            sliding=False,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Association:
+    """Which detections in successive frames are the same person."""
+
+    max_people: int = 8
+    """People kept, those that fill most of the video first."""
+    min_duration: float = 0.4
+    """Time that a person must be seen for, s."""
+    max_gap: float = 0.7
+    """Time that a person may be unseen and still be recognised, s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracking:
+    """Points followed through the video (BRISK, KLT, RANSAC)."""
+
+    num_points: int = 200
+    """Points followed at any time."""
+    threshold: int = 20
+    """BRISK's smallest contrast of a corner, grey levels."""
+    octaves: int = 3
+    """BRISK's pyramid, octaves."""
+    cells: int = 8
+    """Cells along the longer side of the image, over which points are spread."""
+    window: int = 21
+    """Side of the window that is followed, px."""
+    max_epipolar: float = 1.5
+    """Distance from the epipolar line beyond which a point is dropped, px."""
+    keyframe_gap: int = 10
+    """Frames over which a point must fit one rigid motion."""
+    person_margin: float = 0.06
+    """Width added around people's keypoints, of the person's height."""

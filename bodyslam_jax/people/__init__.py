@@ -1,0 +1,6 @@
+"""People: bodies from keypoints or from a regressor's file, made ready for the graph."""
+
+from bodyslam_jax.people._fit import fit_bodies as fit_bodies
+from bodyslam_jax.people._roots import Roots as Roots
+from bodyslam_jax.people._roots import bodies_from_roots as bodies_from_roots
+from bodyslam_jax.people._roots import roots_from_bodies as roots_from_bodies

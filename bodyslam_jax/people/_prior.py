@@ -1,0 +1,73 @@
+"""What postures people take and how fast they change them: a Gaussian process.
+
+A posture θ (21 joints; hands stay at rest) is `mean + basis @ z`. The latent z has
+independent components of unit variance, each a second-order autoregression in time:
+`z_k = a1 z_{k-1} + a2 z_{k-2} + e`. Such a prior counts a posture that is held for a
+second once, not thirty times, and it does not pull a swinging leg towards the mean as
+repeated static priors do, nor towards rest as a penalty on velocity does. Beyond the
+Gaussian, each angle has limits: a knee does not bend forwards.
+
+Learnt by `tools/make_posture_prior.py` from CMU motion capture; `assets/README.md`.
+"""
+
+import functools
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+ASSET = Path(__file__).parent / "assets" / "posture_prior.npz"
+NUM_HANDS = 2
+_TRAINED_AT = 30.0
+
+
+class PosturePrior(eqx.Module):
+    """`k` components of posture, at one frame rate."""
+
+    mean: Float[Array, " 63"]
+    """θ of joints 1 to 21, rad."""
+    basis: Float[Array, "63 k"]
+    """rad per standard deviation of each component."""
+    lower: Float[Array, " 63"]
+    upper: Float[Array, " 63"]
+    """Limits of θ, rad."""
+    typical: Float[Array, "s k"]
+    """Latents of a few postures that fits start from."""
+    autoregression: Float[Array, "k 2"]
+    """`a1, a2` of each component, per frame."""
+
+    def decode(self, latent: Float[Array, "*b k"]) -> Float[Array, "*b 23 3"]:
+        """Body pose θ, axis-angle."""
+        angles = (self.mean + latent @ self.basis.T).reshape(*latent.shape[:-1], 21, 3)
+        rest = jnp.zeros((*latent.shape[:-1], NUM_HANDS, 3), latent.dtype)
+        return jnp.concatenate([angles, rest], axis=-2)
+
+
+def load_posture_prior(
+    fps: float, dtype: np.dtype | type | None = None
+) -> PosturePrior:
+    """The prior that ships with the package, for frames `1/fps` apart.
+
+    An autoregression is a sampled damped oscillator: its poles at another rate are
+    powers of its poles at 30 fps.
+    """
+    stored = _read()
+    polynomial = [np.array([1.0, -a1, -a2]) for a1, a2 in stored["autoregression"]]
+    poles = np.array([np.roots(p) for p in polynomial]).astype(complex)
+    poles = poles ** (_TRAINED_AT / fps)
+    moved = np.stack([poles.sum(1), -poles.prod(1)], axis=1).real
+    dtype = np.dtype(dtype) if dtype else jnp.zeros(0).dtype
+    fields = {name: stored[name] for name in _NAMES if name != "autoregression"}
+    fields["autoregression"] = moved
+    return PosturePrior(**{k: jnp.asarray(v, dtype) for k, v in fields.items()})
+
+
+@functools.cache
+def _read() -> dict[str, np.ndarray]:
+    with np.load(ASSET, allow_pickle=False) as archive:
+        return {name: archive[name].astype(float) for name in archive if name in _NAMES}
+
+
+_NAMES = ("mean", "basis", "lower", "upper", "typical", "autoregression")

@@ -1,0 +1,245 @@
+"""Where the fit of a person starts: many guesses a frame, the best path through them.
+
+One view does not say which way round a body is, nor which leg is in front; a single
+descent ends in the nearest of several minima. So every few frames the body is fitted
+from each of eight headings and a few typical postures, and a path through the frames
+(Viterbi) weighs how well each end explains its keypoints against how far the joints
+would have to jump between frames.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from bodyslam_jax import body as body_lib
+from bodyslam_jax.camera import unproject
+from bodyslam_jax.people._terms import DEPTH_FLOOR, Fit, Scene, cost, linearise
+
+NUM_HEADINGS = 8
+_POSTURES_PER_HEADING = 2
+_KEPT = 6
+_FIRST_STEPS, _LAST_STEPS = 5, 10
+_FRAME_BATCH, _DESCENT_BATCH = 32, 256
+_JOINT_SPEED = 1.2
+"""m/s: how fast joints move about the pelvis, roughly."""
+_INDEPENDENT_JOINTS = 8
+"""Joints of a body move together: 24 of them say as much as about this many."""
+_TURN_SPEED = 2.0
+"""rad/s: how fast people turn round."""
+
+
+def fit_frames(
+    scene: Scene, uv: Float[np.ndarray, "f 25 2"], sigma: Float[np.ndarray, "f 25"]
+) -> tuple[Fit, Float[np.ndarray, "f s"], Float[np.ndarray, "f s 24 3"]]:
+    """Fits each frame by itself, β = 0, from all starts; the best few ends of each.
+
+    **Returns:** the fits with leading axes (frame, start), their costs, and their joints
+    relative to the pelvis, in C; NumPy.
+    """
+    frames = len(uv)
+    starts, value = _batched(_all_starts, _FRAME_BATCH, scene, uv, sigma)
+    # The best postures of every heading: diversity where it matters.
+    by_heading = value.reshape(frames, NUM_HEADINGS, -1)
+    best = np.argsort(by_heading, axis=2)[..., :_POSTURES_PER_HEADING]
+    best = best + by_heading.shape[2] * np.arange(NUM_HEADINGS)[:, None]
+    fits = _take(starts, best.reshape(frames, -1))
+    for steps in (_FIRST_STEPS, _LAST_STEPS):
+        count = fits.latent.shape[1]
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), fits)
+        repeated = np.repeat(uv, count, axis=0), np.repeat(sigma, count, axis=0)
+        limit = jnp.asarray(steps)
+        flat, value, joints = _batched(
+            _descend, _DESCENT_BATCH, (scene, limit), flat, *repeated
+        )
+        fits = jax.tree.map(lambda a: a.reshape(frames, count, *a.shape[1:]), flat)
+        order = np.argsort(value.reshape(frames, count), axis=1)[:, :_KEPT]
+        fits, value, joints = _take(
+            (
+                fits,
+                value.reshape(frames, count),
+                joints.reshape(frames, count, 24, 3),
+            ),
+            order,
+        )
+    return fits, value, joints
+
+
+def _batched(function: Callable[..., Any], size: int, shared: Any, *rows: Any) -> Any:
+    """`function(shared, *rows)` on `size` rows at a time, the last batch filled up: one
+    shape to compile, whatever the number of frames."""
+    total = len(jax.tree.leaves(rows)[0])
+    dtype = jax.tree.leaves(shared)[0].dtype
+    parts = []
+    for first in range(0, total, size):
+        index = np.resize(np.arange(first, min(first + size, total)), size)
+        batch = jax.tree.map(lambda a: jnp.asarray(a[index], dtype), rows)
+        parts.append(jax.tree.map(np.asarray, function(shared, *batch)))
+    return jax.tree.map(lambda *p: np.concatenate(p)[:total], *parts)
+
+
+def _take(tree: Any, index: Int[np.ndarray, "f s"]) -> Any:
+    """Rows `index[f]` of every frame f."""
+    return jax.tree.map(lambda a: a[np.arange(len(index))[:, None], index], tree)
+
+
+@eqx.filter_jit
+def _all_starts(
+    scene: Scene, uv: Float[Array, "f 25 2"], sigma: Float[Array, "f 25"]
+) -> tuple[Fit, Float[Array, "f s"]]:
+    """All starts of each frame and their costs."""
+
+    def one(uv: Array, sigma: Array) -> tuple[Fit, Array]:
+        starts = _frame_starts(scene, uv, sigma)
+        shape = jnp.zeros(10, uv.dtype)
+        value = jax.vmap(lambda fit: cost(scene, fit, shape, uv, sigma))(starts)
+        return starts, value + 0.5 * jnp.sum(starts.latent**2, -1)
+
+    return jax.vmap(one)(uv, sigma)
+
+
+def _frame_starts(
+    scene: Scene, uv: Float[Array, "25 2"], sigma: Float[Array, " 25"]
+) -> Fit:
+    """Every heading with every typical posture, put where the keypoints are."""
+    dtype = uv.dtype
+    angles = jnp.arange(NUM_HEADINGS, dtype=dtype) * (2 * jnp.pi / NUM_HEADINGS)
+    # Upright before the camera, facing it: H's y up is C's y down.
+    facing = jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
+    turned = jax.vmap(lambda a: jaxlie.SO3.from_y_radians(a).as_matrix())(angles)
+    orientation = _roll(uv, sigma) @ facing @ turned
+    latent = scene.prior.typical
+    pose = scene.prior.decode(latent)
+    shape = jnp.zeros(10, dtype)
+    local = body_lib.local_keypoints(scene.body, pose, shape)
+    seen = jnp.einsum("hij,skj->hski", orientation, local)
+    rays = unproject(scene.intrinsics, uv)
+    position = jax.vmap(jax.vmap(lambda x: _place(x, rays, sigma)))(seen)
+    headings, postures = position.shape[:2]
+    flat = lambda a: a.reshape(headings * postures, *a.shape[2:])
+    return Fit(
+        flat(jnp.broadcast_to(orientation[:, None], (headings, postures, 3, 3))),
+        flat(position),
+        flat(jnp.broadcast_to(latent, (headings, *latent.shape))),
+    )
+
+
+def _roll(uv: Array, sigma: Array) -> Float[Array, "3 3"]:
+    """Turn about the optical axis, for who is lying or upside down: from the torso's
+    direction if it is more than 60 degrees from upright, none otherwise."""
+    torso = uv[1] - uv[8]
+    known = (sigma[1] < jnp.inf) & (sigma[8] < jnp.inf)
+    safe = jnp.where(known, torso, jnp.array([0.0, -1.0], torso.dtype))
+    angle = jnp.arctan2(safe[0], -safe[1])
+    angle = jnp.where(jnp.abs(angle) > jnp.pi / 3, angle, 0.0)
+    return jaxlie.SO3.from_z_radians(angle).as_matrix()
+
+
+def _place(
+    points: Float[Array, "25 3"], rays: Float[Array, "25 3"], sigma: Float[Array, " 25"]
+) -> Float[Array, " 3"]:
+    """The translation that puts points on rays best, by linear least squares."""
+    weight = 1 / sigma**2
+    weight = weight / jnp.maximum(jnp.max(weight), jnp.finfo(weight.dtype).tiny)
+    x, y = rays[:, 0], rays[:, 1]
+    one, zero = jnp.ones_like(x), jnp.zeros_like(x)
+    rows = jnp.concatenate(
+        [jnp.stack([one, zero, -x], 1), jnp.stack([zero, one, -y], 1)]
+    )
+    right = jnp.concatenate(
+        [x * points[:, 2] - points[:, 0], y * points[:, 2] - points[:, 1]]
+    )
+    weight = jnp.concatenate([weight, weight])
+    normal = (rows * weight[:, None]).T @ rows + 1e-9 * jnp.eye(3, dtype=x.dtype)
+    found = jnp.linalg.solve(normal, rows.T @ (weight * right))
+    # A negative or tiny depth means points that no body of this posture makes.
+    depth = jnp.maximum(found[2], 2 * DEPTH_FLOOR)
+    return jnp.where(found[2] < depth, depth * rays[8], found)
+
+
+@eqx.filter_jit
+def _descend(
+    shared: tuple[Scene, Int[Array, ""]],
+    fits: Fit,
+    uv: Float[Array, "m 25 2"],
+    sigma: Float[Array, "m 25"],
+) -> tuple[Fit, Float[Array, " m"], Float[Array, "m 24 3"]]:
+    """Levenberg--Marquardt on each of `m` fits, all the same number of steps.
+
+    **Returns:** the fits, their costs, and their joints about the pelvis, in C.
+    """
+    scene, steps = shared
+    shape = jnp.zeros(10, uv.dtype)
+    size = 6 + fits.latent.shape[-1]
+    prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
+
+    def evaluate(fit: Fit, uv: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        normal = linearise(scene, fit, shape, uv, sigma)
+        return (
+            normal.hessian + jnp.diag(prior),
+            normal.gradient.at[6:].add(fit.latent),
+            normal.cost + 0.5 * jnp.sum(fit.latent**2),
+        )
+
+    def propose(fit: Fit, normal: tuple, damping: Array) -> Fit:
+        hessian, gradient, _ = normal
+        hessian = hessian + jnp.diag(damping * jnp.diagonal(hessian) + 1e-6)
+        factor = jax.scipy.linalg.cho_factor(hessian)
+        return fit.moved(-jax.scipy.linalg.cho_solve(factor, gradient))
+
+    def step(_: Array, carry: tuple) -> tuple:
+        fits, normal, damping = carry
+        proposal = jax.vmap(propose)(fits, normal, damping)
+        found = jax.vmap(evaluate)(proposal, uv, sigma)
+        better = found[2] < normal[2]
+        choose = lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+        fits, normal = jax.tree.map(choose, (proposal, found), (fits, normal))
+        return fits, normal, jnp.where(better, damping / 5, damping * 5)
+
+    # The first normal equations are those of a step that is always accepted.
+    blank = (
+        jnp.tile(jnp.eye(size, dtype=uv.dtype), (len(uv), 1, 1)),
+        jnp.zeros((len(uv), size), uv.dtype),
+        jnp.full(len(uv), jnp.inf, uv.dtype),
+    )
+    carry = (fits, blank, jnp.full(len(uv), 0.5, uv.dtype))
+    fits, normal, _ = jax.lax.fori_loop(0, steps + 1, step, carry)
+    local = body_lib.local_joints(scene.body, scene.prior.decode(fits.latent), shape)
+    return fits, normal[2], local @ jnp.swapaxes(fits.orientation, -1, -2)
+
+
+def best_path(
+    costs: Float[np.ndarray, "f s"],
+    joints: Float[np.ndarray, "f s 24 3"],
+    orientation: Float[np.ndarray, "f s 3 3"],
+    time: Float[np.ndarray, " f"],
+) -> Int[np.ndarray, " f"]:
+    """The end of each frame that lies on the cheapest path (Viterbi).
+
+    Args:
+        joints: relative to the pelvis, in C, m.
+        time: of each frame, s, increasing.
+    """
+    frames, starts = costs.shape
+    total = costs[0]
+    came_from = np.zeros((frames, starts), int)
+    for k in range(1, frames):
+        gap = max(time[k] - time[k - 1], 1e-3)
+        moved = joints[k][None] - joints[k - 1][:, None]
+        squared = np.mean(np.sum(moved**2, -1), -1) / (_JOINT_SPEED * gap) ** 2
+        cosine = np.einsum("aij,bij->ab", orientation[k - 1], orientation[k])
+        turn = np.arccos(np.clip((cosine - 1) / 2, -1, 1)) / (_TURN_SPEED * gap)
+        jump = 0.5 * (_INDEPENDENT_JOINTS * squared + turn**2)
+        through = total[:, None] + jump
+        came_from[k] = np.argmin(through, axis=0)
+        total = costs[k] + np.min(through, axis=0)
+    path = np.empty(frames, int)
+    path[-1] = np.argmin(total)
+    for k in range(frames - 1, 0, -1):
+        path[k - 1] = came_from[k, path[k]]
+    return path

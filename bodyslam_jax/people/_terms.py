@@ -1,0 +1,170 @@
+"""How far one posed body is from one frame's keypoints, linearised.
+
+The unknowns of a frame are a small rotation δ (left, in C) of the root orientation, the
+pelvis position p_C and the latent posture z: `6 + k` numbers, then the 10 of the shape
+β that all frames share. Robust cost: Geman and McClure, `ρ(s) = s / (1 + s / c²)` of the
+squared whitened distance s, as in SMPLify (Bogo et al. 2016) but in standard deviations.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax import body as body_lib
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.camera import project
+from bodyslam_jax.people._prior import PosturePrior
+
+KEYPOINT_SIGMA = np.array(
+    # Nose, neck, then shoulder, elbow, wrist of the right and of the left.
+    [0.025, 0.050, 0.030, 0.025, 0.025, 0.030, 0.025, 0.025]
+    # Middle of the hips, then hip, knee, ankle of the right and of the left.
+    + [0.050, 0.050, 0.028, 0.028, 0.050, 0.028, 0.028]
+    # Eyes, ears; big toe, small toe, heel of the left and of the right.
+    + [0.025, 0.025, 0.030, 0.030, 0.040, 0.040, 0.035, 0.040, 0.040, 0.035]
+)
+"""Error of BODY_25 keypoints on the body, m: 0.4 of COCO's annotators' σ_k for an adult,
+twice that at hips and neck, which every detector puts elsewhere (OpenPose outside and
+below SMPL's, MediaPipe inside), and the head's fit where the face is one of many."""
+
+DEPTH_FLOOR = 0.3
+"""m: nobody is fitted closer to the camera."""
+
+
+class Fit(eqx.Module):
+    """One body in one frame (or, with a leading axis, in each of many)."""
+
+    orientation: Float[Array, "*b 3 3"]
+    """R_CH."""
+    position: Float[Array, "*b 3"]
+    """Pelvis joint in C, m."""
+    latent: Float[Array, "*b k"]
+    """Posture, in standard deviations of the prior's components."""
+
+    def moved(self, step: Float[Array, "*b n"]) -> "Fit":
+        turn = jaxlie.SO3.exp(step[..., :3]).as_matrix()
+        position = self.position + step[..., 3:6]
+        depth = jnp.maximum(position[..., 2:], DEPTH_FLOOR)
+        return Fit(
+            turn @ self.orientation,
+            jnp.concatenate([position[..., :2], depth], -1),
+            self.latent + step[..., 6:],
+        )
+
+
+class Scene(eqx.Module):
+    """What all frames and all starts share."""
+
+    body: BodyModel
+    prior: PosturePrior
+    intrinsics: Float[Array, " i"]
+    robust_scale: Float[Array, ""]
+    """c, in standard deviations."""
+    limit_sigma: Float[Array, ""]
+    """How softly the angles' limits are held, rad."""
+    upright_weight: Float[Array, ""]
+    """1/σ² of the body axis' lean out of the image plane (sine)."""
+
+
+class Normal(eqx.Module):
+    """Gauss--Newton normal equations of one frame."""
+
+    hessian: Float[Array, "*b n n"]
+    cross: Float[Array, "*b n 10"]
+    """Between the frame's unknowns and the shape."""
+    shape_hessian: Float[Array, "*b 10 10"]
+    gradient: Float[Array, "*b n"]
+    shape_gradient: Float[Array, "*b 10"]
+    cost: Float[Array, "*b"]
+
+
+def keypoints_in_camera(
+    scene: Scene, fit: Fit, shape: Float[Array, " 10"]
+) -> Float[Array, "25 3"]:
+    local = body_lib.local_keypoints(scene.body, scene.prior.decode(fit.latent), shape)
+    return local @ fit.orientation.T + fit.position
+
+
+def cost(
+    scene: Scene,
+    fit: Fit,
+    shape: Float[Array, " 10"],
+    uv: Float[Array, "25 2"],
+    sigma: Float[Array, " 25"],
+) -> Float[Array, ""]:
+    """Robust keypoints, soft limits and upright prior of one frame; no posture prior."""
+    residual = (
+        project(scene.intrinsics, keypoints_in_camera(scene, fit, shape)) - uv
+    ) / (sigma[:, None])
+    return 0.5 * (
+        jnp.sum(_robust(jnp.sum(residual**2, -1), scene.robust_scale)[0])
+        + jnp.sum((_beyond_limits(scene, fit) / scene.limit_sigma) ** 2)
+        + scene.upright_weight * fit.orientation[2, 1] ** 2
+    )
+
+
+def linearise(
+    scene: Scene,
+    fit: Fit,
+    shape: Float[Array, " 10"],
+    uv: Float[Array, "25 2"],
+    sigma: Float[Array, " 25"],
+) -> Normal:
+    """The same as `cost`, with its derivatives."""
+    size = 6 + fit.latent.shape[-1]
+
+    def residual_of(unknowns: Float[Array, " m"]) -> Float[Array, "25 2"]:
+        # Clamping the depth, as `moved` does, would stop the gradient there.
+        turned = jaxlie.SO3.exp(unknowns[:3]).as_matrix() @ fit.orientation
+        there = Fit(turned, unknowns[3:6], unknowns[6:size])
+        return project(
+            scene.intrinsics, keypoints_in_camera(scene, there, unknowns[size:])
+        )
+
+    here = jnp.concatenate(
+        [jnp.zeros_like(fit.position), fit.position, fit.latent, shape]
+    )
+    predicted, push = jax.linearize(residual_of, here)
+    columns = jax.vmap(push)(jnp.eye(here.size, dtype=here.dtype))
+    residual = (predicted - uv) / sigma[:, None]
+    value, weight = _robust(jnp.sum(residual**2, -1), scene.robust_scale)
+    jac = (columns / sigma[:, None]).reshape(here.size, -1)
+    weighted = jac * jnp.repeat(weight, 2)
+    full = weighted @ jac.T
+    gradient = weighted @ residual.reshape(-1)
+    hessian, gradient_own = full[:size, :size], gradient[:size]
+
+    beyond = _beyond_limits(scene, fit) / scene.limit_sigma
+    limits = scene.prior.basis * (beyond != 0)[:, None] / scene.limit_sigma
+    hessian = hessian.at[6:, 6:].add(limits.T @ limits)
+    gradient_own = gradient_own.at[6:].add(limits.T @ beyond)
+
+    lean = fit.orientation[2, 1]
+    # d(Exp(δ) R)[2, 1] = δ x (R e_y), third component.
+    axis = jnp.stack([fit.orientation[1, 1], -fit.orientation[0, 1], 0 * lean])
+    hessian = hessian.at[:3, :3].add(scene.upright_weight * jnp.outer(axis, axis))
+    gradient_own = gradient_own.at[:3].add(scene.upright_weight * lean * axis)
+    total = 0.5 * (jnp.sum(value) + jnp.sum(beyond**2) + scene.upright_weight * lean**2)
+    return Normal(
+        hessian,
+        full[:size, size:],
+        full[size:, size:],
+        gradient_own,
+        gradient[size:],
+        total,
+    )
+
+
+def _robust(squared: Array, scale: Array) -> tuple[Array, Array]:
+    ratio = 1 + squared / scale**2
+    return squared / ratio, 1 / ratio**2
+
+
+def _beyond_limits(scene: Scene, fit: Fit) -> Float[Array, " 63"]:
+    angles = scene.prior.mean + scene.prior.basis @ fit.latent
+    return jnp.maximum(angles - scene.prior.upper, 0) - jnp.maximum(
+        scene.prior.lower - angles, 0
+    )
