@@ -1,0 +1,38 @@
+"""How far an estimate is from the truth: alignments, errors, readers of both."""
+
+from bodyslam_jax.evaluation._alignment import Alignment as Alignment
+from bodyslam_jax.evaluation._alignment import Similarity as Similarity
+from bodyslam_jax.evaluation._alignment import align as align
+from bodyslam_jax.evaluation._alignment import umeyama as umeyama
+from bodyslam_jax.evaluation._association import associate as associate
+from bodyslam_jax.evaluation._association import evaluate as evaluate
+from bodyslam_jax.evaluation._association import pad_frames as pad_frames
+from bodyslam_jax.evaluation._evaluation import Evaluation as Evaluation
+from bodyslam_jax.evaluation._evaluation import Trajectories as Trajectories
+from bodyslam_jax.evaluation._evaluation import (
+    evaluate_trajectories as evaluate_trajectories,
+)
+from bodyslam_jax.evaluation._evaluation import to_json as to_json
+from bodyslam_jax.evaluation._evaluation import to_rows as to_rows
+from bodyslam_jax.evaluation._evaluation import to_table as to_table
+from bodyslam_jax.evaluation._metrics import Errors as Errors
+from bodyslam_jax.evaluation._metrics import acceleration_error as acceleration_error
+from bodyslam_jax.evaluation._metrics import camera_frame as camera_frame
+from bodyslam_jax.evaluation._metrics import foot_sliding as foot_sliding
+from bodyslam_jax.evaluation._metrics import jitter as jitter
+from bodyslam_jax.evaluation._metrics import (
+    joint_trajectory_error as joint_trajectory_error,
+)
+from bodyslam_jax.evaluation._metrics import mpjpe as mpjpe
+from bodyslam_jax.evaluation._metrics import pa_mpjpe as pa_mpjpe
+from bodyslam_jax.evaluation._metrics import (
+    relative_pose_errors as relative_pose_errors,
+)
+from bodyslam_jax.evaluation._metrics import (
+    root_trajectory_error as root_trajectory_error,
+)
+from bodyslam_jax.evaluation._metrics import trajectory_error as trajectory_error
+from bodyslam_jax.evaluation._metrics import world_mpjpe as world_mpjpe
+from bodyslam_jax.evaluation._readers import read_groundtruth as read_groundtruth
+from bodyslam_jax.evaluation._readers import read_result as read_result
+from bodyslam_jax.evaluation._readers import read_tum as read_tum

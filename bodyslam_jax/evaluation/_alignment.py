@@ -46,17 +46,18 @@ def nearest_rotation(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     xx, xy, xz = m[..., 0, 0], m[..., 0, 1], m[..., 0, 2]
     yx, yy, yz = m[..., 1, 0], m[..., 1, 1], m[..., 1, 2]
     zx, zy, zz = m[..., 2, 0], m[..., 2, 1], m[..., 2, 2]
+    # Order x y z w: of equal eigenvalues the last stands for no rotation.
     davenport = jnp.stack(
         [
-            jnp.stack([xx + yy + zz, yz - zy, zx - xz, xy - yx], -1),
-            jnp.stack([yz - zy, xx - yy - zz, xy + yx, zx + xz], -1),
-            jnp.stack([zx - xz, xy + yx, yy - xx - zz, yz + zy], -1),
-            jnp.stack([xy - yx, zx + xz, yz + zy, zz - xx - yy], -1),
+            jnp.stack([xx - yy - zz, xy + yx, zx + xz, yz - zy], -1),
+            jnp.stack([xy + yx, yy - xx - zz, yz + zy, zx - xz], -1),
+            jnp.stack([zx + xz, yz + zy, zz - xx - yy, xy - yx], -1),
+            jnp.stack([yz - zy, zx - xz, xy - yx, xx + yy + zz], -1),
         ],
         -2,
     )
     _, vectors = jnp.linalg.eigh(davenport)
-    return jaxlie.SO3(vectors[..., -1]).as_matrix()
+    return jaxlie.SO3.from_quaternion_xyzw(vectors[..., -1]).as_matrix()
 
 
 @nearest_rotation.defjvp

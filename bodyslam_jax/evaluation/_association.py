@@ -1,0 +1,293 @@
+"""Two results brought together: same moments, same people."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import linear_sum_assignment
+
+from bodyslam_jax.body import BodyModel, joints, keypoints
+from bodyslam_jax.evaluation._alignment import align
+from bodyslam_jax.evaluation._evaluation import (
+    FEET,
+    PELVIS,
+    Evaluation,
+    Trajectories,
+    evaluate_trajectories,
+)
+from bodyslam_jax.evaluation._metrics import trajectory_error
+from bodyslam_jax.result import Result
+
+_TOES_AND_HEELS = (19, 21, 22, 24)
+"""In BODY_25; on SMPL the vertices 3216, 3387, 6617, 6787 of WHAM's foot sliding."""
+
+
+def evaluate(
+    result: Result | Trajectories,
+    truth: Result | Trajectories,
+    body: BodyModel | None = None,
+    offset: float = 0.0,
+) -> Evaluation:
+    """Every error of `result` against `truth`.
+
+    Results are first associated in time and person (`associate`, on the host).
+    `Trajectories`, which are associated already, pass straight to the pure
+    `evaluate_trajectories`: jit, vmap and differentiate this function with those.
+
+    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
+    """
+    if isinstance(result, Trajectories) and isinstance(truth, Trajectories):
+        return evaluate_trajectories(result, truth)
+    if not isinstance(result, Result) or not isinstance(truth, Result):
+        raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
+    return _evaluate(*associate(result, truth, body, offset))
+
+
+_evaluate = eqx.filter_jit(evaluate_trajectories)
+
+
+def associate(
+    result: Result, truth: Result, body: BodyModel | None = None, offset: float = 0.0
+) -> tuple[Trajectories, Trajectories]:
+    """Estimate and truth on common frames and people.
+
+    Time: `offset` (s) is added to the result's timestamps. The slower of the two sets
+    the frames; the faster is interpolated there (positions linearly, rotations on the
+    geodesic), across at most one and a half of its own frames; at its ends and gaps the
+    nearest frame within half a frame is taken. Other frames are dropped or masked.
+
+    People: the pairing with the least total H-ATE under alignment A3 (A1 without a
+    camera); people without partner are left out.
+
+    Feet: toes and heels of `body` if both sides' joints are that body's, else the ankle
+    and foot joints.
+
+    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
+    """
+    times = result.timestamps + offset
+    slower = _interval(times) >= 0.999 * _interval(truth.timestamps)
+    at = times if slower else truth.timestamps
+    feet, true_feet = _feet(result, truth, body)
+    found = _resample(_host(result, feet), times, at)
+    true = _resample(_host(truth, true_feet), truth.timestamps, at)
+    overlap = np.flatnonzero(found.close & true.close)
+    if not len(overlap):
+        raise ValueError(
+            f"The result spans {_span(times)}, the ground truth "
+            f"{_span(truth.timestamps)}: no frame of one is within half a frame of the "
+            "other; shift the result's clock with `offset`."
+        )
+    frames = slice(overlap[0], overlap[-1] + 1)
+    fps = 1 / _interval(at)
+    everybody = range(len(found.present)), range(len(true.present))
+    pair = (
+        _bundle(found, frames, everybody[0], fps),
+        _bundle(true, frames, everybody[1], fps),
+    )
+    who, true_who = _match(*pair)
+    return _bundle(found, frames, who, fps), _bundle(true, frames, true_who, fps)
+
+
+def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
+    """The same with frames that do not count added to the end: equal shapes stack."""
+    missing = num_frames - trajectories.T_WC.shape[0]
+
+    def pad(x: Array, axis: int, mode: str = "edge") -> Array:
+        return jnp.pad(x, [(0, missing * (i == axis)) for i in range(x.ndim)], mode)
+
+    return Trajectories(
+        pad(trajectories.T_WC, 0),
+        pad(trajectories.camera_valid, 0, "constant"),
+        pad(trajectories.joints, 1),
+        pad(trajectories.present, 1, "constant"),
+        pad(trajectories.feet, 1),
+        trajectories.fps,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Host:
+    """`Trajectories` before they are cut to size, and which frames have data."""
+
+    T_WC: np.ndarray
+    camera_valid: np.ndarray
+    joints: np.ndarray
+    present: np.ndarray
+    feet: np.ndarray
+    close: np.ndarray
+
+
+def _host(result: Result, feet: np.ndarray) -> _Host:
+    has_camera = bool(result.summary.get("has_camera", True))
+    every = np.ones(len(result.timestamps), bool)
+    return _Host(
+        result.T_WC, every & has_camera, result.joints, result.present, feet, every
+    )
+
+
+def _interval(times: Float[np.ndarray, " t"]) -> float:
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+
+
+def _span(times: Float[np.ndarray, " t"]) -> str:
+    return f"{times[0]:.3f} to {times[-1]:.3f} s"
+
+
+def brackets(
+    times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frames before and after each moment, the weight of the latter, whether close.
+
+    A weight strictly between 0 and 1 interpolates, and never across a gap; `close` is
+    where there is data to interpolate, or a frame within half a frame.
+    """
+    interval = _interval(times)
+    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = np.maximum(times[after] - times[before], 1e-12)
+    weight = np.clip((at - times[before]) / gap, 0, 1)
+    nearest = np.round(weight)
+    # Timestamps are rounded in files, and a gap is nothing to interpolate across.
+    blend = (abs(weight - nearest) > 1e-3) & (gap <= 1.5 * interval)
+    distance = np.minimum(abs(at - times[before]), abs(at - times[after]))
+    return (
+        before,
+        after,
+        np.where(blend, weight, nearest),
+        blend | (distance <= 0.5001 * interval),
+    )
+
+
+def interpolate_poses(
+    T: Float[np.ndarray, "t 4 4"],
+    before: np.ndarray,
+    after: np.ndarray,
+    weight: np.ndarray,
+) -> Float[np.ndarray, "u 4 4"]:
+    """Poses between frames: centres linearly, rotations on the geodesic."""
+    w = weight[:, None, None]
+    found = (1 - w) * T[before] + w * T[after]
+    if np.any((weight > 0) & (weight < 1)):
+        # By matrices: jaxlie's own products do not pass strict dtype promotion.
+        start, end = T[before, :3, :3], T[after, :3, :3]
+        turn = jaxlie.SO3.from_matrix(jnp.asarray(np.swapaxes(start, 1, 2) @ end)).log()
+        part = jaxlie.SO3.exp(jnp.asarray(weight, turn.dtype)[:, None] * turn)
+        found[:, :3, :3] = start @ np.asarray(part.as_matrix())
+    return found
+
+
+def _resample(host: _Host, times: np.ndarray, at: np.ndarray) -> _Host:
+    """The same at other moments; `close` says where there was data to take."""
+    if not len(times):
+        raise ValueError("A result without frames cannot be evaluated.")
+    before, after, weight, close = brackets(times, at)
+
+    def positions(x: np.ndarray) -> np.ndarray:
+        w = weight[:, None, None]
+        return (1 - w) * x[:, before] + w * x[:, after]
+
+    def flags(x: np.ndarray) -> np.ndarray:
+        known = (x[..., before] | (weight == 1)) & (x[..., after] | (weight == 0))
+        return known & close
+
+    return _Host(
+        interpolate_poses(host.T_WC, before, after, weight),
+        flags(host.camera_valid),
+        positions(host.joints),
+        flags(host.present),
+        positions(host.feet),
+        close,
+    )
+
+
+def _bundle(
+    host: _Host, frames: slice, people: Sequence[int], fps: float
+) -> Trajectories:
+    who = list(people)
+    return Trajectories(
+        jnp.asarray(host.T_WC[frames]),
+        jnp.asarray(host.camera_valid[frames]),
+        jnp.asarray(host.joints[who][:, frames]),
+        jnp.asarray(host.present[who][:, frames]),
+        jnp.asarray(host.feet[who][:, frames]),
+        jnp.asarray(fps),
+    )
+
+
+def _match(found: Trajectories, true: Trajectories) -> tuple[list[int], list[int]]:
+    """Who is who: estimate's and truth's person of each pair, in the truth's order."""
+    num, num_true = len(found.present), len(true.present)
+    if num <= 1 and num_true <= 1:
+        both = list(range(min(num, num_true)))
+        return both, both
+    cost = np.asarray(_h_ate_of_all_pairs(found, true))
+    cost = np.where(np.isnan(cost), 1e6, cost)
+    who, true_who = linear_sum_assignment(cost)
+    pairs = sorted(
+        (int(b), int(a)) for a, b in zip(who, true_who, strict=True) if cost[a, b] < 1e6
+    )
+    return [a for _, a in pairs], [b for b, _ in pairs]
+
+
+@eqx.filter_jit
+def _h_ate_of_all_pairs(
+    found: Trajectories, true: Trajectories
+) -> Float[Array, "h true"]:
+    camera_valid = found.camera_valid & true.camera_valid
+
+    def h_ate(joints, present, true_joints, true_present):
+        valid = present & true_present
+        _, human = align(
+            "A3",
+            true.T_WC,
+            found.T_WC,
+            camera_valid.astype(joints.dtype),
+            true_joints[:, PELVIS],
+            joints[:, PELVIS],
+            valid.astype(joints.dtype),
+        )
+        return trajectory_error(
+            joints[:, PELVIS], true_joints[:, PELVIS], valid, human
+        ).mean()
+
+    over_truth = jax.vmap(h_ate, (None, None, 0, 0))
+    return jax.vmap(over_truth, (0, 0, None, None))(
+        found.joints, found.present, true.joints, true.present
+    )
+
+
+def _feet(
+    result: Result, truth: Result, body: BodyModel | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Foot points of both sides, of the same kind."""
+    if body is not None and all(_is_of(x, body) for x in (result, truth)):
+        return _toes_and_heels(result, body), _toes_and_heels(truth, body)
+    return result.joints[:, :, FEET], truth.joints[:, :, FEET]
+
+
+def _is_of(result: Result, body: BodyModel) -> bool:
+    """Whether the joints are this body's, to a centimetre."""
+    mine = joints(body, *_pose_shape_trans(result, body))
+    here = result.present[..., None, None]
+    return bool(
+        np.max(np.abs(np.asarray(mine) - result.joints) * here, initial=0) < 0.01
+    )
+
+
+def _toes_and_heels(result: Result, body: BodyModel) -> np.ndarray:
+    found = keypoints(body, *_pose_shape_trans(result, body), layout="body25")
+    return np.asarray(found[:, :, _TOES_AND_HEELS, :])
+
+
+def _pose_shape_trans(result: Result, body: BodyModel) -> tuple[Array, Array, Array]:
+    dtype = body.template.dtype
+    return (
+        jnp.asarray(result.poses, dtype),
+        jnp.asarray(result.betas[:, None], dtype),
+        jnp.asarray(result.trans, dtype),
+    )

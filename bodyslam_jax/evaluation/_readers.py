@@ -1,0 +1,259 @@
+"""Run folders and ground truths, read into one `Result` each."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import BodyModel, joints
+from bodyslam_jax.evaluation._association import brackets, interpolate_poses
+from bodyslam_jax.result import Result
+
+_RUN_FIELDS = {
+    "timestamps": ("t",),
+    "T_WC": ("t", 4, 4),
+    "scale": (),
+    "intrinsics": ("i",),
+    "landmarks": ("l", 3),
+    "poses": ("h", "t", 72),
+    "trans": ("h", "t", 3),
+    "betas": ("h", 10),
+    "joints": ("h", "t", 24, 3),
+    "present": ("h", "t"),
+}
+
+
+def read_result(path: Path) -> Result:
+    """Reads `result.npz` (or the run folder around it) and its `summary.json`.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    what was expected.
+    """
+    file = path / "result.npz" if path.is_dir() else path
+    arrays = _load_npz(file)
+    missing = [name for name in _RUN_FIELDS if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
+    sizes: dict[str, int] = {}
+    for name, axes in _RUN_FIELDS.items():
+        shape = arrays[name].shape
+        fits = len(shape) == len(axes) and all(
+            n == (axis if isinstance(axis, int) else sizes.setdefault(axis, n))
+            for n, axis in zip(shape, axes, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
+        _check_finite(file, name, arrays[name])
+    summary_file = file.with_name("summary.json")
+    summary = json.loads(summary_file.read_text()) if summary_file.exists() else {}
+    fields: dict[str, Any] = {name: _float(arrays[name]) for name in _RUN_FIELDS}
+    fields["scale"] = float(arrays["scale"])
+    fields["present"] = arrays["present"].astype(bool)
+    return Result(**fields, summary=summary)
+
+
+def read_groundtruth(path: Path, body: BodyModel) -> Result:
+    """Reads a true camera trajectory, true bodies, or both, into one `Result`.
+
+    `path` is a folder with `camera.txt` (TUM, camera to world) and `body.npz` (AMASS
+    style; or `body_0.npz`, `body_1.npz` ... for several people), a sequence folder with
+    such a `groundtruth/`, a run folder, or one such file. Bodies start at the camera's
+    first timestamp. Joints that a file does not hold come from `body`. What is not
+    known is absent: `summary["has_camera"]` is false, or there are no people.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    what was expected.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such ground truth.")
+    if path.is_dir():
+        if (path / "groundtruth").is_dir():
+            path = path / "groundtruth"
+        elif (path / "result.npz").exists():
+            return read_result(path)
+        cameras = [p for n in ("camera.txt", "camera.tum") if (p := path / n).exists()]
+        bodies = sorted(path.glob("body.npz")) or sorted(path.glob("body_*.npz"))
+        landmarks = path / "landmarks.npy"
+    elif path.suffix == ".npz":
+        if "T_WC" in _load_npz(path):
+            return read_result(path)
+        cameras, bodies, landmarks = [], [path], None
+    else:
+        cameras, bodies, landmarks = [path], [], None
+    if not cameras and not bodies:
+        raise ValueError(f"{path}: neither camera.txt nor body.npz in this folder.")
+    people = [_read_body(file, body) for file in bodies]
+    people = [_read_body(file, body) for file in bodies]
+    camera = read_tum(cameras[0]) if cameras else None
+    times, T_WC = _timeline(camera, people)
+    placed = [_at(person, times, camera is not None) for person in people]
+    stack = lambda name, *shape: np.reshape(
+        [person[name] for person in placed], (len(placed), *shape)
+    )
+    return Result(
+        timestamps=times,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.ones(4),
+        landmarks=_landmarks(landmarks),
+        poses=stack("poses", len(times), 72).astype(float),
+        trans=stack("trans", len(times), 3).astype(float),
+        betas=stack("betas", 10).astype(float),
+        joints=stack("joints", len(times), 24, 3).astype(float),
+        present=stack("present", len(times)).astype(bool),
+        summary={"input": str(path), "has_camera": camera is not None},
+    )
+
+
+def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
+    """Timestamps (s) and poses (camera to world, m) of a TUM trajectory, sorted.
+
+    A line is `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
+
+    **Raises:** `ValueError` naming the file, what was found and what was expected.
+    """
+    rows = []
+    try:
+        lines = path.read_text().splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: a binary file, not a TUM trajectory.") from None
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) != 8 or not np.all(np.isfinite(row)):
+            raise ValueError(
+                f"{path}, line {number}: {line.strip()[:60]!r}, not eight numbers "
+                "`timestamp tx ty tz qx qy qz qw`."
+            )
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: no pose in it; expected TUM lines of eight numbers.")
+    table = np.array(rows)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    if np.any(np.diff(table[:, 0]) <= 0):
+        raise ValueError(f"{path}: two poses have the same timestamp.")
+    length = np.linalg.norm(table[:, 4:], axis=1)
+    if np.any(abs(length - 1) > 0.05):
+        worst = float(length[np.argmax(abs(length - 1))])
+        raise ValueError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
+    T_WC = np.tile(np.eye(4), (len(table), 1, 1))
+    wxyz = table[:, [7, 4, 5, 6]] / length[:, None]
+    T_WC[:, :3, :3] = np.asarray(jaxlie.SO3(jnp.asarray(wxyz)).as_matrix())
+    T_WC[:, :3, 3] = table[:, 1:4]
+    return table[:, 0], T_WC
+
+
+def _timeline(
+    camera: tuple[np.ndarray, np.ndarray] | None, people: list[dict[str, Any]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The denser of camera and bodies sets the moments; the camera's poses there."""
+    longest = max(people, key=lambda p: len(p["poses"]), default=None)
+    if camera is None:
+        assert longest is not None
+        times = np.arange(len(longest["poses"])) / longest["fps"]
+        return times, np.tile(np.eye(4), (len(times), 1, 1))
+    times, T_WC = camera
+    if longest is None or len(longest["poses"]) <= len(times):
+        return times, T_WC
+    at = times[0] + np.arange(len(longest["poses"])) / longest["fps"]
+    before, after, weight, close = brackets(times, at)
+    return at[close], interpolate_poses(T_WC, before, after, weight)[close]
+
+
+def _at(
+    person: dict[str, Any], times: np.ndarray, has_camera: bool
+) -> dict[str, np.ndarray]:
+    """One person at the moments of the timeline."""
+    num, fps = len(person["poses"]), person["fps"]
+    own = times[0] + np.arange(num) / fps
+    if (
+        has_camera
+        and num == len(times)
+        and abs(np.median(np.diff(times)) * fps - 1) < 0.02
+    ):
+        own = times  # frame by frame, whatever the camera's clock does
+    before, after, weight, close = brackets(own, times)
+    w = weight[:, None]
+    nearest = np.where(weight < 0.5, before, after)
+    trans, joint = person["trans"], person["joints"]
+    return {
+        "poses": person["poses"][nearest],
+        "trans": (1 - w) * trans[before] + w * trans[after],
+        "betas": person["betas"],
+        "joints": (1 - w[..., None]) * joint[before] + w[..., None] * joint[after],
+        "present": close,
+    }
+
+
+def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
+    """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10."""
+    arrays = _load_npz(path)
+    missing = [name for name in ("poses", "trans", "betas") if name not in arrays]
+    rate = next((n for n in _RATES if n in arrays), None)
+    if missing or rate is None:
+        missing += [] if rate else [_RATES[0]]
+        raise ValueError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
+    poses, trans = _float(arrays["poses"]), _float(arrays["trans"])
+    betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate])
+    num = len(poses) if poses.ndim == 2 else -1
+    if num < 1 or poses.shape[1] < 66 or trans.shape != (num, 3):
+        raise ValueError(
+            f"{path}: poses {poses.shape}, trans {trans.shape}, not (t, 72), (t, 3)."
+        )
+    if not 1 <= fps <= 1000:
+        raise ValueError(f"{path}: {rate} is {fps}, not a frame rate in 1/s.")
+    if poses.shape[1] != 72:
+        poses = np.concatenate([poses[:, :66], np.zeros((num, 6))], 1)
+    betas = np.pad(betas[:10], (0, max(0, 10 - len(betas))))
+    if "joints" in arrays:
+        found = _float(arrays["joints"])
+        if found.shape != (num, 24, 3):
+            raise ValueError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
+    else:
+        as_body = [jnp.asarray(x, body.template.dtype) for x in (poses, betas, trans)]
+        found = _float(joints(body, *as_body))
+    for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
+        _check_finite(path, name, array)
+    return {"poses": poses, "trans": trans, "betas": betas, "joints": found, "fps": fps}
+
+
+_RATES = ("mocap_framerate", "mocap_frame_rate")
+
+
+def _landmarks(path: Path | None) -> np.ndarray:
+    if path is None or not path.exists():
+        return np.zeros((0, 3))
+    return _float(np.load(path, allow_pickle=False)).reshape(-1, 3)
+
+
+def _load_npz(path: Path) -> dict[str, np.ndarray]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file.")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {n: archive[n] for n in archive.files if n not in _OBJECTS}
+    except (zipfile.BadZipFile, ValueError, EOFError, AttributeError) as error:
+        raise ValueError(f"{path}: not a readable .npz file ({error}).") from None
+
+
+_OBJECTS = ("marker_data", "marker_labels")
+"""Of AMASS; not needed, and at times pickled."""
+
+
+def _float(array: Any) -> np.ndarray:
+    return np.asarray(array, np.float64)
+
+
+def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
+    if array.dtype.kind not in "fiub" or not np.all(np.isfinite(array)):
+        raise ValueError(f"{path}: {name} holds values that are not finite numbers.")

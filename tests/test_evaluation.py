@@ -1,0 +1,391 @@
+"""Errors: the properties that define them, and evo as an oracle."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from evo.core import metrics as evo_metrics
+from evo.core.trajectory import PoseTrajectory3D
+
+from bodyslam_jax import evaluation
+from bodyslam_jax.evaluation import Trajectories
+from bodyslam_jax.result import Result
+
+NUM = 250
+"""Frames: two chunks of 100 and a short one."""
+
+evaluate = jax.jit(evaluation.evaluate)
+
+
+def _truth(num_people=1, num_frames=NUM):
+    """People walking on curves beside a camera that goes along."""
+    rng = np.random.default_rng(0)
+    t = np.arange(num_frames) / 30.0
+    rest = rng.normal(0, 0.4, (24, 3))
+    joints = []
+    for i in range(num_people):
+        root = np.stack([1.2 * t, 0.05 * np.sin(9 * t), 2 * i + np.sin(t + i)], -1)
+        swing = 0.1 * np.sin(6 * t[:, None, None] + np.arange(24)[:, None])
+        joints.append(root[:, None] + rest + swing * rest[:, ::-1])
+    T_WC = np.tile(np.eye(4), (num_frames, 1, 1))
+    wobble = 0.2 * np.stack([np.sin(t), np.cos(2 * t), np.sin(3 * t)], -1)
+    T_WC[:, :3, :3] = jaxlie.SO3.exp(jnp.asarray(wobble)).as_matrix()
+    T_WC[:, :3, 3] = np.stack([1.1 * t, 1.6 + 0.1 * np.sin(2 * t), -3 + 0 * t], -1)
+    return _result(t, T_WC, np.array(joints))
+
+
+def _result(timestamps, T_WC, joints, present=None, **summary):
+    people, frames = joints.shape[:2]
+    return Result(
+        timestamps=timestamps,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.array([500.0, 500, 320, 240]),
+        landmarks=np.zeros((0, 3)),
+        poses=np.zeros((people, frames, 72)),
+        trans=joints[:, :, 0],
+        betas=np.zeros((people, 10)),
+        joints=joints,
+        present=np.ones((people, frames), bool) if present is None else present,
+        summary=summary,
+    )
+
+
+def _moved(truth, scale=1.0):
+    """The same from another world, `scale` times as large."""
+    move = np.asarray(
+        jaxlie.SE3.exp(jnp.array([1.0, -2.0, 0.5, 0.4, -0.8, 0.3])).as_matrix()
+    )
+    T_WC = move @ truth.T_WC
+    T_WC[:, :3, 3] *= scale
+    joints = scale * (truth.joints @ move[:3, :3].T + move[:3, 3])
+    return dataclasses.replace(truth, T_WC=T_WC, joints=joints)
+
+
+def _pair(result, truth):
+    return evaluation.associate(result, truth)
+
+
+RIGID = ("c_ate_se3", "h_ate_se3", "j_ate_se3", "h_ate_a2", "c_ate_a3", "h_ate_a3")
+RIGID += ("c_ate_a4", "h_ate_a4", "j_ate_a4", "rte", "ate_s", "rpe_translation")
+SIMILAR = ("c_ate_sim3", "h_ate_sim3", "j_ate_sim3", "w_mpjpe", "wa_mpjpe")
+SIMILAR += ("w_mpjpe_tram", "wa_mpjpe_tram", "pa_mpjpe", "rpe_rotation")
+BODY = ("mpjpe", "acceleration_error", "scale_error")
+
+
+def test_truth_against_itself_is_zero():
+    found = evaluate(*_pair(_truth(), _truth()))
+    for name in RIGID + SIMILAR + BODY:
+        assert float(found[name]) < 1e-10, name
+        assert float(found.values.get(f"{name}_rmse", 0.0)) < 1e-10, name
+
+
+def test_rigid_motion_of_the_world_is_no_error():
+    found = evaluate(*_pair(_moved(_truth()), _truth()))
+    for name in RIGID + SIMILAR + BODY:
+        assert float(found[name]) < 1e-10, name
+
+
+def test_wrong_scale_shows_where_scale_is_not_aligned():
+    found = evaluate(*_pair(_moved(_truth(), 0.8), _truth()))
+    for name in SIMILAR:
+        assert float(found[name]) < 1e-10, name
+    for name in RIGID + BODY:
+        assert float(found[name]) > 1e-3, name
+    np.testing.assert_allclose(found["scale"], 1 / 0.8, rtol=1e-12)
+
+
+@pytest.mark.parametrize("chunking", ["wham", "tram"])
+def test_drift_of_a_still_person(chunking):
+    """W grows with the chunk; the alignment over all of it halves that at least."""
+    drift = 0.001
+    still = jnp.broadcast_to(jnp.asarray(_truth().joints[0, 0]), (NUM, 24, 3))
+    moved = still.at[:, :, 2].add(drift * jnp.arange(float(NUM))[:, None])
+    valid = jnp.ones(NUM, bool)
+    w = evaluation.world_mpjpe(moved, still, valid, "first", chunking)
+    wa = evaluation.world_mpjpe(moved, still, valid, "all", chunking)
+    if chunking == "wham":
+        # 99.5 frames x d / 2 in a full chunk; half a step less from fitting two frames.
+        np.testing.assert_allclose(np.mean(w.value[:100]), drift * 49, rtol=0.02)
+    assert float(wa.mean()) <= drift * (25 if chunking == "wham" else 40)
+    assert float(wa.mean()) < float(w.mean()) / 1.8
+
+
+def test_never_a_reflection():
+    mirrored = dataclasses.replace(_truth(), joints=_truth().joints * [1.0, 1, -1])
+    found = evaluate(*_pair(mirrored, _truth()))
+    assert float(found["pa_mpjpe"]) > 0.1 and float(found["wa_mpjpe"]) > 0.1
+
+
+@pytest.mark.parametrize("num_valid", [1, 2, 100, 101, 200, 201, 250])
+def test_chunks_are_those_of_wham_and_tram(num_valid):
+    """Against loops as in their scripts; a last chunk of one frame is not NaN."""
+    joints = jnp.asarray(_truth().joints[0])
+    noisy = joints + 0.05 * jax.random.normal(jax.random.key(1), joints.shape)
+    first = 7 if num_valid < NUM else 0
+    valid = jnp.zeros(NUM, bool).at[first : first + num_valid].set(True)
+    y, x = joints[first : first + num_valid], noisy[first : first + num_valid]
+    wham = [(s, min(s + 100, num_valid)) for s in range(0, num_valid, 100)]
+    tram = []
+    for start in range(0, num_valid - 100, 100):
+        last = start + 200 > num_valid
+        tram.append((start, num_valid - 1 if last else start + 100))
+    for chunking, chunks in (("wham", wham), ("tram", tram or [(0, num_valid)])):
+        for align_with in ("first", "all"):
+            expected = []
+            for a, b in chunks:
+                fit = slice(a, min(a + 2, b)) if align_with == "first" else slice(a, b)
+                found = evaluation.umeyama(
+                    y[fit].reshape(-1, 3), x[fit].reshape(-1, 3), with_scale=True
+                )
+                error = found.apply(x[a:b]) - y[a:b]
+                expected.append(np.linalg.norm(error, axis=-1).mean(1))
+            found = evaluation.world_mpjpe(noisy, joints, valid, align_with, chunking)
+            expected = np.concatenate(expected)
+            np.testing.assert_allclose(found.mean(), expected.mean(), atol=1e-12)
+            rmse = np.sqrt(np.mean(expected**2))
+            np.testing.assert_allclose(found.rmse(), rmse, atol=1e-12)
+
+
+@pytest.mark.parametrize("path", ["straight", "none"])
+def test_root_error_on_degenerate_paths(path):
+    line = jnp.linspace(0.0, 3.0, 50)[:, None] * jnp.array([1.0, 0.5, 0.0])
+    truth = line if path == "straight" else jnp.zeros((50, 3))
+    estimate = truth + jnp.array([0.0, 0.0, 0.01]) * jnp.sin(jnp.arange(50.0))[:, None]
+    valid = jnp.ones(50, bool)
+    rte = lambda x: evaluation.root_trajectory_error(x, truth, valid).mean()
+    assert np.isfinite(rte(estimate)) and float(rte(truth)) < 1e-12
+    for x in (truth, estimate):
+        assert np.all(np.isfinite(jax.grad(rte)(x)))
+
+
+def test_root_error_by_hand():
+    """A path of 3 m (gaps count), one frame 0.2 m off: errors shrink by the fit."""
+    truth = jnp.stack([jnp.arange(4.0), jnp.zeros(4), jnp.zeros(4)], -1)
+    estimate = truth + jnp.array([[0.0, 0, 0], [0, 0, 0], [9, 9, 9], [0.3, 0, 0]])
+    valid = jnp.array([True, True, False, True])
+    found = evaluation.root_trajectory_error(estimate, truth, valid)
+    np.testing.assert_allclose(found.value[valid], np.array([0.1, 0.1, 0.2]) / 3)
+    np.testing.assert_allclose(found.mean(), 0.4 / 9)
+
+
+def _evo(T_WC):
+    return PoseTrajectory3D(
+        timestamps=np.arange(len(T_WC), dtype=float), poses_se3=list(np.asarray(T_WC))
+    )
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """An estimate with errors in everything, and its truth."""
+    truth = _truth()
+    rng = np.random.default_rng(1)
+    estimate = _moved(truth, 0.9)
+    T_WC = estimate.T_WC.copy()
+    T_WC[:, :3, 3] += rng.normal(0, 0.05, (NUM, 3))
+    turn = jaxlie.SO3.exp(jnp.asarray(rng.normal(0, 0.02, (NUM, 3)))).as_matrix()
+    T_WC[:, :3, :3] = T_WC[:, :3, :3] @ np.asarray(turn)
+    joints = estimate.joints + rng.normal(0, 0.05, truth.joints.shape)
+    return dataclasses.replace(estimate, T_WC=T_WC, joints=joints), truth
+
+
+@pytest.mark.parametrize("name, with_scale", [("se3", False), ("sim3", True)])
+def test_absolute_errors_equal_evo(noisy, name, with_scale):
+    estimate, truth = noisy
+    found = evaluate(*_pair(estimate, truth))
+    human, true_human = (np.tile(np.eye(4), (NUM, 1, 1)) for _ in range(2))
+    human[:, :3, 3], true_human[:, :3, 3] = (
+        estimate.joints[0, :, 0],
+        truth.joints[0, :, 0],
+    )
+    for letter, x, y in (
+        ("c", estimate.T_WC, truth.T_WC),
+        ("h", human, true_human),
+    ):
+        theirs, reference = _evo(x), _evo(y)
+        _, _, scale = theirs.align(reference, correct_scale=with_scale)
+        ape = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
+        ape.process_data((reference, theirs))
+        stats = ape.get_all_statistics()
+        ours = f"{letter}_ate_{name}"
+        np.testing.assert_allclose(found[ours], stats["mean"], atol=1e-9)
+        np.testing.assert_allclose(found[f"{ours}_rmse"], stats["rmse"], atol=1e-9)
+        if with_scale and letter == "c":
+            np.testing.assert_allclose(found["scale"], scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [1, 30])
+def test_relative_errors_equal_evo(noisy, step):
+    estimate, truth = (jnp.asarray(x.T_WC) for x in noisy)
+    ours = evaluation.relative_pose_errors(estimate, truth, jnp.ones(NUM, bool), step)
+    relations = evo_metrics.PoseRelation
+    for errors, relation in zip(
+        ours, (relations.translation_part, relations.rotation_angle_rad), strict=True
+    ):
+        rpe = evo_metrics.RPE(relation, step, evo_metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((_evo(truth), _evo(estimate)))
+        stats = rpe.get_all_statistics()
+        np.testing.assert_allclose(errors.mean(), stats["mean"], atol=1e-9)
+        np.testing.assert_allclose(errors.rmse(), stats["rmse"], atol=1e-9)
+
+
+def test_joint_errors_by_hand():
+    """One frame's hand 7 cm off, by the definition of each error."""
+    truth = jnp.asarray(_truth().joints[0, :5])
+    estimate = truth.at[2, 22, 0].add(0.07) + 1.0
+    valid = jnp.ones(5, bool)
+    found = evaluation.mpjpe(estimate, truth, valid)
+    np.testing.assert_allclose(found.mean(), 0.07 / 120, rtol=1e-9)
+    fps = jnp.array(30.0)
+    found = evaluation.acceleration_error(estimate, truth, valid, fps)
+    np.testing.assert_allclose(found.mean(), 4 * 0.07 * 900 / (3 * 24), rtol=1e-9)
+    found = evaluation.jitter(estimate - truth, valid, fps)
+    np.testing.assert_allclose(found.mean(), 6 * 0.07 * 27000 / (2 * 24), rtol=1e-9)
+
+
+def test_feet_slide_only_where_the_truth_stands():
+    truth = jnp.zeros((4, 2, 3)).at[:, 1, 0].set(jnp.arange(4.0))
+    estimate = truth + 0.02 * jnp.arange(4.0)[:, None, None] * jnp.array([0, 0, 1.0])
+    valid = jnp.array([True, True, True, False])
+    found = evaluation.foot_sliding(estimate, truth, valid)
+    assert int(jnp.sum(found.valid)) == 2
+    np.testing.assert_allclose(found.mean(), 0.02)
+
+
+def test_masked_frames_do_not_count(noisy):
+    estimate, truth = _pair(*noisy)
+    mask = jnp.ones(NUM, bool).at[40:60].set(False)
+    masked = lambda x, off: dataclasses.replace(
+        x,
+        T_WC=x.T_WC.at[40:60, :3, 3].add(off),
+        joints=x.joints.at[:, 40:60].add(off),
+        camera_valid=x.camera_valid & mask,
+        present=x.present & mask,
+    )
+    near, far = (evaluate(masked(estimate, off), truth) for off in (0.0, 50.0))
+    for name, value in near.items():
+        np.testing.assert_allclose(value, far[name], atol=1e-12, err_msg=name)
+
+
+def test_padding_changes_nothing(noisy):
+    estimate, truth = _pair(*noisy)
+    short = [jax.tree.map(_first_frames, x) for x in (estimate, truth)]
+    padded = (evaluation.pad_frames(x, NUM) for x in short)
+    found, expected = evaluate(*padded), evaluate(*short)
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, atol=1e-12, err_msg=name)
+
+
+def _first_frames(x):
+    if x.ndim == 0:
+        return x
+    return x[:20] if len(x) == NUM else x[:, :20]
+
+
+def test_a_batch_is_one_call(noisy):
+    estimate, truth = _pair(*noisy)
+    moved = _pair(_truth(), noisy[1])[0]
+    stack = lambda *xs: jax.tree.map(lambda *x: jnp.stack(x), *xs)
+    found = jax.jit(jax.vmap(evaluation.evaluate))(
+        stack(estimate, moved), stack(truth, truth)
+    )
+    for i, single in enumerate((estimate, moved)):
+        for name, value in evaluate(single, truth).items():
+            np.testing.assert_allclose(found[name][i], value, atol=1e-9, err_msg=name)
+
+
+def test_gradients_are_finite_also_at_the_truth(noisy):
+    def total(estimate, truth):
+        found = evaluation.evaluate(estimate, truth)
+        return sum(jnp.where(jnp.isnan(x), 0, x) for x in found.values.values())
+
+    gradient = jax.jit(jax.grad(total, allow_int=True))
+    for estimate, truth in (_pair(*noisy), _pair(noisy[1], noisy[1])):
+        found = gradient(estimate, truth)
+        assert np.all(np.isfinite(found.joints)) and np.all(np.isfinite(found.T_WC))
+
+
+def test_truth_at_another_rate():
+    """Of 120 Hz truth, the frames at our times are taken as they are."""
+    t = np.arange(4 * NUM) / 120.0
+    fine = _truth(num_frames=NUM)
+    coarse = lambda x: np.array(
+        [np.interp(t, fine.timestamps, c) for c in x.reshape(NUM, -1).T]
+    ).T.reshape(4 * NUM, *x.shape[1:])
+    T_WC = coarse(fine.T_WC)
+    T_WC[::4] = fine.T_WC
+    joints = coarse(fine.joints[0])[None]
+    found = evaluate(*_pair(fine, _result(t, T_WC, joints)))
+    assert float(found["c_ate_se3"]) < 1e-9 and float(found["rpe_rotation"]) < 1e-9
+    assert float(found["j_ate_se3"]) < 1e-9
+
+
+def test_truth_between_our_frames_is_interpolated():
+    truth = _truth()
+    keep = lambda x: x[:, 5:200]
+    later = _result(
+        truth.timestamps[5:200] + 0.4 / 30, truth.T_WC[5:200], keep(truth.joints)
+    )
+    estimate, true = evaluation.associate(truth, later)
+    late = estimate.T_WC[5:-5, 0, 3] - true.T_WC[5:-5, 0, 3]
+    # At 1.1 m/s, and not hidden by taking the nearest frame.
+    np.testing.assert_allclose(late, 0.4 * 1.1 / 30, rtol=1e-9)
+    found = evaluation.evaluate(truth, later, offset=0.4 / 30)
+    assert float(found["c_ate_se3"]) < 1e-9
+
+
+def test_nothing_in_common_is_said():
+    truth = _truth(num_frames=20)
+    elsewhere = dataclasses.replace(truth, timestamps=truth.timestamps + 1e3)
+    with pytest.raises(ValueError, match="0.000 to 0.633 s.*1000.000 to 1000.633 s"):
+        evaluation.evaluate(truth, elsewhere)
+
+
+def test_people_are_told_apart():
+    """Two people side by side in another order, and a third whom the truth lacks."""
+    truth = _truth(num_people=2)
+    extra = np.concatenate([truth.joints[::-1], truth.joints[:1] + 30.0])
+    extra[2, ::2] += 0.5
+    estimate = _moved(_result(truth.timestamps, truth.T_WC, extra))
+    found = evaluate(*_pair(estimate, truth))
+    assert found.people["h_ate_a3"].shape == (2,)
+    assert float(jnp.max(found.people["h_ate_a3"])) < 1e-9
+
+
+def test_what_the_truth_lacks_is_nan_and_not_in_the_table():
+    truth = _truth(num_frames=20)
+    blind = dataclasses.replace(truth, summary={"has_camera": False})
+    found = evaluate(*_pair(truth, blind))
+    assert np.isnan(found["c_ate_se3"]) and np.isnan(found["h_ate_a2"])
+    assert float(found["h_ate_se3"]) < 1e-9
+    table = evaluation.to_table(found)
+    assert "H-ATE, SE(3)" in table and "C-ATE" not in table and "nan" not in table
+    assert json.loads(evaluation.to_json(found))["c_ate_se3"] is None
+    alone = _result(truth.timestamps, truth.T_WC, truth.joints[:0])
+    assert "h_ate_se3" not in evaluation.evaluate(truth, alone)
+
+
+def test_single_precision_throughout(noisy):
+    single = lambda x: jax.tree.map(
+        lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, x
+    )
+    estimate, truth = _pair(*noisy)
+    found, expected = (
+        evaluate(single(estimate), single(truth)),
+        evaluate(estimate, truth),
+    )
+    for name, value in expected.items():
+        assert found[name].dtype == jnp.float32
+        np.testing.assert_allclose(found[name], value, rtol=2e-2, err_msg=name)
+
+
+def test_trajectories_and_results_do_not_mix():
+    truth = _truth(num_frames=5)
+    pair = _pair(truth, truth)
+    assert isinstance(pair[0], Trajectories)
+    with pytest.raises(ValueError, match="two"):
+        evaluation.evaluate(pair[0], truth)
