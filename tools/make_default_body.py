@@ -76,7 +76,7 @@ def to_smpl_axes(x):
 
 
 def sample_adults(model):
-    """Rest vertices (n, v, 3) and heads of the bones (n, 104, 3) of random adults, m."""
+    """Rest vertices (n, v, 3) and heads of the bones (n, 104, 3) of adults, m."""
     torch.manual_seed(0)
     ages = torch.distributions.Uniform(torch.tensor(18.0), torch.tensor(70.0))
     people = SimpleShapeDistribution(model, morphological_age_distribution=ages)
@@ -285,9 +285,9 @@ def joint_regressor(vertices, joints, mirror):
             continue
         limb = MIRROR_JOINT[j] != j
         distance = np.linalg.norm(mean - J[j], axis=1)
-        radius = 0.09 if limb and j not in (1, 13, 16) else 0.17
+        radius = 0.13 if limb and j not in (1, 13, 16) else 0.20
         near = np.flatnonzero(distance < radius)
-        near = generator.permutation(near)[:500]
+        near = generator.permutation(near)[:900]
         A = vertices[:, near].transpose(0, 2, 1).reshape(-1, len(near))
         b = joints[:, j].reshape(-1)
         scale = 100 * np.sqrt(len(b))
@@ -356,14 +356,15 @@ def main():
     surface = {k: np.einsum("v,nvc->nc", w, vertices) for k, w in coco.items()}
     vertices, dense = vertices[:, keep], dense[keep]
 
-    # One place for the pelvis; then the mean of the two sides, so that the mean body is
-    # symmetric to the last digit.
-    vertices = vertices - joints[:, :1] + PELVIS
-    surface = {k: s - joints[:, 0] + PELVIS for k, s in surface.items()}
-    joints = joints - joints[:, :1] + PELVIS
     mean = vertices.mean(0)
     mirror, distance = mirror_map(mean)
     print(f"mirror error {1000 * distance.max():.3f} mm")
+    regressor = joint_regressor(vertices[::5], joints[::5], mirror)
+    # One place for the pelvis of every shape, so that β does not move the person.
+    shift = PELVIS - np.einsum("v,nvc->nc", regressor[0], vertices)[:, None]
+    vertices, joints = vertices + shift, joints + shift
+    surface = {k: s + shift[:, 0] for k, s in surface.items()}
+    mean = vertices.mean(0)
     merged = merge_weights(dense, model.bone_labels, mean, joints.mean(0))
 
     area = np.zeros(len(mean))
@@ -392,16 +393,11 @@ def main():
             shape_dirs[:, :, k] *= -1
             beta[:, k] *= -1
 
-    regressor = joint_regressor(vertices[::6], joints[::6], mirror)
     template = mean
-    # The regressed pelvis is fixed exactly, for every shape.
-    template = template + PELVIS - regressor[0] @ template
-    shape_dirs = shape_dirs - np.einsum("v,vck->ck", regressor[0], shape_dirs)
-
     rebuilt = template + np.einsum("vck,nk->nvc", shape_dirs, beta[:300])
     error = np.linalg.norm(rebuilt - vertices[:300], axis=-1)
     J_error = np.linalg.norm(
-        np.einsum("jv,nvc->njc", regressor, rebuilt) - joints[:300], axis=-1
+        np.einsum("jv,nvc->njc", regressor, vertices[:300]) - joints[:300], axis=-1
     )
     picks = {
         name: int(np.linalg.norm(template - surface[source].mean(0), axis=1).argmin())
