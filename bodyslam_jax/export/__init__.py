@@ -1,0 +1,13 @@
+"""What is written: the run folder, the report, files for other programs."""
+
+from bodyslam_jax.export._meshes import write_bvh as write_bvh
+from bodyslam_jax.export._meshes import write_mesh as write_mesh
+from bodyslam_jax.export._meshes import write_trc as write_trc
+from bodyslam_jax.export._run import check_folder as check_folder
+from bodyslam_jax.export._run import run_folder as run_folder
+from bodyslam_jax.export._run import to_yaml as to_yaml
+from bodyslam_jax.export._run import write_body as write_body
+from bodyslam_jax.export._run import write_files as write_files
+from bodyslam_jax.export._run import write_points as write_points
+from bodyslam_jax.export._run import write_run as write_run
+from bodyslam_jax.export._run import write_tum as write_tum
