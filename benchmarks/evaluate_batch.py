@@ -1,0 +1,117 @@
+"""Hundreds of (result, truth) pairs in one jitted, vmapped call.
+
+Copy this to evaluate many runs at once: read, associate and pad each pair on the host,
+stack them, and call `evaluate` under `vmap` and `jit`. Without arguments the pairs are
+made up, and the pairs per second are what is asked:
+
+    python benchmarks/evaluate_batch.py [--pairs 300] [--frames 300]
+    python benchmarks/evaluate_batch.py RUN GROUNDTRUTH [RUN GROUNDTRUTH ...]
+"""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import bodyslam_jax as bs
+from bodyslam_jax import evaluation
+from bodyslam_jax.result import Result
+
+
+def evaluate_pairs(pairs: list[tuple[Result, Result]]) -> evaluation.Evaluation:
+    """Every error of every pair; each value has one entry per pair.
+
+    Pairs of different length are padded to the longest; all need as many people.
+    """
+    associated = [evaluation.associate(result, truth) for result, truth in pairs]
+    longest = max(len(truth.camera_valid) for _, truth in associated)
+    estimates, truths = (
+        jax.tree.map(
+            lambda *x: np.stack(x), *(evaluation.pad_frames(t, longest) for t in side)
+        )
+        for side in zip(*associated, strict=True)
+    )
+    return evaluate_stacked(estimates, truths)
+
+
+evaluate_stacked = jax.jit(jax.vmap(evaluation.evaluate))
+
+
+def made_up_pair(rng: np.random.Generator, num_frames: int) -> tuple[Result, Result]:
+    """A walk beside a camera, and an estimate that is centimetres off."""
+    t = np.arange(num_frames) / 30
+    root = np.stack([1.2 * t, 0.02 * np.sin(12 * t), np.sin(t)], -1)
+    joints = root[:, None] + rng.normal(0, 0.4, (24, 3))
+    T_WC = np.tile(np.eye(4), (num_frames, 1, 1))
+    T_WC[:, :3, 3] = root + [0.3, 0.2, -3.0]
+    truth = Result(
+        timestamps=t,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.ones(4),
+        landmarks=np.zeros((0, 3)),
+        poses=np.zeros((1, num_frames, 72)),
+        trans=root[None],
+        betas=np.zeros((1, 10)),
+        joints=joints[None],
+        present=np.ones((1, num_frames), bool),
+    )
+    moved = T_WC.copy()
+    moved[:, :3, 3] += rng.normal(0, 0.03, (num_frames, 3))
+    noisy = truth.joints + rng.normal(0, 0.05, truth.joints.shape)
+    return dataclasses.replace(truth, T_WC=moved, joints=noisy), truth
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="*", type=Path, help="RUN GROUNDTRUTH ...")
+    parser.add_argument("--pairs", type=int, default=300)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--single", action="store_true", help="32 bit instead of 64")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", not arguments.single)
+    if arguments.folders:
+        body = bs.load_body_model()
+        pairs = [
+            (evaluation.read_result(run), evaluation.read_groundtruth(truth, body))
+            for run, truth in zip(
+                arguments.folders[::2], arguments.folders[1::2], strict=True
+            )
+        ]
+    else:
+        rng = np.random.default_rng(0)
+        pairs = [made_up_pair(rng, arguments.frames) for _ in range(arguments.pairs)]
+
+    start = time.perf_counter()
+    found = jax.block_until_ready(evaluate_pairs(pairs))
+    print(
+        f"{len(pairs)} pairs, with association and compilation: "
+        f"{time.perf_counter() - start:.1f} s on {jax.devices()[0].device_kind}"
+    )
+    for name in ("c_ate_se3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe", "rte"):
+        print(
+            f"{name:>12}  mean {np.mean(found[name]):.4f}  max {np.max(found[name]):.4f}"
+        )
+
+    sides = [evaluation.associate(*pair) for pair in pairs[:1] * len(pairs)]
+    longest = len(sides[0][1].camera_valid)
+    estimates, truths = (
+        jax.tree.map(lambda *x: jnp.stack(x), *side)
+        for side in zip(*sides, strict=True)
+    )
+    jax.block_until_ready(evaluate_stacked(estimates, truths))
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        jax.block_until_ready(evaluate_stacked(estimates, truths))
+        times.append(time.perf_counter() - start)
+    rate = len(pairs) / np.median(times)
+    print(f"the call alone: {rate:.0f} pairs/s of {longest} frames")
+
+
+if __name__ == "__main__":
+    main()
