@@ -80,6 +80,8 @@ class PeopleFit:
     """Scale of the robust loss on keypoints, in their standard deviations."""
     correlation_time: float = 0.15
     """Keypoint errors stay the same for about this long, s."""
+    detector_bias: float = 0.0
+    """0: keypoints are SMPL's joints; 1: hips, neck and shoulders as COCO has them."""
     limit_sigma: float = 0.05
     """Softness of the joints' limits, rad."""
     upright_sigma: float = 0.4
@@ -200,3 +202,44 @@ class Tracking:
     """Frames over which a point must fit one rigid motion."""
     person_margin: float = 0.06
     """Width added around people's keypoints, of the person's height."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """Cameras and map up to scale, from tracks (structure from motion)."""
+
+    max_error: float = 2.0
+    """Reprojection error beyond which an observation is an outlier, px."""
+    min_angle: float = 0.3
+    """Smallest angle between the rays of a point, degrees."""
+    max_first_pairs: int = 4
+    """Pairs of frames that are tried for the start."""
+    keyframe_motion: float = 0.03
+    """Motion of points between keyframes, of the image's longer side."""
+    static_motion: float = 0.6
+    """Motion of points below which the camera stands still, px."""
+    rotation_error: float = 1.0
+    """Error of a pure rotation below which there is no parallax to use, px."""
+    min_parallax: float = 3.0
+    """Angle at the nearer points below which a camera only turns, degrees."""
+    min_shared: int = 12
+    """Points that two successive frames must share, or there is a cut."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of a whole run, one class per stage."""
+
+    body_model: str | None = None
+    """Body model file or folder; without it the default body or the one found."""
+    motion_model: str | None = None
+    """Motion model's weights; without them the ones that ship."""
+    people: bool = True
+    """Whether people are estimated; if not, cameras and map stay without a unit."""
+    overlay: bool = True
+    """Whether `overlay.webm` is written."""
+    association: Association = Association()
+    tracking: Tracking = Tracking()
+    structure: Structure = Structure()
+    people_fit: PeopleFit = PeopleFit()
+    weights: GraphWeights = GraphWeights()

@@ -1,4 +1,4 @@
-"""People: bodies from keypoints or from a regressor's file, made ready for the graph."""
+"""People: bodies from keypoints or from a regressor, made ready for the graph."""
 
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._roots import Roots as Roots

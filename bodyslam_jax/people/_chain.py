@@ -56,7 +56,7 @@ def solve_chain(
         better = new_value < value
         choose = lambda a, b: jnp.where(better, a, b)
         chain, normal = jax.tree.map(choose, (proposal, found), (chain, normal))
-        small = value - new_value < 1e-5 * jnp.abs(value)
+        small = value - new_value < 1e-4 * jnp.abs(value)
         damping = jnp.where(better, damping / 4, damping * 8)
         done = (better & small) | (damping > 1e6)
         return chain, normal, jnp.minimum(new_value, value), damping, count + 1, done
@@ -164,29 +164,29 @@ def _solve_banded(
     even, odd = slice(0, None, 2), slice(1, None, 2)
     inner = spread(one_back[odd])
     blocks = jnp.block([[diagonal[even], inner], [inner, diagonal[odd]]])
-    # Rows: frames 2i, 2i+1; columns: frames 2i-2, 2i-1.
-    none = jnp.zeros_like(inner)
-    back = (
-        jnp.block(
-            [
-                [spread(two_back[even]), spread(one_back[even])],
-                [none, spread(two_back[odd])],
-            ]
-        )
-        .at[0]
-        .set(0.0)
-    )
     right = right.reshape(pairs, 2 * size, columns)
     identity = jnp.eye(2 * size, dtype=right.dtype)
+    # The block before the diagonal, frames 2i, 2i+1 by frames 2i-2, 2i-1, is made of
+    # diagonals, [[p, q], [0, r]]; so a product with it is no matrix product.
+    back = jnp.stack([two_back[even], one_back[even], two_back[odd]], axis=1)
+    back = back.at[0].set(0.0)
+
+    def times(link: Array, m: Array) -> Array:
+        p, q, r = link[:, :, None]
+        return jnp.concatenate([p * m[:size] + q * m[size:], r * m[size:]])
+
+    def transposed_times(link: Array, m: Array) -> Array:
+        p, q, r = link[:, :, None]
+        return jnp.concatenate([p * m[:size], q * m[:size] + r * m[size:]])
 
     def forward(carry: tuple, row: tuple) -> tuple:
         inverse, reduced = carry
         block, link, b = row
-        gain = link @ inverse
-        factor = jax.scipy.linalg.cho_factor(block - gain @ link.T, lower=True)
+        fill = times(link, times(link, inverse).T)
+        factor = jax.scipy.linalg.cho_factor(block - fill, lower=True)
+        b = b - times(link, inverse @ reduced)
         inverse = jax.scipy.linalg.cho_solve(factor, identity)
-        reduced = b - gain @ reduced
-        return (inverse, reduced), (inverse, reduced)
+        return (inverse, b), (inverse, b)
 
     start = (identity, jnp.zeros_like(right[0]))
     _, (inverses, reduced) = jax.lax.scan(forward, start, (blocks, back, right))
@@ -194,7 +194,7 @@ def _solve_banded(
     def backward(carry: tuple, row: tuple) -> tuple:
         link_after, x_after = carry
         inverse, link, b = row
-        x = inverse @ (b - link_after.T @ x_after)
+        x = inverse @ (b - transposed_times(link_after, x_after))
         return (link, x), x
 
     start = (jnp.zeros_like(back[0]), jnp.zeros_like(right[0]))

@@ -7,14 +7,13 @@ mean the depth is that of an adult of average size, so depth and everything else
 by the ratio of statures, 4 to 6 % (1 σ) for adults, and by the focal length's error.
 """
 
-import dataclasses
 import logging
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from bodyslam_jax.body import BodyModel
@@ -22,6 +21,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._roots import Roots, bodies_from_roots
+from bodyslam_jax.people._skeleton import make_skeleton
 from bodyslam_jax.people._starts import best_path, fit_frames
 from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Scene
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
@@ -86,7 +86,7 @@ def make_scene(
     dtype = body.joint_template.dtype
     number = lambda value: jnp.asarray(value, dtype)
     return Scene(
-        body,
+        make_skeleton(body, settings.detector_bias),
         load_posture_prior(fps, dtype),
         number(intrinsics.params),
         number(settings.robust_scale),

@@ -38,9 +38,13 @@ class PosturePrior(eqx.Module):
     autoregression: Float[Array, "k 2"]
     """`a1, a2` of each component, per frame."""
 
+    def angles(self, latent: Float[Array, "*b k"]) -> Float[Array, "*b 63"]:
+        """θ of joints 1 to 21."""
+        return self.mean + latent @ self.basis.T
+
     def decode(self, latent: Float[Array, "*b k"]) -> Float[Array, "*b 23 3"]:
         """Body pose θ, axis-angle."""
-        angles = (self.mean + latent @ self.basis.T).reshape(*latent.shape[:-1], 21, 3)
+        angles = self.angles(latent).reshape(*latent.shape[:-1], 21, 3)
         rest = jnp.zeros((*latent.shape[:-1], NUM_HANDS, 3), latent.dtype)
         return jnp.concatenate([angles, rest], axis=-2)
 

@@ -17,9 +17,16 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax import body as body_lib
 from bodyslam_jax.camera import unproject
-from bodyslam_jax.people._terms import DEPTH_FLOOR, Fit, Scene, cost, linearise
+from bodyslam_jax.people._skeleton import place_points
+from bodyslam_jax.people._terms import (
+    DEPTH_FLOOR,
+    Fit,
+    Scene,
+    cost,
+    joints_about_pelvis,
+    linearise,
+)
 
 NUM_HEADINGS = 8
 _POSTURES_PER_HEADING = 2
@@ -39,8 +46,8 @@ def fit_frames(
 ) -> tuple[Fit, Float[np.ndarray, "f s"], Float[np.ndarray, "f s 24 3"]]:
     """Fits each frame by itself, β = 0, from all starts; the best few ends of each.
 
-    **Returns:** the fits with leading axes (frame, start), their costs, and their joints
-    relative to the pelvis, in C; NumPy.
+    **Returns:** the fits with leading axes (frame, start), their costs, and their
+    joints relative to the pelvis, in C; NumPy.
     """
     frames = len(uv)
     starts, value = _batched(_all_starts, _FRAME_BATCH, scene, uv, sigma)
@@ -114,9 +121,10 @@ def _frame_starts(
     turned = jax.vmap(lambda a: jaxlie.SO3.from_y_radians(a).as_matrix())(angles)
     orientation = _roll(uv, sigma) @ facing @ turned
     latent = scene.prior.typical
-    pose = scene.prior.decode(latent)
     shape = jnp.zeros(10, dtype)
-    local = body_lib.local_keypoints(scene.body, pose, shape)
+    local = jax.vmap(
+        lambda z: place_points(scene.skeleton, scene.prior.angles(z), shape)[1]
+    )(latent)
     seen = jnp.einsum("hij,skj->hski", orientation, local)
     rays = unproject(scene.intrinsics, uv)
     position = jax.vmap(jax.vmap(lambda x: _place(x, rays, sigma)))(seen)
@@ -209,8 +217,8 @@ def _descend(
     )
     carry = (fits, blank, jnp.full(len(uv), 0.5, uv.dtype))
     fits, normal, _ = jax.lax.fori_loop(0, steps + 1, step, carry)
-    local = body_lib.local_joints(scene.body, scene.prior.decode(fits.latent), shape)
-    return fits, normal[2], local @ jnp.swapaxes(fits.orientation, -1, -2)
+    joints = jax.vmap(joints_about_pelvis, in_axes=(None, 0, None))(scene, fits, shape)
+    return fits, normal[2], joints
 
 
 def best_path(

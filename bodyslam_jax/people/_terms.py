@@ -1,9 +1,9 @@
 """How far one posed body is from one frame's keypoints, linearised.
 
-The unknowns of a frame are a small rotation δ (left, in C) of the root orientation, the
-pelvis position p_C and the latent posture z: `6 + k` numbers, then the 10 of the shape
-β that all frames share. Robust cost: Geman and McClure, `ρ(s) = s / (1 + s / c²)` of the
-squared whitened distance s, as in SMPLify (Bogo et al. 2016) but in standard deviations.
+The unknowns of a frame are a small rotation δ (left, in C) of the root orientation,
+the pelvis position p_C and the latent posture z: `6 + k` numbers, then the 10 of shape
+β that all frames share. Robust cost: Geman and McClure, `ρ(s) = s / (1 + s / c²)` of
+the squared whitened distance s, as in SMPLify (Bogo et al., 2016), but there in pixels.
 """
 
 import equinox as eqx
@@ -13,10 +13,9 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax import body as body_lib
-from bodyslam_jax.body import BodyModel
 from bodyslam_jax.camera import project
 from bodyslam_jax.people._prior import PosturePrior
+from bodyslam_jax.people._skeleton import Skeleton, place_points, pose_points
 
 KEYPOINT_SIGMA = np.array(
     # Nose, neck, then shoulder, elbow, wrist of the right and of the left.
@@ -26,9 +25,9 @@ KEYPOINT_SIGMA = np.array(
     # Eyes, ears; big toe, small toe, heel of the left and of the right.
     + [0.025, 0.025, 0.030, 0.030, 0.040, 0.040, 0.035, 0.040, 0.040, 0.035]
 )
-"""Error of BODY_25 keypoints on the body, m: 0.4 of COCO's annotators' σ_k for an adult,
-twice that at hips and neck, which every detector puts elsewhere (OpenPose outside and
-below SMPL's, MediaPipe inside), and the head's fit where the face is one of many."""
+"""Error of BODY_25 keypoints on the body, m: 0.4 of COCO's annotators' σ_k for an
+adult, twice that at hips and neck, which every detector puts elsewhere (OpenPose
+outside and below SMPL's, MediaPipe inside); and heads differ by more than annotators."""
 
 DEPTH_FLOOR = 0.3
 """m: nobody is fitted closer to the camera."""
@@ -58,7 +57,7 @@ class Fit(eqx.Module):
 class Scene(eqx.Module):
     """What all frames and all starts share."""
 
-    body: BodyModel
+    skeleton: Skeleton
     prior: PosturePrior
     intrinsics: Float[Array, " i"]
     robust_scale: Float[Array, ""]
@@ -81,11 +80,12 @@ class Normal(eqx.Module):
     cost: Float[Array, "*b"]
 
 
-def keypoints_in_camera(
+def joints_about_pelvis(
     scene: Scene, fit: Fit, shape: Float[Array, " 10"]
-) -> Float[Array, "25 3"]:
-    local = body_lib.local_keypoints(scene.body, scene.prior.decode(fit.latent), shape)
-    return local @ fit.orientation.T + fit.position
+) -> Float[Array, "24 3"]:
+    """Joints relative to the pelvis, in C, m."""
+    angles = scene.prior.angles(fit.latent)
+    return place_points(scene.skeleton, angles, shape)[0] @ fit.orientation.T
 
 
 def cost(
@@ -95,13 +95,16 @@ def cost(
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],
 ) -> Float[Array, ""]:
-    """Robust keypoints, soft limits and upright prior of one frame; no posture prior."""
-    residual = (
-        project(scene.intrinsics, keypoints_in_camera(scene, fit, shape)) - uv
-    ) / (sigma[:, None])
+    """Robust keypoints, soft limits and upright prior of one frame; not the posture's
+    own prior, which is temporal in a chain and static in a single frame."""
+    angles = scene.prior.angles(fit.latent)
+    _, local = place_points(scene.skeleton, angles, shape)
+    p_C = local @ fit.orientation.T + fit.position
+    residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
+    beyond = _beyond_limits(scene, angles) / scene.limit_sigma
     return 0.5 * (
         jnp.sum(_robust(jnp.sum(residual**2, -1), scene.robust_scale)[0])
-        + jnp.sum((_beyond_limits(scene, fit) / scene.limit_sigma) ** 2)
+        + jnp.sum(beyond**2)
         + scene.upright_weight * fit.orientation[2, 1] ** 2
     )
 
@@ -115,29 +118,29 @@ def linearise(
 ) -> Normal:
     """The same as `cost`, with its derivatives."""
     size = 6 + fit.latent.shape[-1]
-
-    def residual_of(unknowns: Float[Array, " m"]) -> Float[Array, "25 2"]:
-        # Clamping the depth, as `moved` does, would stop the gradient there.
-        turned = jaxlie.SO3.exp(unknowns[:3]).as_matrix() @ fit.orientation
-        there = Fit(turned, unknowns[3:6], unknowns[6:size])
-        return project(
-            scene.intrinsics, keypoints_in_camera(scene, there, unknowns[size:])
-        )
-
-    here = jnp.concatenate(
-        [jnp.zeros_like(fit.position), fit.position, fit.latent, shape]
-    )
-    predicted, push = jax.linearize(residual_of, here)
-    columns = jax.vmap(push)(jnp.eye(here.size, dtype=here.dtype))
-    residual = (predicted - uv) / sigma[:, None]
+    angles = scene.prior.angles(fit.latent)
+    points = pose_points(scene.skeleton, angles, shape)
+    rotated = points.keypoints @ fit.orientation.T
+    p_C = rotated + fit.position
+    view = jax.vmap(jax.jacfwd(lambda p: project(scene.intrinsics, p)))(p_C)
+    view = view / sigma[:, None, None]
+    residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
     value, weight = _robust(jnp.sum(residual**2, -1), scene.robust_scale)
-    jac = (columns / sigma[:, None]).reshape(here.size, -1)
-    weighted = jac * jnp.repeat(weight, 2)
-    full = weighted @ jac.T
+
+    # Pixels by: a turn (δ x p moves p), a shift, the posture, the shape.
+    eye = jnp.eye(3, dtype=p_C.dtype)
+    turned = jnp.swapaxes(jnp.cross(eye[None], rotated[:, None]), -1, -2)
+    view_H = view @ fit.orientation
+    by_angle = jnp.einsum("kcx,kjx->kcj", view_H, points.by_angle.reshape(25, 63, 3))
+    columns = [view @ turned, view, by_angle @ scene.prior.basis]
+    columns.append(view_H @ points.by_shape)
+    jac = jnp.concatenate(columns, axis=-1).reshape(50, -1)
+    weighted = (jac * jnp.repeat(weight, 2)[:, None]).T
+    full = weighted @ jac
     gradient = weighted @ residual.reshape(-1)
     hessian, gradient_own = full[:size, :size], gradient[:size]
 
-    beyond = _beyond_limits(scene, fit) / scene.limit_sigma
+    beyond = _beyond_limits(scene, angles) / scene.limit_sigma
     limits = scene.prior.basis * (beyond != 0)[:, None] / scene.limit_sigma
     hessian = hessian.at[6:, 6:].add(limits.T @ limits)
     gradient_own = gradient_own.at[6:].add(limits.T @ beyond)
@@ -163,8 +166,6 @@ def _robust(squared: Array, scale: Array) -> tuple[Array, Array]:
     return squared / ratio, 1 / ratio**2
 
 
-def _beyond_limits(scene: Scene, fit: Fit) -> Float[Array, " 63"]:
-    angles = scene.prior.mean + scene.prior.basis @ fit.latent
-    return jnp.maximum(angles - scene.prior.upper, 0) - jnp.maximum(
-        scene.prior.lower - angles, 0
-    )
+def _beyond_limits(scene: Scene, angles: Float[Array, " 63"]) -> Float[Array, " 63"]:
+    below, above = scene.prior.lower - angles, angles - scene.prior.upper
+    return jnp.maximum(above, 0) - jnp.maximum(below, 0)

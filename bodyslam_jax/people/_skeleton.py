@@ -1,0 +1,138 @@
+"""The body as this package's fits need it: points on rigid bones, and derivatives.
+
+A keypoint that is a surface point is carried by one bone here, as at rest, which at
+nose, ears, heels and toes is within millimetres of the skinned vertex. In return the
+derivatives are geometry: turning joint j by a small vector ω about its own centre moves
+a point x below it by `ω x (x - x_j)`; no differentiation through a chain of rotations,
+which compiles and runs an order of magnitude slower.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.body import PARENTS, BodyModel, local_keypoints, rest_joints
+
+# Bone that carries each BODY_25 keypoint: SMPL's joint of that name, the head for the
+# face, the toe joint for toes, the ankle for heels.
+_KEYPOINT_BONE = np.array(
+    [15, 12, 17, 19, 21, 16, 18, 20, 0, 2, 5, 8, 1, 4, 7]
+    + [15, 15, 15, 15, 10, 10, 7, 11, 11, 8]
+)
+_CARRIER = np.concatenate([PARENTS, _KEYPOINT_BONE])
+_LEVELS = ((1, 4), (4, 7), (7, 10), (10, 15), (15, 18), (18, 20), (20, 22), (22, 24))
+"""Joints `first:last` whose parents are all in earlier ranges."""
+
+
+def _paths() -> np.ndarray:
+    """Which offsets (24 joints, then 25 keypoints) add up to each point's place."""
+    path = np.zeros((49, 49))
+    for point in range(49):
+        link = point
+        while link > 0:
+            path[point, link] = 1.0
+            link = _CARRIER[link]
+    return path
+
+
+_PATH = _paths()
+
+
+class Skeleton(eqx.Module):
+    """Offsets of 24 joints and 25 keypoints from the joints that carry them, at rest."""
+
+    offset: Float[Array, "49 3"]
+    """m, β = 0; the pelvis' own is 0."""
+    offset_shape: Float[Array, "49 3 10"]
+    """Change per unit of β, m."""
+
+
+class Points(eqx.Module):
+    """A posed skeleton in the root frame H, the pelvis at the origin."""
+
+    joints: Float[Array, "24 3"]
+    keypoints: Float[Array, "25 3"]
+    by_angle: Float[Array, "25 21 3 3"]
+    """Of a keypoint's coordinate (last) by an axis-angle component of joints 1 to 21."""
+    by_shape: Float[Array, "25 3 10"]
+
+
+@eqx.filter_jit
+def _at_rest(body: BodyModel, bias: Array) -> Float[Array, "11 49 3"]:
+    dtype = body.joint_template.dtype
+    shapes = jnp.concatenate([jnp.zeros((1, 10), dtype), jnp.eye(10, dtype=dtype)])
+    joints = rest_joints(body, shapes)
+    pose = jnp.zeros((23, 3), dtype)
+    keypoints = local_keypoints(body, pose, shapes, "body25", bias)
+    return jnp.concatenate([joints - joints[:, :1], keypoints], axis=1)
+
+
+def make_skeleton(body: BodyModel, bias: float) -> Skeleton:
+    """`bias` as `body.local_keypoints` has it: 0 SMPL's joints, 1 COCO detectors'."""
+    dtype = body.joint_template.dtype
+    rest = np.asarray(_at_rest(body, jnp.asarray(bias, dtype)), float)
+    offset = rest - np.where(_CARRIER[:, None] >= 0, rest[:, _CARRIER], 0.0)
+    by_shape = np.moveaxis(offset[1:] - offset[0], 0, -1)
+    return Skeleton(jnp.asarray(offset[0], dtype), jnp.asarray(by_shape, dtype))
+
+
+def place_points(
+    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " 10"]
+) -> tuple[Float[Array, "24 3"], Float[Array, "25 3"]]:
+    """Joints and keypoints in H, m, without derivatives."""
+    orientation = _orientations(jaxlie.SO3.exp(angles.reshape(21, 3)).as_matrix())
+    offset = skeleton.offset + skeleton.offset_shape @ shape
+    carried = jnp.einsum("pij,pj->pi", orientation[_carriers()], offset)
+    point = jnp.asarray(_PATH, angles.dtype) @ carried
+    return point[:24], point[24:]
+
+
+def pose_points(
+    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " 10"]
+) -> Points:
+    """The same with derivatives."""
+    theta = angles.reshape(21, 3)
+    exp = lambda t: jaxlie.SO3.exp(t).as_matrix()
+    turn = exp(theta)
+    change = jax.vmap(jax.jacfwd(exp))(theta)
+    # dR/dθ_a R' is the cross product's matrix of the axis about which θ_a turns.
+    spin = jnp.einsum("jika,jlk->jila", change, turn)
+    axis = jnp.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+    orientation = _orientations(turn)
+    axis = orientation[jnp.array(PARENTS[1:22])] @ axis
+
+    offsets = jnp.concatenate(
+        [(skeleton.offset + skeleton.offset_shape @ shape)[..., None]]
+        + [skeleton.offset_shape],
+        axis=-1,
+    )
+    carried = orientation[_carriers()] @ offsets
+    point = jnp.tensordot(jnp.asarray(_PATH, angles.dtype), carried, 1)
+    place, by_shape = point[..., 0], point[24:, :, 1:]
+    arm = place[24:, None] - place[None, 1:22]
+    arm = arm * jnp.asarray(_below(), angles.dtype)[..., None]
+    by_angle = jnp.cross(jnp.swapaxes(axis, -1, -2)[None], arm[:, :, None])
+    return Points(place[:24], place[24:], by_angle, by_shape)
+
+
+def _carriers() -> Array:
+    return jnp.array(np.maximum(_CARRIER, 0))
+
+
+def _below() -> np.ndarray:
+    """Whether keypoint k is carried, at any remove, by joint j + 1 (itself or below)."""
+    return _PATH[24:, 1:22]
+
+
+def _orientations(turn: Float[Array, "21 3 3"]) -> Float[Array, "24 3 3"]:
+    """Of every joint in H; hands do not turn."""
+    still = jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), (2, 3, 3))
+    turn = jnp.concatenate([still[:1], turn, still])
+    found = turn[:1]
+    for first, last in _LEVELS:
+        parent = jnp.array(PARENTS[first:last])
+        found = jnp.concatenate([found, found[parent] @ turn[first:last]])
+    return found
