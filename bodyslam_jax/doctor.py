@@ -1,4 +1,4 @@
-"""What `bodyslam doctor` says: versions, devices, codecs, and where models were found."""
+"""What `bodyslam doctor` says: versions, devices, codecs, where models were found."""
 
 import importlib.metadata
 import importlib.util

@@ -1,0 +1,191 @@
+"""From tracks and bodies to a first metric state and the factors that refine it.
+
+Section 3.6 of the paper: cameras and landmarks up to scale from structure from motion,
+people placed in them by `T_WH = T_WC T_CH`, and the graph's error terms. The first
+scale comes in closed form from the motion model, which is linear in s.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax import graph, motion
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.people import Roots
+from bodyslam_jax.sequence import Keypoints, Tracks
+
+PIXEL_SIGMA_RANGE = (0.3, 3.0)
+"""px: what a track's noise can be; outside, it is the model that is wrong."""
+KEYPOINT_SHARE = np.array(
+    [1, 2.5, 1.2, 1, 1, 1.2, 1, 1, 2.5, 2.5, 1, 1, 2.5, 1, 1, 1, 1, 1, 1]
+    + [1.3, 1.5, 1.3, 1.3, 1.5, 1.3]
+)
+"""Keypoint noise beside the knee's, BODY_25: hips and neck are defined loosely."""
+
+
+def map_factor(
+    tracks: Tracks, keep: Bool[np.ndarray, " m"], sigma: float, weights: GraphWeights
+) -> graph.Reprojection:
+    """Static landmarks; rejected observations are left out (their `sigma` is `inf`)."""
+    return graph.Reprojection(
+        frame=jnp.asarray(tracks.frame, jnp.int32),
+        landmark=jnp.asarray(tracks.landmark, jnp.int32),
+        pixel=jnp.asarray(tracks.uv, float),
+        sigma=jnp.asarray(np.where(keep, sigma, np.inf)),
+        loss=graph.Cauchy(jnp.asarray(weights.landmark_loss)),
+    )
+
+
+def first_state(
+    cameras: Float[np.ndarray, "t 4 4"],
+    landmarks: Float[np.ndarray, "l 3"],
+    roots: Roots,
+    intrinsics: Float[np.ndarray, " i"],
+) -> graph.State:
+    """The state before any scale is known: s = 1."""
+    return graph.State(
+        scale=jnp.ones(()),
+        cameras=jnp.asarray(cameras),
+        roots=jnp.asarray(roots.T_CH),
+        poses=jnp.asarray(roots.body_pose),
+        shapes=jnp.asarray(roots.shape),
+        landmarks=jnp.asarray(landmarks),
+        intrinsics=jnp.asarray(intrinsics, float),
+    )
+
+
+def no_people(num_frames: int) -> Roots:
+    """An empty list of people, for cameras alone."""
+    return Roots(
+        np.zeros((0, num_frames), bool),
+        np.zeros((0, num_frames, 4, 4)),
+        np.zeros((0, num_frames, 23, 3)),
+        np.zeros((0, 10)),
+    )
+
+
+def free_people(state: graph.State) -> graph.Step:
+    """Only people move: for a camera that stands, or of which only turns are known."""
+    free = jax.tree.map(jnp.zeros_like, state.zero_step())
+    ones = lambda x: jnp.ones_like(x)
+    return dataclasses.replace(
+        free,
+        roots=ones(free.roots),
+        poses=ones(free.poses),
+        shapes=ones(free.shapes),
+    )
+
+
+def keypoint_sigma(
+    keypoints: Keypoints, present: Bool[np.ndarray, "h t"], weights: GraphWeights
+) -> Float[np.ndarray, "h t 25"]:
+    """Standard deviation of each keypoint, px: wider for loose definitions and for low
+    confidence; `inf` where there is none."""
+    confidence = np.clip(keypoints.confidence, 0, 1)
+    with np.errstate(divide="ignore"):
+        sigma = weights.keypoint_sigma * KEYPOINT_SHARE / confidence
+    return np.where((confidence > 0.05) & present[..., None], sigma, np.inf)
+
+
+def people_factors(
+    keypoints: Keypoints | None,
+    roots: Roots,
+    weights: GraphWeights,
+    body: BodyModel,
+) -> list[graph.AbstractFactor]:
+    """Keypoints, postures and shapes of `h` people."""
+    factors: list[graph.AbstractFactor] = []
+    present = roots.present
+    if keypoints is not None:
+        factors.append(
+            graph.JointReprojection(
+                body=body,
+                pixel=jnp.asarray(keypoints.uv, float),
+                sigma=jnp.asarray(keypoint_sigma(keypoints, present, weights)),
+                loss=graph.GemanMcClure(jnp.asarray(weights.keypoint_loss)),
+            )
+        )
+    there = jnp.asarray(present)
+    correlation = graph.runs(there, weights.posture_correlation)
+    factors.append(
+        graph.Posture(
+            rotation=jnp.asarray(roots.body_pose),
+            sigma=jnp.where(there[..., None], weights.posture_sigma, jnp.inf)
+            * jnp.ones(23),
+            correlation=correlation,
+            correlated=weights.posture_correlation > 0,
+            predicted=weights.posture_predicted,
+        )
+    )
+    counted = present.astype(float)
+    if not weights.shape_each_frame:
+        counted = np.zeros_like(counted)
+        counted[np.arange(len(present)), present.argmax(axis=1)] = 1.0
+    with np.errstate(divide="ignore"):
+        sigma = weights.shape_sigma / counted
+    shape = np.broadcast_to(roots.shape[:, None], (*present.shape, 10))
+    factors.append(
+        graph.Shape(
+            shape=jnp.asarray(shape),
+            sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
+        )
+    )
+    return factors
+
+
+def motion_factor(seen: motion.Prediction, weights: GraphWeights) -> graph.HumanMotion:
+    """The motion model's displacements, weighted by its own covariance."""
+    valid = seen.valid
+    eye = jnp.eye(3)
+    if weights.motion_sigma is None:
+        covariance = jnp.where(valid[..., None, None], seen.covariance, eye)
+        lower = jnp.linalg.cholesky(covariance)
+        whitening = jnp.linalg.solve(lower, jnp.broadcast_to(eye, lower.shape))
+        whitening = whitening / weights.motion_inflation
+    else:
+        whitening = jnp.broadcast_to(eye / weights.motion_sigma, (*valid.shape, 3, 3))
+    return graph.HumanMotion(
+        translation=jnp.where(valid[..., None], seen.translation, 0.0),
+        whitening=jnp.where(valid[..., None, None], whitening, 0.0),
+        correlation=graph.runs(valid, weights.motion_correlation),
+        correlated=weights.motion_correlation > 0,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaleStart:
+    """The first guess of s, in closed form."""
+
+    value: float
+    standard_error: float
+    """Infinite if the people's motion says nothing."""
+
+
+def scale_start(state: graph.State, predictor: graph.MotionPredictor) -> ScaleStart:
+    """Robust regression of predicted on observed displacements, people averaged.
+
+    1 with an infinite error where the motion model says nothing, so that the map stays
+    in its own unit.
+    """
+    seen = predictor(state)
+    C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
+    turn = C_WC @ state.roots[..., :3, :3]
+    offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])
+    found = []
+    for h in range(len(state.roots)):
+        one = jax.tree.map(lambda x: x[h], seen)
+        found.append(motion.scale_from_motion(one, turn[h], r_WC, offset[h]))
+    usable = [f for f in found if np.isfinite(f.value) and f.value > 0]
+    if not usable:
+        return ScaleStart(1.0, float("inf"))
+    errors = np.array([f.standard_error for f in usable])
+    errors = np.where(
+        np.isfinite(errors), errors, 0.5 * np.array([f.value for f in usable])
+    )
+    weight = 1 / np.maximum(errors, 1e-6) ** 2
+    value = float(np.sum(weight * [f.value for f in usable]) / weight.sum())
+    return ScaleStart(value, float(weight.sum() ** -0.5))

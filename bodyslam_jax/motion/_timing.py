@@ -1,0 +1,114 @@
+"""Predictions between frames of any rate by a model that works at 30 frames a second.
+
+Postures are interpolated to the model's own clock (slerp), its steps are summed to a
+path, and the path is read off at the times of the frames.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.motion._predict import MotionModel, Prediction, predict
+
+
+class Clock(eqx.Module):
+    """How `t` frames lie on the `g` ticks of a motion model, and the ticks on them."""
+
+    frame: Int[Array, " g"]
+    """The frame at or before each tick."""
+    between: Float[Array, " g"]
+    """How far on to the next frame the tick is, 0 to 1."""
+    tick: Int[Array, " t"]
+    """The tick at or before each frame."""
+    beyond: Float[Array, " t"]
+    """How far on to the next tick the frame is, 0 to 1."""
+    steps: Float[Array, " t"]
+    """Ticks that passed since the frame before."""
+    same: bool = eqx.field(static=True)
+    """Whether frames are ticks, and nothing needs to be interpolated."""
+
+
+def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
+    """Lays the model's ticks, `fps` a second, over a video's timestamps (s)."""
+    position = (timestamps - timestamps[0]) * fps
+    t = len(position)
+    same = bool(np.abs(np.diff(position) - 1).max(initial=0) < 0.02)
+    if same:
+        position = np.arange(t, dtype=float)
+    ticks = np.arange(int(np.ceil(position[-1] - 1e-6)) + 1)
+    frame = np.clip(
+        np.searchsorted(position, ticks, side="right") - 1, 0, max(t - 2, 0)
+    )
+    following = np.minimum(frame + 1, t - 1)
+    gap = np.maximum(position[following] - position[frame], 1e-9)
+    between = np.clip((ticks - position[frame]) / gap, 0, 1)
+    tick = np.clip(np.floor(position + 1e-9).astype(int), 0, max(len(ticks) - 2, 0))
+    return Clock(
+        jnp.asarray(frame),
+        jnp.asarray(between),
+        jnp.asarray(tick),
+        jnp.asarray(position - tick),
+        jnp.asarray(np.diff(position, prepend=position[0])),
+        same,
+    )
+
+
+def predict_between(
+    model: tuple[MotionModel, Clock],
+    body: BodyModel,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    shape: Float[Array, "10"],
+    present: Bool[Array, " t"],
+) -> Prediction:
+    """`predict` at the frames of a `Clock`: row k is the step from frame k-1 to k.
+
+    Errors of successive ticks are taken as fully correlated within one frame's step.
+    """
+    network, clock = model
+    if clock.same:
+        return predict(network, body, orientation, body_pose, shape, present)
+    dtype = body_pose.dtype
+    between, beyond = clock.between.astype(dtype), clock.beyond.astype(dtype)
+    steps = clock.steps.astype(dtype)
+    following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
+
+    def at_ticks(rotation: jaxlie.SO3) -> jaxlie.SO3:
+        first = jaxlie.SO3(rotation.wxyz[clock.frame])
+        second = jaxlie.SO3(rotation.wxyz[following])
+        share = between.reshape(-1, *(1,) * (rotation.wxyz.ndim - 1))
+        return first @ jaxlie.SO3.exp(share * (first.inverse() @ second).log())
+
+    C = at_ticks(jaxlie.SO3.from_matrix(orientation)).as_matrix()
+    pose = at_ticks(jaxlie.SO3.exp(body_pose)).log()
+    there = present[clock.frame] & (present[following] | (between == 0))
+    seen = predict(network, body, C, pose, shape, there)
+
+    before = jnp.concatenate([C[:1], C[:-1]])
+    step = jnp.einsum("gij,gj->gi", before, seen.translation)
+    step = jnp.where(seen.valid[:, None], step, 0)
+    missing = jnp.cumsum(~seen.valid)
+    path = jnp.cumsum(step, axis=0) - step[:1]
+    last = jnp.minimum(clock.tick + 1, len(path) - 1)
+    place = path[clock.tick] + beyond[:, None] * (path[last] - path[clock.tick])
+    moved = place - jnp.concatenate([place[:1], place[:-1]])
+    turned = jnp.concatenate([orientation[:1], orientation[:-1]])
+    end = jnp.where(beyond > 0, last, clock.tick)
+    start = jnp.concatenate([clock.tick[:1], clock.tick[:-1]])
+    valid = (missing[end] == missing[start]) & (jnp.arange(len(steps)) > 0) & present
+    change = (
+        jaxlie.SO3.exp(pose[end - 1]).inverse() @ jaxlie.SO3.exp(seen.body_pose[end])
+    ).log()
+    previous = jnp.concatenate([body_pose[:1], body_pose[:-1]])
+    posture = jaxlie.SO3.exp(previous) @ jaxlie.SO3.exp(steps[:, None, None] * change)
+    return Prediction(
+        translation=jnp.einsum("tji,tj->ti", turned, moved),
+        covariance=seen.covariance[end] * (steps**2)[:, None, None]
+        + jnp.where(valid, 0, 1)[:, None, None].astype(dtype) * jnp.eye(3, dtype=dtype),
+        body_pose=posture.log(),
+        rotation=seen.rotation[end] * steps[:, None],
+        valid=valid,
+    )
