@@ -1,0 +1,10 @@
+"""What comes in: video, features, tracks, structure from motion, and people's files.
+
+NumPy and OpenCV; knows the camera and nothing of the graph.
+"""
+
+from bodyslam_jax.frontend._reconstruct import Reconstruction as Reconstruction
+from bodyslam_jax.frontend._reconstruct import reconstruct as reconstruct
+from bodyslam_jax.frontend._sequence import read_sequence as read_sequence
+from bodyslam_jax.frontend._tracks import track as track
+from bodyslam_jax.frontend._video import frames as frames

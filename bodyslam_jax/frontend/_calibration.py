@@ -1,0 +1,96 @@
+"""`camera.json`, or a guess, -> intrinsics."""
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from bodyslam_jax.sequence import Intrinsics
+
+_log = logging.getLogger(__name__)
+
+_GUESSED_FOCAL = 1.2
+"""Focal length over the longer side: COLMAP's default, a view of 45 degrees."""
+
+_NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
+
+
+def read_camera(path: Path) -> tuple[Intrinsics, float | None]:
+    """Reads `camera.json`: model, size and parameters in COLMAP's order, pixel centres
+    at whole numbers; and the frame rate (1/s) if the file has one.
+
+    **Raises:** `ValueError`, naming the file, if something is missing or impossible.
+    """
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: not a JSON file ({error}).") from None
+    if not isinstance(data, dict):
+        raise ValueError(
+            f"{path}: a JSON object expected, {type(data).__name__} found."
+        )
+    missing = [k for k in ("model", "width", "height", "params") if k not in data]
+    if missing:
+        raise ValueError(f"{path}: no {', '.join(missing)}; only {', '.join(data)}.")
+    model = data["model"]
+    if not isinstance(model, str) or model not in _NUM_PARAMS:
+        raise ValueError(
+            f"{path}: model {model!r}, not one of {', '.join(_NUM_PARAMS)}."
+        )
+    try:
+        params = np.asarray(data["params"], dtype=np.float64)
+        width, height = int(data["width"]), int(data["height"])
+        fps = None if data.get("fps") is None else float(data["fps"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: numbers expected ({error}).") from None
+    if params.shape != (_NUM_PARAMS[model],):
+        raise ValueError(
+            f"{path}: {params.size} params for {model}, not {_NUM_PARAMS[model]}."
+        )
+    params = _as_opencv(model, params)
+    if not np.isfinite(params).all() or (params[:2] <= 0).any():
+        raise ValueError(f"{path}: params {params.tolist()} are not those of a camera.")
+    if width <= 0 or height <= 0:
+        raise ValueError(f"{path}: size {width}x{height} px is not that of an image.")
+    if not (-width < params[2] < 2 * width and -height < params[3] < 2 * height):
+        raise ValueError(
+            f"{path}: principal point {params[2]:g}, {params[3]:g} far outside the "
+            f"image of {width}x{height} px."
+        )
+    if fps is not None and not 0.1 <= fps <= 1000:
+        raise ValueError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
+    return Intrinsics(params, width, height), fps
+
+
+def guess_camera(width: int, height: int, image: Path | None = None) -> Intrinsics:
+    """Intrinsics of an unknown camera: from the EXIF data of `image`, else typical."""
+    focal = _focal_from_exif(image, max(width, height)) if image else None
+    focal = focal or _GUESSED_FOCAL * max(width, height)
+    params = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
+    return Intrinsics(params, width, height, is_guess=True)
+
+
+def _as_opencv(model: str, params: np.ndarray) -> np.ndarray:
+    if model == "SIMPLE_PINHOLE":
+        f, cx, cy = params
+        return np.array([f, f, cx, cy])
+    if model == "SIMPLE_RADIAL":
+        f, cx, cy, k = params
+        return np.array([f, f, cx, cy, k, 0.0, 0.0, 0.0])
+    return params
+
+
+def _focal_from_exif(image: Path, longer_side: int) -> float | None:
+    """px, from the 35 mm equivalent that phones write; None where there is none."""
+    from PIL import Image  # comes with matplotlib
+
+    try:
+        with Image.open(image) as opened:
+            equivalent = opened.getexif().get_ifd(0x8769).get(0xA405)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    if not equivalent or not 5 <= float(equivalent) <= 500:
+        return None
+    _log.info("%s: focal length %s mm (35 mm equivalent).", image.name, equivalent)
+    return float(equivalent) / 36.0 * longer_side

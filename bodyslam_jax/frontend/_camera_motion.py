@@ -1,0 +1,162 @@
+"""What kind of camera motion tracks show: none, rotation, translation, or a cut."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.frontend._bundle import Views
+from bodyslam_jax.frontend._geometry import fit_rotation, relative_pose, unit_rays
+
+
+def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
+    """First frames of shots: 0, and those that share too few points with the last."""
+    ordered = np.lexsort((views.frame, views.landmark))
+    frame, landmark = views.frame[ordered], views.landmark[ordered]
+    same = landmark[1:] == landmark[:-1]
+    # A point seen before and after a frame links the two sides, seen there or not.
+    links = np.zeros(num_frames + 1)
+    np.add.at(links, frame[:-1][same] + 1, 1)
+    np.add.at(links, frame[1:][same] + 1, -1)
+    shared = np.cumsum(links)[:num_frames]
+    return [0] + [k for k in range(1, num_frames) if shared[k] < min_shared]
+
+
+def choose_keyframes(
+    views: Views, first: int, last: int, motion: float, min_shared: int
+) -> Int[np.ndarray, " k"]:
+    """Frames between which points moved by `motion` (at depth 1) or many are new."""
+    by_frame = _by_frame(views)
+    chosen = [first]
+    ids, xy = by_frame.get(first, _nothing())
+    for k in range(first + 1, last + 1):
+        ids_k, xy_k = by_frame.get(k, _nothing())
+        _, a, b = np.intersect1d(ids, ids_k, return_indices=True)
+        if len(ids_k) < min_shared:
+            continue
+        moved = (
+            np.median(np.linalg.norm(xy_k[b] - xy[a], axis=-1)) if len(a) else np.inf
+        )
+        if (
+            moved > motion
+            or len(a) < 0.6 * len(ids)
+            or k == last
+            or k - chosen[-1] > 30
+        ):
+            chosen.append(k)
+            ids, xy = ids_k, xy_k
+    return np.asarray(chosen)
+
+
+def stillness(views: Views) -> float:
+    """How far points wander in the image: median over points of the 90th percentile of
+    the distance from their own median place, in depth-1 units."""
+    ordered = np.argsort(views.landmark, kind="stable")
+    landmark, xy = views.landmark[ordered], views.xy[ordered]
+    starts = np.flatnonzero(np.diff(landmark, prepend=-1))
+    lengths = np.diff(np.append(starts, len(landmark)))
+    long = lengths >= max(5, 0.5 * np.percentile(lengths, 90))
+    wander = []
+    for start, length in zip(starts[long], lengths[long], strict=True):
+        points = xy[start : start + length]
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
+        wander.append(np.percentile(away, 90))
+    return float(np.median(wander)) if wander else 0.0
+
+
+def rotation_error(
+    views: Views, keyframes: Int[np.ndarray, " k"], scale: float
+) -> Float[np.ndarray, "p 4"]:
+    """How badly a pure rotation explains pairs of keyframes.
+
+    Returns: for each pair of keyframes that share 30 points or more: first, second, the
+    median angle (rad) left after the best rotation, and how many points they share.
+    """
+    by_frame = _by_frame(views)
+    rows = []
+    for i, a in enumerate(keyframes):
+        for b in keyframes[i + 1 :]:
+            _, at_a, at_b = np.intersect1d(
+                by_frame[a][0], by_frame[b][0], return_indices=True
+            )
+            if len(at_a) < 30:
+                continue
+            rays = unit_rays(by_frame[a][1][at_a]), unit_rays(by_frame[b][1][at_b])
+            _, away = fit_rotation(*rays, scale)
+            rows.append((a, b, np.median(away), len(at_a)))
+    return np.asarray(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def parallax(views: Views, a: int, b: int, threshold: float) -> float:
+    """Angle (rad) between the rays of the nearer points that two frames share: the 90th
+    percentile after the rotation of the essential matrix; 0 if there is none."""
+    by_frame = _by_frame(views)
+    _, i, j = np.intersect1d(by_frame[a][0], by_frame[b][0], return_indices=True)
+    xy_a, xy_b = by_frame[a][1][i], by_frame[b][1][j]
+    pose = relative_pose(xy_a, xy_b, threshold)
+    if pose is None or pose[2].sum() < 5:
+        return 0.0
+    R, _, good = pose
+    apart = np.linalg.norm(unit_rays(xy_b) - unit_rays(xy_a) @ R.T, axis=-1)
+    return float(np.percentile(apart[good], 90))
+
+
+def rotations_only(
+    views: Views,
+    num_frames: int,
+    num_landmarks: int,
+    scale: float,
+    *,
+    turns: bool = True,
+) -> tuple[
+    Float[np.ndarray, "t 3 3"], Float[np.ndarray, "l 3"], Bool[np.ndarray, " t"]
+]:
+    """Rotations R_CW of a camera that only turns, and directions to the points.
+
+    First frame by frame, then all together: every direction the mean of its rays, every
+    rotation the best for its directions, in turn. With `turns` false the rotations are
+    the identity and only the directions are sought.
+    """
+    by_frame = _by_frame(views)
+    R = np.tile(np.eye(3), (num_frames, 1, 1))
+    direction = np.zeros((num_landmarks, 3))
+    known = np.zeros(num_landmarks, dtype=bool)
+    solved = np.zeros(num_frames, dtype=bool)
+    for k in range(num_frames):
+        ids, xy = by_frame.get(k, _nothing())
+        ray = unit_rays(xy)
+        at = known[ids]
+        if solved.any():
+            R[k] = R[k - 1]
+        if at.sum() >= 6 and turns:
+            R[k] = fit_rotation(direction[ids[at]], ray[at], scale)[0]
+        if at.sum() >= 6 or (not solved.any() and len(ids) >= 6):
+            solved[k] = True
+            new = ids[~at]
+            direction[new] = ray[~at] @ R[k]
+            known[new] = True
+    for _ in range(20):
+        ray_W = np.einsum("mji,mj->mi", R[views.frame], unit_rays(views.xy))
+        away = np.linalg.norm(ray_W - direction[views.landmark], axis=-1)
+        weight = 1 / (1 + (away / scale) ** 2)
+        total = np.zeros_like(direction)
+        np.add.at(total, views.landmark, weight[:, None] * ray_W)
+        length = np.linalg.norm(total, axis=-1, keepdims=True)
+        direction = np.where(length > 0, total / np.maximum(length, 1e-12), direction)
+        for k in np.flatnonzero(solved & turns):
+            ids, xy = by_frame[k]
+            R[k] = fit_rotation(direction[ids], unit_rays(xy), scale)[0]
+    return R, direction, solved
+
+
+def _by_frame(views: Views) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    order = np.argsort(views.frame, kind="stable")
+    frame = views.frame[order]
+    starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    ends = np.append(starts[1:], len(frame))
+    return {
+        int(frame[a]): (views.landmark[order[a:b]], views.xy[order[a:b]])
+        for a, b in zip(starts, ends, strict=True)
+    }
+
+
+def _nothing() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(0, dtype=np.int64), np.zeros((0, 2))

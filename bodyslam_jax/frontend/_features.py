@@ -1,0 +1,106 @@
+"""Image -> BRISK keypoints and descriptors; pairs of points -> RANSAC inliers.
+
+BRISK: Leutenegger et al., ICCV 2011, the detector of Henning et al. (ECCV 2022).
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+
+def make_brisk(threshold: int, octaves: int) -> Any:
+    """OpenCV's BRISK, wherever this build of OpenCV keeps it.
+
+    **Raises:** `ValueError`, saying how to get it, if it is in neither place.
+    """
+    if hasattr(cv2, "BRISK_create"):
+        return cv2.BRISK_create(threshold, octaves)
+    contrib = getattr(cv2, "xfeatures2d", None)
+    if hasattr(contrib, "BRISK_create"):
+        return contrib.BRISK_create(threshold, octaves)
+    raise ValueError(
+        f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
+        "opencv-contrib-python-headless."
+    )
+
+
+def spread(
+    uv: Float[np.ndarray, "n 2"],
+    response: Float[np.ndarray, " n"],
+    taken: Float[np.ndarray, "k 2"],
+    *,
+    size: tuple[int, int],
+    cell: int,
+    quota: int,
+    distance: float,
+) -> list[int]:
+    """Picks points that cover the image: the strongest in each cell that lacks some.
+
+    Args:
+        taken: points there are already; they count for their cell.
+        size: width and height, px.
+        cell: side of a cell, px.
+        quota: points wanted in each cell.
+        distance: least distance between any two points, px.
+    """
+    columns, rows = -(-size[0] // cell), -(-size[1] // cell)
+    lacking = np.full((rows, columns), quota)
+    # A blocked map at one entry per pixel is quicker than any search for neighbours.
+    blocked = np.zeros((size[1], size[0]), dtype=np.uint8)
+    radius = max(1, round(distance))
+    for x, y in taken:
+        cv2.circle(blocked, (round(float(x)), round(float(y))), radius, 1, -1)
+        i, j = int(y) // cell, int(x) // cell
+        if 0 <= i < rows and 0 <= j < columns:
+            lacking[i, j] -= 1
+    chosen = []
+    for k in np.argsort(-response):
+        x, y = int(uv[k, 0] + 0.5), int(uv[k, 1] + 0.5)
+        i, j = y // cell, x // cell
+        if not (0 <= x < size[0] and 0 <= y < size[1]) or lacking[i, j] <= 0:
+            continue
+        if blocked[y, x]:
+            continue
+        cv2.circle(blocked, (x, y), radius, 1, -1)
+        lacking[i, j] -= 1
+        chosen.append(int(k))
+    return chosen
+
+
+def epipolar_inliers(
+    xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
+) -> Bool[np.ndarray, " n"]:
+    """Which pairs fit one essential matrix; all of them if too few to tell.
+
+    Args:
+        xy_a, xy_b: undistorted points at depth 1.
+        threshold: distance from the epipolar line, in the same unit.
+    """
+    if len(xy_a) < 12:
+        return np.ones(len(xy_a), dtype=bool)
+    _, inlier = cv2.findEssentialMat(
+        xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, 500
+    )
+    if inlier is None:
+        return np.ones(len(xy_a), dtype=bool)
+    return inlier.ravel() > 0
+
+
+def match(
+    a: UInt8[np.ndarray, "n 64"], b: UInt8[np.ndarray, "m 64"], *, ratio: float = 0.8
+) -> np.ndarray:
+    """Mutual nearest descriptors (k, 2) whose second-best is clearly worse."""
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    forward = matcher.knnMatch(a, b, k=2)
+    backward = {m.queryIdx: m.trainIdx for m in matcher.match(b, a)}
+    found = [
+        (first.queryIdx, first.trainIdx)
+        for first, second in forward
+        if first.distance < min(ratio * second.distance, 110)
+        and backward[first.trainIdx] == first.queryIdx
+    ]
+    return np.asarray(found, dtype=np.int64).reshape(-1, 2)

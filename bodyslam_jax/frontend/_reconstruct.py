@@ -1,0 +1,284 @@
+"""Tracks and intrinsics -> a camera pose for every frame and a map, up to scale."""
+
+import dataclasses
+import logging
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+from bodyslam_jax.config import Structure
+from bodyslam_jax.frontend._bundle import Scene, Views, errors
+from bodyslam_jax.frontend._camera_motion import (
+    choose_keyframes,
+    find_cuts,
+    parallax,
+    rotation_error,
+    rotations_only,
+    stillness,
+)
+from bodyslam_jax.frontend._sequence import as_opencv
+from bodyslam_jax.frontend._structure import Builder, Growing, Refine
+from bodyslam_jax.sequence import Intrinsics, Tracks
+
+_log = logging.getLogger(__name__)
+
+Kind = Literal["moving", "rotation", "static", "failed"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and map of `t` frames and `l` landmarks, up to scale."""
+
+    kind: Kind
+    """`moving`: all below holds. `rotation`: the camera only turns, its centre is 0 and
+    the landmarks are directions (distance 1). `static`: it does not even turn.
+    `failed`: nothing could be said; poses are the identity."""
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world. The world is the first registered camera, its unit the median
+    distance of landmarks from it."""
+    registered: Bool[np.ndarray, " t"]
+    """Frames whose pose was estimated; the other poses are interpolated or held."""
+    landmarks: Float[np.ndarray, "l 3"]
+    tracks: Tracks
+    """The observations that fit, of these landmarks."""
+    inlier: Bool[np.ndarray, " m"]
+    """Which of the `m` observations given they are."""
+    landmark_ids: Int[np.ndarray, " l"]
+    """Which of the landmarks given these are."""
+    error: float
+    """Median reprojection error of the inliers, px."""
+    warnings: tuple[str, ...] = ()
+
+
+def reconstruct(
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    num_frames: int,
+    config: Structure = Structure(),
+    refine: Refine | None = None,
+) -> Reconstruction:
+    """Structure from motion that says what kind of motion there was.
+
+    After a cut only the longest shot is reconstructed; the other frames hold the
+    nearest pose and are not registered. Every frame gets a pose.
+
+    Args:
+        refine: adjusts cameras and points in place, in the stead of the built-in bundle
+            adjustment while the reconstruction grows.
+    """
+    K, distortion = as_opencv(intrinsics.params)
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    xy = np.zeros((0, 2))
+    if len(tracks.uv):
+        xy = cv2.undistortPoints(tracks.uv[:, None], K, distortion)[:, 0]
+    views = Views(tracks.frame, tracks.landmark, xy)
+    num_landmarks = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
+    problem = _Problem(tracks, views, intrinsics, num_frames, num_landmarks, focal)
+
+    first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
+    within = (views.frame >= first) & (views.frame <= last)
+    shot = views[np.flatnonzero(within)]
+    if len(np.unique(shot.frame)) < 2:
+        return _nothing(problem, "failed", (*warnings, "too few background points."))
+    still = stillness(shot) * focal
+    if still < config.static_motion:
+        text = f"the camera stands still (points wander {still:.2f} px)."
+        return _fixed(problem, within, "static", None, (*warnings, text))
+    motion = config.keyframe_motion * max(intrinsics.width, intrinsics.height) / focal
+    keyframes = choose_keyframes(shot, first, last, motion, config.min_shared)
+    pairs = rotation_error(shot, keyframes, 1 / focal)
+    if len(pairs) and _only_turns(shot, pairs, focal, config):
+        text = (
+            "the camera turns but hardly moves: no depth from parallax, "
+            "the scale rests on the body alone."
+        )
+        return _fixed(problem, within, "rotation", 1 / focal, (*warnings, text))
+    builder = Builder(shot, num_frames, num_landmarks, focal, config, refine)
+    grown = builder.build(keyframes, _first_pairs(pairs, config.max_first_pairs))
+    if grown is None:
+        text = "no pair of frames has enough parallax to start a map."
+        return _nothing(problem, "failed", (*warnings, text))
+    builder.complete(grown, np.arange(first, last + 1))
+    builder.polish(grown, iterations=4)
+    lost = np.arange(first, last + 1)[~grown.registered[first : last + 1]]
+    if len(lost):
+        text = f"{len(lost)} frames not located (from {lost[0]}): poses interpolated."
+        warnings = (*warnings, text)
+    inlier = np.zeros(len(tracks.frame), dtype=bool)
+    inlier[within] = grown.inlier
+    return _moving(problem, grown, inlier, warnings)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    tracks: Tracks
+    views: Views
+    intrinsics: Intrinsics
+    num_frames: int
+    num_landmarks: int
+    focal: float
+
+
+def _longest_shot(
+    views: Views, num_frames: int, min_shared: int
+) -> tuple[int, int, tuple[str, ...]]:
+    starts = find_cuts(views, num_frames, min_shared)
+    ends = [*starts[1:], num_frames]
+    lengths = np.subtract(ends, starts)
+    best = int(np.argmax(lengths))
+    if len(starts) == 1:
+        return 0, num_frames - 1, ()
+    first, last = starts[best], ends[best] - 1
+    at = ", ".join(str(k) for k in starts[1:5]) + (", ..." if len(starts) > 5 else "")
+    text = (
+        f"cut or lost tracking at frame {at}: only frames {first} to {last} are used."
+    )
+    return first, last, (text,)
+
+
+def _only_turns(
+    views: Views, pairs: np.ndarray, focal: float, config: Structure
+) -> bool:
+    """Whether even the pairs that a turning camera explains worst show no depth.
+
+    A wrong focal length makes a pure rotation fit badly too, by some pixels; so what
+    counts in doubt is the angle under which the nearer points are seen.
+    """
+    telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
+    worst = pairs[np.argsort(-telling)[:5]]
+    away = float(np.median(worst[:, 2])) * focal
+    if away < config.rotation_error or away > 6 * config.rotation_error:
+        return away < config.rotation_error
+    angles = [parallax(views, int(a), int(b), 1 / focal) for a, b in worst[:, :2]]
+    return float(np.median(angles)) < np.radians(config.min_parallax)
+
+
+def _first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Pairs of keyframes to start from: much parallax, many points, spread in time."""
+    if not len(pairs):
+        return np.zeros((0, 2), dtype=np.int64)
+    enough = np.minimum(pairs[:, 2], np.radians(5.0))
+    score = enough * np.minimum(pairs[:, 3], 100) ** 1.5
+    chosen: list[np.ndarray] = []
+    for i in np.argsort(-score):
+        apart = [np.abs(pairs[i, :2] - c).max() for c in chosen]
+        span = pairs[i, 1] - pairs[i, 0]
+        if not apart or min(apart) > 0.3 * span:
+            chosen.append(pairs[i, :2])
+        if len(chosen) == count:
+            break
+    return np.asarray(chosen).astype(np.int64)
+
+
+def _moving(
+    problem: _Problem, grown: Growing, inlier: np.ndarray, warnings: tuple[str, ...]
+) -> Reconstruction:
+    """Puts the world into the first camera and the unit at the median distance."""
+    registered = grown.registered
+    k0 = int(np.argmax(registered))
+    R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()
+    ids = np.flatnonzero(np.bincount(problem.views.landmark[inlier], minlength=1))
+    points = (grown.scene.points[ids] - c0) @ R0.T
+    unit = float(np.median(np.linalg.norm(points, axis=-1))) if len(ids) else 1.0
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
+    T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
+    T_WC = interpolate_poses(T_WC, registered)
+    return _pack(
+        problem, "moving", T_WC, registered, points / unit, ids, inlier, warnings
+    )
+
+
+def _fixed(
+    problem: _Problem,
+    within: np.ndarray,
+    kind: Kind,
+    scale: float | None,
+    warnings: tuple[str, ...],
+) -> Reconstruction:
+    """A camera whose centre does not move: rotations if `scale` is given, else none."""
+    shot = problem.views[np.flatnonzero(within)]
+    size = (problem.num_frames, problem.num_landmarks)
+    rotations = rotations_only(shot, *size, scale or 1.0, turns=scale is not None)
+    R_CW, direction, solved = rotations
+    k0 = int(np.argmax(solved))
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R_CW[k0], R_CW)
+    T_WC = interpolate_poses(T_WC, solved)
+    direction = direction @ R_CW[k0].T
+    scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], direction)
+    inlier = within & solved[problem.views.frame]
+    inlier &= errors(scene, problem.views) * problem.focal < 4.0
+    ids = np.flatnonzero(np.bincount(problem.views.landmark[inlier], minlength=1))
+    return _pack(problem, kind, T_WC, solved, direction[ids], ids, inlier, warnings)
+
+
+def _nothing(
+    problem: _Problem, kind: Kind, warnings: tuple[str, ...]
+) -> Reconstruction:
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    none = np.zeros(0, dtype=np.int64)
+    nowhere = np.zeros(problem.num_frames, dtype=bool)
+    inlier = np.zeros(len(problem.views.frame), dtype=bool)
+    return _pack(problem, kind, T_WC, nowhere, np.zeros((0, 3)), none, inlier, warnings)
+
+
+def _pack(
+    problem: _Problem,
+    kind: Kind,
+    T_WC: np.ndarray,
+    registered: np.ndarray,
+    landmarks: np.ndarray,
+    ids: np.ndarray,
+    inlier: np.ndarray,
+    warnings: tuple[str, ...],
+) -> Reconstruction:
+    new = np.full(max(problem.num_landmarks, 1), -1)
+    new[ids] = np.arange(len(ids))
+    tracks = Tracks(
+        problem.tracks.frame[inlier],
+        new[problem.tracks.landmark[inlier]],
+        problem.tracks.uv[inlier],
+    )
+    error = 0.0
+    if inlier.any():
+        scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], landmarks)
+        views = problem.views[np.flatnonzero(inlier)]
+        found = errors(scene, Views(views.frame, tracks.landmark, views.xy))
+        error = float(np.median(found)) * problem.focal
+    for text in warnings:
+        _log.warning("%s", text)
+    return Reconstruction(
+        kind=kind,
+        T_WC=T_WC,
+        registered=registered,
+        landmarks=landmarks,
+        tracks=tracks,
+        inlier=inlier,
+        landmark_ids=ids,
+        error=error,
+        warnings=warnings,
+    )
+
+
+def interpolate_poses(
+    T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
+) -> Float[np.ndarray, "t 4 4"]:
+    """Fills poses that are not known: between neighbours, held before and after."""
+    at = np.flatnonzero(known)
+    if not len(at) or known.all():
+        return T_WC
+    filled = T_WC.copy()
+    time = np.clip(np.arange(len(T_WC)), at[0], at[-1])
+    if len(at) == 1:
+        filled[:] = T_WC[at[0]]
+        return filled
+    turns = Slerp(at, Rotation.from_matrix(T_WC[at, :3, :3]))
+    filled[:, :3, :3] = turns(time).as_matrix()
+    for axis in range(3):
+        filled[:, axis, 3] = np.interp(time, at, T_WC[at, axis, 3])
+    filled[at] = T_WC[at]
+    return filled

@@ -1,0 +1,312 @@
+"""A folder, video or images, and what is known about them -> one checked `Sequence`."""
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from bodyslam_jax.config import Association
+from bodyslam_jax.frontend._association import associate
+from bodyslam_jax.frontend._bodies import read_bodies
+from bodyslam_jax.frontend._calibration import guess_camera, read_camera
+from bodyslam_jax.frontend._keypoints import numbers, open_npz, read_detections
+from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
+from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence, Tracks
+
+_log = logging.getLogger(__name__)
+
+_FPS_TOLERANCE = 0.02
+_MID_HIP = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class _Parts:
+    """Where each part of a sequence lies; None where there is none."""
+
+    name: str
+    footage: Path | None = None
+    keypoints: Path | None = None
+    bodies: Path | None = None
+    camera: Path | None = None
+    tracks: Path | None = None
+    masks: Path | None = None
+    groundtruth: Path | None = None
+
+
+def read_sequence(
+    path: str | Path,
+    *,
+    keypoints: str | Path | None = None,
+    bodies: str | Path | None = None,
+    camera: str | Path | None = None,
+    tracks: str | Path | None = None,
+    masks: str | Path | None = None,
+    config: Association = Association(),
+) -> Sequence:
+    """Reads a sequence folder, a video file or a folder of images.
+
+    The options take the place of what a sequence folder holds under the usual names.
+
+    Args:
+        keypoints: folder of OpenPose files, or one file of another detector.
+        bodies: bodies in the camera frame, `bodies.npz` or another tool's result.
+        camera: `camera.json`; without one the intrinsics are guessed.
+        tracks: point tracks, `.npz`; without them they come from the images.
+        masks: folder of person masks, one image per frame.
+
+    **Raises:** `ValueError`, one line that names the file, what was found and what was
+    expected; nothing that is not finite and in range gets past here.
+    """
+    given = {
+        "keypoints": keypoints,
+        "bodies": bodies,
+        "camera": camera,
+        "tracks": tracks,
+        "masks": masks,
+    }
+    chosen = {k: Path(v) for k, v in given.items() if v is not None}
+    parts = dataclasses.replace(_find_parts(Path(path)), **chosen)
+    if parts.footage is None and parts.tracks is None:
+        raise ValueError(f"{path}: no video.mp4, images/ or tracks.npz.")
+    return _read_parts(Path(path), parts, config)
+
+
+def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) -> Tracks:
+    """Reads `frame`, `landmark` and `uv` (px) of point tracks made elsewhere.
+
+    **Raises:** `ValueError`, naming the file, if they do not fit the video.
+    """
+    with open_npz(path) as archive:
+        missing = [k for k in ("frame", "landmark", "uv") if k not in archive.files]
+        if missing:
+            raise ValueError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
+        frame, landmark, uv = (
+            numbers(path, archive, k) for k in ("frame", "landmark", "uv")
+        )
+    if (
+        uv.ndim != 2
+        or uv.shape[1] != 2
+        or not frame.shape == landmark.shape == (len(uv),)
+    ):
+        raise ValueError(
+            f"{path}: frame {frame.shape}, landmark {landmark.shape}, uv {uv.shape}; "
+            "expected (m,), (m,), (m, 2)."
+        )
+    if not len(uv):
+        raise ValueError(f"{path}: no observation.")
+    if (frame % 1 != 0).any() or (landmark % 1 != 0).any() or frame.min() < 0:
+        raise ValueError(f"{path}: frame and landmark must be whole numbers from 0.")
+    if num_frames is not None and frame.max() >= num_frames:
+        raise ValueError(
+            f"{path}: tracks up to frame {frame.max():.0f}, but the video has "
+            f"{num_frames} frames."
+        )
+    outside = ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
+    if outside > 0.1:
+        raise ValueError(
+            f"{path}: {100 * outside:.0f} % of the points outside the image of "
+            f"{size[0]}x{size[1]} px: of another video?"
+        )
+    _, index = np.unique(landmark, return_inverse=True)
+    frame = frame.astype(np.int64)
+    if len(np.unique(frame * (index.max() + 1) + index)) < len(frame):
+        raise ValueError(f"{path}: a landmark seen twice in one frame.")
+    return Tracks(frame, index.astype(np.int64), uv)
+
+
+def _find_parts(path: Path) -> _Parts:
+    """What lies where in a sequence folder, or that it is just a video or images."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder.")
+    if path.is_file():
+        return _Parts(name=path.stem, footage=path)
+    within = lambda name: path / name if (path / name).exists() else None
+    footage = within("video.mp4") or within("images")
+    if footage is None:
+        videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+        named = [p for p in videos if p.stem == "video"]
+        if len(named or videos) > 1:
+            names = ", ".join(p.name for p in (named or videos)[:4])
+            raise ValueError(f"{path}: which video? {names}; give the file itself.")
+        footage = (named or videos or [None])[0]
+    if footage is None and list_images(path):
+        footage = path
+    return _Parts(
+        name=path.resolve().name,
+        footage=footage,
+        keypoints=within("keypoints") or within("keypoints.npz"),
+        bodies=within("bodies.npz"),
+        camera=within("camera.json"),
+        tracks=within("tracks.npz"),
+        masks=within("masks"),
+        groundtruth=within("groundtruth"),
+    )
+
+
+def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
+    known = read_camera(parts.camera) if parts.camera else None
+    fps = known[1] if known else None
+    footage = look_at(parts.footage, fps) if parts.footage else None
+    warnings = footage.warnings if footage else ()
+    if known:
+        intrinsics = known[0]
+        if footage:
+            warnings += _check_camera(parts, intrinsics, fps, footage)
+    elif footage:
+        first = list_images(footage.path)[0] if footage.path.is_dir() else None
+        intrinsics = guess_camera(footage.width, footage.height, first)
+        warnings += (
+            f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px.",
+        )
+    else:
+        raise ValueError(f"{path}: tracks without a video need a camera.json.")
+    size = (intrinsics.width, intrinsics.height)
+
+    found_tracks = None
+    if parts.tracks:
+        count = len(footage.timestamps) if footage else None
+        found_tracks = read_tracks(parts.tracks, num_frames=count, size=size)
+    stamps = footage.timestamps if footage else _made_up_times(parts, found_tracks, fps)
+    num_frames = len(stamps)
+
+    people = None
+    rate = (num_frames - 1) / (stamps[-1] - stamps[0]) if num_frames > 1 else 30.0
+    if parts.keypoints:
+        detections = read_detections(
+            parts.keypoints, num_frames=num_frames, width=size[0], height=size[1]
+        )
+        people, more = associate(detections, config, rate)
+        warnings += more
+    regressed = None
+    if parts.bodies:
+        regressed = read_bodies(
+            parts.bodies, num_frames=num_frames, intrinsics=intrinsics
+        )
+        if people is not None:
+            people, regressed = _pair(people, regressed, intrinsics)
+    if parts.masks:
+        _check_masks(parts.masks, num_frames)
+    for text in warnings:
+        _log.warning("%s: %s", parts.name, text)
+    return Sequence(
+        name=parts.name,
+        frames=parts.footage,
+        timestamps=stamps,
+        intrinsics=intrinsics,
+        keypoints=people,
+        bodies=regressed,
+        tracks=found_tracks,
+        masks=parts.masks,
+        groundtruth=parts.groundtruth,
+        warnings=warnings,
+    )
+
+
+def _check_camera(
+    parts: _Parts, intrinsics: Intrinsics, fps: float | None, footage: Footage
+) -> tuple[str, ...]:
+    if (intrinsics.width, intrinsics.height) != (footage.width, footage.height):
+        raise ValueError(
+            f"{parts.camera}: for {intrinsics.width}x{intrinsics.height} px, but "
+            f"{footage.path.name} has {footage.width}x{footage.height} px."
+        )
+    stamps = footage.timestamps
+    if fps is None or len(stamps) < 2:
+        return ()
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
+    if abs(rate - fps) > _FPS_TOLERANCE * fps:
+        return (
+            f"camera.json says {fps:g} frames/s, the video {rate:.4g}: video used.",
+        )
+    return ()
+
+
+def _made_up_times(
+    parts: _Parts, tracks: Tracks | None, fps: float | None
+) -> np.ndarray:
+    """Times of a sequence without images: as many as it has keypoints or tracks for."""
+    num = int(tracks.frame.max()) + 1 if tracks else 0
+    if parts.keypoints and parts.keypoints.is_dir():
+        num = max(num, len(list(parts.keypoints.glob("*_keypoints.json"))))
+    return np.arange(num) / (fps or 30.0)
+
+
+def _check_masks(folder: Path, num_frames: int) -> None:
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: not a folder of mask images.")
+    found = len(list_images(folder))
+    if found != num_frames:
+        raise ValueError(
+            f"{folder}: {found} masks, but the video has {num_frames} frames."
+        )
+
+
+def _pair(
+    keypoints: Keypoints, bodies: Bodies, intrinsics: Intrinsics
+) -> tuple[Keypoints, Bodies]:
+    """Puts keypoints and bodies of the same person at the same index.
+
+    By the distance of the projected pelvis from the hips in the image. Whoever has only
+    one of the two is kept, with confidence 0 or not present.
+    """
+    num_k, num_b = len(keypoints.uv), len(bodies.present)
+    cost = np.full((num_k, num_b), 1e6)
+    for j in range(num_b):
+        # The pelvis of a body of average size; only the difference of people matters.
+        pelvis = bodies.trans[j] + np.array([0.0, -0.2, 0.0])
+        pixel = project_points(intrinsics, pelvis)
+        for i in range(num_k):
+            both = bodies.present[j] & (keypoints.confidence[i, :, _MID_HIP] > 0)
+            if both.any():
+                away = np.linalg.norm(
+                    keypoints.uv[i, both, _MID_HIP] - pixel[both], axis=-1
+                )
+                size = np.ptp(keypoints.uv[i, both][..., 1], axis=-1).clip(20)
+                cost[i, j] = np.median(away / size) - 1e-3 * np.sqrt(both.sum())
+    rows, columns = linear_sum_assignment(cost)
+    matched = {
+        int(j): int(i) for i, j in zip(rows, columns, strict=True) if cost[i, j] < 1
+    }
+    target = np.empty(num_b, dtype=np.int64)
+    extra = num_k
+    for j in range(num_b):
+        if j in matched:
+            target[j] = matched[j]
+        else:
+            target[j], extra = extra, extra + 1
+
+    def spread(array: np.ndarray, index: np.ndarray) -> np.ndarray:
+        out = np.zeros((extra, *array.shape[1:]), dtype=array.dtype)
+        out[index] = array
+        return out
+
+    return (
+        Keypoints(
+            *(spread(a, np.arange(num_k)) for a in (keypoints.uv, keypoints.confidence))
+        ),
+        Bodies(
+            *(
+                spread(a, target)
+                for a in (bodies.present, bodies.poses, bodies.shapes, bodies.trans)
+            )
+        ),
+    )
+
+
+def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
+    """Pixels of points (m, 3) in the camera frame; far away if behind the camera."""
+    front = p_C[:, 2] > 0.05
+    safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
+    K, distortion = as_opencv(intrinsics.params)
+    uv = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    return np.where(front[:, None], uv, 1e5)
+
+
+def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Camera matrix and distortion coefficients, as cv2 wants them."""
+    fx, fy, cx, cy = params[:4]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return K, params[4:] if len(params) == 8 else np.zeros(4)

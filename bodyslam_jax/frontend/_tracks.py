@@ -1,0 +1,199 @@
+"""Images -> tracks of static points, about 200 a frame, spread over the image.
+
+BRISK finds the points; pyramidal Lucas--Kanade follows each from frame to frame, there
+and back. Epipolar RANSAC over a gap removes what does not move with the scene; people
+are masked out.
+"""
+
+import dataclasses
+import logging
+from collections import deque
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from bodyslam_jax.config import Tracking
+from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, spread
+from bodyslam_jax.frontend._person_mask import person_masks
+from bodyslam_jax.frontend._sequence import as_opencv
+from bodyslam_jax.frontend._video import frames
+from bodyslam_jax.sequence import Sequence, Tracks
+
+_log = logging.getLogger(__name__)
+
+
+def track(
+    sequence: Sequence,
+    config: Tracking = Tracking(),
+    progress: Callable[[int, int], None] | None = None,
+) -> Tracks:
+    """Follows static points through the images of a sequence.
+
+    Args:
+        progress: called with the number of frames done and their total.
+
+    **Raises:** `ValueError` if images cannot be read or OpenCV lacks BRISK.
+    """
+    tracker = _Tracker(sequence, config)
+    images = frames(sequence, gray=True)
+    masks = person_masks(sequence, config.person_margin)
+    total = sequence.num_frames
+    for k, (image, mask) in enumerate(zip(images, masks, strict=False)):
+        tracker.advance(k, image, mask)
+        if progress is not None:
+            progress(k + 1, total)
+    return tracker.tracks()
+
+
+@dataclasses.dataclass
+class _Live:
+    """Points being followed; rows belong together."""
+
+    ids: np.ndarray
+    uv: np.ndarray
+    step: np.ndarray
+    """Last motion, px a frame: the start of the next search."""
+
+    def keep(self, mask: np.ndarray) -> "_Live":
+        return _Live(*(getattr(self, f.name)[mask] for f in dataclasses.fields(self)))
+
+    def add(self, ids: np.ndarray, uv: np.ndarray) -> "_Live":
+        return _Live(
+            np.concatenate([self.ids, ids]),
+            np.concatenate([self.uv, uv]),
+            np.concatenate([self.step, np.zeros_like(uv)]),
+        )
+
+
+class _Tracker:
+    """What is remembered from frame to frame; memory does not grow with images."""
+
+    def __init__(self, sequence: Sequence, config: Tracking):
+        self.config = config
+        self.size = (sequence.intrinsics.width, sequence.intrinsics.height)
+        self.K, self.distortion = as_opencv(sequence.intrinsics.params)
+        self.brisk = make_brisk(config.threshold, config.octaves)
+        self.live = _Live(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
+        self.previous: np.ndarray | None = None
+        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(
+            maxlen=config.keyframe_gap + 1
+        )
+        self.rows: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self.next_id = 0
+
+    def advance(self, k: int, gray: np.ndarray, mask: np.ndarray | None) -> None:
+        if self.previous is not None and len(self.live.ids):
+            self._follow(gray, mask)
+            self._drop_moving()
+        if self._is_sparse():
+            self._refill(gray, mask)
+        self.previous = gray
+        self.recent.append((self.live.ids, self.live.uv))
+        self.rows.append((k, self.live.ids, self.live.uv))
+
+    def tracks(self) -> Tracks:
+        """All observations of points seen at least three times."""
+        frame = np.concatenate([np.full(len(i), k) for k, i, _ in self.rows])
+        ids = np.concatenate([i for _, i, _ in self.rows])
+        uv = np.concatenate([u for _, _, u in self.rows])
+        count = np.bincount(ids, minlength=self.next_id)
+        kept = count[ids] >= 3
+        _, landmark = np.unique(ids[kept], return_inverse=True)
+        return Tracks(frame[kept], landmark.astype(np.int64), uv[kept])
+
+    def _follow(self, image: np.ndarray, mask: np.ndarray | None) -> None:
+        """From the previous image, there and back again."""
+        assert self.previous is not None
+        live = self.live
+        guess = live.uv + live.step
+        uv, ok = self._flow(self.previous, image, live.uv, guess)
+        back, ok_back = self._flow(image, self.previous, uv, live.uv)
+        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < 0.5)
+        ok &= self._inside(uv, mask)
+        live.step, live.uv = uv - live.uv, uv
+        self.live = live.keep(ok)
+
+    def _flow(
+        self,
+        a: np.ndarray,
+        b: np.ndarray,
+        uv: np.ndarray,
+        guess: np.ndarray,
+        levels: int = 4,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        found, ok, _ = cv2.calcOpticalFlowPyrLK(
+            a,
+            b,
+            uv.astype(np.float32).reshape(-1, 1, 2),
+            guess.astype(np.float32).reshape(-1, 1, 2),
+            winSize=(self.config.window, self.config.window),
+            maxLevel=levels,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            minEigThreshold=1e-4,
+        )
+        return found.reshape(-1, 2).astype(np.float64), ok.ravel() > 0
+
+    def _inside(self, uv: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+        border = 4
+        width, height = self.size
+        x, y = uv.T
+        ok = (
+            (x >= border) & (y >= border) & (x < width - border) & (y < height - border)
+        )
+        if mask is not None:
+            column = np.clip(np.round(x), 0, width - 1).astype(np.int64)
+            row = np.clip(np.round(y), 0, height - 1).astype(np.int64)
+            ok &= mask[row, column] == 0
+        return ok
+
+    def _drop_moving(self) -> None:
+        """Drops what does not fit one rigid motion over the last frames."""
+        live = self.live
+        keep = np.ones(len(live.ids), dtype=bool)
+        if not self.recent:
+            return
+        ids, uv = self.recent[0]
+        _, now, then = np.intersect1d(live.ids, ids, return_indices=True)
+        inlier = epipolar_inliers(
+            self._normalise(uv[then]),
+            self._normalise(live.uv[now]),
+            self.config.max_epipolar / self.K[0, 0],
+        )
+        keep[now[~inlier]] = False
+        self.live = live.keep(keep)
+
+    def _normalise(self, uv: np.ndarray) -> np.ndarray:
+        if not len(uv):
+            return np.zeros((0, 2))
+        return cv2.undistortPoints(uv[:, None], self.K, self.distortion)[:, 0]
+
+    def _is_sparse(self) -> bool:
+        return len(self.live.ids) < 0.85 * self.config.num_points
+
+    def _refill(self, gray: np.ndarray, mask: np.ndarray | None) -> None:
+        found = self.brisk.detect(gray, None if mask is None else cv2.bitwise_not(mask))
+        if not found:
+            return
+        uv = np.array([p.pt for p in found], dtype=np.float64)
+        response = np.array([p.response for p in found], dtype=np.float64)
+        inside = self._inside(uv, mask)
+        uv, response = uv[inside], response[inside]
+        cell = -(-max(self.size) // self.config.cells)
+        cells = -(-self.size[0] // cell) * -(-self.size[1] // cell)
+        missing = self.config.num_points - len(self.live.ids)
+        quota = -(-self.config.num_points // cells)
+        distance = 0.25 * cell
+        chosen = spread(
+            uv,
+            response,
+            self.live.uv,
+            size=self.size,
+            cell=cell,
+            quota=quota,
+            distance=distance,
+        )[: 2 * missing]
+        ids = np.arange(self.next_id, self.next_id + len(chosen))
+        self.next_id += len(chosen)
+        self.live = self.live.add(ids, uv[chosen])

@@ -1,0 +1,171 @@
+"""Video file or folder of images -> frames, one at a time, and when they were taken."""
+
+import dataclasses
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.sequence import Sequence
+
+_log = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+_MAX_JITTER = 0.25
+"""Spread of frame intervals, relative to their median, that is still a fixed rate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Footage:
+    """What a video says of itself, after looking at all of it."""
+
+    path: Path
+    timestamps: Float[np.ndarray, " t"]
+    """s, from 0, increasing"""
+    width: int
+    height: int
+    warnings: tuple[str, ...] = ()
+
+
+def look_at(path: Path, fps: float | None = None) -> Footage:
+    """Counts and times the frames of a video file or a folder of images.
+
+    The number of frames in a video's header is often wrong, so every frame is visited.
+    Sizes are those after the rotation that the file asks for.
+
+    Args:
+        fps: of a folder of images (1/s), 30 if not given; a video brings its own times.
+
+    **Raises:** `ValueError`, naming the file, if it is not a readable video.
+    """
+    if path.is_dir():
+        return _look_at_images(path, fps)
+    return _look_at_video(path)
+
+
+def frames(
+    source: Sequence | Path, *, gray: bool = False
+) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
+    """The images of a sequence in order: BGR, or gray; one in memory at a time.
+
+    **Raises:** `ValueError` if the sequence has no images or one cannot be read.
+    """
+    path = source.frames if isinstance(source, Sequence) else source
+    if path is None:
+        raise ValueError(f"{getattr(source, 'name', source)}: has no video or images.")
+    if path.is_dir():
+        yield from _read_images(path, gray)
+    else:
+        capture = _open(path)
+        try:
+            while True:
+                ok, image = capture.read()
+                if not ok:
+                    break
+                yield cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image
+        finally:
+            capture.release()
+
+
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+    """Images of a folder in the order of the numbers in their names."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
+    return sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sorts `frame_10` after `frame_9`."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(p)) if p.isdigit() else (1, p) for p in parts]
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    # FFmpeg only: OpenCV's other backends take `a.txt` for a pattern of image names.
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise ValueError(f"{path}: not a video that OpenCV can read.")
+    return capture
+
+
+def _look_at_video(path: Path) -> Footage:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file.")
+    capture = _open(path)
+    try:
+        ok, image = capture.read()
+        if not ok:
+            raise ValueError(f"{path}: a video without a readable frame.")
+        nominal = float(capture.get(cv2.CAP_PROP_FPS))
+        announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        times = [float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000]
+        while capture.grab():
+            times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000)
+    finally:
+        capture.release()
+    stamps, warnings = _checked_times(path, np.asarray(times), nominal)
+    # One frame more or less is what containers get wrong; more is a damaged file.
+    if announced > len(times) + max(2, 0.02 * announced):
+        warnings += (f"{path.name}: {announced} frames announced, {len(times)} read.",)
+    return Footage(path, stamps, image.shape[1], image.shape[0], warnings)
+
+
+def _checked_times(
+    path: Path, times: np.ndarray, nominal: float
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Times from 0; made up from the nominal rate where the file's are unusable."""
+    step = np.diff(times)
+    if len(times) == 1:
+        return np.zeros(1), ()
+    if not np.isfinite(times).all() or (step <= 0).any():
+        if not 1 <= nominal <= 1000:
+            nominal = 30.0
+        warning = f"{path.name}: times do not increase; {nominal:g} frames/s taken."
+        return np.arange(len(times)) / nominal, (warning,)
+    median = float(np.median(step))
+    if np.abs(step - median).max() > _MAX_JITTER * median:
+        slow, fast = 1 / step.max(), 1 / step.min()
+        text = f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s."
+        return times - times[0], (text,)
+    return times - times[0], ()
+
+
+def _look_at_images(folder: Path, fps: float | None) -> Footage:
+    images = list_images(folder)
+    if not images:
+        raise ValueError(f"{folder}: no images ({' '.join(IMAGE_SUFFIXES)}).")
+    height, width = _read_image(images[0], gray=True).shape
+    warnings: tuple[str, ...] = ()
+    if fps is None:
+        fps = 30.0
+        warnings = (f"{folder.name}: frame rate not given, 30 frames/s assumed.",)
+    return Footage(folder, np.arange(len(images)) / fps, width, height, warnings)
+
+
+def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:
+    size = None
+    for path in list_images(folder):
+        image = _read_image(path, gray)
+        size = size or image.shape
+        if image.shape != size:
+            found, expected = _size(image.shape), _size(size)
+            raise ValueError(f"{path}: {found}, but the first image is {expected}.")
+        yield image
+
+
+def _read_image(path: Path, gray: bool) -> np.ndarray:
+    flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
+    # Through memory: `imread` cannot open every path and warns on standard error.
+    data = np.fromfile(path, dtype=np.uint8)
+    image = cv2.imdecode(data, flag) if data.size else None
+    if image is None:
+        raise ValueError(f"{path}: not an image that OpenCV can read.")
+    return image
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]} px"
