@@ -97,6 +97,8 @@ class PeopleFit:
     """The same across the line of sight, m; a shaking camera is in it."""
     turn_jitter: float = 0.03
     """The same for the orientation, rad."""
+    depth_error: float = 0.05
+    """Error of a regressor's depth, as a share of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,3 +245,10 @@ class Config:
     structure: Structure = Structure()
     people_fit: PeopleFit = PeopleFit()
     weights: GraphWeights = GraphWeights()
+    solver: Literal["structured", "adam"] = "structured"
+    """Second order, or the paper's 200 + 100 first-order steps."""
+
+    @classmethod
+    def paper(cls) -> "Config":
+        """Weights and schedule of section 3.6 of the paper."""
+        return cls(weights=GraphWeights.paper(), solver="adam")

@@ -1,6 +1,9 @@
 """People: bodies from keypoints or from a regressor, made ready for the graph."""
 
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
+from bodyslam_jax.people._prepare import BodyNoise as BodyNoise
+from bodyslam_jax.people._prepare import body_noise as body_noise
+from bodyslam_jax.people._prepare import prepare_bodies as prepare_bodies
 from bodyslam_jax.people._roots import Roots as Roots
 from bodyslam_jax.people._roots import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people._roots import roots_from_bodies as roots_from_bodies

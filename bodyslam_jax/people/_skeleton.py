@@ -42,7 +42,7 @@ _PATH = _paths()
 
 
 class Skeleton(eqx.Module):
-    """Offsets of 24 joints and 25 keypoints from the joints that carry them, at rest."""
+    """Offsets of 24 joints and 25 keypoints from what carries them, at rest."""
 
     offset: Float[Array, "49 3"]
     """m, β = 0; the pelvis' own is 0."""
@@ -56,7 +56,7 @@ class Points(eqx.Module):
     joints: Float[Array, "24 3"]
     keypoints: Float[Array, "25 3"]
     by_angle: Float[Array, "25 21 3 3"]
-    """Of a keypoint's coordinate (last) by an axis-angle component of joints 1 to 21."""
+    """Of a coordinate (last axis) by a component of the angle of joints 1 to 21."""
     by_shape: Float[Array, "25 3 10"]
 
 
@@ -123,7 +123,7 @@ def _carriers() -> Array:
 
 
 def _below() -> np.ndarray:
-    """Whether keypoint k is carried, at any remove, by joint j + 1 (itself or below)."""
+    """Whether keypoint k hangs on joint j + 1, directly or further down."""
     return _PATH[24:, 1:22]
 
 

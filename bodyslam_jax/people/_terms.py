@@ -27,7 +27,7 @@ KEYPOINT_SIGMA = np.array(
 )
 """Error of BODY_25 keypoints on the body, m: 0.4 of COCO's annotators' σ_k for an
 adult, twice that at hips and neck, which every detector puts elsewhere (OpenPose
-outside and below SMPL's, MediaPipe inside); and heads differ by more than annotators."""
+outside and below SMPL's, MediaPipe inside); heads differ by more than annotators."""
 
 DEPTH_FLOOR = 0.3
 """m: nobody is fitted closer to the camera."""
@@ -103,7 +103,7 @@ def cost(
     residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
     beyond = _beyond_limits(scene, angles) / scene.limit_sigma
     return 0.5 * (
-        jnp.sum(_robust(jnp.sum(residual**2, -1), scene.robust_scale)[0])
+        jnp.sum(robust(jnp.sum(residual**2, -1), scene.robust_scale)[0])
         + jnp.sum(beyond**2)
         + scene.upright_weight * fit.orientation[2, 1] ** 2
     )
@@ -125,7 +125,7 @@ def linearise(
     view = jax.vmap(jax.jacfwd(lambda p: project(scene.intrinsics, p)))(p_C)
     view = view / sigma[:, None, None]
     residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
-    value, weight = _robust(jnp.sum(residual**2, -1), scene.robust_scale)
+    value, weight = robust(jnp.sum(residual**2, -1), scene.robust_scale)
 
     # Pixels by: a turn (δ x p moves p), a shift, the posture, the shape.
     eye = jnp.eye(3, dtype=p_C.dtype)
@@ -161,7 +161,10 @@ def linearise(
     )
 
 
-def _robust(squared: Array, scale: Array) -> tuple[Array, Array]:
+def robust(
+    squared: Float[Array, "*b"], scale: Float[Array, ""]
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """Geman and McClure's ρ of squared whitened distances, and its derivative."""
     ratio = 1 + squared / scale**2
     return squared / ratio, 1 / ratio**2
 

@@ -1,0 +1,297 @@
+"""Bodies that a regressor gave, made fit to start from.
+
+Regressors look at one image at a time: depth jitters by centimetres a frame, now and
+then a body is turned round, frames are missing, β changes. Posture is left as it is:
+smoothing a walk shrinks its steps, and the step is the scale.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import solveh_banded
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.camera import project
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.people._fit import keypoint_sigma, pixels_per_metre
+from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
+from bodyslam_jax.people._skeleton import Skeleton, make_skeleton, place_points
+from bodyslam_jax.people._starts import best_path
+from bodyslam_jax.people._terms import DEPTH_FLOOR, robust
+from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
+
+_BUCKET = 64
+_PLACING_STEPS = 10
+_DETECTOR_FLOOR = 1.0
+"""px"""
+_FLIP_COST = 3.0
+"""What it costs to believe that a regressor took front for back (-log odds)."""
+_KEYPOINT_INDEPENDENCE = 0.1
+"""Share of the keypoints' evidence that counts for or against a flip: their errors and
+the posture's are the same for many frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyNoise:
+    """How much of what a regressor says changes from frame to frame by chance.
+
+    From second differences, so motion that accelerates is in it: upper bounds. The
+    larger, slowly varying part of a regressor's error does not show here.
+    """
+
+    orientation: Float[np.ndarray, " h"]
+    """rad, per axis."""
+    posture: Float[np.ndarray, " h"]
+    """rad, per axis, all joints."""
+    depth: Float[np.ndarray, " h"]
+    """m"""
+    shape: Float[np.ndarray, "h 10"]
+    """Spread of β over the frames."""
+
+
+def prepare_bodies(
+    bodies: Bodies,
+    keypoints: Keypoints | None,
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    fps: float,
+    settings: PeopleFit = PeopleFit(),
+) -> Bodies:
+    """One shape per person, no flips, no short gaps, in place, with a smooth depth.
+
+    Where there are keypoints the pelvis is moved, posture held, to where they fit best;
+    the regressor's own depth stays as a measurement beside them. Person h of `bodies`
+    is person h of `keypoints`.
+    """
+    roots = roots_from_bodies(bodies, body)
+    skeleton = make_skeleton(body, settings.detector_bias)
+    prepared = Roots(
+        roots.present.copy(), roots.T_CH.copy(), roots.body_pose.copy(), roots.shape
+    )
+    for h in range(len(roots.present)):
+        T_CH = prepared.T_CH[h]
+        known = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
+        prepared.present[h] = known
+        where = np.flatnonzero(known)
+        if not len(where):
+            continue
+        uv = np.zeros((len(where), 25, 2))
+        sigma = np.full((len(where), 25), np.inf)
+        if keypoints is not None and h < len(keypoints.uv):
+            uv = keypoints.uv[h, where]
+            sigma = keypoint_sigma(keypoints, intrinsics, h)[where]
+        if np.isfinite(sigma).any():
+            scale = pixels_per_metre(uv, sigma, fps)
+            sigma = np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
+        orientation, position = _place_person(
+            skeleton, intrinsics, roots, h, where, uv, sigma, fps, settings
+        )
+        T_CH[where, :3, :3] = orientation
+        T_CH[where, :3, 3] = position
+        _fill_gaps(prepared, h, settings.max_gap * fps)
+        T_CH[~prepared.present[h]] = np.eye(4)
+    return bodies_from_roots(prepared, body)
+
+
+def body_noise(bodies: Bodies) -> BodyNoise:
+    """What the regressor's jitter is, from the bodies as they came."""
+    found = []
+    for present, poses, shapes, trans in zip(
+        bodies.present, bodies.poses, bodies.shapes, bodies.trans
+    ):
+        middle = present[1:-1] & present[:-2] & present[2:]
+        if not middle.any():
+            found.append((np.nan, np.nan, np.nan, np.full(10, np.nan)))
+            continue
+        R = jaxlie.SO3.exp(jnp.asarray(poses.reshape(len(poses), 24, 3)))
+        before, here, after = (
+            jaxlie.SO3(R.wxyz[a : len(poses) - 2 + a][middle]) for a in (0, 1, 2)
+        )
+        change = (here.inverse() @ after).log() - (before.inverse() @ here).log()
+        change = np.asarray(change)
+        depth = np.diff(trans[:, 2], 2)[middle]
+        found.append(
+            (
+                _spread(change[:, 0]) / np.sqrt(6),
+                _spread(change[:, 1:22]) / np.sqrt(6),
+                _spread(depth) / np.sqrt(6),
+                np.array([_spread(b - np.median(b)) for b in shapes[present].T]),
+            )
+        )
+    return BodyNoise(*(np.array(column, float) for column in zip(*found)))
+
+
+def _spread(values: np.ndarray) -> float:
+    """Standard deviation about zero, from the median: outliers do not count."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def _place_person(
+    skeleton: Skeleton,
+    intrinsics: Intrinsics,
+    roots: Roots,
+    person: int,
+    where: np.ndarray,
+    uv: np.ndarray,
+    sigma: np.ndarray,
+    fps: float,
+    settings: PeopleFit,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
+    dtype = skeleton.offset.dtype
+    T_CH = roots.T_CH[person, where]
+    about = T_CH[:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])  # half a turn about H's y
+    turned = np.stack([T_CH[:, :3, :3], about], axis=1)
+    angles = roots.body_pose[person, where, :21].reshape(-1, 63)
+    depth_sigma = settings.depth_error * T_CH[:, 2, 3]
+    rows = (turned, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
+    length = -len(where) % _BUCKET
+    padded = [
+        jnp.asarray(np.concatenate([a, np.repeat(a[-1:], length, axis=0)]), dtype)
+        for a in rows
+    ]
+    shape = jnp.asarray(roots.shape[person], dtype)
+    camera = jnp.asarray(intrinsics.params, dtype)
+    scale = jnp.asarray(settings.robust_scale, dtype)
+    found = _place_bodies(skeleton, camera, shape, scale, *padded)
+    position, cost, joints = (np.asarray(a[: len(where)], float) for a in found)
+
+    costs = _KEYPOINT_INDEPENDENCE * cost
+    costs[:, 1] += _FLIP_COST * _KEYPOINT_INDEPENDENCE
+    path = best_path(costs, joints, turned, where / fps)
+    each = np.arange(len(where))
+    return turned[each, path], _smooth(position[each, path], where, fps, settings)
+
+
+@eqx.filter_jit
+def _place_bodies(
+    skeleton: Skeleton,
+    intrinsics: Float[Array, " i"],
+    shape: Float[Array, " 10"],
+    scale: Float[Array, ""],
+    orientation: Float[Array, "t 2 3 3"],
+    angles: Float[Array, "t 63"],
+    position: Float[Array, "t 3"],
+    uv: Float[Array, "t 25 2"],
+    sigma: Float[Array, "t 25"],
+    depth_sigma: Float[Array, " t"],
+) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2"], Float[Array, "t 2 24 3"]]:
+    """Pelvis of each frame for either orientation, by robust Gauss--Newton.
+
+    **Returns:** positions in C, costs, and joints about the pelvis in C.
+    """
+
+    def one(R, joints, points, start, uv, sigma, depth_sigma):
+        rotated = points @ R.T
+        # Without keypoints nothing but the regressor's own place is known.
+        across = jnp.where(jnp.any(sigma < jnp.inf), 3.0, 0.01).astype(start.dtype)
+        prior_sigma = jnp.stack([across, across, depth_sigma])
+
+        def residuals(p):
+            predicted = project(intrinsics, rotated + p)
+            return (predicted - uv) / sigma[:, None]
+
+        def step(_, p):
+            r, jac = residuals(p), jax.jacfwd(residuals)(p)
+            _, weight = robust(jnp.sum(r**2, -1), scale)
+            weighted = jac * weight[:, None, None]
+            prior = 1 / prior_sigma**2
+            hessian = jnp.einsum("kci,kcj->ij", weighted, jac) + jnp.diag(prior)
+            gradient = jnp.einsum("kci,kc->i", weighted, r) + prior * (p - start)
+            moved = p - jnp.linalg.solve(hessian, gradient)
+            return moved.at[2].max(DEPTH_FLOOR)
+
+        p = jax.lax.fori_loop(0, _PLACING_STEPS, step, start)
+        value, _ = robust(jnp.sum(residuals(p) ** 2, -1), scale)
+        return p, 0.5 * jnp.sum(value), joints @ R.T
+
+    def frame(R, angles, *rest):
+        joints, points = place_points(skeleton, angles, shape)
+        return jax.vmap(lambda R: one(R, joints, points, *rest))(R)
+
+    return jax.vmap(frame)(orientation, angles, position, uv, sigma, depth_sigma)
+
+
+def _smooth(
+    position: Float[np.ndarray, "m 3"],
+    where: np.ndarray,
+    fps: float,
+    settings: PeopleFit,
+) -> Float[np.ndarray, "m 3"]:
+    """Direction and depth as robustly smoothed curves, at the frames `where`."""
+    depth = position[:, 2]
+    mean_depth = float(np.median(depth))
+    slow = (30 / fps) ** 1.5
+    across = settings.position_jitter * slow / mean_depth
+    coordinates = np.column_stack([position[:, :2] / depth[:, None], depth])
+    jitter = (across, across, settings.depth_jitter * slow)
+    x, y, z = (
+        _smooth_curve(values, where, sigma)
+        for values, sigma in zip(coordinates.T, jitter)
+    )
+    return np.column_stack([x * z, y * z, z])
+
+
+def _smooth_curve(
+    values: Float[np.ndarray, " m"], where: np.ndarray, jitter: float
+) -> Float[np.ndarray, " m"]:
+    """Whittaker's smoother with Student weights: second differences of σ `jitter`.
+
+    The measurement noise is what the values' own second differences say, and its slow
+    part is taken to be as large again for about ten frames.
+    """
+    if len(values) < 5:
+        return values
+    total = where[-1] - where[0] + 1
+    index = where - where[0]
+    noise = max(_spread(np.diff(values, 2)) / np.sqrt(6), 0.1 * jitter)
+    sigma = noise * np.sqrt(10.0)
+    difference = np.array([1.0, -2.0, 1.0]) / jitter
+    stiffness = np.zeros((3, total))
+    for a in range(3):
+        for b in range(a, 3):
+            stiffness[2 - (b - a), b : total - 2 + b] += difference[a] * difference[b]
+    filled = np.interp(np.arange(total), index, values)
+    weight = np.zeros(total)
+    weight[index] = sigma**-2
+    smooth = filled
+    for _ in range(10):
+        banded = stiffness.copy()
+        banded[2] += weight + 1e-9 * sigma**-2
+        smooth = solveh_banded(banded, (weight + 1e-9 * sigma**-2) * filled)
+        error = (values - smooth[index]) / sigma
+        weight[index] = sigma**-2 / (1 + error**2 / 4)
+    return smooth[index]
+
+
+def _fill_gaps(roots: Roots, person: int, longest: float) -> None:
+    """Interpolates gaps of up to `longest` frames, in place."""
+    where = np.flatnonzero(roots.present[person])
+    T_CH, pose = roots.T_CH[person], roots.body_pose[person]
+    for a, b in zip(where[:-1], where[1:]):
+        if not 1 < b - a <= longest + 1:
+            continue
+        share = np.arange(1, b - a) / (b - a)
+        gap = slice(a + 1, b)
+        T_CH[gap, :3, :3] = _slerp(T_CH[a, :3, :3], T_CH[b, :3, :3], share)
+        T_CH[gap, :3, 3] = T_CH[a, :3, 3] + share[:, None] * (
+            T_CH[b, :3, 3] - T_CH[a, :3, 3]
+        )
+        ends = (jaxlie.SO3.exp(jnp.asarray(p)).as_matrix() for p in (pose[a], pose[b]))
+        between = jaxlie.SO3.from_matrix(jnp.asarray(_slerp(*ends, share)))
+        pose[gap] = between.log()
+        roots.present[person, gap] = True
+
+
+def _slerp(a: Array, b: Array, share: np.ndarray) -> np.ndarray:
+    """Rotations between two (or two lists of them), leading axis `share`."""
+    from_, to = (jaxlie.SO3.from_matrix(jnp.asarray(m)) for m in (a, b))
+    whole = (from_.inverse() @ to).log()
+    part = jnp.asarray(share, whole.dtype).reshape(-1, *[1] * whole.ndim) * whole
+    # jaxlie multiplies equal batches only.
+    return np.asarray(from_.as_matrix()) @ np.asarray(jaxlie.SO3.exp(part).as_matrix())
