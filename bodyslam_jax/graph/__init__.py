@@ -25,6 +25,7 @@ from bodyslam_jax.graph._layout import CHUNK as CHUNK
 from bodyslam_jax.graph._layout import Layout as Layout
 from bodyslam_jax.graph._layout import make_layout as make_layout
 from bodyslam_jax.graph._layout import round_up as round_up
+from bodyslam_jax.graph._problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph._problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph._problem import Problem as Problem
 from bodyslam_jax.graph._problem import make_problem as make_problem

@@ -1,11 +1,10 @@
 """Priors, and error terms beyond the paper that can be switched on."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph._factors import AbstractFrameFactor, Touch, _log
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 
@@ -22,6 +21,7 @@ class CameraPrior(AbstractFrameFactor):
     """rad, then units of the map; `inf` where not known."""
     loss: AbstractLoss = Squared()
     of_people = False
+    frame_fields = ("cameras", "sigma")
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -45,6 +45,7 @@ class IntrinsicsPrior(AbstractFrameFactor):
     """px, distortion: 1; `inf` where not known."""
     loss: AbstractLoss = Squared()
     of_people = False
+    frame_fields = ()
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -57,9 +58,9 @@ class IntrinsicsPrior(AbstractFrameFactor):
         known, sigma = data
         return (shared.intrinsics - known) / sigma
 
-    def map_frames(self, function, state):
+    def map_frames(self, function, state, extra=None):
         first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
-        return super().map_frames(function, first)
+        return super().map_frames(function, first, extra)
 
 
 class CameraSmoothness(AbstractFrameFactor):
@@ -72,6 +73,7 @@ class CameraSmoothness(AbstractFrameFactor):
     """Per frame squared: rad, units of the map; `inf` for the first two frames."""
     loss: AbstractLoss = Squared()
     of_people = False
+    frame_fields = ("sigma",)
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -95,6 +97,7 @@ class RootSmoothness(AbstractFrameFactor):
     """m per frame squared; `inf` where a frame of the three is missing."""
     loss: AbstractLoss = Squared()
     of_people = True
+    frame_fields = ("sigma",)
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -121,13 +124,14 @@ class StanceFoot(AbstractFrameFactor):
     Needs no learnt motion, and sees scale through the length of the leg.
     """
 
-    body: Any
+    body: BodyModel
     sigma: Float[Array, "h t f"]
     """m per frame, for the points of the feet; `inf` where one does not carry."""
     loss: AbstractLoss = Squared()
     points: tuple[int, ...] = eqx.field(static=True, default=BODY25_FEET)
     """Which keypoints of BODY_25 they are."""
     of_people = True
+    frame_fields = ("sigma",)
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -143,8 +147,6 @@ class StanceFoot(AbstractFrameFactor):
         return (now - before) / data[:, None]
 
     def _feet(self, frame, shared):
-        from bodyslam_jax.body import local_keypoints
-
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
         p_C = p_H[jnp.array(self.points)] @ frame.root[:3, :3].T + frame.root[:3, 3]
         return p_C @ frame.camera[:3, :3].T + shared.scale * frame.camera[:3, 3]
@@ -159,6 +161,7 @@ class UpDirection(AbstractFrameFactor):
     """rad; `inf` where the person is not there."""
     loss: AbstractLoss = Squared()
     of_people = True
+    frame_fields = ("sigma",)
 
     @property
     def touches(self) -> tuple[Touch, ...]:

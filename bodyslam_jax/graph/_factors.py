@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.camera import project
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import State
+from bodyslam_jax.graph._state import State, compose
 
 Touch = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
@@ -59,6 +60,10 @@ class AbstractFrameFactor(AbstractFactor):
     """A factor for each frame of each person, or of the camera."""
 
     of_people: eqx.AbstractClassVar[bool]
+    frame_fields: eqx.AbstractClassVar[tuple[str, ...]]
+    """Fields with leading axes `h t` (or `t`): what is padded to a common length."""
+    per_joint = False
+    """Whether row j of the residual depends on joint j of the touched poses alone."""
 
     @property
     @abc.abstractmethod
@@ -80,8 +85,8 @@ class AbstractFrameFactor(AbstractFactor):
     def num_lags(self) -> int:
         return 1 + max(lag for _, lag in self.touches)
 
-    def map_frames(self, function, state: State):
-        """`function(data, window, shared)` over frames, and over people if any.
+    def map_frames(self, function, state: State, extra: Any = None):
+        """`function(data, window, shared, extra)` over frames, and people if any.
 
         A window repeats the first frame where there is none before; factors carry no
         weight there.
@@ -90,7 +95,7 @@ class AbstractFrameFactor(AbstractFactor):
         def back(x, lag):
             return x[jnp.maximum(jnp.arange(x.shape[0]) - lag, 0)]
 
-        def one(data, roots, poses, shape):
+        def one(data, extra, roots, poses, shape):
             windows = tuple(
                 Frame(
                     back(state.cameras, lag),
@@ -100,14 +105,15 @@ class AbstractFrameFactor(AbstractFactor):
                 for lag in range(self.num_lags)
             )
             shared = Shared(state.scale, shape, state.intrinsics)
-            return jax.vmap(lambda d, w: function(d, w, shared))(data, windows)
+            over = lambda d, w, e: function(d, w, shared, e)
+            return jax.vmap(over)(data, windows, extra)
 
         if not self.of_people:
-            return one(self.data(), None, None, None)
-        return jax.vmap(one)(self.data(), state.roots, state.poses, state.shapes)
+            return one(self.data(), extra, None, None, None)
+        return jax.vmap(one)(self.data(), extra, state.roots, state.poses, state.shapes)
 
     def residual(self, state: State) -> Float[Array, "*m d"]:
-        return self.map_frames(self.local, state)
+        return self.map_frames(lambda d, w, s, _: self.local(d, w, s), state)
 
 
 class Reprojection(AbstractFactor):
@@ -133,13 +139,16 @@ class Reprojection(AbstractFactor):
 class JointReprojection(AbstractFrameFactor):
     """Keypoints of the person: `u(T_CH p_H(θ, β)) - z`."""
 
-    body: Any
+    body: BodyModel
     pixel: Float[Array, "h t j 2"]
     sigma: Float[Array, "h t j"]
     """px; `inf` where there is no keypoint."""
     loss: AbstractLoss
+    bias: float | Float[Array, ""] = 0.0
+    """Share of the detector's own idea of hips, neck and shoulders, 1."""
     layout: str = eqx.field(static=True, default="body25")
     of_people = True
+    frame_fields = ("pixel", "sigma")
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -151,9 +160,9 @@ class JointReprojection(AbstractFrameFactor):
     def local(self, data, window, shared):
         pixel, sigma = data
         (frame,) = window
-        from bodyslam_jax.body import local_keypoints
-
-        p_H = local_keypoints(self.body, frame.pose, shared.shape, self.layout)
+        p_H = local_keypoints(
+            self.body, frame.pose, shared.shape, self.layout, self.bias
+        )
         p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
         return (project(shared.intrinsics, p_C) - pixel) / sigma[:, None]
 
@@ -177,6 +186,7 @@ class HumanMotion(AbstractFrameFactor):
     correlated: bool = eqx.field(static=True, default=True)
     """Whether any correlation is used; if not, a term spans two frames, not three."""
     of_people = True
+    frame_fields = ("translation", "whitening", "correlation")
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -221,6 +231,8 @@ class Posture(AbstractFrameFactor):
     predicted: bool = eqx.field(static=True, default=False)
     """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
     of_people = True
+    frame_fields = ("rotation", "sigma", "correlation")
+    per_joint = True
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -250,6 +262,7 @@ class Shape(AbstractFrameFactor):
     """`inf` where not measured."""
     loss: AbstractLoss = Squared()
     of_people = True
+    frame_fields = ("shape", "sigma")
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -275,6 +288,7 @@ class OrientationChange(AbstractFrameFactor):
     """Per axis, rad; `inf` where not predicted."""
     loss: AbstractLoss = Squared()
     of_people = True
+    frame_fields = ("rotation", "sigma")
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -302,7 +316,7 @@ def rotation_between(
     first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
     """`Log(Exp(first)^T Exp(second))`, at most pi long."""
-    return (jaxlie.SO3.exp(first).inverse() @ jaxlie.SO3.exp(second)).log()
+    return compose(jaxlie.SO3.exp(-first), jaxlie.SO3.exp(second)).log()
 
 
 def _log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:

@@ -24,6 +24,8 @@ from bodyslam_jax.graph._factors import (
 from bodyslam_jax.graph._layout import CHUNK, Layout, make_layout
 from bodyslam_jax.graph._state import State, Step, gauge
 
+VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics")
+
 
 class MotionPredictor(eqx.Module):
     """The motion model as the graph sees it: a state in, predictions out."""
@@ -50,6 +52,8 @@ class Problem(eqx.Module):
     """1 where a coordinate may move, 0 where it is held."""
     motion: MotionPredictor | None
     layout: Layout
+    variables: tuple[str, ...] = eqx.field(static=True, default=VARIABLES)
+    """Groups that may move at all: the blocks of the others are not even formed."""
 
     def cost(self, state: State) -> Float[Array, ""]:
         """Negative log-likelihood, up to a constant; predictions as they stand."""
@@ -70,26 +74,40 @@ class Problem(eqx.Module):
             names.append(f"{name}_{taken + 1}" if taken else name)
         return names
 
-    def refresh(self, state: State) -> "Problem":
-        """Predicts the motion anew; the gradient does not flow through the network.
+    def predict(self, state: State) -> Any:
+        """What the motion model predicts at a state; `None` without one.
 
-        So people are not drawn to postures for which the network happens to predict
-        what the cameras want.
+        No gradient flows through the network: people are not drawn to postures for
+        which it happens to predict what the cameras want.
         """
         if self.motion is None:
-            return self
+            return None
         seen = self.motion(jax.lax.stop_gradient(state))
+        return {
+            "translation": seen.translation,
+            "rotation": seen.rotation,
+            "body_pose": seen.body_pose,
+        }
+
+    def with_prediction(self, seen: Any) -> "Problem":
+        """The same problem with this prediction in its factors."""
+        if seen is None:
+            return self
         factors = tuple(_with_prediction(factor, seen) for factor in self.factors)
         return eqx.tree_at(lambda p: p.factors, self, factors)
+
+    def refresh(self, state: State) -> "Problem":
+        """The same problem with the motion predicted anew."""
+        return self.with_prediction(self.predict(state))
 
 
 def _with_prediction(factor, seen):
     if isinstance(factor, HumanMotion):
-        return eqx.tree_at(lambda f: f.translation, factor, seen.translation)
+        return eqx.tree_at(lambda f: f.translation, factor, seen["translation"])
     if isinstance(factor, OrientationChange):
-        return eqx.tree_at(lambda f: f.rotation, factor, seen.rotation)
+        return eqx.tree_at(lambda f: f.rotation, factor, seen["rotation"])
     if isinstance(factor, Posture) and factor.predicted:
-        return eqx.tree_at(lambda f: f.rotation, factor, seen.body_pose)
+        return eqx.tree_at(lambda f: f.rotation, factor, seen["body_pose"])
     return factor
 
 
@@ -133,15 +151,17 @@ def make_problem(
         }
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
         free = Step(
-            scale=ones.scale * ("scale" in touched),
+            scale=ones.scale * float("scale" in touched),
             cameras=gauge(state.cameras),
             roots=ones.roots,
             poses=ones.poses,
             shapes=ones.shapes,
             landmarks=ones.landmarks,
-            intrinsics=ones.intrinsics * free_intrinsics,
+            intrinsics=ones.intrinsics * float(free_intrinsics),
         )
-    return Problem(factors, free, motion, layout)
+    movable = jax.tree.map(lambda x: bool(np.any(np.asarray(x))), free)
+    variables = tuple(name for name in VARIABLES if getattr(movable, name))
+    return Problem(factors, free, motion, layout, variables)
 
 
 def _check_finite(name, tree):

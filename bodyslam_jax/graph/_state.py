@@ -95,12 +95,29 @@ def retract_rotation(
     The logarithm is taken on the branch of the base point: an axis-angle vector may
     leave the ball of radius pi, but it does not jump.
     """
-    moved = (jaxlie.SO3.exp(rotation) @ jaxlie.SO3.exp(step)).log()
+    moved = compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)).log()
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)
     far = squared > 4.0
     angle = jnp.sqrt(jnp.where(far, squared, 1.0))
     flipped = jnp.sum(moved * rotation, axis=-1, keepdims=True) < 0
     return jnp.where(far & flipped, moved * (1 - 2 * jnp.pi / angle), moved)
+
+
+def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
+    """Hamilton's product; jaxlie's own mixes integers in, which strict types forbid."""
+    a, b, c, d = (first.wxyz[..., i] for i in range(4))
+    w, x, y, z = (second.wxyz[..., i] for i in range(4))
+    return jaxlie.SO3(
+        jnp.stack(
+            [
+                a * w - b * x - c * y - d * z,
+                a * x + b * w + c * z - d * y,
+                a * y - b * z + c * w + d * x,
+                a * z + b * y - c * x + d * w,
+            ],
+            axis=-1,
+        )
+    )
 
 
 def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
@@ -117,6 +134,6 @@ def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
     exactly: no prior, and no null space in the normal equations.
     """
     offset = jnp.abs(cameras[:, :3, 3] - cameras[0, :3, 3])
-    held = jnp.zeros_like(offset).reshape(-1).at[jnp.argmax(offset)].set(1)
+    held = jnp.zeros_like(offset).reshape(-1).at[jnp.argmax(offset)].set(1.0)
     free = jnp.concatenate([jnp.ones_like(offset), 1 - held.reshape(-1, 3)], axis=1)
-    return free.at[0].set(0)
+    return free.at[0].set(0.0)

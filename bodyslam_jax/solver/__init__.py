@@ -1,0 +1,6 @@
+"""How a problem is solved: structure, linear algebra, steps, baselines, uncertainty."""
+
+from bodyslam_jax.solver._solve import PAPER_SCHEDULE as PAPER_SCHEDULE
+from bodyslam_jax.solver._solve import Solution as Solution
+from bodyslam_jax.solver._solve import Stage as Stage
+from bodyslam_jax.solver._solve import solve as solve

@@ -1,0 +1,147 @@
+"""One damped step of the joint problem, by elimination.
+
+`(H + λ diag H) δ = -J^T r`: landmarks first, then inner postures, then the chunks of
+cameras and people from one end to the other, globals last; and back. A coordinate that
+no measurement sees has a zero row, gets 1 on its diagonal, and stays where it is.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.solver._chunks import (
+    CAMERAS,
+    Factor,
+    assemble,
+    back_substitute,
+    factorise,
+)
+from bodyslam_jax.solver._landmarks import eliminate_landmarks, substitute_landmarks
+from bodyslam_jax.solver._linearise import Linearisation, Sizes, own_to_global
+from bodyslam_jax.solver._people import (
+    POSE,
+    Border,
+    Postures,
+    border_of,
+    eliminate_postures,
+    pose_diagonal,
+    substitute_postures,
+)
+
+
+class Eliminated(eqx.Module):
+    """All that back-substitution needs."""
+
+    damping: dict
+    postures: Postures | None
+    border: Border
+    factor: Factor
+
+
+def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
+    """The diagonal of `J^T J`, by group; landmarks in the order of the tables."""
+    dtype = lin.globals.dtype
+    t = sizes.chunks * CAMERAS // 6
+    diagonal = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1)
+    camera = jnp.zeros((t, 6), dtype)
+    for key in (("alone", "alone", 0), ("camera", "camera", 0)):
+        if key in lin.blocks:
+            camera = camera + diagonal(lin.blocks[key]).reshape(-1, t, 6).sum(axis=0)
+    root = jnp.zeros((sizes.people, t, 6), dtype)
+    if ("root", "root", 0) in lin.blocks:
+        root = diagonal(lin.blocks["root", "root", 0])
+    result = {
+        "globals": diagonal(lin.globals),
+        "camera": camera,
+        "root": root,
+        "landmarks": tuple(
+            jnp.moveaxis(jnp.diagonal(table.own, axis1=1, axis2=2), 2, 1)
+            for table in lin.landmarks
+        ),
+    }
+    if "pose" in lin.gradient:
+        result["pose"] = pose_diagonal(lin)
+    return result
+
+
+def damped(diagonal: dict, damping: Float[Array, ""]) -> dict:
+    """What Marquardt's damping adds to the diagonal."""
+    tiny = jnp.finfo(damping.dtype).tiny ** 0.5
+    add = lambda d: jnp.where(d > tiny, damping * d, 1.0)
+    return jax.tree.map(add, diagonal)
+
+
+def eliminate(
+    problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
+) -> Eliminated:
+    """Factorises the damped normal equations."""
+    reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
+    border = border_of(lin, sizes)
+    postures = None
+    if "pose" in damping:
+        postures = eliminate_postures(lin, sizes, damping["pose"])
+    chunks = assemble(lin, sizes, reduced, postures, border, damping)
+    return Eliminated(damping, postures, border, factorise(chunks, sizes))
+
+
+def solve_step(
+    problem: Problem,
+    state: State,
+    lin: Linearisation,
+    sizes: Sizes,
+    eliminated: Eliminated,
+) -> Step:
+    """The step that solves the factorised equations."""
+    h, n = sizes.people, sizes.chunks
+    steps, common = back_substitute(eliminated.factor, sizes)
+    head = steps.shape[1] - CAMERAS
+    hb = head // h if h else 0
+    people = steps[:, :head].reshape(n, h, hb).swapaxes(0, 1)
+    cameras = steps[:, head:].reshape(n * CAMERAS // 6, 6)
+    base = hb - CAMERAS if h else 0
+    roots = people[..., base:].reshape(h, n * CAMERAS // 6, 6)
+    zero = state.zero_step()
+    poses = zero.poses
+    i = sizes.intrinsics
+    if eliminated.postures is not None:
+        poses = _postures(sizes, eliminated, people, cameras, roots, common)
+        poses = poses.reshape(zero.poses.shape)
+    intrinsics = common[1 : 1 + i] if i else zero.intrinsics
+    landmarks = substitute_landmarks(
+        problem,
+        lin.landmarks,
+        eliminated.damping["landmarks"],
+        cameras,
+        common[1 : 1 + i],
+        zero.landmarks,
+    )
+    return Step(
+        scale=common[0],
+        cameras=cameras,
+        roots=roots,
+        poses=poses,
+        shapes=common[1 + i :].reshape(h, 10),
+        landmarks=landmarks,
+        intrinsics=intrinsics,
+    )
+
+
+def _postures(sizes, eliminated, people, cameras, roots, common):
+    h, n = sizes.people, sizes.chunks
+    border = eliminated.border
+    later = lambda x: jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
+    separator = people[..., :POSE]
+    chunk_roots = roots.reshape(h, n, CAMERAS)
+    chunk_cameras = jnp.broadcast_to(cameras.reshape(1, n, CAMERAS), (h, n, CAMERAS))
+    parts = [later(separator)]
+    if border.cross:
+        parts += [later(chunk_roots[..., -6:]), later(chunk_cameras[..., -6:])]
+    parts.append(chunk_roots)
+    if border.cross:
+        parts.append(chunk_cameras)
+    own = jnp.stack([common[own_to_global(sizes, p)] for p in range(h)])
+    parts.append(jnp.broadcast_to(own[:, None], (h, n, own.shape[-1])))
+    known = jnp.concatenate(parts, axis=-1)
+    return substitute_postures(eliminated.postures, known, separator)

@@ -1,0 +1,83 @@
+"""Rounds a problem's sizes up, so that videos of about the same length compile once.
+
+What is added has no weight: measurements with `sigma = inf`, variables that may not
+move.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from bodyslam_jax.graph import CHUNK, Problem, Reprojection, State, Step, round_up
+
+_FILL = {"sigma": "inf", "whitening": 0.0, "correlation": 0.0, "present": False}
+
+
+def pad(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The same problem with `num_chunks * CHUNK` frames and more landmark slots."""
+    frames = problem.layout.num_chunks * CHUNK - len(state.cameras)
+    landmarks = round_up(len(state.landmarks) + 1) - len(state.landmarks)
+    factors = tuple(_pad_factor(factor, frames) for factor in problem.factors)
+    motion = problem.motion
+    if motion is not None:
+        present = _extend(motion.present, 1, frames, False)
+        motion = eqx.tree_at(lambda m: m.present, motion, present)
+    free = problem.free
+    free = Step(
+        scale=free.scale,
+        cameras=_extend(free.cameras, 0, frames, 0.0),
+        roots=_extend(free.roots, 1, frames, 0.0),
+        poses=_extend(free.poses, 1, frames, 0.0),
+        shapes=free.shapes,
+        landmarks=_extend(free.landmarks, 0, landmarks, 0.0),
+        intrinsics=free.intrinsics,
+    )
+    padded = State(
+        scale=state.scale,
+        cameras=_extend(state.cameras, 0, frames, "edge"),
+        roots=_extend(state.roots, 1, frames, "edge"),
+        poses=_extend(state.poses, 1, frames, "edge"),
+        shapes=state.shapes,
+        landmarks=_extend(state.landmarks, 0, landmarks, 0.0),
+        intrinsics=state.intrinsics,
+    )
+    return Problem(factors, free, motion, problem.layout, problem.variables), padded
+
+
+def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
+    """Drops what `pad` added."""
+    return State(
+        scale=state.scale,
+        cameras=state.cameras[:num_frames],
+        roots=state.roots[:, :num_frames],
+        poses=state.poses[:, :num_frames],
+        shapes=state.shapes,
+        landmarks=state.landmarks[:num_landmarks],
+        intrinsics=state.intrinsics,
+    )
+
+
+def _pad_factor(factor, frames):
+    if isinstance(factor, Reprojection):
+        rows = round_up(len(factor.frame) + 1) - len(factor.frame)
+        return Reprojection(
+            frame=_extend(factor.frame, 0, rows, 0),
+            landmark=_extend(factor.landmark, 0, rows, 0),
+            pixel=_extend(factor.pixel, 0, rows, 0.0),
+            sigma=_extend(factor.sigma, 0, rows, jnp.inf),
+            loss=factor.loss,
+        )
+    axis = 1 if factor.of_people else 0
+    for name in factor.frame_fields:
+        fill = _FILL.get(name, "edge")
+        fill = jnp.inf if fill == "inf" else fill
+        values = _extend(getattr(factor, name), axis, frames, fill)
+        factor = eqx.tree_at(lambda f: getattr(f, name), factor, values)
+    return factor
+
+
+def _extend(x: jax.Array, axis: int, count: int, fill) -> jax.Array:
+    widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
+    if fill == "edge":
+        return jnp.pad(x, widths, mode="edge")
+    return jnp.pad(x, widths, constant_values=jnp.asarray(fill, x.dtype))

@@ -1,0 +1,137 @@
+"""`solve`: a problem and a first state in, the best state and how it was found out."""
+
+import dataclasses
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph import VARIABLES, Problem, State
+from bodyslam_jax.solver import _baselines
+from bodyslam_jax.solver._levenberg_marquardt import (
+    History,
+    StructuredLevenbergMarquardt,
+    lifted,
+)
+from bodyslam_jax.solver._padding import pad, unpad
+
+Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One run of the solver with some groups of variables free."""
+
+    free: tuple[str, ...] = VARIABLES
+    """Among the fields of `State`; what the problem holds stays held."""
+    max_steps: int = 50
+    rtol: float = 1e-8
+    """Relative decrease of the cost at which to stop."""
+
+
+PAPER_SCHEDULE = (
+    Stage(("scale", "cameras", "roots", "landmarks"), max_steps=20, rtol=1e-4),
+    Stage(),
+)
+"""Section 3.6: first where cameras and people are, then everything."""
+
+
+class Solution(eqx.Module):
+    """The best state found. What failed says so in `status`; a state is never NaN."""
+
+    state: State
+    result: optx.RESULTS
+    cost: Float[Array, ""]
+    """Negative log-likelihood at `state`."""
+    histories: tuple[History, ...]
+    """Of each stage."""
+    num_steps: tuple[Array, ...]
+    """Iterations of each stage, accepted or not."""
+
+    @property
+    def status(self) -> str:
+        """`converged`, or what kept it from that."""
+        if self.result == optx.RESULTS.successful:
+            return "converged"
+        if self.result == optx.RESULTS.nonlinear_max_steps_reached:
+            return "ran out of steps"
+        if self.result == optx.RESULTS.nonfinite:
+            return "cost is not finite"
+        return "no step lowers the cost"
+
+
+def solve(
+    problem: Problem,
+    state: State,
+    *,
+    solver: Solver = "structured",
+    schedule: tuple[Stage, ...] = (Stage(),),
+    damping: float = 1e-4,
+) -> Solution:
+    """Minimises the cost of a problem from a first state.
+
+    `structured` is the solver for real videos; the others are baselines for small
+    problems. Pure: jits, differentiates with respect to everything in `problem`, and
+    maps over problems or states of one shape.
+
+    **Raises:** `ValueError` if `state` does not have the sizes the problem was made
+    for. Failure to converge is a `status`.
+    """
+    expected = problem.free.cameras.shape[0], problem.free.landmarks.shape[0]
+    found = state.cameras.shape[0], state.landmarks.shape[0]
+    if found != expected:
+        raise ValueError(
+            f"state: {found[0]} frames and {found[1]} landmarks, expected "
+            f"{expected[0]} and {expected[1]} as in the problem."
+        )
+    if solver != "structured":
+        return _solve_baseline(problem, state, solver, schedule)
+    padded, start = pad(problem, state)
+    solution = _solve_padded(padded, start, schedule, damping)
+    return eqx.tree_at(
+        lambda s: s.state,
+        solution,
+        unpad(solution.state, *found),
+    )
+
+
+@eqx.filter_jit
+def _solve_padded(problem, state, schedule, damping):
+    histories, counts = [], []
+    result = optx.RESULTS.successful
+    cost = problem.cost(state)
+    for stage in schedule:
+        now = restrict(problem, stage.free)
+        method = StructuredLevenbergMarquardt(
+            rtol=stage.rtol, damping=damping, max_history=stage.max_steps
+        )
+        found = optx.least_squares(
+            lifted, method, state, now, max_steps=stage.max_steps, throw=False
+        )
+        better = jnp.isfinite(found.stats["cost"])
+        state = jax.tree.map(
+            lambda new, old, b=better: jnp.where(b, new, old), found.value, state
+        )
+        cost, result = found.stats["cost"], found.result
+        histories.append(found.stats["history"])
+        counts.append(found.stats["num_steps"])
+    return Solution(state, result, cost, tuple(histories), tuple(counts))
+
+
+def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
+    """The same problem with only these groups free."""
+    variables = tuple(name for name in problem.variables if name in free)
+    return dataclasses.replace(problem, variables=variables)
+
+
+def _solve_baseline(problem, state, solver, schedule):
+    run = getattr(_baselines, solver)
+    counts = []
+    result = optx.RESULTS.successful
+    for stage in schedule:
+        state, count, result = run(restrict(problem, stage.free), state, stage)
+        counts.append(count)
+    return Solution(state, result, problem.cost(state), (), tuple(counts))

@@ -1,0 +1,145 @@
+"""Small made-up scenes for the tests of graph and solver: truth, factors, a start."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import bodyslam_jax.graph as g
+from bodyslam_jax.body import load_body_model, local_keypoints
+from bodyslam_jax.camera import project
+
+INTRINSICS = np.array([600.0, 600.0, 320.0, 240.0])
+
+
+@functools.cache
+def body_model():
+    return load_body_model(dtype=jnp.float64)
+
+
+def look(yaw, pitch):
+    """Camera axes in a world with y down and z forward."""
+    return np.array(
+        [
+            [np.cos(yaw), np.sin(yaw) * np.sin(pitch), np.sin(yaw) * np.cos(pitch)],
+            [0, np.cos(pitch), -np.sin(pitch)],
+            [-np.sin(yaw), np.cos(yaw) * np.sin(pitch), np.cos(yaw) * np.cos(pitch)],
+        ]
+    )
+
+
+def truth(rng, frames=12, people=1, landmarks=40, scale=1.7):
+    """A camera that sways, people who walk before it, points around."""
+    k = np.arange(frames)
+    cameras = np.tile(np.eye(4), (frames, 1, 1))
+    for i in range(frames):
+        cameras[i, :3, :3] = look(0.15 * np.sin(0.3 * i), 0.05 * np.cos(0.4 * i))
+        cameras[i, :3, 3] = [0.06 * i, 0.05 * np.sin(0.5 * i), 0.04 * i]
+    roots = np.tile(np.eye(4), (people, frames, 1, 1))
+    poses = 0.1 * rng.standard_normal((people, 1, 23, 3)) * np.ones((1, frames, 1, 1))
+    for h in range(people):
+        poses[h, :, 0, 0] += 0.4 * np.sin(0.4 * k + h)
+        poses[h, :, 1, 0] -= 0.4 * np.sin(0.4 * k + h)
+        for i in range(frames):
+            place = np.array([0.8 * h - 0.3 + 0.02 * i, 0.1, 4.0 + 0.05 * i])
+            turn = look(np.pi + 0.4 + 0.02 * i, 0.0) @ np.diag([1.0, -1, -1])
+            C, r = cameras[i, :3, :3], scale * cameras[i, :3, 3]
+            roots[h, i, :3, :3] = C.T @ turn
+            roots[h, i, :3, 3] = C.T @ (place - r)
+    points = rng.uniform([-4, -2, 4], [5, 2, 9], (landmarks, 3)) / scale
+    return g.State(
+        scale=jnp.asarray(scale),
+        cameras=jnp.asarray(cameras),
+        roots=jnp.asarray(roots),
+        poses=jnp.asarray(poses),
+        shapes=jnp.asarray(0.5 * rng.standard_normal((people, 10))),
+        landmarks=jnp.asarray(points),
+        intrinsics=jnp.asarray(INTRINSICS),
+    )
+
+
+def observations(rng, state, length=8):
+    """Frame and landmark of each observation: runs of frames, with holes."""
+    frames, count = len(state.cameras), len(state.landmarks)
+    start = rng.integers(-length // 2, frames - 1, count)
+    seen = (np.arange(frames)[:, None] >= start) & (
+        np.arange(frames)[:, None] < start + rng.integers(3, length + 1, count)
+    )
+    seen &= rng.random(seen.shape) < 0.9
+    return np.nonzero(seen)
+
+
+def reprojection(rng, state, noise=0.5, length=8, loss=1.5):
+    frame, landmark = observations(rng, state, length)
+    camera = np.asarray(state.cameras)[frame]
+    offset = np.asarray(state.landmarks)[landmark] - camera[:, :3, 3]
+    p_C = np.einsum("mji,mj->mi", camera[:, :3, :3], offset)
+    pixel = np.asarray(project(state.intrinsics, jnp.asarray(p_C)))
+    return g.Reprojection(
+        frame=jnp.asarray(frame),
+        landmark=jnp.asarray(landmark),
+        pixel=jnp.asarray(pixel + noise * rng.standard_normal(pixel.shape)),
+        sigma=jnp.ones(len(frame)),
+        loss=g.Cauchy(loss),
+    )
+
+
+def person_factors(rng, state, noise=1.0, correlation=0.9):
+    """Keypoints, motion, postures and shape, as measured on the true state."""
+    h, t = state.roots.shape[:2]
+    body = body_model()
+    p_H = local_keypoints(body, state.poses, state.shapes[:, None], "body25")
+    p_C = jnp.einsum("htij,htkj->htki", state.roots[..., :3, :3], p_H)
+    pixel = project(state.intrinsics, p_C + state.roots[..., None, :3, 3])
+    normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
+    sigma = np.full((h, t, 25), 3.0)
+    sigma[rng.random(sigma.shape) < 0.1] = np.inf
+    windows = g.HumanMotion(
+        translation=jnp.zeros((h, t, 3)),
+        whitening=jnp.zeros((h, t, 3, 3)),
+        correlation=jnp.zeros((h, t)),
+    )
+    moved = windows.map_frames(
+        lambda d, w, s, _: g.displacement(w[1], w[0], s.scale), state
+    )
+    valid = jnp.ones((h, t), bool).at[:, 0].set(False)
+    covariance = jnp.diag(jnp.array([0.01, 0.02, 0.015]) ** 2)
+    covariance = jnp.broadcast_to(covariance, (h, t, 3, 3))
+    posture = g.retract_rotation(
+        state.poses, 0.05 * noise * normal(h, 1, 23, 3) * jnp.ones((1, t, 1, 1))
+    )
+    there = jnp.ones((h, t), bool)
+    shape_sigma = np.full((h, t, 10), np.inf)
+    shape_sigma[:, 0] = 0.5
+    return [
+        g.JointReprojection(
+            body=body,
+            pixel=pixel + noise * normal(*pixel.shape),
+            sigma=jnp.asarray(sigma),
+            loss=g.GemanMcClure(20.0),
+        ),
+        g.HumanMotion(
+            translation=moved + 0.003 * noise * normal(h, t, 3),
+            whitening=g.whitening_of(covariance, valid),
+            correlation=g.runs(valid, correlation),
+        ),
+        g.Posture(
+            rotation=posture,
+            sigma=jnp.full((h, t, 23), 0.15),
+            correlation=g.runs(there, correlation),
+        ),
+        g.Shape(
+            shape=state.shapes[:, None] + jnp.zeros((h, t, 1)),
+            sigma=jnp.asarray(shape_sigma),
+        ),
+    ]
+
+
+def perturb(rng, problem, state, size=0.02, scale=1.0):
+    """A start off the truth, where the problem lets it move."""
+    draw = lambda x: size * jnp.asarray(rng.standard_normal(x.shape))
+    step = jax.tree.map(draw, state.zero_step())
+    step = jax.tree.map(lambda s, m: s * m, step, problem.free)
+    moved = state.retract(step)
+    return g.State(**{**vars(moved), "scale": state.scale * scale})
