@@ -70,11 +70,11 @@ def adjust(
     camera_of = np.full(len(free), -1)
     camera_of[cameras] = np.arange(len(cameras))
     camera_of = camera_of[views.frame]
-    damping, cost = 1e-4, _cost(scene, views, loss)
+    damping, cost = 1e-5, _cost(scene, views, loss)
     for _ in range(iterations):
         system = _linearise(scene, views, camera_of, point_of, loss, len(cameras))
         improved = False
-        for _ in range(6):
+        for _ in range(4):
             step = _solve(system, damping, len(points))
             if step is None:
                 damping *= 10
@@ -84,6 +84,8 @@ def adjust(
             if new < cost:
                 improved = True
                 break
+            if new < (1 + tolerance) * cost:
+                break  # as good as it gets, up to rounding
             damping *= 10
         if not improved:
             break

@@ -142,7 +142,7 @@ def rotations_only(
         length = np.linalg.norm(total, axis=-1, keepdims=True)
         direction = np.where(length > 0, total / np.maximum(length, 1e-12), direction)
         for k in np.flatnonzero(solved & turns):
-            ids, xy = by_frame[k]
+            ids, xy = by_frame[int(k)]
             R[k] = fit_rotation(direction[ids], unit_rays(xy), scale)[0]
     return R, direction, solved
 

@@ -9,21 +9,33 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+_NO_BRISK = (
+    f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
+    "opencv-contrib-python-headless."
+)
+
 
 def make_brisk(threshold: int, octaves: int) -> Any:
     """OpenCV's BRISK, wherever this build of OpenCV keeps it.
 
     **Raises:** `ValueError`, saying how to get it, if it is in neither place.
     """
-    if hasattr(cv2, "BRISK_create"):
-        return cv2.BRISK_create(threshold, octaves)
-    contrib = getattr(cv2, "xfeatures2d", None)
-    if hasattr(contrib, "BRISK_create"):
-        return contrib.BRISK_create(threshold, octaves)
-    raise ValueError(
-        f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
-        "opencv-contrib-python-headless."
-    )
+    home = _home_of_brisk()
+    if home is None:
+        raise ValueError(_NO_BRISK)
+    return home.BRISK_create(threshold, octaves)
+
+
+def brisk_status() -> str:
+    """One line for people: where BRISK is, or how to get it."""
+    home = _home_of_brisk()
+    return _NO_BRISK if home is None else f"found in {home.__name__} {cv2.__version__}"
+
+
+def _home_of_brisk() -> Any | None:
+    """The module that has BRISK: OpenCV 5 moved it to the contributed ones."""
+    places = (cv2, getattr(cv2, "xfeatures2d", None))
+    return next((p for p in places if hasattr(p, "BRISK_create")), None)
 
 
 def spread(

@@ -102,7 +102,6 @@ def reconstruct(
         text = "no pair of frames has enough parallax to start a map."
         return _nothing(problem, "failed", (*warnings, text))
     builder.complete(grown, np.arange(first, last + 1))
-    builder.polish(grown, iterations=4)
     lost = np.arange(first, last + 1)[~grown.registered[first : last + 1]]
     if len(lost):
         text = f"{len(lost)} frames not located (from {lost[0]}): poses interpolated."

@@ -63,7 +63,7 @@ class Builder:
         ]
 
     def _adjust(self, scene: Scene, views: Views, free: np.ndarray) -> None:
-        adjust(scene, views, free, loss=self.pixel, iterations=10)
+        adjust(scene, views, free, loss=self.pixel, iterations=10, tolerance=1e-3)
 
     def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> Growing | None:
         """The best of the reconstructions that grow from `pairs` of keyframes."""
@@ -79,11 +79,14 @@ class Builder:
             _log.debug("start from frames %d and %d: %.2f", a, b, score)
             if score > best_score:
                 best, best_score = started, score
-            if score > 0.95:
+            if score > 0.9:
                 break
         if best is None:
             return None
         self._grow(best, keyframes)
+        for _ in range(3):  # outliers sorted anew in between
+            self._refine(best, self._free(best))
+            self._triangulate(best, self._views_of(best))
         return best
 
     def complete(self, grown: Growing, frames: np.ndarray) -> None:
@@ -93,20 +96,6 @@ class Builder:
                 self._register(grown, int(k))
         self._triangulate(grown, self._views_of(grown))
         self._mark(grown)
-
-    def polish(self, grown: Growing, iterations: int) -> None:
-        """Bundle adjustment of everything, with outliers sorted anew."""
-        for _ in range(2):
-            use = np.flatnonzero(grown.inlier)
-            free = self._free(grown)
-            adjust(
-                grown.scene,
-                self.views[use],
-                free,
-                loss=self.pixel,
-                iterations=iterations,
-            )
-            self._mark(grown)
 
     def _start(self, a: int, b: int) -> Growing | None:
         _, i, j = np.intersect1d(
