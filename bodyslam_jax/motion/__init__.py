@@ -1,0 +1,30 @@
+"""The learnt prior on human motion: from postures to how many metres the body moved.
+
+Section 3.4 of the paper, made robust to the errors of estimated postures.
+"""
+
+from bodyslam_jax.config import MotionTraining as MotionTraining
+from bodyslam_jax.motion._clips import FPS as FPS
+from bodyslam_jax.motion._clips import Clip as Clip
+from bodyslam_jax.motion._clips import resample as resample
+from bodyslam_jax.motion._evaluation import evaluate_model as evaluate_model
+from bodyslam_jax.motion._noise import disturb as disturb
+from bodyslam_jax.motion._noise import drift as drift
+from bodyslam_jax.motion._placing import fit_shape as fit_shape
+from bodyslam_jax.motion._placing import place as place
+from bodyslam_jax.motion._predict import MotionModel as MotionModel
+from bodyslam_jax.motion._predict import Prediction as Prediction
+from bodyslam_jax.motion._predict import check_compatible as check_compatible
+from bodyslam_jax.motion._predict import predict as predict
+from bodyslam_jax.motion._readers import read_motion as read_motion
+from bodyslam_jax.motion._rollout import Rollout as Rollout
+from bodyslam_jax.motion._rollout import rollout as rollout
+from bodyslam_jax.motion._scale import Scale as Scale
+from bodyslam_jax.motion._scale import scale_from_motion as scale_from_motion
+from bodyslam_jax.motion._timing import Clock as Clock
+from bodyslam_jax.motion._timing import make_clock as make_clock
+from bodyslam_jax.motion._timing import predict_between as predict_between
+from bodyslam_jax.motion._training import draw_history as draw_history
+from bodyslam_jax.motion._training import train as train
+from bodyslam_jax.motion._weights import load_motion_model as load_motion_model
+from bodyslam_jax.motion._weights import save_motion_model as save_motion_model

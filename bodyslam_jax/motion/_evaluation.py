@@ -1,0 +1,271 @@
+"""How far a motion model can be trusted: error, bias, spread and calibration.
+
+Slope is the projection of predicted on true displacement: 1 is unbiased, and its
+error becomes the error of a scale estimated with the model.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.motion._clips import FPS, Clip, resample
+from bodyslam_jax.motion._noise import disturb, drift
+from bodyslam_jax.motion._placing import Trial, place
+from bodyslam_jax.motion._predict import MotionModel, Prediction, predict
+from bodyslam_jax.motion._rotations import change, matrix, transposed, vector
+
+WINDOW = 30
+"""Frames of the longer slope: one second."""
+
+_CHI2_95 = 7.815
+"""95 % of a chi-square variable with 3 degrees of freedom lies below."""
+
+
+class Steps(NamedTuple):
+    """All valid predictions of a data set, `n` steps in `c` sequences padded to `t`."""
+
+    predicted: Float[np.ndarray, "c t 3"]
+    """Displacement in H_{k-1}, m."""
+    true: Float[np.ndarray, "c t 3"]
+    """The same, from the capture."""
+    previous: Float[np.ndarray, "c t 3"]
+    """The step before, in H_{k-2}: constant velocity."""
+    covariance: Float[np.ndarray, "c t 3 3"]
+    frame: Float[np.ndarray, "c t 3 3"]
+    """True C_{W H_{k-1}}."""
+    angle: Float[np.ndarray, "c t"]
+    """Mean over joints of the predicted posture's error, rad."""
+    root_angle: Float[np.ndarray, "c t"]
+    """Error of the predicted root rotation, rad."""
+    place: Float[np.ndarray, "c t"]
+    """Mean over joints of the predicted posture's error, m."""
+    valid: Bool[np.ndarray, "c t"]
+
+
+@eqx.filter_jit
+def _steps(
+    model: MotionModel,
+    body: BodyModel,
+    poses: Float[Array, "c t 24 3"],
+    estimated: Float[Array, "c t 24 3"],
+    trans: Float[Array, "c t 3"],
+    shape: Float[Array, "c 10"],
+    present: Bool[Array, "c t"],
+) -> tuple[Array, ...]:
+    def one(poses, estimated, trans, shape, present):
+        frame = matrix(poses[:, 0])
+        said: Prediction = predict(
+            model,
+            body,
+            matrix(estimated[:, 0]),
+            estimated[:, 1:],
+            shape,
+            present,
+        )
+        before = jnp.concatenate([frame[:1], frame[:-1]])
+        step = jnp.concatenate(
+            [jnp.zeros((1, 3), trans.dtype), jnp.diff(trans, axis=0)]
+        )
+        true = jnp.einsum("tba,tb->ta", before, step)
+        previous = jnp.concatenate([jnp.zeros((1, 3), trans.dtype), true[:-1]])
+        posture = change(said.body_pose, poses[:, 1:])
+        angle = jnp.sqrt((posture**2).sum(-1) + 1e-12).mean(-1)
+        turn = transposed(before) @ frame
+        root = vector(transposed(matrix(said.rotation)) @ turn)
+        gap = local_joints(body, said.body_pose, shape) - local_joints(
+            body, poses[:, 1:], shape
+        )
+        return (
+            said.translation,
+            true,
+            previous,
+            said.covariance,
+            before,
+            angle,
+            jnp.sqrt((root**2).sum(-1)),
+            jnp.sqrt((gap**2).sum(-1)).mean(-1),
+            said.valid,
+        )
+
+    return jax.vmap(one)(poses, estimated, trans, shape, present)
+
+
+def run_trials(
+    model: MotionModel,
+    body: BodyModel,
+    trials: Sequence[Trial],
+    drift_deg: float,
+    *,
+    seed: int = 0,
+    white_deg: float = 0.4,
+    root_drift: float = 0.0,
+) -> Steps:
+    """Predicts all trials from postures with errors of a given size.
+
+    `drift_deg` is the standard deviation of the slow error per joint axis (half as
+    much again at hands and feet); with it come `white_deg` of white noise. The root's
+    orientation errs by `root_drift` times as much.
+    """
+    length = max(len(trial.trans) for trial in trials)
+    length = -(-length // 64) * 64
+    poses = np.zeros((len(trials), length, 24, 3), np.float32)
+    trans = np.zeros((len(trials), length, 3), np.float32)
+    present = np.zeros((len(trials), length), bool)
+    for i, trial in enumerate(trials):
+        t = len(trial.trans)
+        poses[i, :t], trans[i, :t], present[i, :t] = trial.clip.poses, trial.trans, True
+        poses[i, t:], trans[i, t:] = poses[i, t - 1], trans[i, t - 1]
+    shape = np.stack([trial.shape for trial in trials]).astype(np.float32)
+    estimated = poses
+    if drift_deg > 0:
+        estimated = np.asarray(
+            _disturbed(
+                jnp.asarray(poses),
+                jax.random.split(jax.random.key(seed), len(trials)),
+                jnp.deg2rad(jnp.float32(drift_deg)),
+                jnp.deg2rad(jnp.float32(white_deg)),
+                jnp.float32(root_drift),
+            )
+        )
+    chunk = 16
+    model = jax.tree.map(
+        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, model
+    )
+    parts = []
+    for i in range(0, len(trials), chunk):
+        rows = np.arange(i, i + chunk).clip(max=len(trials) - 1)
+        out = _steps(
+            model, body, *(x[rows] for x in (poses, estimated, trans, shape, present))
+        )
+        keep = min(chunk, len(trials) - i)
+        parts.append([np.asarray(x)[:keep] for x in out])
+    return Steps(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+@jax.jit
+def _disturbed(poses, keys, sigma, white, root):
+    noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
+    return disturb(poses, noise.at[:, :, 0].multiply(root))
+
+
+def slope(
+    predicted: Float[np.ndarray, "*n 3"], true: Float[np.ndarray, "*n 3"]
+) -> float:
+    """Projection of predicted on true displacement."""
+    return float((predicted * true).sum() / max(float((true * true).sum()), 1e-12))
+
+
+def summary(
+    steps: Steps, predicted: Float[np.ndarray, "c t 3"] | None = None
+) -> dict[str, float]:
+    """The measures of displacement; `predicted` replaces the model's (baselines)."""
+    valid = steps.valid
+    guess = steps.predicted if predicted is None else predicted
+    error = np.linalg.norm(guess - steps.true, axis=-1)[valid]
+    size = np.linalg.norm(steps.true, axis=-1)[valid]
+    per_sequence = np.array(
+        [
+            slope(g[v], d[v])
+            for g, d, v in zip(guess, steps.true, valid, strict=True)
+            if v.any() and np.linalg.norm(d[v], axis=-1).mean() > 0.01
+        ]
+    )
+    long_guess, long_true = _longer(guess, steps), _longer(steps.true, steps)
+    out = {
+        "steps": int(valid.sum()),
+        "error_mm": 1e3 * float(error.mean()),
+        "step_mm": 1e3 * float(size.mean()),
+        "ratio": float(error.mean() / size.mean()),
+        "slope": slope(guess[valid], steps.true[valid]),
+        "slope_30": slope(long_guess, long_true) if len(long_true) else float("nan"),
+        "spread": float(per_sequence.std()) if len(per_sequence) else float("nan"),
+    }
+    if predicted is None:
+        residual = (steps.predicted - steps.true)[valid].astype(float)
+        covariance = steps.covariance[valid].astype(float)
+        nees = (
+            residual * np.linalg.solve(covariance, residual[..., None])[..., 0]
+        ).sum(-1)
+        out |= {
+            "nees": float(nees.mean() / 3),
+            "coverage_95": float((nees < _CHI2_95).mean()),
+            "posture_deg": float(np.rad2deg(steps.angle[valid].mean())),
+            "root_deg": float(np.rad2deg(steps.root_angle[valid].mean())),
+            "posture_mm": 1e3 * float(steps.place[valid].mean()),
+        }
+    return out
+
+
+def _longer(
+    moves: Float[np.ndarray, "c t 3"], steps: Steps
+) -> Float[np.ndarray, "n 3"]:
+    """Displacements over `WINDOW` frames in the world, wherever all steps are valid."""
+    world = np.einsum("ctab,ctb->cta", steps.frame, moves)
+    sums = np.lib.stride_tricks.sliding_window_view(world, WINDOW, 1).sum(-1)
+    whole = np.lib.stride_tricks.sliding_window_view(steps.valid, WINDOW, 1).all(-1)
+    return sums[whole]
+
+
+def evaluate_model(
+    model: MotionModel,
+    body: BodyModel,
+    dataset: Sequence[Clip],
+    drift_deg: float = 0.0,
+    *,
+    seeds: int = 3,
+    root_drift: float = 0.0,
+    skip: int | None = None,
+) -> dict[str, dict[str, float]]:
+    """Measures a model on clips, by motion class and over `all`, with the baselines.
+
+    Clips of any rate; of interleaved phases only the first counts. Noise is drawn
+    `seeds` times. `skip` leaves out the first frames of every clip, so that models
+    with windows of different lengths are compared on the same steps. Keys of the
+    result: `all` and every class, then `constant velocity` (which is told the last
+    displacement; the model is not) over all.
+
+    **Raises:** `ValueError` if no clip is long enough for a prediction.
+    """
+    clips = [clip for clip in dataset if clip.phase == 0]
+    clips = resample(clips, FPS)
+    trials = place(body, clips)
+    draws = range(seeds if drift_deg > 0 else 1)
+    runs = [
+        run_trials(model, body, trials, drift_deg, seed=i, root_drift=root_drift)
+        for i in draws
+    ]
+    steps = Steps(*(np.concatenate(x) for x in zip(*runs, strict=True)))
+    valid = steps.valid.copy()
+    valid[:, : max(skip or 0, 2)] = False
+    steps = steps._replace(valid=valid)
+    if not valid.any():
+        raise ValueError(
+            f"no usable sequence among {len(clips)}: a prediction needs "
+            f"{model.past + 1} frames at {FPS:g} frames per second."
+        )
+    kinds = np.array([trial.clip.motion for trial in trials] * len(draws))
+    select = lambda rows: Steps(*(x[rows] for x in steps))
+    out = {"all": summary(steps)}
+    for kind in sorted(set(kinds)):
+        if steps.valid[kinds == kind].any():
+            out[str(kind)] = summary(select(kinds == kind))
+    out["constant velocity"] = summary(steps, steps.previous)
+    return out
+
+
+def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, "3"]:
+    """Mean displacement of training clips in H_{k-1}, m a frame at 30 fps."""
+    moves = []
+    for clip in resample([clip for clip in dataset if clip.phase == 0], FPS):
+        turn = np.asarray(matrix(jnp.asarray(clip.poses[:-1, 0])))
+        moves.append(np.einsum("tba,tb->ta", turn, np.diff(clip.trans, axis=0)))
+    return np.concatenate(moves).mean(0)
+
+
+Evaluator = Callable[[MotionModel], dict[str, float]]

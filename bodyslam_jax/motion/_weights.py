@@ -1,0 +1,108 @@
+"""Weights in one `.npz`: a JSON header that says what they are, then plain arrays.
+
+Read without pickle. The header holds format, network, sizes, body, fps, data, licence
+and metrics.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.motion._network import MetricNetwork, PaperNetwork
+from bodyslam_jax.motion._predict import MotionModel
+
+_FORMAT = "bodyslam-motion-1"
+_DEFAULT = Path(__file__).parent / "assets" / "default.npz"
+
+
+def save_motion_model(path: Path | str, model: MotionModel) -> None:
+    """Writes a model; the file appears complete or not at all."""
+    path = Path(path)
+    network = model.network
+    sizes = {"past": model.past}
+    if isinstance(network, PaperNetwork):
+        sizes["width"] = network.encoder[0].weight.shape[1]
+    else:
+        sizes |= {
+            "width": [layer.weight.shape[1] for layer in network.trunks[0]],
+            "members": len(network.trunks),
+            "future": network.future,
+            "posture_frames": network.posture_frames,
+            "posture_width": network.posture[0].weight.shape[1],
+        }
+    header = {
+        "format": _FORMAT,
+        "network": "paper" if isinstance(network, PaperNetwork) else "metric",
+        "sizes": sizes,
+        "body": model.body,
+        "fps": model.fps,
+        "about": json.loads(model.about),
+    }
+    leaves = {
+        f"array_{i}": np.asarray(x, np.float32)
+        for i, x in enumerate(jax.tree.leaves(network))
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with open(partial, "wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **leaves)
+    os.replace(partial, path)
+
+
+def load_motion_model(path: Path | str | None = None) -> MotionModel:
+    """Reads a model's weights (float32), by default those that come with the package.
+
+    **Raises:** `FileNotFoundError`; `ValueError` if the file holds no motion model.
+    """
+    path = _DEFAULT if path is None else Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such motion model.")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
+    except (OSError, KeyError, ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not a motion model ({error}).") from None
+    if header.get("format") != _FORMAT:
+        raise ValueError(
+            f"{path}: format {header.get('format')!r}; expected {_FORMAT!r}."
+        )
+    sizes = header["sizes"]
+    key = jax.random.key(0)
+    if header["network"] == "paper":
+        make = lambda: PaperNetwork.init(key, sizes["past"], sizes["width"])
+    else:
+        make = lambda: MetricNetwork.init(
+            key,
+            sizes["past"],
+            tuple(sizes["width"]),
+            sizes["members"],
+            sizes["future"],
+            sizes["posture_frames"],
+            sizes["posture_width"],
+        )
+    like = eqx.filter_eval_shape(make)
+    wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
+    found = [array.shape for array in arrays]
+    if wanted != found:
+        raise ValueError(
+            f"{path}: arrays {found[:3]}... do not fit the header's sizes; "
+            f"expected {wanted[:3]}..."
+        )
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"{path}: NaN or infinite weights.")
+    network = jax.tree.unflatten(
+        jax.tree.structure(like), [jnp.asarray(a, jnp.float32) for a in arrays]
+    )
+    return MotionModel(
+        network=network,
+        body=header["body"],
+        fps=float(header["fps"]),
+        past=int(sizes["past"]),
+        about=json.dumps(header["about"]),
+    )
