@@ -13,3 +13,4 @@ from bodyslam_jax.body._skeleton import KEYPOINT_NAMES as KEYPOINT_NAMES
 from bodyslam_jax.body._skeleton import KEYPOINT_SPREAD as KEYPOINT_SPREAD
 from bodyslam_jax.body._skeleton import MIRRORED as MIRRORED
 from bodyslam_jax.body._skeleton import PARENTS as PARENTS
+from bodyslam_jax.body._skinning import vertices as vertices

@@ -4,12 +4,16 @@ SMPL (Loper et al., 2015): the joints at rest are linear in the shape,
 `J(β) = J_0 + J_s β`; joint k turns about its parent's frame,
 `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
 
-Arrays are turned so that the batch lies last: the 3x3 products are then plain
-arithmetic on long vectors, one level of the tree at a time.
+Inside, the batch is the last axis: the 3x3 products are then plain arithmetic on long
+vectors, one level of the tree at a time.
 """
 
+import math
+
+import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body._model import BodyModel
@@ -21,6 +25,8 @@ from bodyslam_jax.body._skeleton import (
     PARENTS,
     SURFACE_POINTS,
 )
+
+_PARENT = np.array(PARENTS[1:])
 
 
 def rest_joints(
@@ -41,8 +47,9 @@ def local_joints(
     `body_pose` holds the axis-angle rotations of joints 1 to 23, rad, each in its
     parent's frame; `shape` is SMPL β. Leading axes broadcast.
     """
-    _, position = _chain(_rotations(body_pose), rest_joints(model, shape))
-    return position
+    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    posed = pose_joints(model, flatten(body_pose, batch, 2), flatten(shape, batch, 1))
+    return _unflatten(posed.x, batch)
 
 
 def joints(
@@ -53,10 +60,9 @@ def joints(
 ) -> Float[Array, "*b 24 3"]:
     """Posed joints, m, in the frame into which the root rotation `pose[:3]` turns.
 
-    The pelvis is at `J_0(β) + trans` whatever the pose.
+    The pelvis is at `J_0(β) + trans` whatever the pose. Leading axes broadcast.
     """
-    local = local_joints(model, pose[..., 3:].reshape(*pose.shape[:-1], 23, 3), shape)
-    return _place(model, local, pose, shape, trans)
+    return _placed(model, pose, shape, trans, lambda posed, shape: posed.x)
 
 
 def local_keypoints(
@@ -71,26 +77,14 @@ def local_keypoints(
     **Arguments:**
 
     - `layout`: `body25`, `coco17` or `halpe26`; names are in `KEYPOINT_NAMES`.
-    - `bias`: 0 takes each keypoint to be SMPL's joint of that name, as bodies'
-        projections do; 1 puts hips, neck and shoulders where detectors trained on COCO
-        put them (`DETECTOR_BIAS`). Keypoints are linear in it.
+    - `bias`: 0 takes each keypoint to be SMPL's joint of that name, as projections of
+        bodies do; 1 puts hips, neck and shoulders where detectors trained on COCO put
+        them (`DETECTOR_BIAS`). Keypoints are linear in it.
     """
-    names = KEYPOINT_NAMES[layout]
-    rest = rest_joints(model, shape)
-    R = _rotations(body_pose)
-    G, x = _chain_rotations(R, rest)
-    surface = [n for n in names if n in SURFACE_POINTS]
-    on_skin = _picked_vertices(model, surface, R, G, x, rest, shape)
-    offset = jnp.array([DETECTOR_BIAS.get(n, (0.0, 0.0, 0.0)) for n in names], x.dtype)
-    joint = jnp.array([KEYPOINT_JOINT.get(n, 0) for n in names])
-    at_joint = x[..., joint, :] + jnp.einsum(
-        "...kij,kj->...ki", G[..., joint, :, :], jnp.asarray(bias, x.dtype) * offset
-    )
-    parts = [
-        on_skin[..., surface.index(n), :] if n in surface else at_joint[..., k, :]
-        for k, n in enumerate(names)
-    ]
-    return jnp.stack(parts, axis=-2)
+    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    beta = flatten(shape, batch, 1)
+    posed = pose_joints(model, flatten(body_pose, batch, 2), beta)
+    return _unflatten(_detected(model, posed, beta, layout, bias), batch)
 
 
 def keypoints(
@@ -102,52 +96,180 @@ def keypoints(
     bias: float | Float[Array, ""] = 0.0,
 ) -> Float[Array, "*b keypoints 3"]:
     """`local_keypoints`, placed like `joints`."""
-    body_pose = pose[..., 3:].reshape(*pose.shape[:-1], 23, 3)
-    local = local_keypoints(model, body_pose, shape, layout, bias)
-    return _place(model, local, pose, shape, trans)
+    points = lambda posed, beta: _detected(model, posed, beta, layout, bias)
+    return _placed(model, pose, shape, trans, points)
 
 
-def _place(model, local, pose, shape, trans):
-    """Points of frame H turned by the root and moved to `J_0(β) + trans`."""
-    R = jaxlie.SO3.exp(pose[..., :3]).as_matrix()
-    pelvis = rest_joints(model, shape)[..., 0, :] + trans
-    return jnp.einsum("...ij,...kj->...ki", R, local) + pelvis[..., None, :]
+class Posed:
+    """The joints of `n` bodies in frame H, batch last; lives within one function."""
+
+    def __init__(self, R, rest, G, x):
+        self.R = R
+        """Rotations of joints 1 to 23 in their parents' frames, (23, 3, 3, n)."""
+        self.rest = rest
+        """Joints at rest, m, (24, 3, n)."""
+        self.G = G
+        """Rotations in H, (24, 3, 3, n)."""
+        self.x = x
+        """Places in H, m, (24, 3, n)."""
 
 
-def _rotations(body_pose):
-    return jaxlie.SO3.exp(body_pose).as_matrix()
+def pose_joints(
+    model: BodyModel, body_pose: Float[Array, "n 23 3"], shape: Float[Array, "n 10"]
+) -> Posed:
+    """Forward kinematics of a flat batch."""
+    n = len(body_pose)
+    R = jaxlie.SO3.exp(body_pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
+    moved = model.joint_shape_dirs.reshape(72, 10) @ shape.T
+    rest = model.joint_template[:, :, None] + moved.reshape(24, 3, n)
+    G, x = _chain(R, rest[1:] - rest[_PARENT])
+    G_root = jnp.broadcast_to(jnp.eye(3, dtype=G.dtype)[None, :, :, None], (1, 3, 3, n))
+    x_root = jnp.zeros((1, 3, n), x.dtype)
+    return Posed(R, rest, jnp.concatenate([G_root, G]), jnp.concatenate([x_root, x]))
 
 
-def _chain(R, rest):
-    return _chain_rotations(R, rest)
+def matmul(A, B):
+    """Products of 3x3 matrices with more than one axis behind or before them.
+
+    `A` (j, 3, 3, n) times `B` (j, 3, c, n), written out: XLA makes one loop of it.
+    """
+    term = lambda i: A[:, :, i, None] * B[:, None, i]
+    return term(0) + term(1) + term(2)
 
 
-def _chain_rotations(R, rest):
-    """Rotations `*b 24 3 3` and places `*b 24 3` of the joints in frame H."""
-    batch = jnp.broadcast_shapes(R.shape[:-3], rest.shape[:-2])
-    offset = rest[..., 1:, :] - rest[..., jnp.array(PARENTS[1:]), :]
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=R.dtype), (*batch, 3, 3))
-    G, x = [eye] + [eye] * 23, [jnp.zeros((*batch, 3), R.dtype)] * 24
-    for level in LEVELS:
-        for k in level:
-            p = PARENTS[k]
-            x[k] = x[p] + (G[p] * offset[..., k - 1, None, :]).sum(-1)
-            G[k] = G[p] @ jnp.broadcast_to(R[..., k - 1, :, :], (*batch, 3, 3))
-    return jnp.stack(G, axis=-3), jnp.stack(x, axis=-2)
-
-
-def _picked_vertices(model, names, R, G, x, rest, shape):
-    """Skinned vertices of the named surface points, `*b n 3`, in frame H."""
-    v = model.picks[jnp.array([SURFACE_POINTS.index(n) for n in names])]
-    shaped = model.template[v] + jnp.einsum(
-        "vcs,...s->...vc", model.shape_dirs[v], shape
+def matvec(A, x):
+    """`A` (j, 3, 3, n) times `x` (j, 3, n)."""
+    return (
+        A[:, :, 0] * x[:, None, 0]
+        + A[:, :, 1] * x[:, None, 1]
+        + (A[:, :, 2] * x[:, None, 2])
     )
+
+
+def flatten(x, batch, num_axes):
+    """Broadcasts the leading axes to `batch` and makes one of them."""
+    tail = x.shape[x.ndim - num_axes :]
+    return jnp.broadcast_to(x, (*batch, *tail)).reshape(math.prod(batch), *tail)
+
+
+def root_and_pelvis(model, pose, shape, trans):
+    """Root rotation (3, 3, n) and place of the pelvis (3, n) of a flat batch."""
+    R = jaxlie.SO3.exp(pose[:, :3]).as_matrix().transpose(1, 2, 0)
+    pelvis = model.joint_template[0] + shape @ model.joint_shape_dirs[0].T
+    return R, (pelvis + trans).T
+
+
+def _unflatten(points, batch):
+    return points.transpose(2, 0, 1).reshape(*batch, points.shape[0], 3)
+
+
+def _placed(model, pose, shape, trans, points):
+    batch = jnp.broadcast_shapes(pose.shape[:-1], shape.shape[:-1], trans.shape[:-1])
+    pose, beta = flatten(pose, batch, 1), flatten(shape, batch, 1)
+    posed = pose_joints(model, pose[:, 3:].reshape(len(pose), 23, 3), beta)
+    R, pelvis = root_and_pelvis(model, pose, beta, flatten(trans, batch, 1))
+    return _unflatten(matvec(R[None], points(posed, beta)) + pelvis, batch)
+
+
+def _detected(model, posed, shape, layout, bias):
+    """Keypoints (k, 3, n) in frame H."""
+    names = KEYPOINT_NAMES[layout]
+    surface = [n for n in names if n in SURFACE_POINTS]
+    inner = [n for n in names if n not in SURFACE_POINTS]
+    joint = np.array([KEYPOINT_JOINT[n] for n in inner])
+    offset = np.array([DETECTOR_BIAS.get(n, (0.0, 0.0, 0.0)) for n in inner])
+    offset = jnp.asarray(bias, posed.x.dtype) * jnp.asarray(offset, posed.x.dtype)
+    at_joint = posed.x[joint] + matvec(posed.G[joint], offset[:, :, None])
+    on_skin = _picked_vertices(model, surface, posed, shape)
+    order = np.array([(inner + surface).index(n) for n in names])
+    return jnp.concatenate([at_joint, on_skin])[order]
+
+
+def _picked_vertices(model, names, posed, shape):
+    """Skinned vertices of the named surface points, (k, 3, n), in frame H."""
+    v = model.picks[np.array([SURFACE_POINTS.index(n) for n in names])]
+    dirs = model.shape_dirs[v].reshape(-1, 10)
+    rest = model.template[v][:, :, None] + (dirs @ shape.T).reshape(len(names), 3, -1)
     num_features = model.pose_dirs.shape[-1]
     if num_features:
-        feature = R - jnp.eye(3, dtype=R.dtype)
-        feature = feature.reshape(*R.shape[:-3], 207)[..., :num_features]
-        shaped = shaped + jnp.einsum("vcp,...p->...vc", model.pose_dirs[v], feature)
-    j = model.skin_joint[v]
-    arm = shaped[..., None, :] - rest[..., j, :]
-    moved = x[..., j, :] + jnp.einsum("...vkij,...vkj->...vki", G[..., j, :, :], arm)
-    return (model.skin_weight[v][..., None] * moved).sum(-2)
+        feature = pose_feature(posed.R)[:num_features]
+        dirs = model.pose_dirs[v].reshape(-1, num_features)
+        rest = rest + (dirs @ feature).reshape(rest.shape)
+    point = jnp.zeros_like(rest)
+    for k in range(model.skin_joint.shape[1]):
+        j = model.skin_joint[v, k]
+        moved = posed.x[j] + matvec(posed.G[j], rest - posed.rest[j])
+        point = point + model.skin_weight[v, k][:, None, None] * moved
+    return point
+
+
+def pose_feature(R):
+    """SMPL's `vec(R_k - I)`, k = 1, 2, ...: (207, n) from (23, 3, 3, n)."""
+    eye = jnp.eye(3, dtype=R.dtype)[None, :, :, None]
+    return (R - eye).reshape(207, R.shape[-1])
+
+
+# The chain itself, with its own derivative. Differentiating the products of matrices
+# level by level is slow to compile and to run. But a small turn φ_k of joint k about
+# its own place (axis-angle, in H) moves every joint below it rigidly, so
+#   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x (x_i - x_parent(i)) + G_parent(i) do_i),
+# sums over i from the root down to k: products with constant matrices of ones.
+
+
+def _ancestry():
+    below = np.zeros((24, 24))
+    for k in range(24):
+        i = k
+        while i > 0:
+            below[k, i] = 1.0
+            i = PARENTS[i]
+    return below[1:, 1:], below[_PARENT, 1:]
+
+
+_UP_TO_SELF, _UP_TO_PARENT = _ancestry()
+
+
+@jax.custom_jvp
+def _chain(R, offset):
+    """`G` (23, 3, 3, n) and `x` (23, 3, n) from `R` and bone vectors, in frame H."""
+    G_all, x_all, G, x, above = [], [], None, None, ()
+    for level in LEVELS:
+        here = slice(level[0] - 1, level[-1])
+        if G is None or x is None:
+            G, x = R[here], offset[here]
+        else:
+            parent = np.array([above.index(PARENTS[k]) for k in level])
+            G, x = G[parent], x[parent]
+            x = x + matvec(G, offset[here])
+            G = matmul(G, R[here])
+        G_all.append(G)
+        x_all.append(x)
+        above = level
+    return jnp.concatenate(G_all), jnp.concatenate(x_all)
+
+
+@_chain.defjvp
+def _chain_jvp(primals, tangents):
+    R, offset = primals
+    dR, doffset = tangents
+    G, x = _chain(R, offset)
+    n = R.shape[-1]
+    G_root = jnp.broadcast_to(jnp.eye(3, dtype=G.dtype)[None, :, :, None], (1, 3, 3, n))
+    G_parent = jnp.concatenate([G_root, G])[_PARENT]
+    x_parent = jnp.concatenate([jnp.zeros((1, 3, n), x.dtype), x])[_PARENT]
+    spin = lambda i, j: (dR[:, i] * R[:, j]).sum(1)  # of dR Rᵀ, which is skew
+    phi = matvec(G_parent, jnp.stack([spin(2, 1), spin(0, 2), spin(1, 0)], 1))
+    omega, omega_parent = _tree_sum(_UP_TO_SELF, phi), _tree_sum(_UP_TO_PARENT, phi)
+    dx = _cross(omega_parent, x - x_parent) + matvec(G_parent, doffset)
+    dG = jnp.stack([_cross(omega, G[:, :, i]) for i in range(3)], 2)
+    return (G, x), (dG, _tree_sum(_UP_TO_SELF, dx))
+
+
+def _tree_sum(ones, u):
+    return (jnp.asarray(ones, u.dtype) @ u.reshape(23, -1)).reshape(u.shape)
+
+
+def _cross(a, b):
+    """Cross products of (j, 3, n)."""
+    c = lambda i, j: a[:, i] * b[:, j] - a[:, j] * b[:, i]
+    return jnp.stack([c(1, 2), c(2, 0), c(0, 1)], 1)
