@@ -7,6 +7,7 @@ from bodyslam_jax.evaluation._alignment import umeyama as umeyama
 from bodyslam_jax.evaluation._association import associate as associate
 from bodyslam_jax.evaluation._association import evaluate as evaluate
 from bodyslam_jax.evaluation._association import pad_frames as pad_frames
+from bodyslam_jax.evaluation._evaluation import ROWS as ROWS
 from bodyslam_jax.evaluation._evaluation import Evaluation as Evaluation
 from bodyslam_jax.evaluation._evaluation import Trajectories as Trajectories
 from bodyslam_jax.evaluation._evaluation import (

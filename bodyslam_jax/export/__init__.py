@@ -3,6 +3,7 @@
 from bodyslam_jax.export._meshes import write_bvh as write_bvh
 from bodyslam_jax.export._meshes import write_mesh as write_mesh
 from bodyslam_jax.export._meshes import write_trc as write_trc
+from bodyslam_jax.export._report import write_report as write_report
 from bodyslam_jax.export._run import check_folder as check_folder
 from bodyslam_jax.export._run import run_folder as run_folder
 from bodyslam_jax.export._run import to_yaml as to_yaml

@@ -1,0 +1,137 @@
+"""The report: complete offline, true to the numbers, calm where parts are missing."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from bodyslam_jax import export
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.export import _facts as facts
+from bodyslam_jax.result import Result
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body_model()
+
+
+def _walk(num=90, fps=30.0, people=1):
+    """People along x at 1.2 m/s, the camera beside them at 1 m/s."""
+    t = np.arange(num) / fps
+    T_WC = np.tile(np.eye(4), (num, 1, 1))
+    T_WC[:, :3, 3] = np.stack([1.0 * t, 1.5 + 0 * t, -4 + 0 * t], -1)
+    rng = np.random.default_rng(0)
+    offsets = rng.normal(0, 0.2, (24, 3)) + [0.0, 0.9, 0.0]
+    root = np.stack([1.2 * t, 0 * t, 0 * t], -1)
+    joints = np.tile(root[None, :, None] + offsets, (people, 1, 1, 1))
+    joints[:, :, 0] = root + [0.0, 0.9, 0.0]
+    return Result(
+        timestamps=t,
+        T_WC=T_WC,
+        scale=2.0,
+        intrinsics=np.array([500.0, 510.0, 320.0, 240.0]),
+        landmarks=rng.normal(0, 2, (40, 3)),
+        poses=np.zeros((people, num, 72)),
+        trans=joints[:, :, 0],
+        betas=np.zeros((people, 10)),
+        joints=joints,
+        present=np.ones((people, num), bool),
+    )
+
+
+SUMMARY = {
+    "status": "scale is not observable",
+    "input": {"name": "<script>alert(1)</script>", "width": 640, "height": 480},
+    "warnings": ["focal length guessed & refined"],
+    "scale": {"value": 2.0, "sigma": 0.05},
+    "people": [{"stature_sigma_m": 0.021}],
+    "stages": [
+        {"name": "cameras", "cost_before": 200.0, "cost_after": 20.0, "iterations": 7},
+        {"name": "fails", "cost_before": 0.0, "cost_after": None, "iterations": 0},
+    ],
+    "durations_s": {"tracks": 1.5, "joint": 2.0},
+    "per_frame": {"reprojection_px": [None] * 9 + [0.7] * 81, "tracks": [200] * 90},
+    "errors": {"cameras alone": {"c_ate_se3": 1.5}, "joint": {"c_ate_se3": 0.0251}},
+    "settings": {"solver": {"iterations": 30}},
+}
+
+
+def _write(path, result, body):
+    export.write_report(path / "report.html", result, body)
+    return (path / "report.html").read_text()
+
+
+def _text(page):
+    return re.sub(r"\s+", " ", re.sub(r"<svg.*?</svg>|<[^>]+>", " ", page, flags=re.S))
+
+
+def test_says_what_was_found(tmp_path, body):
+    page = _write(tmp_path, dataclasses.replace(_walk(), summary=SUMMARY), body)
+    text = _text(page)
+    for words in (
+        "scale is not observable",
+        "3.6 m",  # 3 s at 1.2 m/s
+        "1.20 m/s",
+        f"{100 * facts.stature(body, np.zeros(10)):.0f} ± 2 cm",
+        "± 2.5 %",
+        "focal length guessed &amp; refined",
+        "C-ATE, SE(3), mm 1500 25.1",
+        "total 3.5",
+        "iterations: 30",
+    ):
+        assert words in text, words
+    assert page.count("<svg") == 6
+
+
+def test_opens_offline_and_runs_nothing(tmp_path, body):
+    page = _write(tmp_path, dataclasses.replace(_walk(), summary=SUMMARY), body)
+    assert "<script" not in page and "&lt;script&gt;" in page
+    assert not re.search(r"(src|href)=[\"'](?!#|data:)", page.replace("xlink:", ""))
+    assert "@import" not in page and "url(http" not in page
+    assert "var(--camera)" in page and "#0a0b0c" not in page
+
+
+@pytest.mark.parametrize(
+    "result",
+    [_walk(), _walk(people=0), _walk(num=1), _walk(num=2), _walk(people=6)],
+    ids=["no summary", "nobody", "one frame", "two frames", "a crowd"],
+)
+def test_missing_parts_are_left_out(tmp_path, body, result):
+    text = _text(_write(tmp_path, result, body))
+    assert "nan" not in text.lower() and "None" not in text
+    assert "Warnings" not in text and "Error against" not in text
+
+
+def test_absent_people_and_no_map(tmp_path, body):
+    result = _walk(people=2)
+    present = result.present.copy()
+    present[0, 20:50] = False
+    present[1] = False
+    result = dataclasses.replace(
+        result, present=present, landmarks=result.landmarks[:0]
+    )
+    page = _write(tmp_path, result, body)
+    assert "there for 1.9 s" in page and "nan" not in _text(page)
+    # The gap is no distance: 19 + 39 frames at 1.2 m/s.
+    way = facts.person_facts(result, 0)
+    np.testing.assert_allclose(way.distance, 1.2 * (19 + 39) / 30, rtol=1e-6)
+    assert np.isnan(way.speed[30]) and way.speed[5] == pytest.approx(1.2)
+
+
+def test_jitter_is_not_distance():
+    still = _walk()
+    noise = np.random.default_rng(0).normal(0, 0.02, (90, 3))
+    still.joints[0, :, 0] = noise + [0.0, 0.9, 0.0]
+    raw = np.linalg.norm(np.diff(noise[:, [0, 2]], axis=0), axis=1).sum()
+    assert facts.person_facts(still, 0).distance < 0.15 * raw
+
+
+def test_skating_is_the_speed_of_the_foot_that_stands():
+    result = _walk()
+    result.joints[0, :, 10] = [0.0, 0.05, 0.0]
+    result.joints[0, :, 11, 1] = 0.2
+    assert facts.foot_skating(result, 0) < 1e-12
+    result.joints[0, :, 10, 0] = 0.3 * result.timestamps
+    np.testing.assert_allclose(facts.foot_skating(result, 0), 0.3)
