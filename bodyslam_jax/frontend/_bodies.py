@@ -1,102 +1,109 @@
 """Regressed bodies -> one checked `Bodies`, whatever tool they came from.
 
-The contract's `bodies.npz` and SPIN's keys are read here; `_body_tools.py` reads the
-result files of other tools.
+The contract's `bodies.npz` is read here; `_body_tools.py` reads the files of others.
 """
 
-import dataclasses
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
-from bodyslam_jax.frontend._keypoints import numbers, open_npz
-from bodyslam_jax.frontend._perspective import full_translation, turn_to_camera
+from bodyslam_jax.frontend._body_tools import READERS, Unfit, from_spin
+from bodyslam_jax.frontend._pickle import restricted_load
+from bodyslam_jax.frontend._rows import Rows
 from bodyslam_jax.sequence import Bodies, Intrinsics
 
 _MAX_DISTANCE = 200.0
 """A person further away than this is not a person, m."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Rows:
-    """`m` bodies in the camera frame, in no order."""
-
-    frame: Int[np.ndarray, " m"]
-    person: Int[np.ndarray, " m"]
-    """Any integer that is the same for the same person."""
-    poses: Float[np.ndarray, "m 72"]
-    """Axis-angle, rad, root first."""
-    betas: Float[np.ndarray, "m 10"]
-    trans: Float[np.ndarray, "m 3"]
-    """m: the pelvis is at `J_0(β) + trans`."""
-
-
 def read_bodies(path: Path, *, num_frames: int, intrinsics: Intrinsics) -> Bodies:
-    """Reads regressed bodies, recognised by content.
+    """Reads regressed bodies, recognised by content; a folder of TRAM's tracks too.
+
+    Nothing in the file is run: see `_pickle.py`.
 
     **Raises:** `ValueError`, naming the file, if it is none of the known kinds, has NaN
     or infinity in it, or belongs to another video.
     """
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: no such file.")
-    rows = _read_npz(path, num_frames, intrinsics)
+    if path.is_dir():
+        rows = _read_tram_folder(path, num_frames, intrinsics)
+    else:
+        rows = _read(path, restricted_load(path), num_frames, intrinsics)
     return _gather(path, rows, num_frames)
 
 
-def _read_npz(path: Path, num_frames: int, intrinsics: Intrinsics) -> Rows:
-    with open_npz(path) as archive:
-        keys = set(archive.files)
-        get = lambda key: numbers(path, archive, key)
-        if {"poses", "betas", "frame"} <= keys and keys & {"trans", "camera"}:
-            poses, frame = get("poses"), get("frame")
-        elif {"pose", "betas", "camera"} <= keys:  # SPIN: a row per frame, no numbers
-            poses, frame = get("pose"), np.arange(len(get("pose")))
-            if "frame" in keys:
-                frame = get("frame")
-            elif len(poses) != num_frames:
-                raise ValueError(
-                    f"{path}: {len(poses)} bodies without `frame`, but the video has "
-                    f"{num_frames} frames."
-                )
-        else:
-            raise ValueError(
-                f"{path}: not bodies that this program knows; arrays {archive.files}."
-            )
-        person = get("person") if "person" in keys else np.zeros(len(poses))
-        betas = get("betas")
-        if "trans" in keys:
-            trans = get("trans")
-        else:
-            if "bbox" not in keys:
-                raise ValueError(f"{path}: `camera` needs `bbox` (cx, cy, side px).")
-            camera, box = get("camera"), get("bbox")
-            _check_shape(path, "camera", camera, (len(poses), 3))
-            _check_shape(path, "bbox", box, (len(poses), 3))
-            _check_shape(path, "pose", poses, (len(poses), 72))
-            if (camera[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
-                raise ValueError(
-                    f"{path}: `camera` or `bbox` with a size of 0 or less."
-                )
-            trans = full_translation(camera, box, intrinsics)
-            root = turn_to_camera(poses[:, :3], box, intrinsics)
-            poses = np.concatenate([root, poses[:, 3:]], axis=-1)
-    for name, array, shape in (
-        ("poses", poses, (len(poses), 72)),
-        ("betas", betas, (len(poses), 10)),
-        ("trans", trans, (len(poses), 3)),
-        ("frame", frame, (len(poses),)),
-        ("person", person, (len(poses),)),
+def _read(path: Path, data: Any, num_frames: int, intrinsics: Intrinsics) -> Rows:
+    if isinstance(data, dict) and set(data) == {"results"}:
+        data = data["results"]
+    if not isinstance(data, dict) or not data:
+        raise ValueError(f"{path}: no named arrays in it, so not bodies.")
+    try:
+        if {"frame", "poses", "betas"} <= set(data):
+            return _from_contract(data, intrinsics, num_frames)
+        for _, recognise, read in READERS:
+            if recognise(data):
+                return read(data, intrinsics, num_frames)
+    except Unfit as error:
+        raise ValueError(f"{path}: {error}.") from None
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+        what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+        raise ValueError(f"{path}: incomplete or damaged bodies ({what}).") from None
+    known = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
+    keys = ", ".join(str(k) for k in list(data)[:6])
+    raise ValueError(f"{path}: not bodies of {known} or bodies.npz; it holds {keys}.")
+
+
+def _from_contract(data: dict, intrinsics: Intrinsics, num_frames: int) -> Rows:
+    if "trans" not in data:
+        if "camera" not in data:
+            raise Unfit("neither `trans` nor `camera` and `bbox`")
+        return from_spin({**data, "pose": data["poses"]}, intrinsics, num_frames)
+    arrays = {}
+    n = len(np.atleast_1d(np.asarray(data["frame"])))
+    person = data.get("person", np.zeros(n))
+    for name, value, shape in (
+        ("frame", data["frame"], (n,)),
+        ("person", person, (n,)),
+        ("poses", data["poses"], (n, 72)),
+        ("betas", data["betas"], (n, 10)),
+        ("trans", data["trans"], (n, 3)),
     ):
-        _check_shape(path, name, array, shape)
-    return Rows(frame.astype(np.int64), person.astype(np.int64), poses, betas, trans)
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            raise Unfit(f"`{name}` holds {array.dtype}, not numbers")
+        if array.shape != shape:
+            raise Unfit(f"`{name}` is {array.shape}, not {shape}")
+        if not np.isfinite(array).all():
+            raise Unfit(f"`{name}` has NaN or infinity in it")
+        arrays[name] = array.astype(
+            np.int64 if name in ("frame", "person") else np.float64
+        )
+    return Rows(**arrays)
 
 
-def _check_shape(
-    path: Path, name: str, array: np.ndarray, expected: tuple[int, ...]
-) -> None:
-    if array.shape != expected:
-        raise ValueError(f"{path}: `{name}` is {array.shape}, not {expected}.")
+def _read_tram_folder(folder: Path, num_frames: int, intrinsics: Intrinsics) -> Rows:
+    """TRAM's `hps/` (one file per person), with `camera.npy` beside or above it."""
+    tracks = sorted(folder.glob("**/hps_track_*.npy"))
+    if not tracks:
+        raise ValueError(f"{folder}: a folder without TRAM's hps_track_*.npy.")
+    cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
+    camera_file = next((p for p in cameras if p.is_file()), None)
+    camera = restricted_load(camera_file) if camera_file else {}
+    shared = {k: camera[k] for k in ("img_focal", "img_center") if k in camera}
+    rows = []
+    for track in tracks:
+        data = restricted_load(track)
+        if not isinstance(data, dict):
+            raise ValueError(f"{track}: not a dictionary of arrays.")
+        one = _read(track, {**data, **shared}, num_frames, intrinsics)
+        number = int(re.findall(r"\d+", track.stem)[-1])
+        person = np.full(len(one.frame), number)
+        rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
+    names = ("frame", "person", "poses", "betas", "trans")
+    return Rows(*(np.concatenate([getattr(r, name) for r in rows]) for name in names))
 
 
 def _gather(path: Path, rows: Rows, num_frames: int) -> Bodies:
@@ -113,6 +120,9 @@ def _gather(path: Path, rows: Rows, num_frames: int) -> Bodies:
         raise ValueError(f"{path}: a body {distance:.0f} m away; `trans` is in m.")
     if (rows.trans[:, 2] < -0.5).all():
         raise ValueError(f"{path}: all bodies behind the camera; z is forward.")
+    turn = float(np.linalg.norm(rows.poses.reshape(-1, 3), axis=-1).max())
+    if turn > 20:
+        raise ValueError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
     people, index = np.unique(rows.person, return_inverse=True)
     size = (len(people), num_frames)
     present = np.zeros(size, dtype=bool)

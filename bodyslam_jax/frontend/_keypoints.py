@@ -207,7 +207,7 @@ def _read_npz(path: Path, num_frames: int) -> Detections:
             f"{num_frames}."
         )
     points = to_body25(path, points)
-    seen = (points[..., 2] > 0).any(axis=-1)
+    seen = points[..., 2].max(axis=-1) > 0
     return [points[seen[:, k], k] for k in range(num_frames)]
 
 

@@ -1,0 +1,264 @@
+"""Pickled result files without running what is in them.
+
+Pickle, joblib, PyTorch's zip files and object arrays of NumPy can hold code that runs
+on loading. This unpickler makes numbers, text, lists, dictionaries and arrays, by
+functions of its own, and refuses every other name before it is called.
+"""
+
+import bz2
+import collections
+import gzip
+import io
+import lzma
+import pickle
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+_MAX_BYTES = 8 << 30
+"""More than this is not a result file but a bomb."""
+
+_STORAGES = {
+    "DoubleStorage": "f8",
+    "FloatStorage": "f4",
+    "HalfStorage": "f2",
+    "LongStorage": "i8",
+    "IntStorage": "i4",
+    "ShortStorage": "i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
+    "BoolStorage": "?",
+}
+
+
+class Refused(pickle.UnpicklingError):
+    """A name in a pickle that is not on the list."""
+
+
+def restricted_load(path: Path, allow: Mapping[str, Any] | None = None) -> Any:
+    """Loads a pickle, joblib, `.pt` or `.npy` file made of plain data.
+
+    Tensors become NumPy arrays.
+
+    Args:
+        allow: more names (`module.name`), and what to call in their place.
+
+    **Raises:** `ValueError`, naming the file, if it is damaged or holds anything else.
+    """
+    allowed = _ALLOWED | dict(allow or {})
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+            file.seek(0)
+            if head.startswith(b"PK\x03\x04"):
+                return _load_zip(file, allowed)
+            if head.startswith(b"\x93NUMPY"):
+                return load_array(file, allowed)
+            stream = _decompressed(file, head)
+            start = stream.tell()
+            if stream.read(1) != b"\x80":
+                raise ValueError("neither a pickle nor an archive")
+            stream.seek(start)
+            return _Unpickler(stream, allowed).load()
+    except Refused as error:
+        raise ValueError(f"{path}: refused, {error}.") from None
+    except (MemoryError, RecursionError, Exception) as error:
+        # A damaged pickle can fail anywhere, with any error.
+        what = f"{type(error).__name__}: {error}".splitlines()[0][:150]
+        raise ValueError(f"{path}: not a readable result file ({what}).") from None
+
+
+def load_array(file: BinaryIO, allow: Mapping[str, Any] | None = None) -> Any:
+    """Reads one array in NumPy's format; a lone pickled object is returned as it is."""
+    version = np.lib.format.read_magic(file)
+    reader = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if reader is None:
+        raise Refused(f"unknown version {version} of NumPy's format")
+    start = file.tell()
+    shape, _, dtype = reader(file)
+    if not dtype.hasobject:
+        file.seek(start - 8)
+        return np.lib.format.read_array(file, allow_pickle=False)
+    found = _Unpickler(file, _ALLOWED | dict(allow or {})).load()
+    is_lone = shape == () and isinstance(found, np.ndarray) and found.size == 1
+    return found.item() if is_lone else found
+
+
+# The one written in Python: joblib's arrays need its loop.
+_Base: Any = getattr(pickle, "_Unpickler")
+
+
+class _Unpickler(_Base):
+    dispatch = dict(_Base.dispatch)
+
+    def __init__(self, file: BinaryIO, allowed: Mapping[str, Any]):
+        # latin1 is what Python 2's arrays need.
+        super().__init__(file, encoding="latin1")
+        self.raw, self.allowed = file, allowed
+
+    def find_class(self, module: str, name: str) -> Any:
+        key = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
+        if key not in self.allowed:
+            raise Refused(f"it wants to load {module}.{name}")
+        return self.allowed[key]
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise Refused("it refers to data outside the file")
+
+    def load_build(self) -> None:
+        # Setting attributes of anything else could change this program's own functions.
+        if not isinstance(self.stack[-2], np.ndarray | np.dtype | _JoblibArray):
+            raise Refused(f"it wants to change a {type(self.stack[-2]).__name__}")
+        super().load_build()
+        if isinstance(self.stack[-1], _JoblibArray):
+            # joblib writes an array's bytes behind the object that describes it.
+            self.stack[-1] = self.stack[-1].read(self)
+
+    dispatch[pickle.BUILD[0]] = load_build
+
+
+class _JoblibArray:
+    """Stands for joblib's `NumpyArrayWrapper`: a header, with the bytes behind it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    order: str
+
+    def read(self, unpickler: _Unpickler) -> Any:
+        if self.dtype.hasobject:
+            return _Unpickler(unpickler.raw, unpickler.allowed).load()
+        if getattr(self, "numpy_array_alignment_bytes", None) is not None:
+            (padding,) = unpickler.raw.read(1)
+            unpickler.raw.read(padding)
+        count = int(np.prod(self.shape, dtype=np.int64))
+        size = count * self.dtype.itemsize
+        if not 0 <= size <= _MAX_BYTES:
+            raise Refused(f"an array of {size} bytes")
+        array = np.frombuffer(unpickler.raw.read(size), self.dtype, count)
+        order = "F" if self.order == "F" else "C"
+        return array.reshape(self.shape, order=order).copy()
+
+
+class _Storage:
+    """PyTorch's storages, by name: only the type of their numbers matters."""
+
+    def __init__(self, dtype: str):
+        self.dtype = np.dtype(dtype)
+
+
+def _load_zip(file: BinaryIO, allowed: Mapping[str, Any]) -> Any:
+    """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
+    with zipfile.ZipFile(file) as archive:
+        total = sum(entry.file_size for entry in archive.infolist())
+        if total > _MAX_BYTES:
+            raise Refused(f"{total} bytes unpacked")
+        pickles = [n for n in archive.namelist() if n.endswith("/data.pkl")]
+        if not pickles:
+            return {
+                n.removesuffix(".npy"): load_array(io.BytesIO(archive.read(n)), allowed)
+                for n in archive.namelist()
+                if n.endswith(".npy")
+            }
+        folder = pickles[0].removesuffix("data.pkl")
+        unpickler = _Unpickler(io.BytesIO(archive.read(pickles[0])), allowed)
+
+        def storage(pid: Any) -> np.ndarray:
+            kind, storage_type, key, _, count = pid
+            if kind != "storage" or not isinstance(storage_type, _Storage):
+                raise Refused(f"unknown reference {kind!r}")
+            data = archive.read(f"{folder}data/{key}")
+            return np.frombuffer(data, storage_type.dtype, int(count))
+
+        unpickler.persistent_load = storage
+        return unpickler.load()
+
+
+def _decompressed(file: BinaryIO, head: bytes) -> BinaryIO:
+    """joblib's compressed files look like what they are compressed with."""
+    if head[:1] == b"x":
+        unpacked = zlib.decompressobj().decompress(file.read(), _MAX_BYTES)
+        return io.BytesIO(unpacked)
+    for magic, opener in (
+        (b"\x1f\x8b", gzip.open),
+        (b"BZh", bz2.open),
+        (b"\xfd7zXZ", lzma.open),
+    ):
+        if head.startswith(magic):
+            with opener(file) as unpacked:
+                return io.BytesIO(unpacked.read(_MAX_BYTES))
+    return file
+
+
+def _reconstruct(_subtype: Any, _shape: Any, _kind: Any) -> np.ndarray:
+    """An empty array, whose state follows; the shape given here is never used."""
+    return np.ndarray((0,), dtype=np.uint8)
+
+
+def _from_buffer(
+    buffer: bytes, dtype: np.dtype, shape: tuple[int, ...], order: str
+) -> np.ndarray:
+    array = np.frombuffer(buffer, dtype=dtype)
+    return array.reshape(shape, order="F" if order == "F" else "C").copy()
+
+
+def _scalar(dtype: np.dtype, data: Any = b"") -> Any:
+    data = data.encode("latin1") if isinstance(data, str) else data
+    if dtype.hasobject:
+        raise Refused("a scalar of objects")
+    return np.frombuffer(data, dtype, 1)[0]
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    """Bytes, as Python 2 pickles them."""
+    return text.encode("latin1")
+
+
+def _tensor(storage: np.ndarray, offset: int, size: Any, stride: Any, *_: Any) -> Any:
+    """A copy of a strided view, checked to lie within its storage."""
+    size, stride, offset = tuple(size), tuple(stride), int(offset)
+    if not all(isinstance(n, int) and n >= 0 for n in (*size, *stride, offset)):
+        raise Refused("a tensor of impossible shape")
+    if 0 in size:
+        return np.zeros(size, storage.dtype)
+    last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
+    if last >= len(storage) or np.prod(size, dtype=np.float64) > _MAX_BYTES:
+        raise Refused("a tensor larger than its storage")
+    steps = [s * storage.dtype.itemsize for s in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
+
+
+def _parameter(data: Any, *_: Any) -> Any:
+    return data
+
+
+_ALLOWED: dict[str, Any] = {
+    "collections.OrderedDict": dict,
+    "collections.defaultdict": lambda *_: {},
+    "collections.deque": collections.deque,
+    "builtins.set": set,
+    "builtins.frozenset": frozenset,
+    "builtins.list": list,
+    "builtins.dict": dict,
+    "builtins.tuple": tuple,
+    "builtins.slice": slice,
+    "builtins.complex": complex,
+    "__builtin__.set": set,
+    "_codecs.encode": _encode,
+    "pathlib.PosixPath": lambda *parts: "/".join(str(p) for p in parts),
+    "numpy.ndarray": np.ndarray,
+    "numpy.dtype": np.dtype,
+    "numpy.core.multiarray._reconstruct": _reconstruct,
+    "numpy.core.multiarray.scalar": _scalar,
+    "numpy.core.numeric._frombuffer": _from_buffer,
+    "joblib.numpy_pickle.NumpyArrayWrapper": _JoblibArray,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": _parameter,
+    "torch.Size": tuple,
+} | {f"torch.{name}": _Storage(dtype) for name, dtype in _STORAGES.items()}
