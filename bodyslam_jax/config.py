@@ -19,9 +19,12 @@ class GraphWeights:
     """Static points, px."""
     landmark_loss: float = 1.5
     """Cauchy scale, in `pixel_sigma`."""
-    keypoint_sigma: float = 6.0
-    """Keypoints of confidence 1, px; divided by the confidence."""
-    keypoint_loss: float = 16.0
+    keypoint_sigma: float | None = None
+    """Keypoints of confidence 1, px; divided by the confidence. Without it, the
+    detector's usual error in metres of the body, as it appears at its distance."""
+    keypoint_inflation: float = 1.5
+    """Factor on the detector's usual error: errors last, frames are not independent."""
+    keypoint_loss: float = 5.0
     """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
@@ -41,6 +44,14 @@ class GraphWeights:
     """Whether each frame counts as a measurement of β of its own."""
     orientation_sigma: float | None = None
     """Predicted turns of the person, rad a frame; none without it."""
+    root_sigma: float | None = 0.12
+    """Regressed orientation of the person, stationary, rad per axis; none without it."""
+    root_correlation: float = 0.96
+    """Of its errors in successive frames at 30 fps."""
+    root_turning: float | None = 0.015
+    """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
+    root_smoothness: float | None = 0.006
+    """Change of the pelvis' step in a frame of 1/30 s, m; free without it."""
 
     @classmethod
     def paper(cls) -> "GraphWeights":
@@ -61,6 +72,9 @@ class GraphWeights:
             posture_predicted=True,
             shape_sigma=1.0,
             shape_each_frame=True,
+            root_sigma=None,
+            root_turning=None,
+            root_smoothness=None,
         )
 
 
@@ -241,7 +255,7 @@ class Simulation:
     seed: int | None = None
     """Everything random follows from it; without it the sequence's own."""
     motion: str | None = None
-    """Motion data to walk with (CMU archive, AMASS, BVH); without it clips that ship."""
+    """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
     noise: Literal["none", "low", "real"] = "real"
     """Errors of all measurements, unless set apart below."""
     keypoint_noise: Literal["none", "low", "real"] | None = None
