@@ -166,7 +166,7 @@ def from_gvhmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     trans = _array(body, "transl", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
     if "K_fullimg" in data:
         K = np.broadcast_to(_array(data, "K_fullimg", None), (n, 3, 3))
-        trans = _refocused(trans, K[:, 0, 0], K[:, :2, 2], camera)
+        trans = _refocused(trans, _focals(K), K[:, :2, 2], camera)
     poses = np.concatenate(
         [root, _array(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
     )
@@ -254,7 +254,7 @@ def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         trans = _array(one, "root_trans_cam", (n, 3)) - _PELVIS_SMPL
         if "cam_K" in one:
             K = np.broadcast_to(_array(one, "cam_K", None), (n, 3, 3))
-            pelvis = _refocused(trans + _PELVIS_SMPL, K[:, 0, 0], K[:, :2, 2], camera)
+            pelvis = _refocused(trans + _PELVIS_SMPL, _focals(K), K[:, :2, 2], camera)
             trans = pelvis - _PELVIS_SMPL
         poses = np.concatenate([root, _array(one, "smpl_pose", (n, 69))], axis=-1)
         seen = np.asarray(one.get("visible", np.ones(n))).astype(bool)
@@ -438,13 +438,22 @@ def _refocused(
     """Moves bodies so that they look the same through the true camera.
 
     Distance is proportional to focal length for the same size in the image.
+
+    Args:
+        focal: of the tool's camera, px: one number a body, or two (x, y).
+        center: its principal point, px: one for all, or one a body.
     """
     fx, fy, cx, cy = camera.params[:4]
-    z = trans[:, 2] * fx / focal
+    focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
     center = np.broadcast_to(center, (len(trans), 2))
-    u = center[:, 0] + focal * trans[:, 0] / trans[:, 2]
-    v = center[:, 1] + focal * trans[:, 1] / trans[:, 2]
-    return np.stack([(u - cx) * z / fx, (v - cy) * z / fy, z], axis=-1)
+    z = trans[:, 2] * fx / focal[:, 0]
+    uv = center + focal * trans[:, :2] / trans[:, 2:]
+    xy = (uv - [cx, cy]) / [fx, fy] * z[:, None]
+    return np.concatenate([xy, z[:, None]], axis=-1)
+
+
+def _focals(K: np.ndarray) -> np.ndarray:
+    return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
 
 
 def _from_crops(

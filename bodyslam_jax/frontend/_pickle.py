@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def restricted_load(path: Path, allow: Mapping[str, Any] | None = None) -> Any:
         raise ValueError(f"{path}: not a readable result file ({what}).") from None
 
 
-def load_array(file: BinaryIO, allow: Mapping[str, Any] | None = None) -> Any:
+def load_array(file: io.BufferedIOBase, allow: Mapping[str, Any] | None = None) -> Any:
     """Reads one array in NumPy's format; a lone pickled object is returned as it is."""
     version = np.lib.format.read_magic(file)
     reader = {
@@ -98,7 +98,7 @@ _Base: Any = getattr(pickle, "_Unpickler")
 class _Unpickler(_Base):
     dispatch = dict(_Base.dispatch)
 
-    def __init__(self, file: BinaryIO, allowed: Mapping[str, Any]):
+    def __init__(self, file: io.BufferedIOBase, allowed: Mapping[str, Any]):
         # latin1 is what Python 2's arrays need.
         super().__init__(file, encoding="latin1")
         self.raw, self.allowed = file, allowed
@@ -153,7 +153,7 @@ class _Storage:
         self.dtype = np.dtype(dtype)
 
 
-def _load_zip(file: BinaryIO, allowed: Mapping[str, Any]) -> Any:
+def _load_zip(file: io.BufferedIOBase, allowed: Mapping[str, Any]) -> Any:
     """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
     with zipfile.ZipFile(file) as archive:
         total = sum(entry.file_size for entry in archive.infolist())
@@ -180,16 +180,17 @@ def _load_zip(file: BinaryIO, allowed: Mapping[str, Any]) -> Any:
         return unpickler.load()
 
 
-def _decompressed(file: BinaryIO, head: bytes) -> BinaryIO:
+def _decompressed(file: io.BufferedIOBase, head: bytes) -> io.BufferedIOBase:
     """joblib's compressed files look like what they are compressed with."""
     if head[:1] == b"x":
         unpacked = zlib.decompressobj().decompress(file.read(), _MAX_BYTES)
         return io.BytesIO(unpacked)
-    for magic, opener in (
-        (b"\x1f\x8b", gzip.open),
-        (b"BZh", bz2.open),
-        (b"\xfd7zXZ", lzma.open),
-    ):
+    openers: dict[bytes, Any] = {
+        b"\x1f\x8b": gzip.open,
+        b"BZh": bz2.open,
+        b"\xfd7zXZ": lzma.open,
+    }
+    for magic, opener in openers.items():
         if head.startswith(magic):
             with opener(file) as unpacked:
                 return io.BytesIO(unpacked.read(_MAX_BYTES))
@@ -202,7 +203,7 @@ def _reconstruct(_subtype: Any, _shape: Any, _kind: Any) -> np.ndarray:
 
 
 def _from_buffer(
-    buffer: bytes, dtype: np.dtype, shape: tuple[int, ...], order: str
+    buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: str
 ) -> np.ndarray:
     array = np.frombuffer(buffer, dtype=dtype)
     return array.reshape(shape, order="F" if order == "F" else "C").copy()
