@@ -403,6 +403,7 @@ def main():
         name: int(np.linalg.norm(template - surface[source].mean(0), axis=1).argmin())
         for name, source in KEYPOINT_OF.items()
     }
+    picks["head_top"] = int(template[:, 1].argmax())
     figures = {
         "samples": NUM_SAMPLES,
         "vertices": int(len(template)),

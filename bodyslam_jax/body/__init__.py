@@ -1,16 +1,21 @@
 """The person: model file -> shaped body -> posed joints -> keypoints -> vertices."""
 
+from bodyslam_jax.body._files import check as check
 from bodyslam_jax.body._files import load_body_model as load_body_model
+from bodyslam_jax.body._files import search_paths as search_paths
+from bodyslam_jax.body._files import write_npz as write_npz
 from bodyslam_jax.body._kinematics import joints as joints
 from bodyslam_jax.body._kinematics import keypoints as keypoints
 from bodyslam_jax.body._kinematics import local_joints as local_joints
 from bodyslam_jax.body._kinematics import local_keypoints as local_keypoints
 from bodyslam_jax.body._kinematics import rest_joints as rest_joints
 from bodyslam_jax.body._model import BodyModel as BodyModel
+from bodyslam_jax.body._show import save_picture as save_picture
 from bodyslam_jax.body._skeleton import DETECTOR_BIAS as DETECTOR_BIAS
 from bodyslam_jax.body._skeleton import JOINT_NAMES as JOINT_NAMES
 from bodyslam_jax.body._skeleton import KEYPOINT_NAMES as KEYPOINT_NAMES
 from bodyslam_jax.body._skeleton import KEYPOINT_SPREAD as KEYPOINT_SPREAD
 from bodyslam_jax.body._skeleton import MIRRORED as MIRRORED
 from bodyslam_jax.body._skeleton import PARENTS as PARENTS
+from bodyslam_jax.body._skeleton import SURFACE_POINTS as SURFACE_POINTS
 from bodyslam_jax.body._skinning import vertices as vertices

@@ -101,8 +101,8 @@ def _by_chunks(function, *arrays):
     if n <= _CHUNK:
         return function(*arrays)
     whole = n - n % _CHUNK
-    chunks = [a[:whole].reshape(-1, _CHUNK, *a.shape[1:]) for a in arrays]
-    out = jax.lax.map(lambda xs: function(*xs), tuple(chunks))
+    split = lambda a: a[:whole].reshape(n // _CHUNK, _CHUNK, *a.shape[1:])
+    out = jax.lax.map(lambda xs: function(*xs), tuple(map(split, arrays)))
     out = out.reshape(whole, *out.shape[2:])
     if whole < n:
         out = jnp.concatenate([out, function(*[a[whole:] for a in arrays])])
