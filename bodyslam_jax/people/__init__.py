@@ -1,6 +1,7 @@
 """People: bodies from keypoints or from a regressor, made ready for the graph."""
 
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
+from bodyslam_jax.people._fit import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people._prepare import BodyNoise as BodyNoise
 from bodyslam_jax.people._prepare import body_noise as body_noise
 from bodyslam_jax.people._prepare import prepare_bodies as prepare_bodies

@@ -38,7 +38,7 @@ class ChainProblem(eqx.Module):
 
 class Chain(eqx.Module):
     fit: Fit
-    shape: Float[Array, " 10"]
+    shape: Float[Array, " s"]
 
 
 @eqx.filter_jit
@@ -111,7 +111,7 @@ def _shifted(values: Array, by: int) -> Array:
 
 def _newton(
     problem: ChainProblem, chain: Chain, normal: Normal, damping: Array
-) -> tuple[Float[Array, "t n"], Float[Array, " 10"]]:
+) -> tuple[Float[Array, "t n"], Float[Array, " s"]]:
     ties = problem.ties
     w, c1, c2 = ties.weight, ties.c1, ties.c2
     pull = w * _temporal(ties, chain.fit)

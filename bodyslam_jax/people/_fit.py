@@ -21,7 +21,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._roots import Roots, bodies_from_roots
-from bodyslam_jax.people._skeleton import make_skeleton
+from bodyslam_jax.people._skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people._starts import best_path, fit_frames
 from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Scene
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
@@ -76,7 +76,7 @@ def fit_bodies(
         roots.body_pose[h, fitted] = scene.prior.decode(chain.fit.latent)
         roots.T_CH[h, ~present] = np.eye(4)
         roots.body_pose[h, ~present] = 0.0
-        roots.shape[h] = chain.shape
+        roots.shape[h] = chain.shape[:10]
     return bodies_from_roots(roots, body)
 
 
@@ -170,7 +170,7 @@ def _fit_person(
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
     last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
-    chain = Chain(jax.tree.map(last, start), jnp.zeros(10, dtype))
+    chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
     chain, value = solve_chain(problem, chain, settings.max_steps)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     cropped = jax.tree.map(lambda a: np.asarray(a[: len(uv)], float), chain.fit)

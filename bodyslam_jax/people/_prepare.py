@@ -20,7 +20,12 @@ from bodyslam_jax.camera import project
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._fit import keypoint_sigma, pixels_per_metre
 from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
-from bodyslam_jax.people._skeleton import Skeleton, make_skeleton, place_points
+from bodyslam_jax.people._skeleton import (
+    NUM_SHAPE,
+    Skeleton,
+    make_skeleton,
+    place_points,
+)
 from bodyslam_jax.people._starts import best_path
 from bodyslam_jax.people._terms import DEPTH_FLOOR, robust
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
@@ -155,7 +160,7 @@ def _place_person(
         jnp.asarray(np.concatenate([a, np.repeat(a[-1:], length, axis=0)]), dtype)
         for a in rows
     ]
-    shape = jnp.asarray(roots.shape[person], dtype)
+    shape = jnp.zeros(NUM_SHAPE, dtype).at[:10].set(roots.shape[person])
     camera = jnp.asarray(intrinsics.params, dtype)
     scale = jnp.asarray(settings.robust_scale, dtype)
     found = _place_bodies(skeleton, camera, shape, scale, *padded)
@@ -172,7 +177,7 @@ def _place_person(
 def _place_bodies(
     skeleton: Skeleton,
     intrinsics: Float[Array, " i"],
-    shape: Float[Array, " 10"],
+    shape: Float[Array, " s"],
     scale: Float[Array, ""],
     orientation: Float[Array, "t 2 3 3"],
     angles: Float[Array, "t 63"],

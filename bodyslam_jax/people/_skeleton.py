@@ -41,13 +41,34 @@ def _paths() -> np.ndarray:
 _PATH = _paths()
 
 
+# How far a detector's idea of a keypoint is from SMPL's, for one detector and person the
+# same in all frames: which keypoints (right, left), along which axis of the bone that
+# carries them (m, 1 σ). Mirrored in x. As extra shape components they are estimated
+# with the person; held at zero, a hip 3 cm off would read as legs bent by 20 degrees.
+_OFFSETS = (
+    *(((9, 12), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.04), (2, 0.02))),
+    *(((2, 5), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.025), (2, 0.02))),
+    *(((8,), axis, sigma) for axis, sigma in ((1, 0.04), (2, 0.02))),
+    *(((1,), axis, sigma) for axis, sigma in ((1, 0.03), (2, 0.02))),
+    *(((10, 13), axis, sigma) for axis, sigma in ((1, 0.02), (2, 0.015))),
+    *(((11, 14), axis, sigma) for axis, sigma in ((1, 0.02), (2, 0.015))),
+    *(((3, 6), 0, 0.02), ((4, 7), 0, 0.025)),
+    *(((0, 15, 16, 17, 18), axis, 0.02) for axis in (1, 2)),
+    *(((19, 20, 22, 23), axis, 0.02) for axis in (1, 2)),
+    *(((21, 24), axis, 0.015) for axis in (1, 2)),
+)
+NUM_SHAPE = 10 + len(_OFFSETS)
+"""β, then the detector's offsets in standard deviations."""
+_LEFT = (5, 6, 7, 12, 13, 14, 16, 18, 19, 20, 21)
+
+
 class Skeleton(eqx.Module):
     """Offsets of 24 joints and 25 keypoints from what carries them, at rest."""
 
     offset: Float[Array, "49 3"]
     """m, β = 0; the pelvis' own is 0."""
-    offset_shape: Float[Array, "49 3 10"]
-    """Change per unit of β, m."""
+    offset_shape: Float[Array, "49 3 s"]
+    """Change per unit of each shape component, m: `NUM_SHAPE` of them."""
 
 
 class Points(eqx.Module):
@@ -57,7 +78,7 @@ class Points(eqx.Module):
     keypoints: Float[Array, "25 3"]
     by_angle: Float[Array, "25 21 3 3"]
     """Of a coordinate (last axis) by a component of the angle of joints 1 to 21."""
-    by_shape: Float[Array, "25 3 10"]
+    by_shape: Float[Array, "25 3 s"]
 
 
 @eqx.filter_jit
@@ -75,12 +96,17 @@ def make_skeleton(body: BodyModel, bias: float) -> Skeleton:
     dtype = body.joint_template.dtype
     rest = np.asarray(_at_rest(body, jnp.asarray(bias, dtype)), float)
     offset = rest - np.where(_CARRIER[:, None] >= 0, rest[:, _CARRIER], 0.0)
-    by_shape = np.moveaxis(offset[1:] - offset[0], 0, -1)
+    by_shape = np.zeros((49, 3, NUM_SHAPE))
+    by_shape[..., :10] = np.moveaxis(offset[1:] - offset[0], 0, -1)
+    for column, (points, axis, sigma) in enumerate(_OFFSETS, start=10):
+        for point in points:
+            mirrored = axis == 0 and point not in _LEFT
+            by_shape[24 + point, axis, column] = -sigma if mirrored else sigma
     return Skeleton(jnp.asarray(offset[0], dtype), jnp.asarray(by_shape, dtype))
 
 
 def place_points(
-    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " 10"]
+    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " s"]
 ) -> tuple[Float[Array, "24 3"], Float[Array, "25 3"]]:
     """Joints and keypoints in H, m, without derivatives."""
     orientation = _orientations(jaxlie.SO3.exp(angles.reshape(21, 3)).as_matrix())
@@ -91,7 +117,7 @@ def place_points(
 
 
 def pose_points(
-    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " 10"]
+    skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " s"]
 ) -> Points:
     """The same with derivatives."""
     theta = angles.reshape(21, 3)

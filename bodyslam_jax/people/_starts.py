@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.camera import unproject
-from bodyslam_jax.people._skeleton import place_points
+from bodyslam_jax.people._skeleton import NUM_SHAPE, place_points
 from bodyslam_jax.people._terms import (
     DEPTH_FLOOR,
     Fit,
@@ -103,7 +103,7 @@ def _all_starts(
 
     def one(uv: Array, sigma: Array) -> tuple[Fit, Array]:
         starts = _frame_starts(scene, uv, sigma)
-        shape = jnp.zeros(10, uv.dtype)
+        shape = jnp.zeros(NUM_SHAPE, uv.dtype)
         value = jax.vmap(lambda fit: cost(scene, fit, shape, uv, sigma))(starts)
         return starts, value + 0.5 * jnp.sum(starts.latent**2, -1)
 
@@ -121,7 +121,7 @@ def _frame_starts(
     turned = jax.vmap(lambda a: jaxlie.SO3.from_y_radians(a).as_matrix())(angles)
     orientation = _roll(uv, sigma) @ facing @ turned
     latent = scene.prior.typical
-    shape = jnp.zeros(10, dtype)
+    shape = jnp.zeros(NUM_SHAPE, dtype)
     local = jax.vmap(
         lambda z: place_points(scene.skeleton, scene.prior.angles(z), shape)[1]
     )(latent)
@@ -182,7 +182,7 @@ def _descend(
     **Returns:** the fits, their costs, and their joints about the pelvis, in C.
     """
     scene, steps = shared
-    shape = jnp.zeros(10, uv.dtype)
+    shape = jnp.zeros(NUM_SHAPE, uv.dtype)
     size = 6 + fits.latent.shape[-1]
     prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
 

@@ -72,16 +72,16 @@ class Normal(eqx.Module):
     """Gauss--Newton normal equations of one frame."""
 
     hessian: Float[Array, "*b n n"]
-    cross: Float[Array, "*b n 10"]
+    cross: Float[Array, "*b n s"]
     """Between the frame's unknowns and the shape."""
-    shape_hessian: Float[Array, "*b 10 10"]
+    shape_hessian: Float[Array, "*b s s"]
     gradient: Float[Array, "*b n"]
-    shape_gradient: Float[Array, "*b 10"]
+    shape_gradient: Float[Array, "*b s"]
     cost: Float[Array, "*b"]
 
 
 def joints_about_pelvis(
-    scene: Scene, fit: Fit, shape: Float[Array, " 10"]
+    scene: Scene, fit: Fit, shape: Float[Array, " s"]
 ) -> Float[Array, "24 3"]:
     """Joints relative to the pelvis, in C, m."""
     angles = scene.prior.angles(fit.latent)
@@ -91,7 +91,7 @@ def joints_about_pelvis(
 def cost(
     scene: Scene,
     fit: Fit,
-    shape: Float[Array, " 10"],
+    shape: Float[Array, " s"],
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],
 ) -> Float[Array, ""]:
@@ -112,7 +112,7 @@ def cost(
 def linearise(
     scene: Scene,
     fit: Fit,
-    shape: Float[Array, " 10"],
+    shape: Float[Array, " s"],
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],
 ) -> Normal:
