@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from bodyslam_jax.synthetic._posing import Person
-from bodyslam_jax.synthetic._room import Room, Surface, surfaces, texture_size
+from bodyslam_jax.synthetic._room import Room, Surface, texture_size
 from bodyslam_jax.synthetic._texture import make_texture
 
 _NEAR = 0.05
@@ -43,7 +43,7 @@ class Renderer:
         self.person = person
         self.intrinsics = intrinsics
         self.size = size
-        self.surfaces = surfaces(room)
+        self.surfaces = room.faces()
         self.extents = [texture_size(s, _TEXELS) for s in self.surfaces]
         textures = [
             make_texture(rng, int(h), int(w), s.kind, _TEXELS)

@@ -13,168 +13,165 @@ _CLEARANCE = 0.35
 
 
 @dataclasses.dataclass(frozen=True)
-class Room:
-    """The inside of a box, with `n` boxes in it."""
-
-    low: Float[np.ndarray, "3"]
-    """Corner of the room, m."""
-    high: Float[np.ndarray, "3"]
-    box_low: Float[np.ndarray, "n 3"]
-    """Corners of the furniture, m."""
-    box_high: Float[np.ndarray, "n 3"]
-
-
-@dataclasses.dataclass(frozen=True)
 class Surface:
     """A rectangle `origin + a edge_u + b edge_v`, a and b from 0 to 1."""
 
     origin: Float[np.ndarray, "3"]
     edge_u: Float[np.ndarray, "3"]
     edge_v: Float[np.ndarray, "3"]
-    """Along the texture's rows, downwards on walls, m."""
+    """Along the texture's columns, downwards on walls, m."""
     normal: Float[np.ndarray, "3"]
     """Unit vector to the side from which it is seen."""
     kind: str
     """`floor`, `ceiling`, `wall` or `furniture`."""
 
 
-def make_room(
-    rng: np.random.Generator,
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """A box that is turned about the vertical only."""
+
+    centre: Float[np.ndarray, "3"]
+    half: Float[np.ndarray, "3"]
+    """Half of its width, height and depth, m."""
+    yaw: float
+    """rad"""
+
+    @property
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Columns: its width, height and depth directions in the world."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    def side(self, axis: int, sign: int, inwards: bool, kind: str) -> Surface:
+        """The face whose outer normal is `sign` times direction `axis`."""
+        u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
+        axes = self.axes
+        edges = 2 * self.half * axes
+        corner = self.centre + sign * self.half[axis] * axes[:, axis]
+        down = -1.0 if v == 1 else 1.0
+        origin = corner - edges[:, u] / 2 - down * edges[:, v] / 2
+        normal = (-sign if inwards else sign) * axes[:, axis]
+        return Surface(origin, edges[:, u], down * edges[:, v], normal, kind)
+
+
+@dataclasses.dataclass(frozen=True)
+class Room:
+    """The inside of a box, with boxes in it that stand on its floor."""
+
+    walls: Box
+    boxes: tuple[Box, ...]
+
+    def faces(self) -> tuple[Surface, ...]:
+        """All rectangles that can be seen from inside."""
+        kinds = {(1, -1): "floor", (1, 1): "ceiling"}
+        room = [
+            self.walls.side(axis, sign, True, kinds.get((axis, sign), "wall"))
+            for axis in range(3)
+            for sign in (-1, 1)
+        ]
+        furniture = [
+            box.side(axis, sign, False, "furniture")
+            for box in self.boxes
+            for axis in range(3)
+            for sign in (-1, 1)
+            if (axis, sign) != (1, -1)  # what stands on the floor hides its own
+        ]
+        return (*room, *furniture)
+
+    def is_hidden(
+        self, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "l 3"]
+    ) -> Bool[np.ndarray, " l"]:
+        """Whether furniture is between `eye` and each point (slab test)."""
+        hidden = np.zeros(len(points), bool)
+        for box in self.boxes:
+            start = (eye - box.centre) @ box.axes
+            way = (points - eye) @ box.axes
+            way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+            first, second = (-box.half - start) / way, (box.half - start) / way
+            enter = np.minimum(first, second).max(axis=1)
+            leave = np.maximum(first, second).min(axis=1)
+            hidden |= (enter < leave) & (enter < 1 - 1e-4) & (leave > 1e-6)
+        return hidden
+
+
+def furnish(
     person: Float[np.ndarray, "t 3"],
     camera: Float[np.ndarray, "t 3"],
-    margin: tuple[float, float] = (1.2, 2.5),
+    rng: np.random.Generator,
+    *,
+    is_hall: bool = False,
 ) -> Room:
-    """A room around the two paths, whose furniture is in nobody's way or view.
+    """A room around two paths, whose furniture is in nobody's way or view.
 
-    `margin` is how far walls are from the paths at least and at most, m.
+    Walls are 1.2 to 2.5 m from the paths; a hall is higher and has more in its middle.
     """
     both = np.concatenate([person, camera])
-    low, high = both.min(axis=0), both.max(axis=0)
-    low, high = low - rng.uniform(*margin, 3), high + rng.uniform(*margin, 3)
-    low[1], high[1] = 0.0, max(rng.uniform(2.6, 3.2), camera[:, 1].max() + 0.4)
-    boxes_low: list[np.ndarray] = []
-    boxes_high: list[np.ndarray] = []
-    wanted = int(np.clip(0.16 * (high - low)[[0, 2]].prod(), 6, 30))
-    every = slice(None, None, 3)
-    ways = np.concatenate([person[every], camera[every]])[:, [0, 2]]
-    views = np.linspace(camera[every], person[every], 9).reshape(-1, 3)[:, [0, 2]]
+    low = both.min(axis=0) - rng.uniform(1.2, 2.5, 3)
+    high = both.max(axis=0) + rng.uniform(1.2, 2.5, 3)
+    height = rng.uniform(3.5, 5.0) if is_hall else rng.uniform(2.6, 3.2)
+    low[1], high[1] = 0.0, max(height, both[:, 1].max() + 0.4)
+    walls = Box((low + high) / 2, (high - low) / 2, 0.0)
+    wanted = int(np.clip(0.14 * (high - low)[[0, 2]].prod(), 6, 40))
+    ways = both[::3, [0, 2]]
+    views = np.linspace(camera[::3], person[::3], 9).reshape(-1, 3)[:, [0, 2]]
+    boxes: list[Box] = []
     for _ in range(40 * wanted):
-        if len(boxes_low) >= wanted:
+        if len(boxes) >= wanted:
             break
-        size = rng.uniform((0.3, 0.3, 0.3), (1.3, 2.0, 1.3))
-        size[1] *= rng.uniform(0.4, 1.0)
-        at = rng.uniform(low[[0, 2]], high[[0, 2]] - size[[0, 2]])
-        wall = rng.integers(0, 6)
-        if wall < 4:  # Two thirds of all furniture stands at a wall.
-            ends = (low, high - size)
-            at[wall // 2] = ends[wall % 2][2 * (wall // 2)]
-        a = np.array([at[0], 0.0, at[1]])
-        b = a + size
-        gap = lambda p: np.maximum(a[[0, 2]] - p, p - b[[0, 2]]).max(axis=1)
-        if gap(ways).min() < _CLEARANCE or gap(views).min() < 0.1:
+        half = 0.5 * rng.uniform((0.3, 0.3, 0.3), (1.3, 1.9, 1.3))
+        at = rng.uniform(low + half, high - half)
+        yaw = rng.uniform(0, np.pi)
+        wall = int(rng.integers(0, 4 if is_hall else 6))
+        if wall < (2 if is_hall else 4):  # Most furniture stands at a wall.
+            yaw, axis = 0.0, 2 * (wall // 2) if not is_hall else 2 * wall
+            side = rng.integers(0, 2)
+            at[axis] = ((low + half), (high - half))[side][axis]
+        at[1] = half[1]
+        box = Box(at, half, yaw)
+        if _gap(box, ways) < _CLEARANCE or _gap(box, views) < 0.1:
             continue
-        if any(
-            (a < h + 0.05).all() and (b > l - 0.05).all()
-            for l, h in zip(boxes_low, boxes_high, strict=True)
-        ):
+        radius = np.hypot(half[0], half[2])
+        inside = (at - low)[[0, 2]].min() > radius and (high - at)[
+            [0, 2]
+        ].min() > radius
+        if yaw and not inside:
             continue
-        boxes_low.append(a)
-        boxes_high.append(b)
-    return Room(
-        low,
-        high,
-        np.array(boxes_low).reshape(-1, 3),
-        np.array(boxes_high).reshape(-1, 3),
-    )
+        if all(_apart(box, other) for other in boxes):
+            boxes.append(box)
+    return Room(walls, tuple(boxes))
 
 
-def surfaces(room: Room) -> list[Surface]:
-    """All rectangles that can be seen from inside the room."""
-    kinds = {(1, 0): "floor", (1, 1): "ceiling"}
-    found = [
-        _face(room.low, room.high, axis, side, -1.0, kinds.get((axis, side), "wall"))
-        for axis in range(3)
-        for side in range(2)
-    ]
-    for low, high in zip(room.box_low, room.box_high, strict=True):
-        found += [
-            _face(low, high, axis, side, 1.0, "furniture")
-            for axis in range(3)
-            for side in range(2)
-            if (axis, side) != (1, 0)  # furniture stands on the floor
-        ]
-    return found
+def _gap(box: Box, points: Float[np.ndarray, "l 2"]) -> float:
+    """Smallest distance on the floor from a box to points, along its own axes, m."""
+    c, s = np.cos(box.yaw), np.sin(box.yaw)
+    local = (points - box.centre[[0, 2]]) @ np.array([[c, s], [-s, c]])
+    return float((np.abs(local) - box.half[[0, 2]]).max(axis=1).min())
 
 
-def _face(
-    low: Float[np.ndarray, "3"],
-    high: Float[np.ndarray, "3"],
-    axis: int,
-    side: int,
-    outward: float,
-    kind: str,
-) -> Surface:
-    """One side of a box; the image on a wall is upright."""
-    size = high - low
-    origin = low.copy()
-    origin[axis] = (low, high)[side][axis]
-    u_axis, v_axis = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
-    edge_u, edge_v, normal = np.zeros(3), np.zeros(3), np.zeros(3)
-    edge_u[u_axis], edge_v[v_axis] = size[u_axis], size[v_axis]
-    if v_axis == 1:
-        origin[1], edge_v = high[1], -edge_v
-    normal[axis] = outward * (2 * side - 1)
-    return Surface(origin, edge_u, edge_v, normal, kind)
+def _apart(a: Box, b: Box) -> bool:
+    """Whether two boxes surely do not touch, by their circles on the floor or sides."""
+    way = np.abs(a.centre - b.centre)[[0, 2]]
+    if a.yaw == b.yaw == 0.0:
+        return bool((way > a.half[[0, 2]] + b.half[[0, 2]] + 0.03).any())
+    return np.hypot(*way) > np.hypot(*a.half[[0, 2]]) + np.hypot(*b.half[[0, 2]])
 
 
-def sample_points(
-    rng: np.random.Generator, room: Room, count: int
+def landmarks_on(
+    faces: tuple[Surface, ...], density: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "l 3"], Float[np.ndarray, "l 3"]]:
-    """Points on all surfaces and the normals there; furniture has twice its share."""
-    faces = surfaces(room)
-    area = np.array(
-        [
-            np.linalg.norm(f.edge_u)
-            * np.linalg.norm(f.edge_v)
-            * (2.0 if f.kind == "furniture" else 1.0)
-            for f in faces
-        ]
-    )
-    of = np.searchsorted(np.cumsum(area) / area.sum(), rng.random(count))
-    of = np.minimum(of, len(faces) - 1)
-    a, b = rng.uniform(0.01, 0.99, (2, count, 1))
-    stack = lambda name: np.stack([getattr(f, name) for f in faces])[of]
-    points = stack("origin") + a * stack("edge_u") + b * stack("edge_v")
-    free = ~_inside(room, points)
-    return points[free], stack("normal")[free]
+    """Points on all faces, `density` a square metre, and the normals there.
 
-
-def _inside(room: Room, points: Float[np.ndarray, "l 3"]) -> Bool[np.ndarray, " l"]:
-    """Whether points of wall or floor are covered by furniture."""
-    eps = 1e-6
-    above = points[:, None] >= room.box_low - eps
-    below = points[:, None] <= room.box_high + eps
-    touching = (above & below).all(axis=2)
-    # A point on a box touches that box; it is covered if it lies on the room's
-    # boundary too.
-    edge = (np.abs(points - room.low) < eps) | (np.abs(points - room.high) < eps)
-    return touching.any(axis=1) & edge.any(axis=1)
-
-
-def is_visible(
-    room: Room, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "l 3"]
-) -> Bool[np.ndarray, " l"]:
-    """Whether no furniture is between `eye` and each point (slab test)."""
-    if not len(room.box_low):
-        return np.ones(len(points), bool)
-    way = points - eye
-    way = np.where(np.abs(way) < 1e-9, 1e-9, way)[:, None]
-    first = (room.box_low - eye) / way
-    second = (room.box_high - eye) / way
-    enter = np.minimum(first, second).max(axis=2)
-    leave = np.maximum(first, second).min(axis=2)
-    hidden = (enter < leave) & (enter < 1 - 1e-4) & (leave > 1e-6)
-    return ~hidden.any(axis=1)
+    Furniture, being nearer, has twice as many; the ceiling, being plain, half.
+    """
+    share = {"furniture": 2.0, "ceiling": 0.5}
+    points, normals = [], []
+    for face in faces:
+        area = np.linalg.norm(face.edge_u) * np.linalg.norm(face.edge_v)
+        count = rng.poisson(density * area * share.get(face.kind, 1.0))
+        a, b = rng.uniform(0.01, 0.99, (2, count, 1))
+        points.append(face.origin + a * face.edge_u + b * face.edge_v)
+        normals.append(np.tile(face.normal, (count, 1)))
+    return np.concatenate(points), np.concatenate(normals)
 
 
 def texture_size(surface: Surface, per_metre: float) -> Int[np.ndarray, "2"]:
