@@ -1,0 +1,180 @@
+"""The overlay: bodies where the camera sees them, and a video that plays."""
+
+import dataclasses
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bodyslam_jax import view
+from bodyslam_jax.body import joints, load_body_model
+from bodyslam_jax.result import Result
+from bodyslam_jax.sequence import Tracks
+
+WIDTH, HEIGHT = 160, 120
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body_model(dtype=jnp.float32)
+
+
+@eqx.filter_jit
+def _joints(body, pose, trans):
+    return joints(body, pose, jnp.zeros(10, jnp.float32), trans)
+
+
+def _scene(body, depths=(4.0,), num=4):
+    """People in rest pose, upright, straight ahead of a still camera."""
+    people = len(depths)
+    poses = np.zeros((people, num, 72))
+    poses[..., 0] = np.pi  # The camera's y points down.
+    trans = np.zeros((people, num, 3))
+    trans[..., 2] = np.array(depths)[:, None]
+    trans[..., 1] = 0.2
+    still = [
+        _joints(body, *(jnp.asarray(x[h, 0], jnp.float32) for x in (poses, trans)))
+        for h in range(people)
+    ]
+    posed = np.reshape(still, (people, 1, 24, 3)).repeat(num, axis=1)
+    return Result(
+        timestamps=np.arange(num) / 25.0,
+        T_WC=np.tile(np.eye(4), (num, 1, 1)),
+        scale=1.0,
+        intrinsics=np.array([150.0, 150.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2]),
+        landmarks=np.zeros((0, 3)),
+        poses=poses,
+        trans=trans,
+        betas=np.zeros((people, 10)),
+        joints=posed.astype(np.float64),
+        present=np.ones((people, num), bool),
+    )
+
+
+def _black():
+    return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+
+def _pixels(result, person=0):
+    """Where the joints are seen."""
+    p = result.joints[person, 0]
+    return np.round(result.intrinsics[0] * p[:, :2] / p[:, 2:] + result.intrinsics[2:4])
+
+
+def test_body_covers_its_joints(body):
+    result = _scene(body)
+    drawn = view.draw_frame(_black(), result, body, 0).any(-1)
+    for u, v in _pixels(result).astype(int):
+        assert drawn[v, u]
+    assert 0.03 < drawn.mean() < 0.1
+    rows, columns = np.nonzero(drawn)
+    assert abs(columns.mean() - (WIDTH - 1) / 2) < 2
+    tall = (rows.max() - rows.min()) * 4 / 150
+    assert 1.5 < tall < 1.9  # m
+
+
+def test_the_nearer_person_covers_the_other(body):
+    both = view.draw_frame(_black(), _scene(body, (4.0, 6.0)), body, 0).astype(int)
+    near = view.draw_frame(_black(), _scene(body, (4.0,)), body, 0).astype(int)
+    covered = near.any(-1)
+    assert np.mean(np.abs(both - near)[covered].max(-1) > 0) < 0.01
+
+
+@pytest.mark.parametrize("depth", [-3.0, 0.0, 0.1, 0.5])
+def test_at_and_behind_the_camera(body, depth):
+    """What reaches behind the camera is left out, and nothing is drawn of the rest."""
+    drawn = view.draw_frame(_black(), _scene(body, (depth,)), body, 0)
+    assert drawn.any() == (depth > 0.05)
+
+
+def test_absent_people_are_not_drawn(body):
+    result = _scene(body)
+    gone = dataclasses.replace(result, present=np.zeros_like(result.present))
+    assert not view.draw_frame(_black(), gone, body, 0).any()
+
+
+def test_coarse_body_is_nearly_the_same(body):
+    coarse, faces = view.coarse_body(body)
+    assert len(faces) < 0.35 * len(body.faces)
+    assert faces.max() < coarse.num_vertices == len(coarse.skin_weight)
+    extent = np.ptp(np.asarray(body.template), axis=0)
+    np.testing.assert_allclose(
+        np.ptp(np.asarray(coarse.template), 0), extent, atol=0.03
+    )
+
+
+def _read(path):
+    capture = cv2.VideoCapture(str(path))
+    images = []
+    while True:
+        ok, image = capture.read()
+        if not ok:
+            return np.array(images), capture.get(cv2.CAP_PROP_FPS)
+        images.append(image)
+
+
+@pytest.mark.parametrize("codec", ["VP8", "VP9"])
+def test_video_plays_without_frames(tmp_path, body, codec):
+    result = _scene(body)
+    view.write_overlay(tmp_path / "o.webm", None, result, body, codec=codec)
+    images, fps = _read(tmp_path / "o.webm")
+    assert images.shape == (4, HEIGHT, WIDTH, 3)
+    assert fps == pytest.approx(25, abs=0.1)
+    u, v = _pixels(result)[0].astype(int)
+    assert images[1, v, u].max() > 80
+
+
+def test_video_over_larger_frames_that_end_early(tmp_path, body):
+    """Frames are shrunk and the body with them; black where frames are missing."""
+    result = _scene(body, num=40)
+    frames = [np.full((HEIGHT, WIDTH, 3), 200, np.uint8)] * 2
+    path = tmp_path / "o.webm"
+    view.write_overlay(path, iter(frames), result, body, max_width=WIDTH // 2 + 1)
+    images, _ = _read(path)
+    assert images.shape == (40, HEIGHT // 2, WIDTH // 2, 3)
+    assert images[1, 5, 5].min() > 150 and images[30, 5, 5].max() < 60
+    u, v = (_pixels(result)[0] / 2).astype(int)
+    assert images[30, v, u].max() > 80
+
+
+def test_points_and_their_trails(tmp_path, body):
+    result = dataclasses.replace(_scene(body), present=np.zeros((1, 4), bool))
+    tracks = Tracks(
+        np.array([0, 1, 2, 2]),
+        np.array([7, 7, 7, 9]),
+        np.array([[20.0, 80], [30, 80], [40, 80], [20, 20]]),
+    )
+    pictures = list(
+        view._pictures(
+            None, iter(()), result, body, tracks, (WIDTH, HEIGHT), np.ones(2)
+        )
+    )
+    assert pictures[2][80, 25].any() and pictures[2][20, 20].any()
+    assert not pictures[0][20, 20].any() and not pictures[3][80, 25].any()
+
+
+def test_the_inset_follows_camera_and_person(body):
+    result = _scene(body, num=30)
+    result.T_WC[:, 0, 3] = np.linspace(0, 3, 30)
+    moving = list(
+        view._pictures(None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2))
+    )
+    corner = np.s_[10:50, -50:-10]
+    assert np.abs(moving[29][corner].astype(int) - moving[0][corner]).max() > 60
+
+
+def test_a_video_cut_short_is_an_error(tmp_path, body):
+    path = tmp_path / "o.webm"
+    view.write_overlay(path, None, _scene(body, num=30), body)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(OSError, match="frames written; disk full"):
+        view._check(path, 30)
+
+
+def test_one_frame_and_nobody(tmp_path, body):
+    result = _scene(body, depths=(), num=1)
+    view.write_overlay(tmp_path / "o.webm", None, result, body)
+    assert len(_read(tmp_path / "o.webm")[0]) == 1
