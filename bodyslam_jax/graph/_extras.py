@@ -118,6 +118,58 @@ class RootSmoothness(AbstractFrameFactor):
         return (now - 2 * before + first) / data
 
 
+class RootTurning(AbstractFrameFactor):
+    """The person keeps turning in the world as before: angular velocities, as rotation
+    vectors from k-2 to k-1 and from k-1 to k, are the same."""
+
+    sigma: Float[Array, "h t"]
+    """rad per frame squared; `inf` where a frame of the three is missing."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("sigma",)
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return tuple((name, lag) for name in ("camera", "root") for lag in range(3))
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        now, before, first = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
+        return (_log(before.T @ now) - _log(first.T @ before)) / data
+
+
+class RootOrientation(AbstractFrameFactor):
+    """Regressed orientation of the person in the camera, `Log(C̃_CH^T C_CH)`, with
+    errors that last as those of `Posture` do."""
+
+    orientation: Float[Array, "h t 3 3"]
+    """C̃_CH"""
+    sigma: Float[Array, "h t"]
+    """Stationary standard deviation per axis, rad; `inf` where not measured."""
+    correlation: Float[Array, "h t"]
+    """ρ between the errors of k-1 and k; 0 at the start of a run."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("orientation", "sigma", "correlation")
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("root", 0), ("root", 1)
+
+    def data(self):
+        previous = jnp.roll(self.orientation, 1, axis=1)
+        return self.orientation, previous, self.sigma, self.correlation
+
+    def local(self, data, window, shared):
+        measured, previous, sigma, correlation = data
+        error = _log(measured.T @ window[0].root[:3, :3])
+        before = _log(previous.T @ window[1].root[:3, :3])
+        error = error - correlation * before
+        return error / jnp.sqrt(1 - correlation**2) / sigma
+
+
 class StanceFoot(AbstractFrameFactor):
     """The foot that carries the weight does not move in the world, between k-1 and k.
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.camera import project
+from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State, compose
 
@@ -80,6 +81,12 @@ class AbstractFrameFactor(AbstractFactor):
         self, data: Any, window: tuple[Frame, ...], shared: Shared
     ) -> Float[Array, "*m d"]:
         """The residual of one frame; `window[lag]` is the frame that far back."""
+
+    def jacobian(
+        self, data: Any, window: tuple[Frame, ...], shared: Shared
+    ) -> tuple[Float[Array, "*m d"], dict[str, Float[Array, "*m d n"]]] | None:
+        """The residual and, if known in closed form, its derivatives by variable."""
+        return None
 
     @property
     def num_lags(self) -> int:
@@ -165,6 +172,29 @@ class JointReprojection(AbstractFrameFactor):
         )
         p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
         return (project(shared.intrinsics, p_C) - pixel) / sigma[:, None]
+
+    def jacobian(self, data, window, shared):
+        pixel, sigma = data
+        (frame,) = window
+        C_CH = frame.root[:3, :3]
+        p_H, by_pose, by_shape = keypoint_jacobian(
+            self.body, frame.pose, shared.shape, self.layout, self.bias
+        )
+        p_C = p_H @ C_CH.T + frame.root[:3, 3]
+        seen, push = jax.linearize(lambda p: project(shared.intrinsics, p), p_C)
+        basis = jnp.eye(3, dtype=p_C.dtype)
+        by_C = jnp.stack([push(jnp.broadcast_to(e, p_C.shape)) for e in basis], -1)
+        by_C = by_C / sigma[:, None, None]
+        by_H = by_C @ C_CH
+        by_intrinsics = jax.jacfwd(lambda i: project(i, p_C))(shared.intrinsics)
+        # p_C = C Exp(ω) p_H + r: dp_C/dω = -C [p_H]x, row by row the cross product.
+        turn = jnp.cross(p_H[:, None, :], by_H)
+        return (seen - pixel) / sigma[:, None], {
+            "root": jnp.concatenate([turn, by_C], axis=-1),
+            "pose": jnp.einsum("kdi,ikm->kdm", by_H, by_pose),
+            "shape": by_H @ by_shape,
+            "intrinsics": by_intrinsics / sigma[:, None, None],
+        }
 
 
 class HumanMotion(AbstractFrameFactor):

@@ -31,10 +31,11 @@ MAX_DAMPING = 1e12
 
 
 class History(eqx.Module):
-    """One row an iteration, of which the first `num_steps` are filled."""
+    """One entry an iteration, of which the first `num_steps` are filled."""
 
-    cost: Float[Array, " n"]
-    terms: Float[Array, "n k"]
+    cost: Float[Array, " n+1"]
+    """Before each iteration, and after the last."""
+    terms: Float[Array, "n+1 k"]
     """By factor, in the order of the problem."""
     damping: Float[Array, " n"]
     step: Float[Array, " n"]
@@ -46,9 +47,11 @@ class _Loop(eqx.Module):
     prediction: Any
     observations: tuple[Observations, ...]
     lin: Linearisation
-    cost: Float[Array, ""]
+    stale: Bool[Array, ""]
+    """Whether `lin` is of an earlier state."""
     damping: Float[Array, ""]
     growth: Float[Array, ""]
+    cost: Float[Array, ""]
     steps: Int[Array, ""]
     done: Bool[Array, ""]
     result: optx.RESULTS
@@ -68,27 +71,24 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     max_history: int = eqx.field(static=True, default=256)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        prediction = args.predict(y)
-        problem: Problem = args.with_prediction(prediction)
-        observations = gather(problem)
         dtype = y.scale.dtype
-        n, k = self.max_history, len(problem.factors)
-        cost = problem.cost(y)
+        n, k = self.max_history, len(args.factors)
+        observations = gather(args)
+        struct = eqx.filter_eval_shape(linearise, args, observations, y)
         return _Loop(
-            prediction=prediction,
+            prediction=args.predict(y),
             observations=observations,
-            lin=linearise(problem, observations, y),
-            cost=cost,
+            lin=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct),
+            stale=jnp.array(True),
             damping=jnp.asarray(self.damping, dtype),
             growth=jnp.asarray(2.0, dtype),
+            cost=jnp.asarray(jnp.inf, dtype),
             steps=jnp.array(0),
             done=jnp.array(False),
-            result=optx.RESULTS.where(
-                jnp.isfinite(cost), optx.RESULTS.successful, optx.RESULTS.nonfinite
-            ),
+            result=optx.RESULTS.successful,
             history=History(
-                jnp.zeros(n, dtype),
-                jnp.zeros((n, k), dtype),
+                jnp.zeros(n + 1, dtype),
+                jnp.zeros((n + 1, k), dtype),
                 jnp.zeros(n, dtype),
                 jnp.zeros(n, dtype),
                 jnp.zeros(n, bool),
@@ -96,64 +96,66 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
-        problem: Problem = args.with_prediction(state.prediction)
-        lin, dtype = state.lin, y.scale.dtype
-        sizes = sizes_of(problem, y)
+        dtype = y.scale.dtype
+        sizes = sizes_of(args, y)
+
+        def anew(_):
+            seen = args.predict(y)
+            return linearise(args.with_prediction(seen), state.observations, y), seen
+
+        lin, prediction = jax.lax.cond(
+            state.stale, anew, lambda _: (state.lin, state.prediction), None
+        )
+        problem: Problem = args.with_prediction(prediction)
+        known = jnp.sum(lin.costs)
         diagonal = diagonals(lin, sizes)
         extra = damped(diagonal, state.damping)
         eliminated = eliminate(problem, lin, sizes, extra)
         move = solve_step(problem, y, lin, sizes, eliminated)
         length = _quadratic(problem, diagonal, move)
-        predicted = 0.5 * (state.damping * length - _slope(problem, lin, sizes, move))
+        predicted = 0.5 * (state.damping * length - _slope(problem, lin, move))
         finite = jnp.isfinite(predicted) & jnp.isfinite(length)
         move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
         trial = y.retract(move)
         terms = jnp.stack([f.cost(trial) for f in problem.factors])
         cost = jnp.sum(terms)
-        decrease = state.cost - cost
-        gain = decrease / jnp.where(predicted > 0, predicted, 1.0)
+        gain = (known - cost) / jnp.where(predicted > 0, predicted, 1.0)
         accept = finite & (predicted > 0) & (gain > GAIN)
-
-        def accepted(_):
-            seen = problem.predict(trial)
-            new = problem.with_prediction(seen)
-            fresh = linearise(new, state.observations, trial)
-            return trial, seen, fresh, cost if seen is None else new.cost(trial)
-
-        def rejected(_):
-            return y, state.prediction, lin, state.cost
-
-        new_y, prediction, lin, new_cost = jax.lax.cond(
-            accept, accepted, rejected, None
-        )
         shrink = jnp.maximum(1 - (2 * gain - 1) ** 3, 1 / 3)
         lower = jnp.maximum(state.damping * shrink, self.min_damping)
-        raise_ = jnp.maximum(state.damping, self.min_damping) * state.growth
-        floor = 4 * jnp.finfo(dtype).eps
-        small = predicted <= jnp.maximum(self.rtol, floor) * state.cost
-        done = finite & small & (accept | (predicted <= floor * state.cost))
-        done = done & ((state.damping <= 1e-2) | (predicted <= floor * state.cost))
-        stuck = ~accept & (raise_ > MAX_DAMPING)
-        at = state.steps
-        history = History(
-            state.history.cost.at[at].set(cost, mode="drop"),
-            state.history.terms.at[at].set(terms, mode="drop"),
-            state.history.damping.at[at].set(state.damping, mode="drop"),
-            state.history.step.at[at].set(jnp.sqrt(length), mode="drop"),
-            state.history.accepted.at[at].set(accept, mode="drop"),
+        higher = jnp.maximum(state.damping, self.min_damping) * state.growth
+        # Below the rounding of the cost itself, no decrease can be seen.
+        floor = 8 * jnp.finfo(dtype).eps * known
+        tiny = predicted <= floor
+        small = predicted <= jnp.maximum(self.rtol * known, floor)
+        done = finite & (tiny | (small & accept & (state.damping <= 1e-2)))
+        stuck = ~accept & ~done & (higher > MAX_DAMPING)
+        broken = ~jnp.isfinite(known)
+        result = optx.RESULTS.where(
+            stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
+        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
+        old, at = state.history, state.steps
+        put = lambda rows, i, value: rows.at[i].set(value, mode="drop")
+        history = History(
+            put(put(old.cost, at, known), at + 1, jnp.where(accept, cost, known)),
+            put(put(old.terms, at, lin.costs), at + 1, terms),
+            put(old.damping, at, state.damping),
+            put(old.step, at, jnp.sqrt(length)),
+            put(old.accepted, at, accept),
+        )
+        new_y = jax.tree.map(lambda a, b: jnp.where(accept, a, b), trial, y)
         loop = _Loop(
             prediction=prediction,
             observations=state.observations,
             lin=lin,
-            cost=new_cost,
-            damping=jnp.where(accept, lower, raise_),
+            stale=accept,
+            damping=jnp.where(accept, lower, higher),
             growth=jnp.where(accept, 2.0, 2 * state.growth).astype(dtype),
+            cost=jnp.where(accept, cost, known),
             steps=state.steps + 1,
             done=done,
-            result=optx.RESULTS.where(
-                stuck, optx.RESULTS.nonlinear_divergence, state.result
-            ),
+            result=result,
             history=history,
         )
         return new_y, loop, None
@@ -179,7 +181,7 @@ def _quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]
     return total
 
 
-def _slope(problem, lin, sizes, step):
+def _slope(problem, lin, step):
     """`g^T δ`"""
     total = jnp.sum(lin.globals_gradient * _globals({"globals": lin.globals}, step))
     gradient = lin.gradient

@@ -20,8 +20,6 @@ from bodyslam_jax.graph import (
     Reprojection,
     Shared,
     State,
-    retract_pose,
-    retract_rotation,
 )
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
@@ -75,6 +73,8 @@ class Linearisation(eqx.Module):
     globals: Float[Array, "g g"]
     globals_gradient: Float[Array, " g"]
     landmarks: tuple[LandmarkBlocks, ...]
+    costs: Float[Array, " k"]
+    """Of each factor."""
 
 
 class Observations(eqx.Module):
@@ -120,7 +120,12 @@ def linearise(
         elif isinstance(factor, AbstractFrameFactor):
             _frames(problem, factor, state, sums)
     return Linearisation(
-        sums.blocks, sums.gradient, sums.globals, sums.globals_gradient, landmarks
+        sums.blocks,
+        sums.gradient,
+        sums.globals,
+        sums.globals_gradient,
+        landmarks,
+        jnp.stack(sums.costs),
     )
 
 
@@ -131,6 +136,7 @@ class _Sums:
         self.sizes = sizes
         self.blocks: dict[tuple[str, str, int], Array] = {}
         self.gradient: dict[str, Array] = {}
+        self.costs: list[Array] = []
         dtype = state.scale.dtype
         self.globals = jnp.zeros((sizes.globals, sizes.globals), dtype)
         self.globals_gradient = jnp.zeros(sizes.globals, dtype)
@@ -163,6 +169,7 @@ def _frames(problem, factor, state, sums):
     sizes, variables = sums.sizes, problem.variables
     touches = [t for t in factor.touches if _GROUP[t[0]] in variables]
     if not touches:
+        sums.costs.append(factor.cost(state))
         return
     local = [t for t in touches if t[0] in ("pose", "root", "camera")]
     common = [t[0] for t in touches if t[0] not in ("pose", "root", "camera")]
@@ -175,25 +182,38 @@ def _frames(problem, factor, state, sums):
     ends = [sum(length[: i + 1]) for i in range(len(length))]
     parts = [slice(e - n, e) for e, n in zip(ends, length, strict=True)]
 
-    def one(data, window, shared, _):
-        def moved(step):
-            if joint:
-                step = jnp.broadcast_to(step, (23, ends[-1]))
-            frames, rest = list(window), shared
-            for (name, lag), part in zip(local, parts[: len(local)], strict=True):
-                frames[lag] = _move(frames[lag], name, step[..., part])
-            for name, part in zip(common, parts[len(local) :], strict=True):
-                rest = _move_shared(rest, name, step[..., part])
-            residual = factor.local(data, tuple(frames), rest)
-            return residual, residual
+    def one(data, window, shared, turns):
+        known = factor.jacobian(data, window, shared)
+        if known is not None:
+            residual, parts_of = known
+            names = [name for name, _ in local] + common
+            jac = jnp.concatenate([parts_of[name] for name in names], axis=-1)
+        else:
 
-        zero = jnp.zeros(ends[-1], state.scale.dtype)
-        jac, residual = jax.jacfwd(moved, has_aux=True)(zero)
+            def moved(step):
+                if joint:
+                    step = jnp.broadcast_to(step, (23, ends[-1]))
+                frames, rest = list(window), shared
+                for (name, lag), part in zip(local, parts[: len(local)], strict=True):
+                    frames[lag] = _move(frames[lag], name, step[..., part], turns[lag])
+                for name, part in zip(common, parts[len(local) :], strict=True):
+                    rest = _move_shared(rest, name, step[..., part])
+                residual = factor.local(data, tuple(frames), rest)
+                return residual, residual
+
+            zero = jnp.zeros(ends[-1], state.scale.dtype)
+            jac, residual = jax.jacfwd(moved, has_aux=True)(zero)
         s = jnp.sum(residual**2, axis=-1)
         root_weight = jnp.sqrt(factor.loss.weight(s))
-        return jac * root_weight[..., None, None], residual * root_weight[..., None]
+        jac = jac * root_weight[..., None, None]
+        return jac, residual * root_weight[..., None], factor.loss.rho(s)
 
-    jac, residual = factor.map_frames(one, state)
+    turns: tuple = (None,) * factor.num_lags
+    if any(name == "pose" for name, _ in local):
+        turn = _inverse_right_jacobian(state.poses)
+        turns = tuple(shift_back(turn, lag) for lag in range(factor.num_lags))
+    jac, residual, rho = factor.map_frames(one, state, turns)
+    sums.costs.append(0.5 * jnp.sum(rho))
     if not factor.of_people:
         jac, residual = jac[None], residual[None]
     h, t = jac.shape[:2]
@@ -259,13 +279,44 @@ def shift(x: Array, lag: int) -> Array:
     return jnp.concatenate([x[:, lag:], jnp.zeros_like(x[:, :lag])], axis=1)
 
 
-def _move(frame, name, step):
+def shift_back(x: Array, lag: int) -> Array:
+    """What frame k - lag holds, at frame k; the first repeats."""
+    return x[:, jnp.maximum(jnp.arange(x.shape[1]) - lag, 0)]
+
+
+def _move(frame, name, step, turn):
+    """First order in the step, which is all that a derivative at 0 sees."""
     if name == "pose":
-        pose = retract_rotation(frame.pose, step.reshape(23, 3))
-        return Frame(frame.camera, frame.root, pose)
+        step = jnp.einsum("jab,jb->ja", turn, step.reshape(23, 3))
+        return Frame(frame.camera, frame.root, frame.pose + step)
     if name == "root":
-        return Frame(frame.camera, retract_pose(frame.root, step), frame.pose)
-    return Frame(retract_pose(frame.camera, step), frame.root, frame.pose)
+        return Frame(frame.camera, _nudge(frame.root, step), frame.pose)
+    return Frame(_nudge(frame.camera, step), frame.root, frame.pose)
+
+
+def _nudge(pose, step):
+    """`retract_pose` to first order."""
+    rotation = pose[:3, :3]
+    rotation = rotation + jnp.cross(rotation, jnp.broadcast_to(step[:3], (3, 3)))
+    top = jnp.concatenate([rotation, (pose[:3, 3] + step[3:])[:, None]], axis=1)
+    return jnp.concatenate([top, pose[3:]], axis=0)
+
+
+def _inverse_right_jacobian(rotation):
+    """`d Log(Exp(θ) Exp(δ)) / dδ` at 0, `*b 3 3`; finite below a full turn."""
+    squared = jnp.sum(rotation**2, axis=-1)[..., None, None]
+    small = squared < 1e-4
+    safe = jnp.where(small, 1.0, squared)
+    angle = jnp.sqrt(safe)
+    half = 0.5 * angle
+    factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    factor = jnp.where(small, 1 / 12 + squared / 720, factor)
+    x, y, z = (rotation[..., i] for i in range(3))
+    zero = jnp.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    eye = jnp.eye(3, dtype=rotation.dtype)
+    return eye + 0.5 * skew + factor * (skew @ skew)
 
 
 def _move_shared(shared, name, step):
@@ -302,15 +353,19 @@ def _landmarks(problem, factor, observations, state, sums):
     gradient = jnp.zeros((frames, 6), dtype)
     mixed = jnp.zeros((frames, 6, sizes.intrinsics), dtype)
     tables = []
+    cost = jnp.zeros((), dtype)
     for bucket, seen in zip(problem.layout.buckets, observations, strict=True):
         frame = frames_of(bucket.first_chunk, bucket.width)
         parts = _bucket(problem, factor.loss, bucket, seen, frame, state, sizes)
+        parts, rho = parts
         tables.append(parts[0])
+        cost = cost + 0.5 * rho
         hessian = hessian.at[frame].add(parts[1])
         gradient = gradient.at[frame].add(parts[2])
         if sizes.intrinsics:
             mixed = mixed.at[frame].add(parts[3])
             sums.add_globals(None, *_with_scale(parts[4], parts[5]))
+    sums.costs.append(cost)
     if "cameras" in sizes.variables:
         sums.add(("alone", "alone", 0), hessian)
         sums.add_gradient("camera_alone", gradient)
@@ -351,7 +406,9 @@ def _bucket(problem, loss, bucket, seen, frame, state, sizes):
     pixel, push = jax.linearize(lambda p: project(intrinsics, p), p_C)
     by_point = [push(e) for e in basis]
     error = (pixel - seen.pixel) * seen.weight[..., None]
-    root_weight = jnp.sqrt(loss.weight(jnp.sum(error**2, axis=-1)))
+    s = jnp.sum(error**2, axis=-1)
+    root_weight = jnp.sqrt(loss.weight(s))
+    total_rho = jnp.sum(loss.rho(s))
     residual = [error[..., i] * root_weight for i in range(2)]
     a = [[d[..., i] * (seen.weight * root_weight) for d in by_point] for i in range(2)]
     x, y, z = (p_C[..., i] for i in range(3))
@@ -442,7 +499,7 @@ def _bucket(problem, loss, bucket, seen, frame, state, sizes):
         )
         extra = (mixed, total, total_gradient)
     table = LandmarkBlocks(cross, to_landmarks, own, stack(gradient, 1))
-    return (table, hessian, camera_gradient, *extra)
+    return (table, hessian, camera_gradient, *extra), total_rho
 
 
 def _symmetric(entry, n, axis=1):
