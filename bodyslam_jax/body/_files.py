@@ -146,7 +146,7 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
     if zipfile.is_zipfile(file):
         arrays = {}
         try:
-            with np.load(file, allow_pickle=False) as archive:
+            with open(file, "rb") as opened, np.load(opened) as archive:
                 for name in archive.files:
                     try:
                         arrays[name] = archive[name]
