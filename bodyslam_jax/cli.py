@@ -4,6 +4,9 @@ JAX is imported inside the commands, never for `--help`. Exit codes: 0 done; 1 b
 input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 """
 
+import dataclasses
+import functools
+import inspect
 import logging
 import os
 import sys
@@ -16,6 +19,7 @@ import tyro
 from bodyslam_jax.config import Config, MotionTraining, Simulation
 
 _Input = tyro.conf.Positional[Path]
+_Preset = Literal["default", "paper"]
 _Flat = Annotated[Config, tyro.conf.arg(name="")]
 log = logging.getLogger("bodyslam_jax")
 
@@ -30,6 +34,8 @@ def run(
     camera: Path | None = None,
     tracks: Path | None = None,
     masks: Path | None = None,
+    preset: _Preset = "default",
+    settings: Path | None = None,
     config: _Flat = Config(),
 ) -> int:
     """Estimates cameras, people and map, in metres, from a video or sequence folder.
@@ -42,6 +48,8 @@ def run(
         camera: camera.json, if not in the input.
         tracks: tracks.npz made elsewhere, if not in the input.
         masks: Folder of person masks, if not in the input.
+        preset: `paper` has the weights and the first-order schedule of the paper.
+        settings: A config.yaml to start from; options beside it prevail.
         config: Settings of every stage.
     """
     from bodyslam_jax import frontend, pipeline
@@ -57,11 +65,19 @@ def run(
     return _finish(pipeline.run_to_folder(sequence, out, config), out)
 
 
-def demo(*, out: Path = Path("bodyslam_demo"), config: _Flat = Config()) -> int:
+def demo(
+    *,
+    out: Path = Path("bodyslam_demo"),
+    preset: _Preset = "default",
+    settings: Path | None = None,
+    config: _Flat = Config(),
+) -> int:
     """Renders a walker filmed by a moving camera and runs the whole pipeline on it.
 
     Args:
         out: Run folder to write.
+        preset: `paper` has the weights and the first-order schedule of the paper.
+        settings: A config.yaml to start from; options beside it prevail.
         config: Settings of every stage.
     """
     from bodyslam_jax import pipeline
@@ -207,6 +223,82 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
 }
 
 
+def base_config(argv: list[str]) -> Config:
+    """The settings that `--preset` and `--settings` start from.
+
+    **Raises:** `ValueError` if the file is not a config.yaml.
+    """
+
+    def value(flag: str) -> str | None:
+        joined = [a.partition("=")[2] for a in argv if a.startswith(f"{flag}=")]
+        after = [argv[i + 1] for i, a in enumerate(argv[:-1]) if a == flag]
+        return (joined + after + [None])[0]
+
+    config = Config.paper() if value("--preset") == "paper" else Config()
+    path = value("--settings")
+    return config if path is None else read_settings(Path(path), config)
+
+
+def read_settings(path: Path, base: Config) -> Config:
+    """`base` with what a config.yaml says.
+
+    **Raises:** `ValueError`, naming file and key, if it is not one.
+    """
+    import yaml
+
+    try:
+        found = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not YAML ({error}).") from error
+    return _merged(found, base, str(path))
+
+
+def _merged(found: Any, base: Any, where: str) -> Any:
+    if not isinstance(found, dict):
+        raise ValueError(f"{where}: found {found!r}, expected settings by name.")
+    known = {field.name for field in dataclasses.fields(base)}
+    changes = {}
+    for name, value in found.items():
+        if name not in known:
+            raise ValueError(
+                f"{where}: no setting `{name}`; expected one of {sorted(known)}."
+            )
+        old = getattr(base, name)
+        if dataclasses.is_dataclass(old):
+            value = _merged(value, old, f"{where}: {name}")
+        elif isinstance(old, tuple) and isinstance(value, list):
+            value = tuple(value)
+        elif old is not None and value is not None and type(value) is not type(old):
+            if not (isinstance(old, float) and type(value) is int):
+                raise ValueError(
+                    f"{where}: {name}: found {value!r}, expected "
+                    f"{type(old).__name__} as in {old!r}."
+                )
+            value = float(value)
+        changes[name] = value
+    return dataclasses.replace(base, **changes)
+
+
+def _starting_from(command: Callable[..., Any], config: Config) -> Callable[..., Any]:
+    """The same command with another default of its `config`."""
+    signature = inspect.signature(command)
+    if "config" not in signature.parameters:
+        return command
+    if not isinstance(signature.parameters["config"].default, Config):
+        return command
+
+    @functools.wraps(command)
+    def started(*args: Any, **kwargs: Any) -> Any:
+        return command(*args, **kwargs)
+
+    parameters = [
+        p.replace(default=config) if p.name == "config" else p
+        for p in signature.parameters.values()
+    ]
+    started.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
+    return started
+
+
 def main() -> None:
     """Runs one command and turns its outcome into an exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
@@ -215,16 +307,19 @@ def main() -> None:
     commands, prog = _COMMANDS, "bodyslam"
     if argv[:1] == ["body-model"]:
         commands, prog, argv = _BODY, "bodyslam body-model", argv[1:]
-    if not any(flag in argv for flag in ("-h", "--help")):
-        _prepare_jax()
     try:
+        base = base_config(argv)
+        commands = {name: _starting_from(c, base) for name, c in commands.items()}
+        if argv and not any(flag in argv for flag in ("-h", "--help")):
+            _prepare_jax()
         code = tyro.extras.subcommand_cli_from_dict(
             commands, prog=prog, description=__doc__.splitlines()[0], args=argv
         )
     except (OSError, ValueError) as error:
         sys.exit(f"bodyslam: {_one_line(error)}")
     except KeyboardInterrupt:
-        sys.exit("bodyslam: interrupted; the same command continues where this one was")
+        print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
+        sys.exit(130)
     sys.exit(code or 0)
 
 

@@ -45,7 +45,7 @@ class GraphWeights:
     orientation_sigma: float | None = None
     """Predicted turns of the person, rad a frame; none without it."""
     root_sigma: float | None = 0.12
-    """Regressed orientation of the person, stationary, rad per axis; none without it."""
+    """Regressed orientation, stationary, rad per axis; not used without it."""
     root_correlation: float = 0.96
     """Of its errors in successive frames at 30 fps."""
     root_turning: float | None = 0.015
@@ -236,8 +236,8 @@ class Structure:
     """Motion of points below which the camera stands still, px."""
     rotation_error: float = 1.0
     """Error of a pure rotation below which there is no parallax to use, px."""
-    min_parallax: float = 3.0
-    """Angle at the nearer points below which a camera only turns, degrees."""
+    min_baseline: float = 0.08
+    """Extent of the camera's path below which it only turns, of the distance of points."""
     min_shared: int = 12
     """Points that two successive frames must share, or there is a cut."""
 
@@ -296,3 +296,21 @@ class Config:
     def paper(cls) -> "Config":
         """Weights and schedule of section 3.6 of the paper."""
         return cls(weights=GraphWeights.paper(), solver="adam")
+
+
+@dataclasses.dataclass(frozen=True)
+class Detect:
+    """Finding people and keypoints in the images, for who has no keypoints."""
+
+    detector: str | None = None
+    """YOLOX of one's own, an ONNX file; by default YOLOX-S, fetched once."""
+    pose: str | None = None
+    """RTMPose of one's own, an ONNX file; by default DWPose-L 384x288, fetched once."""
+    offline: bool = False
+    """Never use the network."""
+    min_score: float = 0.5
+    """Score of people that are looked at."""
+    max_overlap: float = 0.45
+    """Overlap of two boxes above which they are the same person."""
+    max_people: int = 4
+    """The largest ones in an image that are looked at."""

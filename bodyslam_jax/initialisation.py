@@ -12,19 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bodyslam_jax import graph, motion
+from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.people import Roots
-from bodyslam_jax.sequence import Keypoints, Tracks
+from bodyslam_jax.sequence import Sequence, Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
 """px: what a track's noise can be; outside, it is the model that is wrong."""
-KEYPOINT_SHARE = np.array(
-    [1, 2.5, 1.2, 1, 1, 1.2, 1, 1, 2.5, 2.5, 1, 1, 2.5, 1, 1, 1, 1, 1, 1]
-    + [1.3, 1.5, 1.3, 1.3, 1.5, 1.3]
-)
-"""Keypoint noise beside the knee's, BODY_25: hips and neck are defined loosely."""
 
 
 def map_factor(
@@ -81,60 +76,96 @@ def free_people(state: graph.State) -> graph.Step:
 
 
 def keypoint_sigma(
-    keypoints: Keypoints, present: Bool[np.ndarray, "h t"], weights: GraphWeights
+    sequence: Sequence, roots: Roots, weights: GraphWeights
 ) -> Float[np.ndarray, "h t 25"]:
-    """Standard deviation of each keypoint, px: wider for loose definitions and for low
-    confidence; `inf` where there is none."""
-    confidence = np.clip(keypoints.confidence, 0, 1)
-    with np.errstate(divide="ignore"):
-        sigma = weights.keypoint_sigma * KEYPOINT_SHARE / confidence
-    return np.where((confidence > 0.05) & present[..., None], sigma, np.inf)
+    """Standard deviation of each keypoint, px; `inf` where there is none.
+
+    A detector's error is a share of the person's size in the image: its usual error in
+    metres of the body (wider for loosely defined points and for low confidence), seen
+    at the person's distance.
+    """
+    keypoints = sequence.keypoints
+    assert keypoints is not None
+    focal = float(np.mean(sequence.intrinsics.params[:2]))
+    sigma = np.full(keypoints.confidence.shape, np.inf)
+    for h in range(len(sigma)):
+        if weights.keypoint_sigma is None:
+            depth = np.maximum(roots.T_CH[h, :, 2, 3], 0.1)
+            metres = people.keypoint_sigma(keypoints, sequence.intrinsics, h)
+            sigma[h] = weights.keypoint_inflation * metres * (focal / depth)[:, None]
+        else:
+            confidence = np.clip(keypoints.confidence[h], 0, 1)
+            with np.errstate(divide="ignore"):
+                sigma[h] = weights.keypoint_sigma / confidence
+    return np.where(roots.present[..., None], sigma, np.inf)
 
 
 def people_factors(
-    keypoints: Keypoints | None,
-    roots: Roots,
-    weights: GraphWeights,
-    body: BodyModel,
+    sequence: Sequence, roots: Roots, weights: GraphWeights, body: BodyModel
 ) -> list[graph.AbstractFactor]:
-    """Keypoints, postures and shapes of `h` people."""
+    """Keypoints, postures, shapes and smooth paths of `h` people."""
     factors: list[graph.AbstractFactor] = []
-    present = roots.present
-    if keypoints is not None:
+    there = jnp.asarray(roots.present)
+    if sequence.keypoints is not None:
         factors.append(
             graph.JointReprojection(
                 body=body,
-                pixel=jnp.asarray(keypoints.uv, float),
-                sigma=jnp.asarray(keypoint_sigma(keypoints, present, weights)),
+                pixel=jnp.asarray(sequence.keypoints.uv, float),
+                sigma=jnp.asarray(keypoint_sigma(sequence, roots, weights)),
                 loss=graph.GemanMcClure(jnp.asarray(weights.keypoint_loss)),
             )
         )
-    there = jnp.asarray(present)
-    correlation = graph.runs(there, weights.posture_correlation)
+    per_frame = 30.0 / sequence.fps
+    between = lambda rho: graph.runs(there, rho**per_frame)
+    where = lambda mask, sigma: jnp.where(mask, sigma, jnp.inf)
     factors.append(
         graph.Posture(
             rotation=jnp.asarray(roots.body_pose),
-            sigma=jnp.where(there[..., None], weights.posture_sigma, jnp.inf)
-            * jnp.ones(23),
-            correlation=correlation,
+            sigma=where(there[..., None], weights.posture_sigma) * jnp.ones(23),
+            correlation=between(weights.posture_correlation),
             correlated=weights.posture_correlation > 0,
             predicted=weights.posture_predicted,
         )
     )
-    counted = present.astype(float)
+    factors.append(_shape_factor(roots, weights))
+    if weights.root_sigma is not None:
+        factors.append(
+            graph.RootOrientation(
+                orientation=jnp.asarray(roots.T_CH[..., :3, :3]),
+                sigma=where(there, weights.root_sigma),
+                correlation=between(weights.root_correlation),
+            )
+        )
+    three = jnp.asarray(_in_a_row(roots.present, 3))
+    if weights.root_turning is not None:
+        sigma = where(three, weights.root_turning * per_frame**2)
+        factors.append(graph.RootTurning(sigma))
+    if weights.root_smoothness is not None:
+        sigma = where(three, weights.root_smoothness * per_frame**2)
+        factors.append(graph.RootSmoothness(sigma))
+    return factors
+
+
+def _shape_factor(roots: Roots, weights: GraphWeights) -> graph.Shape:
+    counted = roots.present.astype(float)
     if not weights.shape_each_frame:
         counted = np.zeros_like(counted)
-        counted[np.arange(len(present)), present.argmax(axis=1)] = 1.0
-    with np.errstate(divide="ignore"):
-        sigma = weights.shape_sigma / counted
-    shape = np.broadcast_to(roots.shape[:, None], (*present.shape, 10))
-    factors.append(
-        graph.Shape(
-            shape=jnp.asarray(shape),
-            sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
-        )
+        counted[np.arange(len(counted)), roots.present.argmax(axis=1)] = 1.0
+    sigma = np.where(counted > 0, weights.shape_sigma, np.inf)
+    shape = np.broadcast_to(roots.shape[:, None], (*counted.shape, 10))
+    return graph.Shape(
+        shape=jnp.asarray(shape),
+        sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
     )
-    return factors
+
+
+def _in_a_row(present: Bool[np.ndarray, "h t"], count: int) -> Bool[np.ndarray, "h t"]:
+    """Frames that end a run of `count` frames in which the person is there."""
+    found = present.copy()
+    for lag in range(1, count):
+        found[:, lag:] &= present[:, :-lag]
+        found[:, :lag] = False
+    return found
 
 
 def motion_factor(seen: motion.Prediction, weights: GraphWeights) -> graph.HumanMotion:

@@ -92,17 +92,20 @@ def run(
     """
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
-    key = fingerprint(sequence, config)
+    key = fingerprint(sequence, config.tracking)
     with watch("tracks"):
         tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
+    key = fingerprint(key, config.structure, config.weights.landmark_loss)
     with watch("cameras"):
         cameras = cache.stage(
             "cameras", key, Cameras, lambda: _cameras(sequence, tracks, config)
         )
+    key = fingerprint(sequence, config.people_fit, config.people, config.body_model)
     with watch("people"):
         bodies = cache.stage(
-            "people", key, Bodies, lambda: _people(sequence, cameras, body, config)
+            "people", key, Bodies, lambda: _people(sequence, body, config)
         )
+    key = fingerprint(sequence, config)
     with watch("joint"):
         joint = cache.stage(
             "joint", key, Joint, lambda: _joint(sequence, cameras, bodies, body, config)
@@ -161,9 +164,7 @@ def _cameras(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     )
 
 
-def _people(
-    sequence: Sequence, cameras: Cameras, body: body_.BodyModel, config: Config
-) -> Bodies:
+def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies:
     """Bodies in the camera frame: a regressor's, cleaned, or fitted to keypoints."""
     t = sequence.num_frames
     if not config.people or (sequence.bodies is None and sequence.keypoints is None):
@@ -209,19 +210,26 @@ def _joint(
     )
     moving = cameras.kind == "moving"
     start = initialisation.ScaleStart(1.0, float("inf"))
+    stages = []
     factors = []
     if moving:
-        start = initialisation.scale_start(state, predictor)
-        state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
         factors.append(
             initialisation.map_factor(
                 cameras.tracks, cameras.keep, cameras.pixel_sigma, config.weights
             )
         )
     if len(roots.present):
-        factors += initialisation.people_factors(
-            sequence.keypoints, roots, config.weights, body
+        seen = initialisation.people_factors(sequence, roots, config.weights, body)
+        alone = [f for f in seen if not isinstance(f, graph.RootSmoothness)]
+        problem = graph.make_problem(
+            alone, state, free=initialisation.free_people(state)
         )
+        state = _solve(problem, state, config, "people", stages).state
+        factors += seen
+        if moving:
+            start = initialisation.scale_start(state, predictor)
+            log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
+            state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
         factors.append(initialisation.motion_factor(predictor(state), config.weights))
     if not factors:
         raise ValueError(f"{sequence.name}: no landmarks and no people to estimate.")
@@ -231,9 +239,8 @@ def _joint(
         motion=predictor if len(roots.present) else None,
         free=None if moving else initialisation.free_people(state),
     )
-    solution = solver.solve(problem, state, schedule=solver.PAPER_SCHEDULE)
+    solution = _solve(problem, state, config, "joint", stages)
     best = solution.state
-    log.info("graph: %s, cost %.4g", solution.status, float(solution.cost))
     return Joint(
         scale=float(best.scale),
         scale_start=start.value,
@@ -247,8 +254,38 @@ def _joint(
         intrinsics=np.asarray(best.intrinsics),
         present=roots.present,
         status=solution.status,
-        stages=(),
+        stages=tuple(stages),
     )
+
+
+def _solve(
+    problem: graph.Problem,
+    state: graph.State,
+    config: Config,
+    name: str,
+    stages: list[dict],
+) -> solver.Solution:
+    """`solver.solve` with a line for the log and one for the report."""
+    start = time.perf_counter()
+    before = float(problem.cost(state))
+    schedule = solver.PAPER_SCHEDULE if name == "joint" else (solver.Stage(),)
+    solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
+    stages.append(
+        {
+            "name": name,
+            "cost_before": before,
+            "cost_after": float(solution.cost),
+            "iterations": int(sum(int(n) for n in solution.num_steps)),
+            "seconds": round(time.perf_counter() - start, 2),
+            "status": solution.status,
+        }
+    )
+    log.info(
+        "%s: cost %.4g -> %.4g in %d steps, %s",
+        *list(stages[-1].values())[:4],
+        solution.status,
+    )
+    return solution
 
 
 def _result(

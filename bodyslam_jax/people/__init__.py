@@ -1,5 +1,6 @@
 """People: bodies from keypoints or from a regressor, made ready for the graph."""
 
+from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._fit import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people._prepare import BodyNoise as BodyNoise
