@@ -191,12 +191,15 @@ def _at(
         "trans": (1 - w) * trans[before] + w * trans[after],
         "betas": person["betas"],
         "joints": (1 - w[..., None]) * joint[before] + w[..., None] * joint[after],
-        "present": close,
+        "present": close & person["present"][nearest],
     }
 
 
 def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
-    """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10."""
+    """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10.
+
+    An optional `present` (t,) says in which frames the person is known.
+    """
     arrays = _load_npz(path)
     missing = [name for name in ("poses", "trans", "betas") if name not in arrays]
     rate = next((n for n in _RATES if n in arrays), None)
@@ -224,7 +227,17 @@ def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
         found = _float(joints(body, *as_body))
     for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
         _check_finite(path, name, array)
-    return {"poses": poses, "trans": trans, "betas": betas, "joints": found, "fps": fps}
+    present = np.ravel(arrays.get("present", np.ones(num))).astype(bool)
+    if len(present) != num:
+        raise ValueError(f"{path}: present {present.shape}, not {(num,)}.")
+    return {
+        "poses": poses,
+        "trans": trans,
+        "betas": betas,
+        "joints": found,
+        "present": present,
+        "fps": fps,
+    }
 
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
