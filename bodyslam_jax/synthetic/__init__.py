@@ -1,6 +1,14 @@
 """Exact and noisy made-up scenes, for tests, demo, notebooks and benchmarks."""
 
+from bodyslam_jax.config import Simulation as Simulation
 from bodyslam_jax.synthetic._scene import Scene as Scene
 from bodyslam_jax.synthetic._scene import look_at as look_at
 from bodyslam_jax.synthetic._scene import scene as scene
 from bodyslam_jax.synthetic._scene import walk as walk
+from bodyslam_jax.synthetic._simulate import SimulatedSequence as SimulatedSequence
+from bodyslam_jax.synthetic._simulate import simulate as simulate
+from bodyslam_jax.synthetic._writing import as_sequence as as_sequence
+from bodyslam_jax.synthetic._writing import as_truth as as_truth
+from bodyslam_jax.synthetic._writing import demo_scene as demo_scene
+from bodyslam_jax.synthetic._writing import render as render
+from bodyslam_jax.synthetic._writing import write_sequence as write_sequence

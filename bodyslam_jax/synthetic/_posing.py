@@ -19,7 +19,9 @@ class Person:
     def __init__(self, body: BodyModel, shape: Float[np.ndarray, "10"]):
         array = lambda x: np.asarray(x, np.float64)
         self.shape = shape
-        self.rest = array(body.joint_template) + array(body.joint_shape_dirs) @ shape
+        self._joint_template = array(body.joint_template)
+        self._joint_shape_dirs = array(body.joint_shape_dirs)
+        self.rest = self.rest_joints(shape)
         """Joints at rest, m, (24, 3)."""
         self.skin = array(body.template) + array(body.shape_dirs) @ shape
         """Vertices at rest, m, (v, 3)."""
@@ -31,6 +33,13 @@ class Person:
         ):
             self.weights[rows, joint] += weight
         self.picks = np.asarray(body.picks)
+
+    def rest_joints(
+        self, shape: Float[np.ndarray, "*b 10"]
+    ) -> Float[np.ndarray, "*b 24 3"]:
+        """Joints at rest of other shapes of the same body model, m."""
+        moved = np.einsum("jab,...b->...ja", self._joint_shape_dirs, shape)
+        return self._joint_template + moved
 
     def joints(
         self, poses: Float[np.ndarray, "t 24 3"], pelvis: Float[np.ndarray, "t 3"]

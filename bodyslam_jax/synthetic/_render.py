@@ -267,8 +267,10 @@ def clothes(rng: np.random.Generator, person: Person) -> Float[np.ndarray, "v 3"
     """Colours (BGR) of a shirt, trousers, shoes, skin and hair, by nearest joint."""
     joint = person.weights.argmax(axis=1)
     skin = np.array([110, 140, 190.0]) * rng.uniform(0.5, 1.15)
-    shirt, trousers = rng.uniform(40, 215, 3), rng.uniform(25, 120, 3)
-    shoes, hair = rng.uniform(20, 90, 3), rng.uniform(15, 80, 3)
+    shirt = rng.uniform(60, 190) + rng.uniform(-45, 45, 3)
+    trousers = rng.uniform(35, 110) + rng.uniform(-20, 20, 3)
+    shoes = rng.uniform(25, 80) + rng.uniform(-10, 10, 3)
+    hair = rng.uniform(15, 70) * np.array([0.7, 0.85, 1.0])
     colour = np.tile(skin, (len(joint), 1))
     colour[np.isin(joint, (3, 6, 9, 13, 14, 16, 17))] = shirt
     colour[np.isin(joint, (0, 1, 2, 4, 5))] = trousers

@@ -83,7 +83,14 @@ class Room:
     ) -> Bool[np.ndarray, " l"]:
         """Whether furniture is between `eye` and each point (slab test)."""
         hidden = np.zeros(len(points), bool)
+        if not len(points):
+            return hidden
+        low = np.minimum(points.min(axis=0), eye)
+        high = np.maximum(points.max(axis=0), eye)
         for box in self.boxes:
+            reach = np.linalg.norm(box.half)
+            if (box.centre + reach < low).any() or (box.centre - reach > high).any():
+                continue
             start = (eye - box.centre) @ box.axes
             way = (points - eye) @ box.axes
             way = np.where(np.abs(way) < 1e-9, 1e-9, way)
@@ -131,10 +138,8 @@ def furnish(
         if _gap(box, ways) < _CLEARANCE or _gap(box, views) < 0.1:
             continue
         radius = np.hypot(half[0], half[2])
-        inside = (at - low)[[0, 2]].min() > radius and (high - at)[
-            [0, 2]
-        ].min() > radius
-        if yaw and not inside:
+        to_wall = np.minimum(at - low, high - at)[[0, 2]].min()
+        if yaw and to_wall < radius:
             continue
         if all(_apart(box, other) for other in boxes):
             boxes.append(box)
@@ -153,7 +158,8 @@ def _apart(a: Box, b: Box) -> bool:
     way = np.abs(a.centre - b.centre)[[0, 2]]
     if a.yaw == b.yaw == 0.0:
         return bool((way > a.half[[0, 2]] + b.half[[0, 2]] + 0.03).any())
-    return np.hypot(*way) > np.hypot(*a.half[[0, 2]]) + np.hypot(*b.half[[0, 2]])
+    reach = np.hypot(*a.half[[0, 2]]) + np.hypot(*b.half[[0, 2]])
+    return bool(np.hypot(*way) > reach)
 
 
 def landmarks_on(

@@ -20,7 +20,8 @@ def make_texture(
 
     BRISK finds corners in it from half a metre to ten, and no part of it repeats.
     """
-    base = np.array(_BASE[kind], np.float32) * rng.uniform(0.75, 1.2, 3)
+    base = np.array(_BASE[kind], np.float32) * rng.uniform(0.8, 1.15)
+    base = base * rng.uniform(0.9, 1.1, 3)
     image = base * (1 + 0.22 * _clouds(rng, height, width))[:, :, None]
     if kind in ("floor", "ceiling"):
         _tile(rng, image, per_metre * (0.5 if kind == "floor" else 0.6))

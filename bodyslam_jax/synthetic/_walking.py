@@ -66,7 +66,7 @@ def walk_along(
     path: Float[np.ndarray, "p 2"],
     num_frames: int,
     rng: np.random.Generator,
-    max_turn: float = np.radians(40.0),
+    max_turn: float = np.radians(60.0),
 ) -> Walk:
     """`num_frames` of walking along the closed `path` (x, z in m).
 
@@ -277,8 +277,8 @@ def _steer(
         to = at(progress + _LOOK_AHEAD) - position
         off = np.arctan2(to[0], to[1]) - heading[k] - previous
         off = (off + np.pi) % (2 * np.pi) - np.pi
-        wanted = np.clip(0.12 * off, -limit, limit)
-        rate += np.clip(wanted - rate, -0.12 * limit, 0.12 * limit)
+        wanted = np.clip(0.2 * off, -limit, limit)
+        rate += np.clip(wanted - rate, -0.2 * limit, 0.2 * limit)
         previous = previous + rate
         yaw[k] = previous
         direction = heading[k] + previous

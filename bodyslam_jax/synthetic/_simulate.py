@@ -1,0 +1,179 @@
+"""The ten named sequences: a walk, a camera, a room, and what is measured of them."""
+
+import dataclasses
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.config import Simulation
+from bodyslam_jax.motion import read_motion
+from bodyslam_jax.sequence import Tracks
+from bodyslam_jax.synthetic._filming import (
+    FPS,
+    HANDLING,
+    film_following,
+    film_room,
+    floor_path,
+)
+from bodyslam_jax.synthetic._measuring import (
+    NOISE,
+    Regressed,
+    detect_keypoints,
+    regress_bodies,
+)
+from bodyslam_jax.synthetic._posing import Person
+from bodyslam_jax.synthetic._room import Room, furnish
+from bodyslam_jax.synthetic._tracking import track_points
+from bodyslam_jax.synthetic._walking import Walk, walk_along, walking_clips
+
+ASSETS = Path(__file__).parent / "assets"
+INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
+"""`fx fy cx cy`, px."""
+SIZE = (640, 480)
+"""Width and height of the image, px."""
+LENGTH = {
+    **{"E1": 600, "E2": 700, "E3": 800, "M1": 700, "M2": 800, "M3": 900, "M4": 1000},
+    **{"D1": 600, "D2": 800, "D3": 1000},
+}
+"""Frames of each sequence at 30 fps."""
+_AROUND = ("E3", "M2", "M4", "D2")
+"""Where the person walks round the camera; in the others in front of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedSequence:
+    """A sequence with everything that is true about it; world: y up, floor at 0, m."""
+
+    name: str
+    settings: Simulation
+    timestamps: Float[np.ndarray, " t"]
+    """s"""
+    intrinsics: Float[np.ndarray, "4"]
+    """`fx fy cx cy`, px."""
+    size: tuple[int, int]
+    """Width and height of the image, px."""
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """True cameras, camera to world."""
+    person: Person
+    """The true body at rest."""
+    walk: Walk
+    """The true motion."""
+    joints: Float[np.ndarray, "t 24 3"]
+    """True joints, world."""
+    room: Room
+    keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
+    """Measured pixels and confidences, BODY_25; 0 0 0 is missing."""
+    bodies: Regressed
+    """Measured bodies in the camera frame."""
+    tracks: Tracks
+    """Measured tracks of static points."""
+    landmarks: Float[np.ndarray, "l 3"]
+    """True places of the tracks' points, world."""
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "t 72"]:
+        """True poses; the root turns the body into the world."""
+        return self.walk.poses.reshape(-1, 72)
+
+    @property
+    def trans(self) -> Float[np.ndarray, "t 3"]:
+        """True pelvis joint minus `J_0(β)`, m, world."""
+        return self.walk.pelvis - self.person.rest[0]
+
+
+def simulate(
+    settings: Simulation = Simulation(), body: BodyModel | None = None
+) -> SimulatedSequence:
+    """Simulates one of the named sequences, or a variant of it.
+
+    **Arguments:**
+
+    - `settings`: which sequence, family, length, seed, motion and noise.
+    - `body`: the body model; the default body without it. Pose blend shapes are ignored.
+
+    **Raises:** `FileNotFoundError` or `ValueError`, naming the file, if the motion
+    cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames.
+    """
+    num_frames = settings.length or LENGTH[settings.sequence]
+    if num_frames < 2:
+        raise ValueError(f"length {num_frames}: a sequence needs 2 frames or more.")
+    name = f"{settings.sequence}-{settings.family}"
+    seed = zlib.crc32(name.encode()) if settings.seed is None else settings.seed
+    # One stream each, so that a noise level changes nothing that is true
+    truth, key, reg, pts = np.random.default_rng(seed).spawn(4)
+    source = settings.motion or str(ASSETS / "walking.npz")
+    clips = walking_clips(read_motion(source), source)
+
+    shape = np.clip(truth.standard_normal(10), -2.0, 2.0)
+    person = Person(body or load_body_model(), shape)
+    handling = HANDLING[settings.sequence[0]]
+    around = settings.sequence in _AROUND
+    path, place = floor_path(settings.family, around, truth)
+    walk = walk_along(person, clips, path, num_frames, truth)
+    if settings.family == "room":
+        T_WC = film_room(walk.pelvis, place, handling, truth)
+    else:
+        T_WC = film_following(walk.pelvis, handling, truth)
+    room = furnish(
+        walk.pelvis, T_WC[:, :3, 3], truth, is_hall=settings.family == "follow"
+    )
+    return measure(settings, name, person, walk, T_WC, room, (key, reg, pts))
+
+
+def measure(
+    settings: Simulation,
+    name: str,
+    person: Person,
+    walk: Walk,
+    T_WC: Float[np.ndarray, "t 4 4"],
+    room: Room,
+    streams: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
+) -> SimulatedSequence:
+    """Measures what is true; `streams` are for keypoints, bodies and tracks."""
+    level = lambda own: NOISE[own or settings.noise]
+    R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
+    to_camera = lambda x: np.einsum("tab,tjb->tja", R_CW, x - centre[:, None])
+    G, joints = person.joints(walk.poses, walk.pelvis)
+    joints_C = to_camera(joints)
+    points_C = to_camera(person.keypoints(G, joints, settings.detector_bias))
+    keypoints = detect_keypoints(
+        points_C, joints_C, INTRINSICS, SIZE, level(settings.keypoint_noise), streams[0]
+    )
+    if not settings.feet_and_face:
+        for array in keypoints:
+            array[:, [0, *range(15, 25)]] = 0.0
+    poses_C = walk.poses.copy()
+    root = Rotation.from_matrix(R_CW) * Rotation.from_rotvec(walk.poses[:, 0])
+    poses_C[:, 0] = root.as_rotvec()
+    bodies = regress_bodies(
+        person, poses_C, joints_C[:, 0], keypoints, INTRINSICS,
+        level(settings.body_noise), streams[1],
+    )  # fmt: skip
+    tracks, landmarks = track_points(
+        room, T_WC, joints_C, INTRINSICS, SIZE, level(settings.track_noise), streams[2],
+        life=HANDLING[settings.sequence[0]].track_life,
+    )  # fmt: skip
+    return SimulatedSequence(
+        name=name,
+        settings=settings,
+        timestamps=np.arange(len(T_WC)) / FPS,
+        intrinsics=INTRINSICS,
+        size=SIZE,
+        T_WC=T_WC,
+        person=person,
+        walk=walk,
+        joints=joints,
+        room=room,
+        keypoints=keypoints,
+        bodies=bodies,
+        tracks=tracks,
+        landmarks=landmarks,
+    )

@@ -1,0 +1,196 @@
+"""Simulated sequences as folders, films and the objects that the pipeline takes."""
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.config import Simulation
+from bodyslam_jax.export import write_tum
+from bodyslam_jax.result import Result
+from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
+from bodyslam_jax.synthetic._filming import FPS
+from bodyslam_jax.synthetic._render import Renderer, write_video
+from bodyslam_jax.synthetic._simulate import SimulatedSequence, simulate
+
+_MARK = "simulation.json"
+"""Settings of the simulation; a folder with it may be written again."""
+_DEMO_FRAMES = 105
+
+
+def write_sequence(
+    folder: Path, simulated: SimulatedSequence, *, tracks: bool = True
+) -> Path:
+    """Writes a sequence folder with its ground truth, whole or not at all.
+
+    A video is rendered if the settings say so. `bodies_weak_perspective.npz` holds the
+    same bodies as `bodies.npz`, as weak perspective in the crops they were seen in.
+
+    **Arguments:**
+
+    - `folder`: new, empty, or an earlier simulation, which is replaced.
+    - `tracks`: whether `tracks.npz` is written; without it tracks come from the video.
+
+    **Raises:** `ValueError` if `folder` holds something else or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: a file; expected a folder to write.")
+    if folder.exists() and any(folder.iterdir()) and not (folder / _MARK).exists():
+        raise ValueError(f"{folder}: not empty and not a simulation; choose another.")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=".simulation-", dir=folder.parent))
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written ({error.strerror}).") from None
+    try:
+        _write(partial, simulated, tracks)
+        partial.chmod(0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(partial, folder)
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written ({error.strerror}).") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return folder
+
+
+def demo_scene(folder: Path, seed: int = 0) -> Path:
+    """Renders three and a half seconds of a walker whom a camera goes along with.
+
+    Writes a sequence folder without tracks, so that they come from the video. What is
+    there of the same seed is kept.
+    """
+    settings = Simulation(
+        sequence="M1", family="follow", length=_DEMO_FRAMES, seed=seed, render=True
+    )
+    mark = Path(folder) / _MARK
+    if mark.exists() and json.loads(mark.read_text()) == dataclasses.asdict(settings):
+        return Path(folder)
+    return write_sequence(folder, simulate(settings), tracks=False)
+
+
+def render(simulated: SimulatedSequence) -> Iterator[UInt8[np.ndarray, "rows cols 3"]]:
+    """The frames (BGR) of a simulated sequence, one after the other."""
+    seed = [simulated.num_frames, *simulated.name.encode()]
+    renderer = Renderer(
+        simulated.room,
+        simulated.person,
+        simulated.intrinsics,
+        simulated.size,
+        np.random.default_rng(seed),
+    )
+    G, x = simulated.person.joints(simulated.walk.poses, simulated.walk.pelvis)
+    for k, T_WC in enumerate(simulated.T_WC):
+        yield renderer.frame(T_WC, simulated.person.vertices(G[k], x[k]))[0]
+
+
+def as_sequence(simulated: SimulatedSequence) -> Sequence:
+    """What is measured, as the readers would give it; without a video."""
+    uv, confidence = simulated.keypoints
+    bodies, t = simulated.bodies, simulated.num_frames
+    present = np.zeros((1, t), bool)
+    poses, shapes = np.zeros((1, t, 72)), np.zeros((1, t, 10))
+    trans = np.zeros((1, t, 3))
+    present[0, bodies.frame] = True
+    poses[0, bodies.frame] = bodies.poses
+    shapes[0, bodies.frame] = bodies.shapes
+    trans[0, bodies.frame] = bodies.trans
+    return Sequence(
+        name=simulated.name,
+        frames=None,
+        timestamps=simulated.timestamps,
+        intrinsics=Intrinsics(simulated.intrinsics, *simulated.size),
+        keypoints=Keypoints(uv[None], confidence[None]),
+        bodies=Bodies(present, poses, shapes, trans),
+        tracks=simulated.tracks,
+    )
+
+
+def as_truth(simulated: SimulatedSequence) -> Result:
+    """What is true, as a result that evaluation compares with."""
+    return Result(
+        timestamps=simulated.timestamps,
+        T_WC=simulated.T_WC,
+        scale=1.0,
+        intrinsics=simulated.intrinsics,
+        landmarks=simulated.landmarks,
+        poses=simulated.poses[None],
+        trans=simulated.trans[None],
+        betas=simulated.person.shape[None],
+        joints=simulated.joints[None],
+        present=np.ones((1, simulated.num_frames), bool),
+    )
+
+
+def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
+    width, height = simulated.size
+    camera = {
+        "model": "PINHOLE",
+        "width": width,
+        "height": height,
+        "params": simulated.intrinsics.tolist(),
+        "fps": FPS,
+    }
+    (folder / "camera.json").write_text(json.dumps(camera))
+    _write_keypoints(folder / "keypoints", simulated)
+    bodies = simulated.bodies
+    np.savez_compressed(
+        folder / "bodies.npz",
+        frame=bodies.frame,
+        poses=bodies.poses,
+        betas=bodies.shapes,
+        trans=bodies.trans,
+    )
+    np.savez_compressed(
+        folder / "bodies_weak_perspective.npz",
+        frame=bodies.frame,
+        poses=bodies.poses_crop,
+        betas=bodies.shapes,
+        camera=bodies.camera,
+        bbox=bodies.box,
+    )
+    if tracks:
+        np.savez_compressed(
+            folder / "tracks.npz",
+            frame=simulated.tracks.frame.astype(np.int32),
+            landmark=simulated.tracks.landmark.astype(np.int32),
+            uv=simulated.tracks.uv.astype(np.float32),
+        )
+    truth = folder / "groundtruth"
+    truth.mkdir()
+    write_tum(truth / "camera.txt", simulated.timestamps, simulated.T_WC)
+    np.save(truth / "landmarks.npy", simulated.landmarks)
+    np.savez_compressed(
+        truth / "body.npz",
+        poses=simulated.poses,
+        trans=simulated.trans,
+        betas=simulated.person.shape,
+        joints=simulated.joints,
+        mocap_framerate=np.array(FPS),
+        gender=np.array("neutral"),
+    )
+    if simulated.settings.render:
+        write_video(folder / "video.mp4", render(simulated), FPS, simulated.size)
+    settings = dataclasses.asdict(simulated.settings)
+    (folder / _MARK).write_text(json.dumps(settings, indent=1))
+
+
+def _write_keypoints(folder: Path, simulated: SimulatedSequence) -> None:
+    """One file per frame in OpenPose's layout, without a person where none is found."""
+    folder.mkdir()
+    uv, confidence = simulated.keypoints
+    for k in range(simulated.num_frames):
+        rows: Float[np.ndarray, "25 3"] = np.column_stack([uv[k], confidence[k]])
+        flat = [round(float(x), 3) for x in rows.ravel()]
+        people = [{"person_id": [-1], "pose_keypoints_2d": flat}]
+        content = {"version": 1.3, "people": people if confidence[k].any() else []}
+        path = folder / f"{simulated.name}_{k:012d}_keypoints.json"
+        path.write_text(json.dumps(content))

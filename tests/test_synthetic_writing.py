@@ -1,0 +1,125 @@
+"""Folders of simulated sequences: the readers find in them what was simulated."""
+
+import dataclasses
+import itertools
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from bodyslam_jax import synthetic
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.evaluation import read_groundtruth
+from bodyslam_jax.frontend import read_sequence
+from bodyslam_jax.frontend._bodies import read_bodies
+
+SETTINGS = synthetic.Simulation(sequence="M2", length=40, seed=3)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return synthetic.simulate(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def folder(simulated, tmp_path_factory):
+    return synthetic.write_sequence(tmp_path_factory.mktemp("a") / "m2", simulated)
+
+
+def test_readers_find_what_was_simulated(simulated, folder):
+    found, wanted = read_sequence(folder), synthetic.as_sequence(simulated)
+    assert found.warnings == ()
+    np.testing.assert_allclose(found.timestamps, wanted.timestamps, atol=1e-9)
+    np.testing.assert_array_equal(found.intrinsics.params, wanted.intrinsics.params)
+    assert not found.intrinsics.is_guess
+    np.testing.assert_array_equal(found.bodies.present, wanted.bodies.present)
+    for name in ("poses", "shapes", "trans"):
+        got, true = getattr(found.bodies, name), getattr(wanted.bodies, name)
+        np.testing.assert_allclose(got, true, atol=1e-12)
+    # Keypoint files have three decimals
+    np.testing.assert_allclose(found.keypoints.uv, wanted.keypoints.uv, atol=6e-4)
+    np.testing.assert_array_equal(
+        found.keypoints.confidence > 0, wanted.keypoints.confidence > 5e-4
+    )
+    np.testing.assert_array_equal(found.tracks.frame, wanted.tracks.frame)
+    np.testing.assert_allclose(found.tracks.uv, wanted.tracks.uv, atol=1e-4)
+
+
+def test_truth_of_the_folder_is_the_truth(simulated, folder):
+    found = read_groundtruth(folder, load_body_model())
+    wanted = synthetic.as_truth(simulated)
+    np.testing.assert_allclose(found.T_WC, wanted.T_WC, atol=1e-7)  # nine decimals
+    for name in ("poses", "trans", "betas", "joints", "landmarks", "present"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(wanted, name), atol=1e-12
+        )
+
+
+def test_weak_perspective_says_the_same(simulated, folder):
+    intrinsics = synthetic.as_sequence(simulated).intrinsics
+    read = lambda name: read_bodies(folder / name, num_frames=40, intrinsics=intrinsics)
+    full, weak = read("bodies.npz"), read("bodies_weak_perspective.npz")
+    np.testing.assert_array_equal(full.present, weak.present)
+    np.testing.assert_allclose(full.trans, weak.trans, atol=1e-6)
+    np.testing.assert_allclose(full.poses, weak.poses, atol=1e-9)
+
+
+def test_folder_is_written_whole_and_over_nothing_else(simulated, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(ValueError, match="not empty"):
+        synthetic.write_sequence(tmp_path / "mine", simulated)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ValueError, match="a file"):
+        synthetic.write_sequence(tmp_path / "file", simulated)
+    with pytest.raises(ValueError, match="cannot be written"):
+        synthetic.write_sequence(tmp_path / "file" / "below", simulated)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "mine"]
+    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    (out / "tracks.npz").unlink()
+    assert synthetic.write_sequence(out, simulated, tracks=False) == out
+    assert not (out / "tracks.npz").exists()
+    assert json.loads((out / "simulation.json").read_text())["seed"] == 3
+
+
+def test_a_write_that_fails_leaves_nothing(simulated, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numpy.savez_compressed", full)
+    with pytest.raises(ValueError, match="No space left"):
+        synthetic.write_sequence(tmp_path / "out", simulated)
+    assert not list(tmp_path.iterdir())
+
+
+def test_video_shows_the_person_where_the_truth_is(simulated):
+    """Where the camera stands still, all that changes is the walker."""
+    still = np.repeat(simulated.T_WC[:1], 40, axis=0)
+    film = synthetic.render(dataclasses.replace(simulated, T_WC=still))
+    frames = list(itertools.islice(film, 2))
+    change = abs(frames[1].astype(float) - frames[0]).max(axis=2) > 25
+    change = cv2.erode(change.astype(np.uint8), np.ones((2, 2), np.uint8)) > 0
+    T = simulated.T_WC[0]
+    p = (simulated.joints[0] - T[:3, 3]) @ T[:3, :3]
+    uv = p[:, :2] / p[:, 2:] * simulated.intrinsics[:2] + simulated.intrinsics[2:]
+    rows, columns = np.nonzero(change)
+    assert len(rows) > 50
+    margin = 0.35 * np.ptp(uv[:, 1])  # the shadow beside the feet is the farthest
+    for found, place in ((columns, uv[:, 0]), (rows, uv[:, 1])):
+        assert found.min() > place.min() - margin
+        assert found.max() < place.max() + margin
+
+
+@pytest.mark.slow
+def test_demo_scene_is_a_sequence_with_a_video(tmp_path):
+    folder = synthetic.demo_scene(tmp_path / "demo")
+    sequence = read_sequence(folder)
+    assert sequence.frames == folder / "video.mp4"
+    assert sequence.tracks is None
+    assert 90 <= sequence.num_frames <= 120
+    before = (folder / "video.mp4").stat().st_mtime_ns
+    synthetic.demo_scene(folder)
+    assert (folder / "video.mp4").stat().st_mtime_ns == before
+    assert synthetic.demo_scene(folder, seed=1) == folder
+    assert (folder / "video.mp4").stat().st_mtime_ns != before
