@@ -103,7 +103,7 @@ class PeopleFit:
     shape_frames: float = 3.0
     """Frames' worth of evidence on shape in a whole clip: keypoint bias is the same in
     all frames, so they do not add up."""
-    motion_scale: float = 1.5
+    motion_scale: float = 2.0
     """How much less predictable than in the motion data people move."""
     depth_jitter: float = 0.005
     """Change of the depth's change from frame to frame at 30 fps, m."""
@@ -125,27 +125,27 @@ class MotionTraining:
     """Frames before the predicted one that a window holds."""
     future: int = 1
     """1 if displacement may depend on the posture of the frame it leads to, else 0."""
-    width: tuple[int, ...] = (256, 256, 256)
+    width: tuple[int, ...] = (320, 256, 256)
     """Units of the hidden layers."""
     members: int = 1
     """Networks of which displacement is the mean."""
     seed: int = 0
     """Initial weights and every random choice follow from it."""
-    epochs: int = 60
+    epochs: int = 80
     """Each has as many windows as the data have 120 Hz starting points."""
     segments: int = 128
     """Segments in a batch; each is of another person, speed and noise level."""
     steps: int = 16
     """Successive windows of a segment."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 1.5e-3
     """Adam's at the start; falls to nothing along a cosine if `decay`."""
     decay: bool = True
     """Whether the learning rate falls."""
     weight_decay: float = 1e-4
     """AdamW's."""
-    slope_weight: float = 10.0
+    slope_weight: float = 2.0
     """Penalty on the squared bias of displacement per noise level: bias is scale."""
-    segment_weight: float = 1.0
+    segment_weight: float = 0.5
     """Penalty on the mean error over a segment, beside that of single steps."""
     drift_deg: float = 10.0
     """Largest standard deviation of the slow error of joint angles, degrees."""
@@ -172,6 +172,7 @@ class MotionTraining:
             past=2,
             width=(1024,),
             epochs=100,
+            learning_rate=1e-3,
             segments=4096,
             steps=1,
             decay=False,
@@ -237,7 +238,7 @@ class Structure:
     rotation_error: float = 1.0
     """Error of a pure rotation below which there is no parallax to use, px."""
     min_baseline: float = 0.08
-    """Extent of the camera's path below which it only turns, of the distance of points."""
+    """Extent of the path below which a camera only turns, of the distance of points."""
     min_shared: int = 12
     """Points that two successive frames must share, or there is a cut."""
 

@@ -16,7 +16,7 @@ from bodyslam_jax.motion._clips import (
     leg_length,
     mirror,
     rest_from_offsets,
-    windows,
+    split,
 )
 from bodyslam_jax.motion._noise import CORRELATION
 from bodyslam_jax.motion._readers import gender
@@ -53,7 +53,9 @@ def write_cmu(path, clips, **changes):
         poses=np.concatenate([clip.poses for clip in clips]),
         trans=np.concatenate([clip.trans for clip in clips]),
         fps=np.int32(30),
-        parents=np.array([-1, 0, 0, 0, *range(1, 10), 9, 9, *range(12, 15), *range(16, 22)]),
+        parents=np.array(
+            [-1, 0, 0, 0, *range(1, 10), 9, 9, *range(12, 15), *range(16, 22)]
+        ),
         seq_start=np.cumsum([0, *lengths[:-1]]),
         seq_length=np.array(lengths),
         seq_name=np.array([clip.name for clip in clips]),
@@ -76,7 +78,9 @@ def write_amass(path, t=50, rate=120.0, key="mocap_framerate", **changes):
     rng = np.random.default_rng(0)
     arrays = {
         "poses": rng.normal(0, 0.1, (t, 156)),
-        "trans": np.stack([np.arange(t) / rate, 0 * np.arange(t), 0.93 + 0 * np.arange(t)], -1),
+        "trans": np.stack(
+            [np.arange(t) / rate, 0 * np.arange(t), 0.93 + 0 * np.arange(t)], -1
+        ),
         "betas": np.zeros(16),
         "gender": np.array(b"female"),
         key: np.array(rate),
@@ -107,7 +111,10 @@ def test_amass_split_into_root_and_body(tmp_path):
         whole = dict(archive)
     poses = whole.pop("poses")
     np.savez(
-        tmp_path / "s" / "b.npz", root_orient=poses[:, :3], pose_body=poses[:, 3:66], **whole
+        tmp_path / "s" / "b.npz",
+        root_orient=poses[:, :3],
+        pose_body=poses[:, 3:66],
+        **whole,
     )
     first, second = read_motion(tmp_path)
     np.testing.assert_array_equal(first.poses, second.poses)
@@ -241,7 +248,12 @@ def test_phases_are_put_together_again():
     dense = make_clip(83, fps=120.0)
     parts = [
         dataclasses.replace(
-            dense, fps=30.0, poses=dense.poses[i::4], trans=dense.trans[i::4], phase=i, phases=4
+            dense,
+            fps=30.0,
+            poses=dense.poses[i::4],
+            trans=dense.trans[i::4],
+            phase=i,
+            phases=4,
         )
         for i in (2, 0, 3, 1)
     ]
@@ -249,12 +261,6 @@ def test_phases_are_put_together_again():
     assert whole.fps == 120
     np.testing.assert_array_equal(whole.poses, dense.poses[:80])
     assert interleave(parts[:2]) == tuple(sorted(parts[:2], key=lambda c: c.phase))
-
-
-def test_windows_overlap_or_do_not():
-    assert windows(7, 2).tolist()[:2] == [[0, 1, 2], [1, 2, 3]]
-    chunks = windows(10, 2, sliding=False)
-    assert chunks.tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
 def test_mirroring_twice_changes_nothing():
@@ -269,7 +275,32 @@ def test_fitted_shape_has_the_legs_of_the_subject():
     body = load_body_model()
     shape = jnp.asarray([1.0, -0.5, 0.3, 0, 0, 0, 0, 0, 0, 0], body.template.dtype)
     rest = np.asarray(rest_joints(body, shape), float)
-    parents = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
+    parents = [
+        -1,
+        0,
+        0,
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+        7,
+        8,
+        9,
+        9,
+        9,
+        12,
+        13,
+        14,
+        16,
+        17,
+        18,
+        19,
+        20,
+        21,
+    ]
     offsets = np.zeros((24, 3))
     for k in range(1, 24):
         offsets[k] = rest[k] - rest[parents[k]]
@@ -308,3 +339,19 @@ def test_disturb_has_finite_derivatives(angle):
     poses = jnp.zeros((1, 24, 3)).at[0, :, 0].set(angle)
     slope = jax.grad(lambda p: disturb(p, 0.1 * jnp.ones_like(p)).sum())(poses)
     assert jnp.isfinite(slope).all()
+
+
+def test_no_subject_is_on_both_sides():
+    clips = [
+        make_clip(20, subject=s, split=p)
+        for s, p in zip("aabc", ["train", "other", "val", "train"])
+    ]
+    clips.append(make_clip(20, subject="b", split="other"))
+    training, validation = split(clips)
+    assert {c.subject for c in training} == {"a", "c"}
+    assert [c.split for c in validation] == ["val"]
+    unnamed = [make_clip(20, subject=s, split="") for s in "abcdefghij"]
+    training, validation = split(unnamed)
+    assert len(training) == 8
+    assert not {c.subject for c in training} & {c.subject for c in validation}
+    assert split(unnamed[:1]) == ((unnamed[0],), ())

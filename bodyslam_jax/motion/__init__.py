@@ -7,7 +7,12 @@ from bodyslam_jax.config import MotionTraining as MotionTraining
 from bodyslam_jax.motion._clips import FPS as FPS
 from bodyslam_jax.motion._clips import Clip as Clip
 from bodyslam_jax.motion._clips import resample as resample
+from bodyslam_jax.motion._clips import split as split
 from bodyslam_jax.motion._evaluation import evaluate_model as evaluate_model
+from bodyslam_jax.motion._figures import compare as compare
+from bodyslam_jax.motion._figures import draw_errors as draw_errors
+from bodyslam_jax.motion._figures import draw_rollout as draw_rollout
+from bodyslam_jax.motion._figures import write_table as write_table
 from bodyslam_jax.motion._noise import disturb as disturb
 from bodyslam_jax.motion._noise import drift as drift
 from bodyslam_jax.motion._placing import fit_shape as fit_shape

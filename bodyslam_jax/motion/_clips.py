@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from bodyslam_jax.motion._rotations import change, matrix, turned
 
@@ -129,17 +129,19 @@ def resample(clips: Sequence[Clip], fps: float = FPS) -> tuple[Clip, ...]:
     Any rate will do (100, 120.00004577, ...); where a new frame falls on an old one
     it is that one. The last frames are dropped rather than extrapolated.
     """
+    if not clips:
+        return ()
     index, fraction, following, new = [], [], [], []
     offset = 0
     for clip in clips:
         ratio = clip.fps / fps  # frames of the clip per new frame
         nearest = round(ratio)
-        if nearest >= 1 and abs(ratio - nearest) < 1e-4 * ratio:
+        if nearest >= 1 and abs(ratio - nearest) < 1e-3 * ratio:
             ratio = float(nearest)  # 120.00004577 is meant to be 120
         t = len(clip.poses)
         count = int(np.floor((t - 1) / ratio + 1e-6)) + 1
         position = np.minimum(np.arange(count) * ratio, t - 1)
-        low = np.minimum(position.astype(int), max(t - 2, 0))
+        low = position.astype(int)
         index.append(low + offset)
         following.append(np.minimum(low + 1, t - 1) + offset)
         fraction.append(position - low)
@@ -193,10 +195,21 @@ def interleave(clips: Sequence[Clip]) -> tuple[Clip, ...]:
     return tuple(out)
 
 
-def windows(length: int, past: int, *, sliding: bool = True) -> Int[np.ndarray, "w p"]:
-    """Frame numbers of `past` frames and their target, one row per window.
+def split(
+    clips: Sequence[Clip], share: float = 0.2, seed: int = 0
+) -> tuple[tuple[Clip, ...], tuple[Clip, ...]]:
+    """Training and validation clips; no subject is in both.
 
-    Non-overlapping windows share no frame, as in section 3.4 of the paper.
+    Where the data name validation subjects they are it; else a random `share` of the
+    subjects, at least one, unless there is only one.
     """
-    first = np.arange(0, length - past, 1 if sliding else past + 1)
-    return first[:, None] + np.arange(past + 1)
+    subjects = sorted({clip.subject for clip in clips})
+    held = {clip.subject for clip in clips if clip.split == "val"}
+    if not held and len(subjects) > 1:
+        count = max(1, round(share * len(subjects)))
+        rng = np.random.default_rng(seed)
+        held = set(rng.permutation(subjects)[:count].tolist())
+    training = tuple(clip for clip in clips if clip.subject not in held)
+    kept = {"val", ""}
+    validation = [c for c in clips if c.subject in held and c.split in kept]
+    return training, tuple(validation)

@@ -4,7 +4,7 @@ Slope is the projection of predicted on true displacement: 1 is unbiased, and it
 error becomes the error of a scale estimated with the model.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.motion._clips import FPS, Clip, resample
 from bodyslam_jax.motion._noise import disturb, drift
 from bodyslam_jax.motion._placing import Trial, place
-from bodyslam_jax.motion._predict import MotionModel, Prediction, predict
+from bodyslam_jax.motion._predict import MotionModel, Prediction, in_dtype, predict
 from bodyslam_jax.motion._rotations import change, matrix, transposed, vector
 
 WINDOW = 30
@@ -134,9 +134,7 @@ def run_trials(
             )
         )
     chunk = 16
-    model = jax.tree.map(
-        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, model
-    )
+    model, body = in_dtype(model, jnp.float32), in_dtype(body, jnp.float32)
     parts = []
     for i in range(0, len(trials), chunk):
         rows = np.arange(i, i + chunk).clip(max=len(trials) - 1)
@@ -178,7 +176,7 @@ def summary(
     )
     long_guess, long_true = _longer(guess, steps), _longer(steps.true, steps)
     out = {
-        "steps": int(valid.sum()),
+        "steps": float(valid.sum()),
         "error_mm": 1e3 * float(error.mean()),
         "step_mm": 1e3 * float(size.mean()),
         "ratio": float(error.mean() / size.mean()),
@@ -220,7 +218,8 @@ def evaluate_model(
     *,
     seeds: int = 3,
     root_drift: float = 0.0,
-    skip: int | None = None,
+    skip: int = 0,
+    constant: Float[np.ndarray, "3"] | None = None,
 ) -> dict[str, dict[str, float]]:
     """Measures a model on clips, by motion class and over `all`, with the baselines.
 
@@ -228,7 +227,8 @@ def evaluate_model(
     `seeds` times. `skip` leaves out the first frames of every clip, so that models
     with windows of different lengths are compared on the same steps. Keys of the
     result: `all` and every class, then `constant velocity` (which is told the last
-    displacement; the model is not) over all.
+    displacement; the model is not) over all, and `constant`, a displacement in
+    H_{k-1} (m) that is always predicted, if there is one.
 
     **Raises:** `ValueError` if no clip is long enough for a prediction.
     """
@@ -242,7 +242,7 @@ def evaluate_model(
     ]
     steps = Steps(*(np.concatenate(x) for x in zip(*runs, strict=True)))
     valid = steps.valid.copy()
-    valid[:, : max(skip or 0, 2)] = False
+    valid[:, : max(skip, 2)] = False
     steps = steps._replace(valid=valid)
     if not valid.any():
         raise ValueError(
@@ -256,6 +256,9 @@ def evaluate_model(
         if steps.valid[kinds == kind].any():
             out[str(kind)] = summary(select(kinds == kind))
     out["constant velocity"] = summary(steps, steps.previous)
+    if constant is not None:
+        always = np.broadcast_to(constant, steps.true.shape)
+        out["constant"] = summary(steps, always)
     return out
 
 
@@ -266,6 +269,3 @@ def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, "3"]:
         turn = np.asarray(matrix(jnp.asarray(clip.poses[:-1, 0])))
         moves.append(np.einsum("tba,tb->ta", turn, np.diff(clip.trans, axis=0)))
     return np.concatenate(moves).mean(0)
-
-
-Evaluator = Callable[[MotionModel], dict[str, float]]

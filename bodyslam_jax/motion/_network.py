@@ -70,7 +70,7 @@ def init_layers(
         weight = jax.random.normal(
             jax.random.fold_in(key, i), (rows, columns), jnp.float32
         )
-        layers.append(Layer(weight * gain, jnp.zeros(columns, jnp.float32)))
+        layers.append(Layer(weight * float(gain), jnp.zeros(columns, jnp.float32)))
     return tuple(layers)
 
 
@@ -146,14 +146,16 @@ class PaperNetwork(eqx.Module):
     def init(key: PRNGKeyArray, past: int, width: int = 1024) -> "PaperNetwork":
         keys = jax.random.split(key, 3)
         d = past * 72 + 10
-        none = lambda n: Normalisation(jnp.zeros(n), jnp.ones(n))
+        none = lambda n: Normalisation(
+            jnp.zeros(n, jnp.float32), jnp.ones(n, jnp.float32)
+        )
         return PaperNetwork(
             encoder=init_layers(keys[0], (d, width, width, width), np.sqrt(2.0)),
             position=init_layers(keys[1], (width, width, width, 3)),
             posture=init_layers(keys[2], (width, width, width, 72), 0.1),
             inputs=none(d),
             outputs=none(75),
-            spread=0.02 * jnp.eye(3),
+            spread=0.02 * jnp.eye(3, dtype=jnp.float32),
         )
 
     def normalised(self, features: Float[Array, "*b d"]) -> Float[Array, "*b 75"]:

@@ -1,9 +1,12 @@
 """From a sequence of postures to what each step must have been, in metres."""
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
@@ -72,8 +75,11 @@ def sequence_windows(
     )
 
 
-def in_dtype(model: MotionModel, dtype: jnp.dtype) -> MotionModel:
-    """The same model with weights of another precision."""
+Arrays = TypeVar("Arrays", MotionModel, BodyModel)
+
+
+def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:
+    """The same model with numbers of another precision."""
     cast = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
     return jax.tree.map(cast, model)
 

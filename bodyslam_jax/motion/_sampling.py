@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
 from bodyslam_jax.config import MotionTraining
@@ -35,6 +35,9 @@ DENSE = 4
 _CLASS_WEIGHT = {"walk": 1.0, "run": 2.0}
 _OTHER_WEIGHT = 0.15
 """How often a class is drawn; runs are few, and what is neither is slow."""
+
+_ROOT_SHARE = 0.3
+"""Share of segments in which the root's orientation errs too."""
 
 
 class Corpus(eqx.Module):
@@ -111,17 +114,20 @@ def draw(
     """Draws a batch."""
     s, l, past = settings.segments, settings.steps, settings.past
     keys = jax.random.split(key, 8)
-    row = jnp.searchsorted(data.cumulative, jax.random.uniform(keys[0], (s,)))
+    row = jnp.searchsorted(
+        data.cumulative, jax.random.uniform(keys[0], (s,), jnp.float32)
+    )
     row = jnp.minimum(row, len(data.start) - 1)
-    strides = jnp.asarray(settings.strides)
+    strides = jnp.asarray(settings.strides, jnp.int32)
     stride = strides[jax.random.randint(keys[1], (s,), 0, len(strides))]
-    frames = data.start[row, None] + stride[:, None] * jnp.arange(past + l)
+    count = jnp.arange(past + l, dtype=jnp.int32)
+    frames = data.start[row, None] + stride[:, None] * count
     inside = frames <= data.last[row, None]
     frames = jnp.minimum(frames, data.last[row, None])
     poses, path = data.poses[frames], data.path[frames]
     if settings.mirror:
         poses, path = _mirrored(jax.random.bernoulli(keys[2], 0.5, (s,)), poses, path)
-    shape = settings.shape_sigma * jax.random.normal(keys[3], (s, 10))
+    shape = settings.shape_sigma * jax.random.normal(keys[3], (s, 10), jnp.float32)
     noise = _errors(keys[4:8], s, past + l, settings)
     estimated = disturb(poses, noise)
 
@@ -178,7 +184,7 @@ def _mirrored(
 
 
 def _errors(
-    keys: PRNGKeyArray, s: int, frames: int, settings: MotionTraining
+    keys: Key[Array, "4"], s: int, frames: int, settings: MotionTraining
 ) -> Float[Array, "s f 24 3"]:
     """Drift in equal steps from none to `drift_deg` after a clean share of segments.
 
@@ -186,13 +192,16 @@ def _errors(
     a random share.
     """
     clean = settings.clean_share
-    level = jnp.clip((jnp.arange(s) / s - clean) / max(1 - clean, 1e-6), 0.0)
-    sigma = jnp.deg2rad(settings.drift_deg) * level.astype(jnp.float32)
-    white = jnp.deg2rad(settings.white_deg) * jax.random.uniform(keys[0], (s,))
-    white = jnp.where(jnp.arange(s) < clean * s * 0.7, 0.0, white)
+    place = np.arange(s) / s
+    level = np.clip((place - clean) / max(1 - clean, 1e-6), 0, None)
+    sigma = jnp.asarray(np.deg2rad(settings.drift_deg) * level, jnp.float32)
+    most = jnp.asarray(
+        np.where(place < 0.7 * clean, 0.0, np.deg2rad(settings.white_deg)), jnp.float32
+    )
+    white = most * jax.random.uniform(keys[0], (s,), jnp.float32)
     noise = jax.vmap(drift, (0, None, 0, 0))(
         jax.random.split(keys[1], s), frames, sigma, white
     )
-    share = jax.random.uniform(keys[2], (s,)) * settings.root_drift
-    share = share * jax.random.bernoulli(keys[3], 0.3, (s,))
+    share = settings.root_drift * jax.random.uniform(keys[2], (s,), jnp.float32)
+    share = jnp.where(jax.random.bernoulli(keys[3], _ROOT_SHARE, (s,)), share, 0.0)
     return noise.at[:, :, 0].multiply(share[:, None, None])

@@ -24,9 +24,9 @@ class Scale(NamedTuple):
 
 def scale_from_motion(
     prediction: Prediction,
-    orientation: Float[Array, "t 3 3"],
-    camera: Float[Array, "t 3"],
-    offset: Float[Array, "t 3"],
+    orientation: Float[Array | np.ndarray, "t 3 3"],
+    camera: Float[Array | np.ndarray, "t 3"],
+    offset: Float[Array | np.ndarray, "t 3"],
 ) -> Scale:
     """Scale `s` so that people move as their postures say, in closed form.
 

@@ -34,7 +34,7 @@ from bodyslam_jax.motion._network import (
     normalisation,
 )
 from bodyslam_jax.motion._placing import Trial, place
-from bodyslam_jax.motion._predict import MotionModel
+from bodyslam_jax.motion._predict import MotionModel, in_dtype
 from bodyslam_jax.motion._rotations import change
 from bodyslam_jax.motion._sampling import Batch, Corpus, corpus, draw
 
@@ -223,7 +223,8 @@ def run_epoch(
         value, gradient = jax.value_and_grad(
             lambda moving: loss(eqx.combine(moving, fixed), batch, settings)
         )(moving)
-        updates, state = update.update(gradient, state, moving)
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integers
+            updates, state = update.update(gradient, state, moving)
         network = eqx.combine(optax.apply_updates(moving, updates), fixed)
         done = progress.epoch * steps + number.astype(jnp.float32)
         keep = jnp.minimum(_AVERAGING, (1 + done) / (10 + done))
@@ -265,6 +266,7 @@ def train(
     **Raises:** `ValueError` if no clip is long enough, if a checkpoint belongs to
     other settings or data, or if training diverges.
     """
+    body = in_dtype(body, jnp.float32)
     data = corpus(clips, settings)
     trials = place(body, resample([c for c in validation if c.phase == 0], FPS))
     steps = -(-data.num_windows // (settings.segments * settings.steps))
