@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax import frontend
-from bodyslam_jax.body import BodyModel, joints
-from bodyslam_jax.evaluation._readers import read_tum
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.evaluation._readers import posed_joints, read_tum
 from bodyslam_jax.export._run import write_body, write_tum
 from bodyslam_jax.frontend._pickle import restricted_load
 
@@ -222,14 +221,13 @@ def _person(
     body: BodyModel,
 ) -> dict[str, Any]:
     """A person in the world, with joints of the body model."""
-    as_body = [jnp.asarray(x, body.dtype) for x in (poses, betas, trans)]
     return {
         "poses": poses,
         "trans": trans,
         "betas": betas,
         "present": present,
         "gender": gender,
-        "joints": np.asarray(joints(body, *as_body), np.float64),
+        "joints": posed_joints(body, poses, betas, trans),
     }
 
 

@@ -5,6 +5,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -223,8 +224,7 @@ def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
         if found.shape != (num, 24, 3):
             raise ValueError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
     else:
-        as_body = [jnp.asarray(x, body.template.dtype) for x in (poses, betas, trans)]
-        found = _float(joints(body, *as_body))
+        found = posed_joints(body, poses, betas, trans)
     for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
         _check_finite(path, name, array)
     present = np.ravel(arrays.get("present", np.ones(num))).astype(bool)
@@ -239,6 +239,26 @@ def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
         "fps": fps,
     }
 
+
+def posed_joints(
+    body: BodyModel,
+    poses: Float[np.ndarray, "t 72"],
+    betas: Float[np.ndarray, " 10"],
+    trans: Float[np.ndarray, "t 3"],
+) -> Float[np.ndarray, "t 24 3"]:
+    """Joints of a body model, m, in padded chunks: one compilation for all lengths."""
+    found = []
+    for start in range(0, len(poses), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        missing = _CHUNK - len(poses[part])
+        pose, place = (np.pad(x[part], ((0, missing), (0, 0))) for x in (poses, trans))
+        as_body = [jnp.asarray(x, body.dtype) for x in (pose, betas, place)]
+        found.append(_float(_joints(body, *as_body))[: _CHUNK - missing])
+    return np.concatenate(found)
+
+
+_CHUNK = 256
+_joints = eqx.filter_jit(joints)
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 
