@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.frontend._bundle import Views
-from bodyslam_jax.frontend._geometry import fit_rotation, relative_pose, unit_rays
+from bodyslam_jax.frontend._geometry import fit_rotation, unit_rays
 
 
 def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
@@ -46,20 +46,21 @@ def choose_keyframes(
     return np.asarray(chosen)
 
 
-def stillness(views: Views) -> float:
-    """How far points wander in the image: median over points of the 90th percentile of
-    the distance from their own median place, in depth-1 units."""
-    ordered = np.argsort(views.landmark, kind="stable")
+def stillness(views: Views, window: int = 10) -> float:
+    """How far points wander in the image, at depth 1: the median over points of the
+    distance between the median places in their first and farthest `window` frames."""
+    ordered = np.lexsort((views.frame, views.landmark))
     landmark, xy = views.landmark[ordered], views.xy[ordered]
     starts = np.flatnonzero(np.diff(landmark, prepend=-1))
     lengths = np.diff(np.append(starts, len(landmark)))
-    long = lengths >= max(5, 0.5 * np.percentile(lengths, 90))
+    long = lengths >= max(2, 0.5 * np.percentile(lengths, 90))
     wander = []
     for start, length in zip(starts[long], lengths[long], strict=True):
         points = xy[start : start + length]
-        away = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
-        wander.append(np.percentile(away, 90))
-    return float(np.median(wander)) if wander else 0.0
+        parts = np.array_split(points, max(2, length // window))
+        places = np.array([np.median(part, axis=0) for part in parts])
+        wander.append(np.linalg.norm(places - places[0], axis=-1).max())
+    return float(np.median(wander)) if wander else np.inf
 
 
 def rotation_error(
@@ -83,20 +84,6 @@ def rotation_error(
             _, away = fit_rotation(*rays, scale)
             rows.append((a, b, np.median(away), len(at_a)))
     return np.asarray(rows, dtype=np.float64).reshape(-1, 4)
-
-
-def parallax(views: Views, a: int, b: int, threshold: float) -> float:
-    """Angle (rad) between the rays of the nearer points that two frames share: the 90th
-    percentile after the rotation of the essential matrix; 0 if there is none."""
-    by_frame = _by_frame(views)
-    _, i, j = np.intersect1d(by_frame[a][0], by_frame[b][0], return_indices=True)
-    xy_a, xy_b = by_frame[a][1][i], by_frame[b][1][j]
-    pose = relative_pose(xy_a, xy_b, threshold)
-    if pose is None or pose[2].sum() < 5:
-        return 0.0
-    R, _, good = pose
-    apart = np.linalg.norm(unit_rays(xy_b) - unit_rays(xy_a) @ R.T, axis=-1)
-    return float(np.percentile(apart[good], 90))
 
 
 def rotations_only(

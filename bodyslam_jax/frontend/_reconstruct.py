@@ -14,7 +14,6 @@ from bodyslam_jax.frontend._bundle import Scene, Views, errors
 from bodyslam_jax.frontend._camera_motion import (
     choose_keyframes,
     find_cuts,
-    parallax,
     rotation_error,
     rotations_only,
     stillness,
@@ -82,7 +81,11 @@ def reconstruct(
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
     if len(np.unique(shot.frame)) < 2:
-        return _nothing(problem, "failed", (*warnings, "too few background points."))
+        seen = np.bincount(views.frame, minlength=num_frames) if len(xy) else [0]
+        text = f"too few background points: {np.median(seen):.0f} a frame."
+        if num_frames < 2:
+            text = "one frame shows no motion."
+        return _nothing(problem, "failed", (*warnings, text))
     still = stillness(shot) * focal
     if still < config.static_motion:
         text = f"the camera stands still (points wander {still:.2f} px)."
@@ -90,25 +93,29 @@ def reconstruct(
     motion = config.keyframe_motion * max(intrinsics.width, intrinsics.height) / focal
     keyframes = choose_keyframes(shot, first, last, motion, config.min_shared)
     pairs = rotation_error(shot, keyframes, 1 / focal)
-    if len(pairs) and _only_turns(shot, pairs, focal, config):
-        text = (
-            "the camera turns but hardly moves: no depth from parallax, "
-            "the scale rests on the body alone."
-        )
-        return _fixed(problem, within, "rotation", 1 / focal, (*warnings, text))
-    builder = Builder(shot, num_frames, num_landmarks, focal, config, refine)
-    grown = builder.build(keyframes, _first_pairs(pairs, config.max_first_pairs))
-    if grown is None:
+    away = _turning_error(pairs) * focal / config.rotation_error
+    grown = None
+    if away > 1:
+        starts = _first_pairs(pairs, config.max_first_pairs)
+        builder = Builder(shot, num_frames, num_landmarks, focal, config, refine)
+        grown = builder.build(keyframes, starts)
+    if grown is not None:
+        builder.complete(grown, np.arange(first, last + 1))
+        inlier = np.zeros(len(tracks.frame), dtype=bool)
+        inlier[within] = grown.inlier
+        found = _moving(problem, grown, inlier, (first, last), warnings)
+        path = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
+        # A wrong focal length makes even a turning camera seem to move a little.
+        if away > 6 or path > config.min_baseline:
+            return found
+    elif away > 6:
         text = "no pair of frames has enough parallax to start a map."
         return _nothing(problem, "failed", (*warnings, text))
-    builder.complete(grown, np.arange(first, last + 1))
-    lost = np.arange(first, last + 1)[~grown.registered[first : last + 1]]
-    if len(lost):
-        text = f"{len(lost)} frames not located (from {lost[0]}): poses interpolated."
-        warnings = (*warnings, text)
-    inlier = np.zeros(len(tracks.frame), dtype=bool)
-    inlier[within] = grown.inlier
-    return _moving(problem, grown, inlier, warnings)
+    text = (
+        "the camera turns but hardly moves: no depth from parallax, the scale rests on "
+        "the body alone."
+    )
+    return _fixed(problem, within, "rotation", 1 / focal, (*warnings, text))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +138,8 @@ def _longest_shot(
     if len(starts) == 1:
         return 0, num_frames - 1, ()
     first, last = starts[best], ends[best] - 1
+    if first == last:
+        return first, last, ()
     at = ", ".join(str(k) for k in starts[1:5]) + (", ..." if len(starts) > 5 else "")
     text = (
         f"cut or lost tracking at frame {at}: only frames {first} to {last} are used."
@@ -138,21 +147,12 @@ def _longest_shot(
     return first, last, (text,)
 
 
-def _only_turns(
-    views: Views, pairs: np.ndarray, focal: float, config: Structure
-) -> bool:
-    """Whether even the pairs that a turning camera explains worst show no depth.
-
-    A wrong focal length makes a pure rotation fit badly too, by some pixels; so what
-    counts in doubt is the angle under which the nearer points are seen.
-    """
+def _turning_error(pairs: np.ndarray) -> float:
+    """Error (rad) of a pure rotation for the pairs that it explains worst."""
+    if not len(pairs):
+        return np.inf
     telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
-    worst = pairs[np.argsort(-telling)[:5]]
-    away = float(np.median(worst[:, 2])) * focal
-    if away < config.rotation_error or away > 6 * config.rotation_error:
-        return away < config.rotation_error
-    angles = [parallax(views, int(a), int(b), 1 / focal) for a, b in worst[:, :2]]
-    return float(np.median(angles)) < np.radians(config.min_parallax)
+    return float(np.median(pairs[np.argsort(-telling)[:5], 2]))
 
 
 def _first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
@@ -173,9 +173,18 @@ def _first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _moving(
-    problem: _Problem, grown: Growing, inlier: np.ndarray, warnings: tuple[str, ...]
+    problem: _Problem,
+    grown: Growing,
+    inlier: np.ndarray,
+    shot: tuple[int, int],
+    warnings: tuple[str, ...],
 ) -> Reconstruction:
     """Puts the world into the first camera and the unit at the median distance."""
+    lost = np.arange(shot[0], shot[1] + 1)
+    lost = lost[~grown.registered[lost]]
+    if len(lost):
+        text = f"{len(lost)} frames not located (from {lost[0]}): poses interpolated."
+        warnings = (*warnings, text)
     registered = grown.registered
     k0 = int(np.argmax(registered))
     R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()

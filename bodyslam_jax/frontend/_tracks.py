@@ -193,7 +193,7 @@ class _Tracker:
             cell=cell,
             quota=quota,
             distance=distance,
-        )[: 2 * missing]
+        )[: missing + self.config.num_points // 20]
         ids = np.arange(self.next_id, self.next_id + len(chosen))
         self.next_id += len(chosen)
         self.live = self.live.add(ids, uv[chosen])
