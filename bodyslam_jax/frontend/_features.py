@@ -69,11 +69,11 @@ def spread(
             lacking[i, j] -= 1
     chosen = []
     for k in np.argsort(-response):
-        x, y = int(uv[k, 0] + 0.5), int(uv[k, 1] + 0.5)
-        i, j = y // cell, x // cell
-        if not (0 <= x < size[0] and 0 <= y < size[1]) or lacking[i, j] <= 0:
+        x, y = (int(c) for c in uv[k])
+        if not (0 <= x < size[0] and 0 <= y < size[1]):
             continue
-        if blocked[y, x]:
+        i, j = y // cell, x // cell
+        if lacking[i, j] <= 0 or blocked[y, x]:
             continue
         cv2.circle(blocked, (x, y), radius, 1, -1)
         lacking[i, j] -= 1
