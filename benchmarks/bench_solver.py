@@ -2,11 +2,11 @@
 
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
-    python benchmarks/bench_solver.py breakdown --frames 1000
 
-The generator is the project's own and seeded. Compilation is outside the clock and given
-by itself; all solvers' results are judged by one cost function. Set
-`OPENBLAS_NUM_THREADS=1`: its threads and XLA's get in each other's way.
+The generator is the project's own and seeded. Compilation is outside the clock and
+given by itself; all solvers' results are judged by one cost function. Set
+`OPENBLAS_NUM_THREADS=1`: its threads and XLA's get in each other's way. Processor time
+is beside wall time, which on a shared machine says little.
 """
 
 import argparse
@@ -204,39 +204,41 @@ def start_of(problem, truth, rng, array):
     return moved
 
 
-def timed(run):
-    """Result, seconds of the first call (with compilation), median of three more."""
-    began = time.perf_counter()
-    result = jax.block_until_ready(run())
-    first = time.perf_counter() - began
-    times = []
-    for _ in range(3):
-        began = time.perf_counter()
+def timed(run, repeats):
+    """Result; wall and processor seconds of the first call (with compilation), and
+    medians of `repeats` more."""
+    rows = []
+    for _ in range(1 + repeats):
+        wall, cpu = time.perf_counter(), time.process_time()
         result = jax.block_until_ready(run())
-        times.append(time.perf_counter() - began)
-    return result, first, float(np.median(times))
+        rows.append((time.perf_counter() - wall, time.process_time() - cpu))
+    return result, rows[0], np.median(rows[1:], axis=0)
 
 
-def report(name, problem, truth, start, schedule):
-    solution, first, seconds = timed(lambda: solve(problem, start, schedule=schedule))
+def report(name, problem, truth, start, schedule, repeats):
+    run = lambda: solve(problem, start, schedule=schedule)
+    solution, first, (wall, cpu) = timed(run, repeats)
     steps = sum(int(n) for n in solution.num_steps)
     cost = float(problem.cost(solution.state))
     print(
-        f"{name:28s} {seconds:8.2f} s {seconds / steps:7.3f} s/it {steps:4d} it  "
+        f"{name:28s} {wall:7.2f} s (processor {cpu:.2f}) {wall / steps:6.3f} s/it "
+        f"({cpu / steps:.3f}) {steps:3d} it  "
         f"cost {float(problem.cost(start)):.4g} -> {cost:.8g} "
         f"(truth {float(problem.cost(truth)):.6g}) "
         f"s {float(solution.state.scale):.4f}/{float(truth.scale):.4f} "
-        f"{solution.status}; compile {first - seconds:.1f} s",
+        f"{solution.status}; compile {first[0] - wall:.1f} s "
+        f"(processor {first[1] - cpu:.1f})",
         flush=True,
     )
-    return solution, seconds
+    return solution
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["landmarks", "joint", "breakdown"])
+    parser.add_argument("what", choices=["landmarks", "joint"])
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rtol", type=float, default=1e-6)
     args = parser.parse_args()
     dtype = np.float32 if args.float32 else np.float64
@@ -246,7 +248,8 @@ def main():
         problem, truth, start = make(frames, people, dtype=dtype)
         count = len(problem.factors[0].frame)
         name = f"{frames} / {len(truth.landmarks)} / {count} {np.dtype(dtype).name}"
-        report(name, problem, truth, start, (Stage(rtol=args.rtol),))
+        schedule = (Stage(rtol=args.rtol),)
+        report(name, problem, truth, start, schedule, args.repeats)
 
 
 if __name__ == "__main__":

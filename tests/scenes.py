@@ -136,6 +136,26 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
     ]
 
 
+def extra_factors(rng, state):
+    """Everything that can be switched on, for its blocks: not all of it true."""
+    h, t = state.roots.shape[:2]
+    late = lambda *shape, skip: jnp.full(shape, 0.05).at[:, :skip].set(jnp.inf)
+    return [
+        g.OrientationChange(
+            rotation=jnp.asarray(0.05 * rng.standard_normal((h, t, 3))),
+            sigma=late(h, t, skip=1),
+        ),
+        g.CameraPrior(cameras=state.cameras, sigma=jnp.full((t, 6), 0.3)),
+        g.IntrinsicsPrior(
+            intrinsics=state.intrinsics[None], sigma=jnp.full((1, 4), 20.0)
+        ),
+        g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
+        g.RootSmoothness(sigma=late(h, t, skip=2)),
+        g.StanceFoot(body=body_model(), sigma=late(h, t, 4, skip=1)),
+        g.UpDirection(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
+    ]
+
+
 def perturb(rng, problem, state, size=0.02, scale=1.0):
     """A start off the truth, where the problem lets it move."""
     draw = lambda x: size * jnp.asarray(rng.standard_normal(x.shape))

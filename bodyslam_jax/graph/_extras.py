@@ -5,7 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph._factors import AbstractFrameFactor, Touch, _log
+from bodyslam_jax.graph._factors import (
+    AbstractFrameFactor,
+    Touch,
+    _log,
+    unit_length,
+)
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 
 BODY25_FEET = (19, 21, 22, 24)
@@ -91,11 +96,15 @@ class CameraSmoothness(AbstractFrameFactor):
 
 
 class RootSmoothness(AbstractFrameFactor):
-    """The pelvis keeps its velocity in the world, `r_k - 2 r_{k-1} + r_{k-2}`, m."""
+    """The pelvis keeps its velocity in the world, `r_k - 2 r_{k-1} + r_{k-2}`.
+
+    In metres, or with a `body` in lengths of the leg, as for `HumanMotion`.
+    """
 
     sigma: Float[Array, "h t"]
-    """m per frame squared; `inf` where a frame of the three is missing."""
+    """Per frame squared; `inf` where a frame of the three is missing."""
     loss: AbstractLoss = Squared()
+    body: BodyModel | None = None
     of_people = True
     frame_fields = ("sigma",)
 
@@ -105,6 +114,7 @@ class RootSmoothness(AbstractFrameFactor):
             *(("camera", lag) for lag in range(3)),
             *(("root", lag) for lag in range(3)),
             ("scale", 0),
+            *((("shape", 0),) if self.body is not None else ()),
         )
 
     def data(self):
@@ -115,7 +125,7 @@ class RootSmoothness(AbstractFrameFactor):
             shared.scale * f.camera[:3, 3] + f.camera[:3, :3] @ f.root[:3, 3]
             for f in window
         )
-        return (now - 2 * before + first) / data
+        return (now - 2 * before + first) / unit_length(self.body, shared) / data
 
 
 class RootTurning(AbstractFrameFactor):

@@ -21,6 +21,7 @@ from bodyslam_jax.camera import project
 from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State, compose
+from bodyslam_jax.motion import leg_length
 
 Touch = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
@@ -204,10 +205,14 @@ class HumanMotion(AbstractFrameFactor):
     so that it is linear in s. With a correlation ρ the model's errors in successive
     frames are not taken for independent: the residual is `e_k - ρ e_{k-1}` over its
     own standard deviation.
+
+    With a `body`, lengths are in lengths of the leg, whose steps the model predicts.
+    Otherwise a smaller person in a smaller world has smaller errors in metres, and the
+    estimate shrinks.
     """
 
     translation: Float[Array, "h t 3"]
-    """r̃: predicted displacement from k-1 to k, in H_{k-1}, m."""
+    """r̃: predicted displacement from k-1 to k, in H_{k-1}, m (with `body`: legs)."""
     whitening: Float[Array, "h t 3 3"]
     """`W` with `W^T W` the inverse of the covariance (m^-1); 0 where not predicted."""
     correlation: Float[Array, "h t"]
@@ -215,6 +220,7 @@ class HumanMotion(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     correlated: bool = eqx.field(static=True, default=True)
     """Whether any correlation is used; if not, a term spans two frames, not three."""
+    body: BodyModel | None = None
     of_people = True
     frame_fields = ("translation", "whitening", "correlation")
 
@@ -225,6 +231,7 @@ class HumanMotion(AbstractFrameFactor):
             *(("camera", lag) for lag in lags),
             *(("root", lag) for lag in lags),
             ("scale", 0),
+            *((("shape", 0),) if self.body is not None else ()),
         )
 
     def data(self):
@@ -235,9 +242,10 @@ class HumanMotion(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         translation, previous, whitening, correlation = data
-        error = displacement(window[1], window[0], shared.scale) - translation
+        leg = unit_length(self.body, shared)
+        error = displacement(window[1], window[0], shared.scale) / leg - translation
         if self.correlated:
-            before = displacement(window[2], window[1], shared.scale) - previous
+            before = displacement(window[2], window[1], shared.scale) / leg - previous
             error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
         return whitening @ error
 
@@ -340,6 +348,13 @@ def displacement(before: Frame, now: Frame, scale: Array) -> Float[Array, " 3"]:
     moved = moved + now.camera[:3, :3] @ now.root[:3, 3]
     moved = moved - before.camera[:3, :3] @ before.root[:3, 3]
     return before.root[:3, :3].T @ (before.camera[:3, :3].T @ moved)
+
+
+def unit_length(body: BodyModel | None, shared: Shared) -> Float[Array, ""]:
+    """The length of the person's leg, m; 1 m without a body."""
+    if body is None or shared.shape is None:
+        return jnp.ones_like(shared.scale)
+    return leg_length(body, shared.shape)
 
 
 def rotation_between(

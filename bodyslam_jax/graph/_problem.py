@@ -23,6 +23,7 @@ from bodyslam_jax.graph._factors import (
 )
 from bodyslam_jax.graph._layout import CHUNK, Layout, make_layout
 from bodyslam_jax.graph._state import State, Step, gauge
+from bodyslam_jax.motion import leg_length
 
 VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics")
 
@@ -74,17 +75,18 @@ class Problem(eqx.Module):
             names.append(f"{name}_{taken + 1}" if taken else name)
         return names
 
-    def predict(self, state: State) -> Any:
+    def predict(self, state: State, *, frozen: bool = True) -> Any:
         """What the motion model predicts at a state; `None` without one.
 
-        No gradient flows through the network: people are not drawn to postures for
-        which it happens to predict what the cameras want.
+        `frozen`, no gradient flows through the network: people are not drawn to
+        postures for which it happens to predict what the cameras want.
         """
         if self.motion is None:
             return None
-        seen = self.motion(jax.lax.stop_gradient(state))
+        seen = self.motion(jax.lax.stop_gradient(state) if frozen else state)
         return {
             "translation": seen.translation,
+            "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
             "rotation": seen.rotation,
             "body_pose": seen.body_pose,
         }
@@ -103,7 +105,8 @@ class Problem(eqx.Module):
 
 def _with_prediction(factor, seen):
     if isinstance(factor, HumanMotion):
-        return eqx.tree_at(lambda f: f.translation, factor, seen["translation"])
+        unit = 1 if factor.body is None else seen["leg"]
+        return eqx.tree_at(lambda f: f.translation, factor, seen["translation"] / unit)
     if isinstance(factor, OrientationChange):
         return eqx.tree_at(lambda f: f.rotation, factor, seen["rotation"])
     if isinstance(factor, Posture) and factor.predicted:

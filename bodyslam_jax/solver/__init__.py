@@ -1,6 +1,10 @@
 """How a problem is solved: structure, linear algebra, steps, baselines, uncertainty."""
 
+from bodyslam_jax.solver._covariance import Marginals as Marginals
+from bodyslam_jax.solver._covariance import marginals as marginals
+from bodyslam_jax.solver._covariance import observability as observability
 from bodyslam_jax.solver._solve import PAPER_SCHEDULE as PAPER_SCHEDULE
 from bodyslam_jax.solver._solve import Solution as Solution
 from bodyslam_jax.solver._solve import Stage as Stage
+from bodyslam_jax.solver._solve import restrict as restrict
 from bodyslam_jax.solver._solve import solve as solve

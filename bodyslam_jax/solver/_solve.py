@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.solver import _baselines
+from bodyslam_jax.solver._implicit import cotangent_of_problem
 from bodyslam_jax.solver._levenberg_marquardt import (
     History,
     StructuredLevenbergMarquardt,
@@ -90,7 +91,7 @@ def solve(
     if solver != "structured":
         return _solve_baseline(problem, state, solver, schedule)
     padded, start = pad(problem, state)
-    solution = _solve_padded(padded, start, schedule, damping)
+    solution = _differentiable(padded, start, schedule, damping)
     return eqx.tree_at(
         lambda s: s.state,
         solution,
@@ -119,6 +120,37 @@ def _solve_padded(problem, state, schedule, damping):
         histories.append(found.stats["history"])
         counts.append(found.stats["num_steps"])
     return Solution(state, result, cost, tuple(histories), tuple(counts))
+
+
+@eqx.filter_custom_vjp
+def _differentiable(problem, state, schedule, damping):
+    return _solve_padded(problem, state, schedule, damping)
+
+
+@_differentiable.def_fwd
+def _forward(perturbed, problem, state, schedule, damping):
+    solution = _solve_padded(problem, state, schedule, damping)
+    return solution, solution.state
+
+
+@_differentiable.def_bwd
+def _backward(found, cotangent, perturbed, problem, state, schedule, damping):
+    arrive = cotangent.state
+    full = jax.tree.map(
+        lambda c, x: jnp.zeros_like(x) if c is None else c,
+        arrive,
+        found,
+        is_leaf=lambda x: x is None,
+    )
+    now = restrict(problem, schedule[-1].free)
+    given = cotangent_of_problem(now, found, full)
+    if cotangent.cost is not None:
+        # At a minimum the state's own share of the cost's derivative is 0.
+        arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+        by_cost = jax.grad(lambda a: eqx.combine(a, static).refresh(found).cost(found))
+        more = by_cost(arrays)
+        given = jax.tree.map(lambda a, b: a + cotangent.cost * b, given, more)
+    return given
 
 
 def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:

@@ -1,0 +1,141 @@
+"""Derivatives of a solution, by the implicit function theorem.
+
+At a solution x*(p) the gradient `F(δ, p)` of the cost is 0, so for a cotangent v on the
+solution the cotangent on p is `-(∂F/∂p)^T λ` with `(∂F/∂δ)^T λ = v`. The true second
+derivative of the robust cost is used (Gauss-Newton's would be wrong wherever residuals
+are not 0), solved for by GMRES with the structured factorisation as preconditioner: a
+few products. Nothing is unrolled. Predictions of the motion model are held when F is
+taken, as the solver holds them, but they move with x and p when F is differentiated.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from bodyslam_jax.graph import Problem, Reprojection, State, Step
+from bodyslam_jax.solver._baselines import mask_of
+from bodyslam_jax.solver._linearise import Linearisation, gather, linearise, sizes_of
+from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
+
+_LITTLE = {"float64": 1e-9, "float32": 1e-5}
+
+
+def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Problem:
+    """What a cotangent on the solution is on everything in the (padded) problem."""
+    problem = _without_single_views(problem)
+    zero = state.zero_step()
+    mask = _determined(problem, state)
+    masked = lambda step: jax.tree.map(lambda m, s: m * s, mask, step)
+    _, pull = jax.vjp(state.retract, zero)
+    (right,) = pull(cotangent)
+    right = masked(right)
+    arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+
+    def gradient(step, arrays):
+        whole: Problem = eqx.combine(arrays, static)
+        moved = state.retract(step)
+        seen = whole.predict(moved, frozen=False)
+        fixed = whole.with_prediction(seen)
+        return jax.grad(lambda d: fixed.cost(state.retract(d)))(step)
+
+    _, transpose = jax.vjp(lambda d: gradient(d, arrays), zero)
+    held = jax.tree.map(lambda m: 1 - m, mask)
+
+    def operator(step):
+        (product,) = transpose(masked(step))
+        rest = jax.tree.map(lambda k, s: k * s, held, step)
+        return jax.tree.map(lambda a, b: a + b, masked(product), rest)
+
+    precondition = _preconditioner(problem, state)
+    tolerance = 1e3 * float(jnp.finfo(state.scale.dtype).eps)
+    adjoint, _ = jax.scipy.sparse.linalg.gmres(
+        operator, right, M=precondition, tol=tolerance, restart=20, maxiter=5
+    )
+    _, pull = jax.vjp(lambda a: gradient(zero, a), arrays)
+    (result,) = pull(jax.tree.map(jnp.negative, masked(adjoint)))
+    return result
+
+
+def _without_single_views(problem: Problem) -> Problem:
+    """Drops observations of landmarks seen once: they say nothing about the rest, and
+    leave the landmark's depth, and so the linear system, without a solution."""
+    factors = list(problem.factors)
+    for i, factor in enumerate(factors):
+        if isinstance(factor, Reprojection):
+            seen = jnp.isfinite(factor.sigma)
+            count = jnp.zeros(problem.free.landmarks.shape[0], jnp.int32)
+            count = count.at[factor.landmark].add(seen.astype(jnp.int32))
+            once = count[factor.landmark] < 2
+            sigma = jnp.where(once, jnp.inf, factor.sigma)
+            factors[i] = eqx.tree_at(lambda f: f.sigma, factor, sigma)
+    return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
+
+
+def _determined(problem: Problem, state: State) -> Step:
+    """The mask, without coordinates that no measurement sees."""
+    problem = problem.refresh(state)
+    sizes = sizes_of(problem, state)
+    diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
+    mask, zero = mask_of(problem), state.zero_step()
+    count = sizes.intrinsics
+    landmarks = zero.landmarks
+    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
+        moved = jnp.moveaxis(own, 1, 2)
+        landmarks = landmarks.at[bucket.landmark].set(moved, mode="drop")
+    poses = diagonal.get("pose", zero.poses).reshape(zero.poses.shape)
+    there = Step(
+        scale=diagonal["globals"][0],
+        cameras=diagonal["camera"],
+        roots=diagonal["root"],
+        poses=poses,
+        shapes=diagonal["globals"][1 + count :].reshape(zero.shapes.shape),
+        landmarks=landmarks,
+        intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,
+    )
+    return jax.tree.map(lambda m, d: jnp.where(d > 0, m, 0.0), mask, there)
+
+
+def _preconditioner(problem: Problem, state: State):
+    """`v -> (J^T J)^-1 v`, by the solver's own elimination."""
+    problem = problem.refresh(state)
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state)
+    little = jnp.asarray(_LITTLE[state.scale.dtype.name], state.scale.dtype)
+    damping = damped(diagonals(lin, sizes), little)
+
+    def apply(right: Step) -> Step:
+        there = with_gradient(problem, lin, jax.tree.map(jnp.negative, right))
+        eliminated = eliminate(problem, there, sizes, damping)
+        return solve_step(problem, state, there, sizes, eliminated)
+
+    return apply
+
+
+def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisation:
+    """The same blocks with another gradient."""
+    count = lin.globals.shape[0] - 1 - step.shapes.size
+    gradient = {}
+    for name, known in lin.gradient.items():
+        if name == "pose":
+            gradient[name] = step.poses.reshape(known.shape)
+        elif name == "root":
+            gradient[name] = step.roots
+        else:
+            gradient[name] = jnp.zeros_like(known)
+    if "camera_alone" in gradient:
+        gradient["camera_alone"] = step.cameras
+    elif "camera" in gradient:
+        gradient["camera"] = gradient["camera"].at[0].set(step.cameras)
+    common = jnp.concatenate(
+        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
+    )
+    # Padding points at a row of zeros, so that groups are filled by plain gathering.
+    tables = tuple(
+        eqx.tree_at(
+            lambda t: t.gradient,
+            table,
+            jnp.moveaxis(step.landmarks[bucket.landmark], 1, 2),
+        )
+        for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True)
+    )
+    return Linearisation(lin.blocks, gradient, lin.globals, common, tables, lin.costs)
