@@ -10,7 +10,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
@@ -141,8 +141,9 @@ def people_factors(
         sigma = where(three, weights.root_turning * per_frame**2)
         factors.append(graph.RootTurning(sigma))
     if weights.root_smoothness is not None:
-        sigma = where(three, weights.root_smoothness * per_frame**2)
-        factors.append(graph.RootSmoothness(sigma))
+        leg = motion.leg_length(body, jnp.asarray(roots.shape))[:, None]
+        sigma = where(three, weights.root_smoothness * per_frame**2 / leg)
+        factors.append(graph.RootSmoothness(sigma, body=body))
     return factors
 
 
@@ -168,7 +169,12 @@ def _in_a_row(present: Bool[np.ndarray, "h t"], count: int) -> Bool[np.ndarray, 
     return found
 
 
-def motion_factor(seen: motion.Prediction, weights: GraphWeights) -> graph.HumanMotion:
+def motion_factor(
+    seen: motion.Prediction,
+    shapes: Float[Array, "h 10"],
+    body: BodyModel,
+    weights: GraphWeights,
+) -> graph.HumanMotion:
     """The motion model's displacements, weighted by its own covariance."""
     valid = seen.valid
     eye = jnp.eye(3)
@@ -179,11 +185,13 @@ def motion_factor(seen: motion.Prediction, weights: GraphWeights) -> graph.Human
         whitening = whitening / weights.motion_inflation
     else:
         whitening = jnp.broadcast_to(eye / weights.motion_sigma, (*valid.shape, 3, 3))
+    leg = motion.leg_length(body, shapes)[:, None, None]
     return graph.HumanMotion(
-        translation=jnp.where(valid[..., None], seen.translation, 0.0),
-        whitening=jnp.where(valid[..., None, None], whitening, 0.0),
+        translation=jnp.where(valid[..., None], seen.translation / leg, 0.0),
+        whitening=jnp.where(valid[..., None, None], whitening * leg[..., None], 0.0),
         correlation=graph.runs(valid, weights.motion_correlation),
         correlated=weights.motion_correlation > 0,
+        body=body,
     )
 
 

@@ -2,70 +2,35 @@
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import export, frontend, graph, initialisation, motion, people, solver
+from bodyslam_jax import (
+    evaluation,
+    export,
+    frontend,
+    graph,
+    initialisation,
+    motion,
+    people,
+    solver,
+    synthetic,
+    view,
+)
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config
+from bodyslam_jax.outcome import Cameras, Joint, assemble
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Bodies, Sequence, Tracks
 
 log = logging.getLogger(__name__)
-FEET = (10, 11)
-"""SMPL's foot joints."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Cameras:
-    """The up-to-scale reconstruction after bundle adjustment."""
-
-    kind: str
-    """`moving`, `rotation` (no parallax) or `static`."""
-    T_WC: Float[np.ndarray, "t 4 4"]
-    registered: Bool[np.ndarray, " t"]
-    """Frames that were located; the poses of others are filled in."""
-    landmarks: Float[np.ndarray, "l 3"]
-    tracks: Tracks
-    """Observations of `landmarks`."""
-    keep: Bool[np.ndarray, " m"]
-    """Observations that fit."""
-    pixel_sigma: float
-    """Robust standard deviation of those, px."""
-    intrinsics: Float[np.ndarray, " i"]
-    costs: tuple[float, float]
-    """Before and after bundle adjustment."""
-    warnings: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class Joint:
-    """The graph's optimum."""
-
-    scale: float
-    scale_start: float
-    scale_start_error: float
-    scale_sigma: float
-    cameras: Float[np.ndarray, "t 4 4"]
-    roots: Float[np.ndarray, "h t 4 4"]
-    poses: Float[np.ndarray, "h t 23 3"]
-    shapes: Float[np.ndarray, "h 10"]
-    landmarks: Float[np.ndarray, "l 3"]
-    intrinsics: Float[np.ndarray, " i"]
-    present: Bool[np.ndarray, "h t"]
-    status: str
-    stages: tuple[dict, ...]
 
 
 class Stopwatch:
@@ -110,7 +75,7 @@ def run(
         joint = cache.stage(
             "joint", key, Joint, lambda: _joint(sequence, cameras, bodies, body, config)
         )
-    return _result(sequence, config, body, cameras, joint, watch.seconds)
+    return assemble(sequence, config, body, cameras, joint, watch.seconds)
 
 
 def _tracks(sequence: Sequence, config: Config) -> Tracks:
@@ -230,7 +195,11 @@ def _joint(
             start = initialisation.scale_start(state, predictor)
             log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
-        factors.append(initialisation.motion_factor(predictor(state), config.weights))
+        factors.append(
+            initialisation.motion_factor(
+                predictor(state), state.shapes, body, config.weights
+            )
+        )
     if not factors:
         raise ValueError(f"{sequence.name}: no landmarks and no people to estimate.")
     problem = graph.make_problem(
@@ -288,170 +257,47 @@ def _solve(
     return solution
 
 
-def _result(
-    sequence: Sequence,
-    config: Config,
-    body: body_.BodyModel,
-    cameras: Cameras,
-    joint: Joint,
-    seconds: dict[str, float],
-) -> Result:
-    """The optimum in a metric world whose y axis is the people's up."""
-    T_WC = joint.cameras.copy()
-    T_WC[:, :3, 3] *= joint.scale
-    turn = upright(T_WC, T_WC @ joint.roots, joint.present)
-    T_WC = turn @ T_WC
-    T_WH = T_WC @ joint.roots
-    landmarks = joint.scale * joint.landmarks @ turn[:3, :3].T + turn[:3, 3]
-    root = np.asarray(jaxlie.SO3.from_matrix(jnp.asarray(T_WH[..., :3, :3])).log())
-    poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
-    rest = np.asarray(body_.rest_joints(body, jnp.asarray(joint.shapes)))
-    trans = T_WH[..., :3, 3] - rest[:, None, 0]
-    shapes = jnp.asarray(joint.shapes)[:, None]
-    joints = np.array(
-        body_.joints(body, jnp.asarray(poses), shapes, jnp.asarray(trans))
-    )
-    if joint.present.any():
-        # The floor is where feet are lowest, but for a few frames.
-        floor = np.quantile(joints[joint.present][:, FEET, 1].min(axis=1), 0.05)
-        for points in (T_WC[:, :3, 3], trans, joints, landmarks):
-            points[..., 1] -= floor
-    result = Result(
-        timestamps=sequence.timestamps,
-        T_WC=T_WC,
-        scale=joint.scale,
-        intrinsics=joint.intrinsics,
-        landmarks=landmarks if cameras.kind == "moving" else np.zeros((0, 3)),
-        poses=poses,
-        trans=trans,
-        betas=joint.shapes,
-        joints=np.asarray(joints),
-        present=joint.present,
-    )
-    summary = summarise(sequence, config, body, cameras, joint, result, seconds)
-    return dataclasses.replace(result, summary=summary)
-
-
-def upright(
-    T_WC: Float[np.ndarray, "t 4 4"],
-    T_WH: Float[np.ndarray, "h t 4 4"],
-    present: Bool[np.ndarray, "h t"],
-) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion to a world with y up, z ahead of the first camera, which is its
-    origin.
-
-    Nothing measures gravity: up is where people's trunks point on average, or, without
-    people, where the first camera's top does.
-    """
-    up = T_WH[present][:, :3, 1].sum(axis=0) if present.any() else -T_WC[0, :3, 1]
-    y = up / np.linalg.norm(up)
-    ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
-    if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.
-        ahead = T_WC[0, :3, 1] - y * (y @ T_WC[0, :3, 1])
-    z = ahead / np.linalg.norm(ahead)
-    turn = np.eye(4)
-    turn[:3, :3] = np.stack([np.cross(y, z), y, z])
-    turn[:3, 3] = -turn[:3, :3] @ T_WC[0, :3, 3]
-    return turn
-
-
-def summarise(
-    sequence: Sequence,
-    config: Config,
-    body: body_.BodyModel,
-    cameras: Cameras,
-    joint: Joint,
-    result: Result,
-    seconds: dict[str, float],
-) -> dict[str, Any]:
-    """`summary.json`: what a person wants to know first, then everything else."""
-    warnings = [*sequence.warnings, *cameras.warnings]
-    status = "ok"
-    if not joint.present.any():
-        status = "no people: cameras and map have no unit"
-    elif not np.isfinite(result.T_WC).all():
-        status = "failed"
-    if cameras.kind != "moving":
-        warnings.append(
-            "metric size comes from the body alone: the camera's path gives none."
-        )
-    path = lambda x: float(np.linalg.norm(np.diff(x, axis=0), axis=-1).sum())
-    persons = []
-    for h in range(len(result.poses)):
-        there = result.present[h]
-        pelvis = result.joints[h, there, 0]
-        duration = max(there.sum() - 1, 1) / sequence.fps
-        persons.append(
-            {
-                "frames": int(there.sum()),
-                "path_m": path(pelvis),
-                "speed_m_s": path(pelvis) / duration,
-                "stature_m": stature(body, result.betas[h]),
-            }
-        )
-    headline = [
-        f"{sequence.name}: {status}",
-        f"camera: {path(result.T_WC[:, :3, 3]):.2f} m in "
-        f"{result.timestamps[-1] - result.timestamps[0]:.1f} s ({cameras.kind})",
-    ]
-    headline += [
-        f"person {h}: {p['path_m']:.2f} m, {p['speed_m_s']:.2f} m/s, "
-        f"{100 * p['stature_m']:.0f} cm tall"
-        for h, p in enumerate(persons)
-    ]
-    return {
-        "status": status,
-        "headline": headline,
-        "warnings": warnings,
-        "input": {
-            "name": sequence.name,
-            "frames": sequence.num_frames,
-            "fps": sequence.fps,
-            "width": sequence.intrinsics.width,
-            "height": sequence.intrinsics.height,
-            "intrinsics_guessed": sequence.intrinsics.is_guess,
-        },
-        "camera_motion": cameras.kind,
-        "scale": {
-            "value": result.scale,
-            "sigma": joint.scale_sigma,
-            "start": joint.scale_start,
-            "start_standard_error": joint.scale_start_error,
-        },
-        "people": persons,
-        "counts": {
-            "landmarks": len(result.landmarks),
-            "observations": int(cameras.keep.sum()),
-            "people": len(persons),
-        },
-        "pixel_sigma": cameras.pixel_sigma,
-        "stages": list(joint.stages),
-        "solver": joint.status,
-        "durations_s": seconds,
-        "settings": dataclasses.asdict(config),
-        "versions": versions(),
-    }
-
-
-def stature(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
-    """Height of the mesh in its rest pose, m."""
-    rest = jnp.zeros(72)
-    vertices = body_.vertices(body, rest, jnp.asarray(shape), jnp.zeros(3))
-    return float(vertices[:, 1].max() - vertices[:, 1].min())
-
-
-def versions() -> dict[str, str]:
-    """What ran: a result can be repeated only with the same."""
-    names = ("bodyslam-jax", "jax", "optimistix", "numpy", "opencv-python-headless")
-    return {name: importlib.metadata.version(name) for name in names}
-
-
 def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:
     """`run`, with finished stages kept in `out` and everything of the contract written.
+
+    Where the sequence has a ground truth, the report says how far off the result is.
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
     export.check_folder(out)
+    body = body_.load_body_model(config.body_model)
     result = run(sequence, config, cache=Cache(out / ".cache"))
-    export.write_run(out, result, config)
+    if sequence.groundtruth is not None:
+        truth = evaluation.read_groundtruth(sequence.groundtruth, body)
+        result.summary["errors"] = errors(result, truth)
+    watch = Stopwatch()
+    with export.run_folder(out) as partial:
+        if config.overlay and sequence.frames is not None:
+            with watch("overlay"):
+                view.write_overlay(
+                    partial / "overlay.webm", frontend.frames(sequence), result, body
+                )
+        result.summary["durations_s"] |= watch.seconds
+        export.write_files(partial, result, config)
+        export.write_report(partial / "report.html", result, body)
     return result
+
+
+def errors(result: Result, truth: Result) -> dict[str, dict[str, float]]:
+    """What `bodyslam evaluate` says, for the report."""
+    found = evaluation.evaluate(result, truth)
+    return {"joint estimate, in metres": {k: float(v) for k, v in found.items()}}
+
+
+def demo(out: Path, config: Config = Config()) -> Result:
+    """Renders a walker whom a moving camera films, and runs everything on the images.
+
+    The scene is written to `out/scene`, a sequence folder with its ground truth.
+
+    **Raises:** `ValueError` if `out` cannot be written.
+    """
+    export.check_folder(out)
+    watch = Stopwatch()
+    with watch("rendering"):
+        scene = synthetic.demo_scene(out / "scene")
+    return run_to_folder(frontend.read_sequence(scene), out, config)

@@ -25,7 +25,7 @@ from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Tracks
 
 Image = UInt8[np.ndarray, "y x 3"]
-_CAMERA = (214, 111, 31)
+_CAMERA: tuple[int, int, int] = (214, 111, 31)
 _PEOPLE = ((36, 110, 232), (115, 170, 40), (200, 90, 150), (20, 160, 200))
 """BGR, as in the report."""
 _POINT = (90, 230, 120)
@@ -92,6 +92,16 @@ def write_overlay(
             pending = encoder.submit(writer.write, picture)
     writer.release()
     _check(path, len(t))
+
+
+def can_write(path: Path, codec: str) -> bool:
+    """Whether this OpenCV has the encoder of a four-letter code for such a file."""
+    with _quiet():
+        fourcc = cv2.VideoWriter.fourcc(*codec)
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, 30.0, (64, 64))
+        found = writer.isOpened()
+        writer.release()
+    return found
 
 
 @contextlib.contextmanager
@@ -352,6 +362,7 @@ class _Plan:
         return inset
 
     def _paths(self, end: int) -> list[tuple[np.ndarray, tuple[int, int, int]]]:
+        paths: list[tuple[np.ndarray, tuple[int, int, int]]]
         paths = [(self.result.T_WC[:end, [0, 2], 3], _CAMERA)]
         for h, here in enumerate(self.result.present):
             seen = np.flatnonzero(here[:end])

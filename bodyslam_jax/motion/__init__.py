@@ -20,6 +20,7 @@ from bodyslam_jax.motion._placing import place as place
 from bodyslam_jax.motion._predict import MotionModel as MotionModel
 from bodyslam_jax.motion._predict import Prediction as Prediction
 from bodyslam_jax.motion._predict import check_compatible as check_compatible
+from bodyslam_jax.motion._predict import leg_length as leg_length
 from bodyslam_jax.motion._predict import predict as predict
 from bodyslam_jax.motion._readers import read_motion as read_motion
 from bodyslam_jax.motion._rollout import Rollout as Rollout

@@ -1,0 +1,87 @@
+import subprocess
+import sys
+
+import pytest
+
+from bodyslam_jax import cli
+from bodyslam_jax.config import Config
+
+
+def _run(monkeypatch, capsys, *argv):
+    """The command in this process: exit code, standard output, standard error."""
+    monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    out = capsys.readouterr()
+    code = stopped.value.code
+    if isinstance(code, str):
+        return 1, out.out, code
+    return code, out.out, out.err
+
+
+def test_help_imports_no_jax():
+    code = (
+        "import sys; sys.argv = ['bodyslam', '--help']\n"
+        "from bodyslam_jax import cli\n"
+        "try:\n    cli.main()\nexcept SystemExit:\n    pass\n"
+        "assert 'jax' not in sys.modules, 'jax was imported'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [["run"], ["nosuch"], ["run", "x", "--out", "y", "--nosuch", "1"], ["evaluate"]],
+)
+def test_wrong_usage_is_exit_code_2(monkeypatch, capsys, argv):
+    assert _run(monkeypatch, capsys, *argv)[0] == 2
+
+
+def test_no_such_input_is_one_line(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "run"
+    code, _, err = _run(monkeypatch, capsys, "run", tmp_path / "none.mp4", "--out", out)
+    assert code == 1 and not out.exists()
+    assert "none.mp4" in err and len(err.strip().splitlines()) == 1
+
+
+def test_check_says_what_a_file_is_not(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "model.pkl"
+    path.write_text("not a pickle")
+    code, _, err = _run(monkeypatch, capsys, "body-model", "check", path)
+    assert code == 1 and "model.pkl" in err and len(err.strip().splitlines()) == 1
+
+
+def test_doctor_reports(monkeypatch, capsys):
+    code, out, _ = _run(monkeypatch, capsys, "doctor")
+    assert code == 0
+    for word in ("jax", "BRISK", "body model", "motion model", "devices"):
+        assert word in out
+
+
+def test_preset_and_settings_are_where_options_start(tmp_path):
+    assert cli.base_config([]) == Config()
+    assert cli.base_config(["--preset", "paper"]).solver == "adam"
+    path = tmp_path / "config.yaml"
+    path.write_text("solver: adam\nweights:\n  pixel_sigma: 2\n")
+    found = cli.base_config([f"--settings={path}"])
+    assert found.solver == "adam" and found.weights.pixel_sigma == 2.0
+
+
+@pytest.mark.parametrize(
+    "text", ["[1, 2", "- a list", "nosuch: 1", "weights: 3", "solver: [adam]"]
+)
+def test_bad_settings_name_file(tmp_path, text):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match="config.yaml"):
+        cli.base_config(["--settings", str(path)])
+
+
+def test_written_settings_are_read_back(tmp_path):
+    from bodyslam_jax import export
+
+    config = Config.paper()
+    path = tmp_path / "config.yaml"
+    path.write_text(export.to_yaml(config))
+    assert cli.read_settings(path, Config()) == config
