@@ -38,7 +38,7 @@ class GraphWeights:
     """Of their errors in successive frames at 30 fps."""
     posture_predicted: bool = False
     """Whether postures are held to the motion model's prediction instead."""
-    shape_sigma: float = 1.0
+    shape_sigma: float = 0.4
     """Regressed β; one measurement a person, as the regressor errs alike in all."""
     shape_each_frame: bool = False
     """Whether each frame counts as a measurement of β of its own."""

@@ -11,7 +11,6 @@ import logging
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import maximum_filter1d, median_filter
@@ -21,6 +20,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._roots import Roots, bodies_from_roots
+from bodyslam_jax.people._rotations import slerp
 from bodyslam_jax.people._skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people._starts import best_path, fit_frames
 from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Scene
@@ -173,8 +173,7 @@ def _fit_person(
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
     chain, value = solve_chain(problem, chain, settings.max_steps)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
-    cropped = jax.tree.map(lambda a: np.asarray(a[: len(uv)], float), chain.fit)
-    return fitted, Chain(cropped, np.asarray(chain.shape, float))
+    return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
 
 
 def _in_pixels(sigma: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -196,9 +195,8 @@ def _start(
     )
     fits, costs, joints = fit_frames(scene, uv[chosen], sigma_px[chosen])
     path = best_path(costs, joints, fits.orientation, chosen / fps)
-    fit = jax.tree.map(lambda a: jnp.asarray(a[np.arange(len(chosen)), path]), fits)
-    position = np.asarray(fit.position)
-    speed = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) * fps
+    fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
+    speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
     broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST
     return _interpolate(fit, chosen, broken, len(uv)), chosen[1:][broken]
 
@@ -213,11 +211,13 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
     share = np.clip(share, 0.0, 1.0)
     if len(broken):
         share = np.where(broken[np.maximum(after - 1, 0)], share >= 1.0, share)
-    weight = jnp.asarray(share, fit.position.dtype)[:, None]
-    blend = lambda a: a[before] + weight * (a[after] - a[before])
-    from_, to = (jaxlie.SO3.from_matrix(fit.orientation[i]) for i in (before, after))
-    turn = jaxlie.SO3.exp(weight * (to @ from_.inverse()).log())
-    return Fit((turn @ from_).as_matrix(), blend(fit.position), blend(fit.latent))
+    position, latent = (
+        a[before] + share[:, None] * (a[after] - a[before])
+        for a in (fit.position, fit.latent)
+    )
+    turned = slerp(fit.orientation[before], fit.orientation[after], share)
+    dtype = fit.position.dtype
+    return Fit(*(jnp.asarray(a, dtype) for a in (turned, position, latent)))
 
 
 def make_ties(

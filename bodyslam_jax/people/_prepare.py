@@ -10,7 +10,6 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import solveh_banded
@@ -20,6 +19,7 @@ from bodyslam_jax.camera import project
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._fit import keypoint_sigma, pixels_per_metre
 from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
+from bodyslam_jax.people._rotations import matrices, slerp, vectors
 from bodyslam_jax.people._skeleton import (
     NUM_SHAPE,
     Skeleton,
@@ -113,12 +113,9 @@ def body_noise(bodies: Bodies) -> BodyNoise:
         if not middle.any():
             found.append((np.nan, np.nan, np.nan, np.full(10, np.nan)))
             continue
-        R = jaxlie.SO3.exp(jnp.asarray(poses.reshape(len(poses), 24, 3)))
-        before, here, after = (
-            jaxlie.SO3(R.wxyz[a : len(poses) - 2 + a][middle]) for a in (0, 1, 2)
-        )
-        change = (here.inverse() @ after).log() - (before.inverse() @ here).log()
-        change = np.asarray(change)
+        turns = matrices(poses.reshape(len(poses), 24, 3))
+        step = vectors(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
+        change = np.diff(step, axis=0)[middle]
         depth = np.diff(trans[:, 2], 2)[middle]
         found.append(
             (
@@ -283,20 +280,13 @@ def _fill_gaps(roots: Roots, person: int, longest: float) -> None:
             continue
         share = np.arange(1, b - a) / (b - a)
         gap = slice(a + 1, b)
-        T_CH[gap, :3, :3] = _slerp(T_CH[a, :3, :3], T_CH[b, :3, :3], share)
+        ends = np.broadcast_to(T_CH[[a, b], None, :3, :3], (2, len(share), 3, 3))
+        T_CH[gap, :3, :3] = slerp(*ends, share)
         T_CH[gap, :3, 3] = T_CH[a, :3, 3] + share[:, None] * (
             T_CH[b, :3, 3] - T_CH[a, :3, 3]
         )
-        ends = (jaxlie.SO3.exp(jnp.asarray(p)).as_matrix() for p in (pose[a], pose[b]))
-        between = jaxlie.SO3.from_matrix(jnp.asarray(_slerp(*ends, share)))
-        pose[gap] = between.log()
+        size = (2, len(share), 23, 3, 3)
+        ends = np.broadcast_to(matrices(pose[[a, b]])[:, None], size)
+        joint_share = np.repeat(share[:, None], 23, axis=1)
+        pose[gap] = vectors(slerp(*ends, joint_share))
         roots.present[person, gap] = True
-
-
-def _slerp(a: Array, b: Array, share: np.ndarray) -> np.ndarray:
-    """Rotations between two (or two lists of them), leading axis `share`."""
-    from_, to = (jaxlie.SO3.from_matrix(jnp.asarray(m)) for m in (a, b))
-    whole = (from_.inverse() @ to).log()
-    part = jnp.asarray(share, whole.dtype).reshape(-1, *[1] * whole.ndim) * whole
-    # jaxlie multiplies equal batches only.
-    return np.asarray(from_.as_matrix()) @ np.asarray(jaxlie.SO3.exp(part).as_matrix())

@@ -3,11 +3,11 @@
 import dataclasses
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel, rest_joints
+from bodyslam_jax.people._rotations import matrices, vectors
 from bodyslam_jax.sequence import Bodies
 
 
@@ -32,9 +32,7 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
     present = np.asarray(bodies.present, bool)
     pelvis = _pelvis(body, bodies.shapes) + bodies.trans
     T_CH = np.tile(np.eye(4), (*present.shape, 1, 1))
-    T_CH[..., :3, :3] = np.asarray(
-        jaxlie.SO3.exp(jnp.asarray(bodies.poses[..., :3])).as_matrix()
-    )
+    T_CH[..., :3, :3] = matrices(bodies.poses[..., :3])
     T_CH[..., :3, 3] = pelvis
     T_CH[~present] = np.eye(4)
     body_pose = bodies.poses[..., 3:].reshape(*present.shape, 23, 3).astype(float)
@@ -51,13 +49,13 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
 def bodies_from_roots(roots: Roots, body: BodyModel) -> Bodies:
     """Inverse of `roots_from_bodies`, for bodies whose β does not change."""
     frames = roots.present.shape[1]
-    orientation = jaxlie.SO3.from_matrix(jnp.asarray(roots.T_CH[..., :3, :3])).log()
+    orientation = vectors(roots.T_CH[..., :3, :3])
     pose = roots.body_pose.reshape(*roots.present.shape, 69)
     shapes = np.repeat(roots.shape[:, None], frames, axis=1)
     trans = roots.T_CH[..., :3, 3] - _pelvis(body, shapes)
     return Bodies(
         roots.present,
-        np.concatenate([np.asarray(orientation, float), pose], axis=-1),
+        np.concatenate([orientation, pose], axis=-1),
         shapes,
         np.where(roots.present[..., None], trans, 0.0),
     )

@@ -41,8 +41,8 @@ def _paths() -> np.ndarray:
 _PATH = _paths()
 
 
-# How far a detector's idea of a keypoint is from SMPL's, for one detector and person the
-# same in all frames: which keypoints (right, left), along which axis of the bone that
+# How far a detector's idea of a keypoint is from SMPL's, for one detector and person
+# the same in all frames: which keypoints, along which axis of the bone that
 # carries them (m, 1 σ). Mirrored in x. As extra shape components they are estimated
 # with the person; held at zero, a hip 3 cm off would read as legs bent by 20 degrees.
 _OFFSETS = (

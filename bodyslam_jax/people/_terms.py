@@ -141,7 +141,8 @@ def linearise(
     hessian, gradient_own = full[:size, :size], gradient[:size]
 
     beyond = _beyond_limits(scene, angles) / scene.limit_sigma
-    limits = scene.prior.basis * (beyond != 0)[:, None] / scene.limit_sigma
+    active = (beyond != 0).astype(beyond.dtype) / scene.limit_sigma
+    limits = scene.prior.basis * active[:, None]
     hessian = hessian.at[6:, 6:].add(limits.T @ limits)
     gradient_own = gradient_own.at[6:].add(limits.T @ beyond)
 
