@@ -163,6 +163,16 @@ def test_descriptors_match_both_ways():
     np.testing.assert_array_equal(order[found[:, 1]], found[:, 0])
 
 
+def test_points_hidden_for_a_while_are_found_again(tmp_path):
+    images = plane_images(16)
+    for image in images[6:10]:
+        image[:, 160:] = 128  # something passes close before the camera
+    found = track(write_images(tmp_path / "a", images))
+    frames_of = lambda keep: set(found.landmark[keep & (found.uv[:, 0] > 190)].tolist())
+    before, after = frames_of(found.frame == 5), frames_of(found.frame >= 10)
+    assert len(before & after) > 0.3 * len(before)
+
+
 def test_a_cut_in_the_images_is_found(tmp_path):
     images = plane_images(14) + plane_images(8, seed=3)
     sequence = write_images(tmp_path / "a", images)

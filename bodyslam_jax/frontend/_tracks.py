@@ -1,12 +1,11 @@
 """Images -> tracks of static points, about 200 a frame, spread over the image.
 
 BRISK finds the points; pyramidal Lucas--Kanade follows each from frame to frame, there
-and back. Epipolar RANSAC over a gap removes what does not move with the scene; people
-are masked out.
+and back. BRISK's descriptors bring back points that were lost for a while. Epipolar
+RANSAC over a gap removes what does not move with the scene; people are masked out.
 """
 
 import dataclasses
-import logging
 from collections import deque
 from collections.abc import Callable
 
@@ -14,13 +13,19 @@ import cv2
 import numpy as np
 
 from bodyslam_jax.config import Tracking
-from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, spread
+from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, match, spread
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.frontend._sequence import as_opencv
 from bodyslam_jax.frontend._video import frames
 from bodyslam_jax.sequence import Sequence, Tracks
 
-_log = logging.getLogger(__name__)
+_REFILL_GAP = 3
+"""Frames between two searches for points, unless half of them are gone."""
+_KEYFRAME_STEP = 12
+"""Frames between two that are remembered."""
+_NUM_KEYFRAMES = 12
+_LEAST_CONTRAST = 6
+"""BRISK's threshold in the flattest image, grey levels."""
 
 
 def track(
@@ -66,6 +71,16 @@ class _Live:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Keyframe:
+    """A frame whose points can be found again."""
+
+    image: np.ndarray
+    ids: np.ndarray
+    uv: np.ndarray
+    descriptors: np.ndarray
+
+
 class _Tracker:
     """What is remembered from frame to frame; memory does not grow with images."""
 
@@ -81,24 +96,34 @@ class _Tracker:
         )
         self.rows: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.next_id = 0
+        self.threshold = config.threshold
+        self.last_refill = -_REFILL_GAP
+        self.keyframes: deque[_Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
+        self.last_keyframe = -_KEYFRAME_STEP
+        self.scale_of: dict[int, float] = {}
+        """Size of the BRISK keypoint that began a point, px."""
 
     def advance(self, k: int, gray: np.ndarray, mask: np.ndarray | None) -> None:
         if self.previous is not None and len(self.live.ids):
             self._follow(gray, mask)
             self._drop_moving()
-        if self._is_sparse():
+        if self._is_sparse(k):
             self._refill(gray, mask)
+            self.last_refill = k
+            if k - self.last_keyframe >= _KEYFRAME_STEP:
+                self._remember(gray)
+                self.last_keyframe = k
         self.previous = gray
         self.recent.append((self.live.ids, self.live.uv))
         self.rows.append((k, self.live.ids, self.live.uv))
 
     def tracks(self) -> Tracks:
-        """All observations of points seen at least three times."""
+        """All observations of points seen three times (in all frames, if fewer)."""
         frame = np.concatenate([np.full(len(i), k) for k, i, _ in self.rows])
         ids = np.concatenate([i for _, i, _ in self.rows])
         uv = np.concatenate([u for _, _, u in self.rows])
         count = np.bincount(ids, minlength=self.next_id)
-        kept = count[ids] >= 3
+        kept = count[ids] >= min(3, len(self.rows))
         _, landmark = np.unique(ids[kept], return_inverse=True)
         return Tracks(frame[kept], landmark.astype(np.int64), uv[kept])
 
@@ -169,31 +194,96 @@ class _Tracker:
             return np.zeros((0, 2))
         return cv2.undistortPoints(uv[:, None], self.K, self.distortion)[:, 0]
 
-    def _is_sparse(self) -> bool:
-        return len(self.live.ids) < 0.85 * self.config.num_points
+    def _is_sparse(self, k: int) -> bool:
+        wanted, found = self.config.num_points, len(self.live.ids)
+        since = k - self.last_refill
+        return found < 0.5 * wanted or (found < 0.85 * wanted and since >= _REFILL_GAP)
 
     def _refill(self, gray: np.ndarray, mask: np.ndarray | None) -> None:
-        found = self.brisk.detect(gray, None if mask is None else cv2.bitwise_not(mask))
+        """Finds lost points again, then new ones where the image lacks points."""
+        wanted = self.config.num_points
+        found = self._detect(gray, mask)
         if not found:
             return
         uv = np.array([p.pt for p in found], dtype=np.float64)
         response = np.array([p.response for p in found], dtype=np.float64)
-        inside = self._inside(uv, mask)
-        uv, response = uv[inside], response[inside]
         cell = -(-max(self.size) // self.config.cells)
-        cells = -(-self.size[0] // cell) * -(-self.size[1] // cell)
-        missing = self.config.num_points - len(self.live.ids)
-        quota = -(-self.config.num_points // cells)
-        distance = 0.25 * cell
+        # Cells under a person or without texture give their share to the others.
+        occupied = np.unique(uv.astype(np.int64) // cell, axis=0)
+        quota = -(-wanted // max(len(occupied), 1))
+        room = {"size": self.size, "cell": cell}
+        some = spread(
+            uv, response, self.live.uv, quota=2 * quota, distance=0.1 * cell, **room
+        )[: 2 * wanted]
+        self._revive(gray, [found[i] for i in some])
         chosen = spread(
-            uv,
-            response,
-            self.live.uv,
-            size=self.size,
-            cell=cell,
-            quota=quota,
-            distance=distance,
-        )[: missing + self.config.num_points // 20]
+            uv, response, self.live.uv, quota=quota, distance=0.2 * cell, **room
+        )[: max(0, wanted - len(self.live.ids)) + wanted // 20]
         ids = np.arange(self.next_id, self.next_id + len(chosen))
         self.next_id += len(chosen)
+        for i, which in zip(ids, chosen, strict=True):
+            self.scale_of[int(i)] = found[which].size
         self.live = self.live.add(ids, uv[chosen])
+
+    def _detect(self, gray: np.ndarray, mask: np.ndarray | None) -> list[cv2.KeyPoint]:
+        """BRISK corners outside people; its threshold follows the texture."""
+        wanted = self.config.num_points
+        free = None if mask is None else cv2.bitwise_not(mask)
+        while True:
+            self.brisk.setThreshold(self.threshold)
+            found = self.brisk.detect(gray, free)
+            uv = np.array([p.pt for p in found], dtype=np.float64).reshape(-1, 2)
+            inside = self._inside(uv, mask)
+            if len(found) > 15 * wanted:
+                self.threshold = min(round(self.threshold * 1.3), 80)
+            elif inside.sum() < 3 * wanted and self.threshold > _LEAST_CONTRAST:
+                self.threshold = max(round(self.threshold / 1.5), _LEAST_CONTRAST)
+                if inside.sum() < wanted:
+                    continue
+            return [p for p, ok in zip(found, inside, strict=True) if ok]
+
+    def _remember(self, gray: np.ndarray) -> None:
+        """Describes the points of this frame, so that they can be found again."""
+        points = []
+        for row, (i, (x, y)) in enumerate(
+            zip(self.live.ids, self.live.uv, strict=True)
+        ):
+            size = self.scale_of[int(i)]
+            points.append(cv2.KeyPoint(float(x), float(y), size, class_id=row))
+        kept, descriptors = self.brisk.compute(gray, points)
+        if len(kept):
+            rows = np.array([p.class_id for p in kept])
+            self.keyframes.append(
+                _Keyframe(gray, self.live.ids[rows], self.live.uv[rows], descriptors)
+            )
+
+    def _revive(self, gray: np.ndarray, found: list[cv2.KeyPoint]) -> None:
+        """Goes on with points of older keyframes that are seen again.
+
+        The descriptor says where, the image of the keyframe where exactly, and the
+        motion of all points between the two frames whether that can be.
+        """
+        kept, descriptors = self.brisk.compute(gray, found)
+        if not len(kept):
+            return
+        seen = np.array([p.pt for p in kept], dtype=np.float64)
+        for key in reversed(self.keyframes):
+            lost = np.flatnonzero(~np.isin(key.ids, self.live.ids))
+            pairs = match(key.descriptors[lost], descriptors)
+            if len(pairs) < 4:
+                continue
+            then, guess = key.uv[lost[pairs[:, 0]]], seen[pairs[:, 1]]
+            now, ok = self._flow(key.image, gray, then, guess, 1)
+            back, ok_back = self._flow(gray, key.image, now, then, 1)
+            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < 0.5)
+            ok &= np.linalg.norm(now - guess, axis=-1) < 4.0
+            ids, then, now = key.ids[lost[pairs[ok, 0]]], then[ok], now[ok]
+            _, a, b = np.intersect1d(key.ids, self.live.ids, return_indices=True)
+            if not len(ids) or len(a) + len(ids) < 20:
+                continue
+            inlier = epipolar_inliers(
+                self._normalise(np.concatenate([key.uv[a], then])),
+                self._normalise(np.concatenate([self.live.uv[b], now])),
+                self.config.max_epipolar / self.K[0, 0],
+            )[len(a) :]
+            self.live = self.live.add(ids[inlier], now[inlier])
