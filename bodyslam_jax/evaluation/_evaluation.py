@@ -185,12 +185,11 @@ def _person_errors(
             f"j_ate_{name}",
             metrics.joint_trajectory_error(joints, true_joints, usable, human),
         )
-    for chunking, suffix in (("wham", ""), ("tram", "_tram")):
-        for align_with, name in (("first", "w"), ("all", "wa")):
-            error = metrics.world_mpjpe(
-                joints, true_joints, valid, align_with, chunking
-            )
-            values |= _both(f"{name}_mpjpe{suffix}", error)
+    chunkings: dict[str, metrics.Chunking] = {"": "wham", "_tram": "tram"}
+    for suffix, chunking in chunkings.items():
+        first = metrics.world_mpjpe(joints, true_joints, valid, "first", chunking)
+        every = metrics.world_mpjpe(joints, true_joints, valid, "all", chunking)
+        values |= _both(f"w_mpjpe{suffix}", first) | _both(f"wa_mpjpe{suffix}", every)
     values |= _both("rte", metrics.root_trajectory_error(centre, true_centre, valid))
     in_camera = metrics.camera_frame(joints, estimate.T_WC)
     true_in_camera = metrics.camera_frame(true_joints, truth.T_WC)

@@ -50,7 +50,8 @@ class Errors(eqx.Module):
 
 def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Length of each vector, with derivative 0 where it is zero."""
-    square = jnp.sum(x**2, -1)
+    # Written out: XLA on CPU does not vectorise a sum over so short an axis.
+    square = sum((x[..., k] ** 2 for k in range(1, x.shape[-1])), x[..., 0] ** 2)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 

@@ -75,7 +75,7 @@ def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
 def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, "t d"]:
     """Moving average; straight lines at the ends, where an average would lag."""
     size = min(int(_SMOOTHING * fps) | 1, len(points) - 1 + len(points) % 2)
-    return savgol_filter(points, size, 1, axis=0) if size > 2 else points
+    return np.asarray(savgol_filter(points, size, 1, axis=0)) if size > 2 else points
 
 
 def foot_skating(result: Result, person: int) -> float:

@@ -28,7 +28,7 @@ _VARIABLES = {
 }
 FULL, HALF = 11.0, 5.4
 """Widths of figures, inches: across the page, and half of it."""
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.size": 10,

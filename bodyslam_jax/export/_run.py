@@ -110,7 +110,7 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
         for field in dataclasses.fields(result)
         if field.name != "summary"
     }
-    np.savez_compressed(folder / "result.npz", **arrays)
+    _savez(folder / "result.npz", arrays)
     write_tum(folder / "camera.tum", result.timestamps, result.T_WC)
     for h in range(len(result.poses)):
         write_body(
@@ -158,21 +158,19 @@ def write_body(
     **more: np.ndarray,
 ) -> None:
     """Writes one person AMASS style, at the given rate; `more` arrays beside."""
-    np.savez_compressed(
-        path,
-        poses=poses,
-        trans=trans,
-        betas=betas,
-        mocap_framerate=np.array(fps),
-        gender=np.array(gender),
-        **more,
-    )
+    person = {"poses": poses, "trans": trans, "betas": betas}
+    rate = {"mocap_framerate": np.array(fps), "gender": np.array(gender)}
+    _savez(path, person | rate | more)
+
+
+def _savez(path: Path, arrays: dict[str, Any]) -> None:
+    np.savez_compressed(path, **arrays)
 
 
 def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:
     """Writes points as binary PLY, m."""
     if len(points):
-        path.write_bytes(trimesh.PointCloud(points).export(file_type="ply"))
+        trimesh.PointCloud(points).export(path, file_type="ply")
         return
     # trimesh refuses to write no point at all, and an empty map is a result too.
     properties = "".join(f"property float {axis}\n" for axis in "xyz")
