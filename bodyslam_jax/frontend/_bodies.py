@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bodyslam_jax.frontend._body_tools import READERS, Unfit, from_spin
+from bodyslam_jax.frontend._body_parts import Unfit, join
+from bodyslam_jax.frontend._body_tools import READERS, from_spin
 from bodyslam_jax.frontend._pickle import restricted_load
 from bodyslam_jax.frontend._rows import Rows
 from bodyslam_jax.sequence import Bodies, Intrinsics
@@ -102,8 +103,7 @@ def _read_tram_folder(folder: Path, num_frames: int, intrinsics: Intrinsics) -> 
         number = int(re.findall(r"\d+", track.stem)[-1])
         person = np.full(len(one.frame), number)
         rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
-    names = ("frame", "person", "poses", "betas", "trans")
-    return Rows(*(np.concatenate([getattr(r, name) for r in rows]) for name in names))
+    return join(rows)
 
 
 def _gather(path: Path, rows: Rows, num_frames: int) -> Bodies:

@@ -6,13 +6,28 @@ where a tool means something else, the pelvis of the average body (SMPL's or SMP
 stands for J_0. SMPL-X's shapes mean other things than SMPL's and are left out.
 """
 
-import re
 from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.frontend._perspective import full_translation, turn_to_camera
+from bodyslam_jax.frontend._body_parts import (
+    Unfit,
+    as_rotvec,
+    betas_of,
+    focals,
+    frames_of,
+    frames_of_names,
+    from_crops,
+    join,
+    middle,
+    numbers_of,
+    people_of,
+    refocused,
+    rotations_of,
+    tell_apart,
+)
+from bodyslam_jax.frontend._perspective import turn_to_camera
 from bodyslam_jax.frontend._rows import Rows
 from bodyslam_jax.sequence import Intrinsics
 
@@ -22,25 +37,21 @@ _PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
 
 
-class Unfit(ValueError):
-    """A file of a known tool that lacks something; the reader adds the file's name."""
-
-
 def from_spin(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """SPIN: a row per frame; weak perspective in boxes that SPIN itself leaves out."""
-    poses = _array(data, "pose", (-1, 72))
-    frame = _frames(data, "frame", len(poses), num_frames)
+    poses = numbers_of(data, "pose", (-1, 72))
+    frame = frames_of(data, "frame", len(poses), num_frames)
     if "bbox" not in data:
         raise Unfit("`camera` needs `bbox` (m, 3: cx, cy, side px)")
     box, crop = (
-        _array(data, "bbox", (len(poses), 3)),
-        _array(data, "camera", (len(poses), 3)),
+        numbers_of(data, "bbox", (len(poses), 3)),
+        numbers_of(data, "camera", (len(poses), 3)),
     )
-    return _from_crops(
+    return from_crops(
         frame,
-        _people(data, len(poses)),
+        people_of(data, len(poses)),
         poses,
-        _betas(data, "betas", len(poses)),
+        betas_of(data, "betas", len(poses)),
         crop,
         box,
         camera,
@@ -51,56 +62,56 @@ def from_vibe(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """VIBE: `{person: {...}}`, crops as boxes (cx, cy, w, h) with w = h."""
     rows = []
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
-        poses = _array(one, "pose", (-1, 72))
+        poses = numbers_of(one, "pose", (-1, 72))
         n = len(poses)
-        boxes = _array(one, "bboxes", (n, 4))
+        boxes = numbers_of(one, "bboxes", (n, 4))
         rows.append(
-            _from_crops(
-                _frames(one, "frame_ids", n, num_frames),
+            from_crops(
+                frames_of(one, "frame_ids", n, num_frames),
                 np.full(n, number),
                 poses,
-                _betas(one, "betas", n),
-                _array(one, "pred_cam", (n, 3)),
+                betas_of(one, "betas", n),
+                numbers_of(one, "pred_cam", (n, 3)),
                 boxes[:, :3],
                 camera,
             )
         )
-    return _join(rows)
+    return join(rows)
 
 
 def from_wham(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """WHAM: `{person: {...}}`; `pose`, `trans` are in the camera (`_world` is not)."""
     rows = []
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
-        poses = _array(one, "pose", (-1, 72))
+        poses = numbers_of(one, "pose", (-1, 72))
         n = len(poses)
         rows.append(
             Rows(
-                _frames(one, "frame_ids", n, num_frames),
+                frames_of(one, "frame_ids", n, num_frames),
                 np.full(n, number),
                 poses,
-                _betas(one, "betas", n),
-                _array(one, "trans", (n, 3)),
+                betas_of(one, "betas", n),
+                numbers_of(one, "trans", (n, 3)),
             )
         )
-    return _join(rows)
+    return join(rows)
 
 
 def from_cliff(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """CLIFF: full-image translation for its own focal length, image names."""
-    poses = _rotations(data, "pose", 24)
+    poses = rotations_of(data, "pose", 24)
     n = len(poses)
     if "imgname" in data:
-        frame = _frames_of_names([str(name) for name in np.ravel(data["imgname"])])
+        frame = frames_of_names([str(name) for name in np.ravel(data["imgname"])])
     else:
-        frame = _frames(data, "frame", n, num_frames)
+        frame = frames_of(data, "frame", n, num_frames)
     if len(frame) != n:
         raise Unfit(f"{len(frame)} image names for {n} bodies")
-    trans = _array(data, "global_t", (n, 3))
+    trans = numbers_of(data, "global_t", (n, 3))
     if "focal_l" in data:
-        focal = np.broadcast_to(np.ravel(_array(data, "focal_l", None)), (n,))
-        trans = _refocused(trans, focal, _middle(camera), camera)
-    return Rows(frame, _tell_apart(frame), poses, _betas(data, "shape", n), trans)
+        focal = np.broadcast_to(np.ravel(numbers_of(data, "focal_l", None)), (n,))
+        trans = refocused(trans, focal, middle(camera), camera)
+    return Rows(frame, tell_apart(frame), poses, betas_of(data, "shape", n), trans)
 
 
 def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
@@ -110,7 +121,7 @@ def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     relative to the crop's ray.
     """
     names = sorted(data)
-    numbered = _frames_of_names([str(name) for name in names])
+    numbered = frames_of_names([str(name) for name in names])
     frame, person, poses, betas, trans, box = [], [], [], [], [], []
     for number, name in zip(numbered, names, strict=True):
         found = data[name]
@@ -120,7 +131,7 @@ def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
                 continue  # predicted, not seen
             x, y, w, h = np.ravel(found["bbox"][i])[:4]
             parts = [
-                _as_rotvec(np.asarray(body[key]), joints).ravel()
+                as_rotvec(np.asarray(body[key]), joints).ravel()
                 for key, joints in (("global_orient", 1), ("body_pose", 23))
             ]
             frame.append(number)
@@ -134,7 +145,7 @@ def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     stacked = [np.asarray(a, dtype=np.float64) for a in (poses, betas, trans, box)]
     poses, betas, trans, box = stacked
     focal = np.full(len(frame), 5000 / 256 * max(camera.width, camera.height))
-    trans = _refocused(trans, focal, _middle(camera), camera)
+    trans = refocused(trans, focal, middle(camera), camera)
     root = turn_to_camera(poses[:, :3], box, camera)
     poses = np.concatenate([root, poses[:, 3:]], axis=-1)
     return Rows(np.asarray(frame), np.asarray(person), poses, betas, trans)
@@ -142,18 +153,18 @@ def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
 
 def from_tram(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """TRAM: one `hps_track_k.npy` is one person, with full-image translation."""
-    poses = _as_rotvec(_array(data, "pred_rotmat", (-1, 24, 3, 3)), 24)
+    poses = as_rotvec(numbers_of(data, "pred_rotmat", (-1, 24, 3, 3)), 24)
     n = len(poses)
-    trans = _array(data, "pred_trans", None).reshape(n, 3)
+    trans = numbers_of(data, "pred_trans", None).reshape(n, 3)
     if "img_focal" in data:
         focal = np.full(n, float(np.ravel(data["img_focal"])[0]))
-        center = np.asarray(data.get("img_center", _middle(camera)), dtype=np.float64)
-        trans = _refocused(trans, focal, center, camera)
+        center = np.asarray(data.get("img_center", middle(camera)), dtype=np.float64)
+        trans = refocused(trans, focal, center, camera)
     return Rows(
-        _frames(data, "frame", n, num_frames),
+        frames_of(data, "frame", n, num_frames),
         np.zeros(n, dtype=np.int64),
         poses.reshape(n, 72),
-        _betas(data, "pred_shape", n),
+        betas_of(data, "pred_shape", n),
         trans,
     )
 
@@ -161,16 +172,16 @@ def from_tram(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
 def from_gvhmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """GVHMR: SMPL-X in the camera of `K_fullimg`, a row per frame."""
     body = data["smpl_params_incam"]
-    root = _array(body, "global_orient", (-1, 3))
+    root = numbers_of(body, "global_orient", (-1, 3))
     n = len(root)
-    trans = _array(body, "transl", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
+    trans = numbers_of(body, "transl", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
     if "K_fullimg" in data:
-        K = np.broadcast_to(_array(data, "K_fullimg", None), (n, 3, 3))
-        trans = _refocused(trans, _focals(K), K[:, :2, 2], camera)
+        K = np.broadcast_to(numbers_of(data, "K_fullimg", None), (n, 3, 3))
+        trans = refocused(trans, focals(K), K[:, :2, 2], camera)
     poses = np.concatenate(
-        [root, _array(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
+        [root, numbers_of(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
     )
-    frame = _frames(data, "frame", n, num_frames)
+    frame = frames_of(data, "frame", n, num_frames)
     return Rows(frame, np.zeros(n, np.int64), poses, np.zeros((n, 10)), trans)
 
 
@@ -183,43 +194,43 @@ def from_prompthmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     ):
         body = one["smplx_cam"]
         if "pose" in body:
-            pose = _array(body, "pose", None)
+            pose = numbers_of(body, "pose", None)
         else:
-            pose = _as_rotvec(_array(body, "rotmat", None), None)
+            pose = as_rotvec(numbers_of(body, "rotmat", None), None)
         n = len(pose)
         pose = pose.reshape(n, -1)[:, :66]
         if pose.shape[1] != 66:
             raise Unfit(f"`pose` of {pose.shape[1]} numbers, not 66 or more")
-        trans = _array(body, "trans", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
+        trans = numbers_of(body, "trans", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
         if "img_focal" in world:
             focal = np.full(n, float(np.ravel(world["img_focal"])[0]))
-            center = np.asarray(world.get("img_center", _middle(camera)), np.float64)
-            trans = _refocused(trans, focal, center, camera)
+            center = np.asarray(world.get("img_center", middle(camera)), np.float64)
+            trans = refocused(trans, focal, center, camera)
         rows.append(
             Rows(
-                _frames(one, "frames", n, num_frames),
+                frames_of(one, "frames", n, num_frames),
                 np.full(n, number),
                 np.concatenate([pose, np.zeros((n, 6))], axis=-1),
                 np.zeros((n, 10)),
                 trans,
             )
         )
-    return _join(rows)
+    return join(rows)
 
 
 def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
-    trans = _array(data, "trans", (-1, -1, 3))
+    trans = numbers_of(data, "trans", (-1, -1, 3))
     p, t = trans.shape[:2]
     if t != num_frames:
         raise Unfit(f"{t} frames, but the video has {num_frames}")
     scale = float(np.ravel(data.get("world_scale", 1.0))[0])
-    R = np.broadcast_to(_array(data, "cam_R", None), (p, t, 3, 3))
-    shift = scale * np.broadcast_to(_array(data, "cam_t", None), (p, t, 3))
-    root = _array(data, "root_orient", (p, t, 3))
-    body = _array(data, "pose_body", None).reshape(p, t, 63)
+    R = np.broadcast_to(numbers_of(data, "cam_R", None), (p, t, 3, 3))
+    shift = scale * np.broadcast_to(numbers_of(data, "cam_t", None), (p, t, 3))
+    root = numbers_of(data, "root_orient", (p, t, 3))
+    body = numbers_of(data, "pose_body", None).reshape(p, t, 63)
     betas = np.broadcast_to(
-        _array(data, "betas", None)[..., :10].reshape(p, -1, 10), (p, t, 10)
+        numbers_of(data, "betas", None)[..., :10].reshape(p, -1, 10), (p, t, 10)
     )
     # A world transform moves the pelvis, not the model's origin.
     pelvis = np.einsum("ptij,ptj->pti", R, trans + _PELVIS_SMPL) + shift
@@ -228,9 +239,9 @@ def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     )
     moved = pelvis - _PELVIS_SMPL
     if "intrins" in data:
-        fx, _, cx, cy = np.ravel(_array(data, "intrins", None))[:4]
+        fx, _, cx, cy = np.ravel(numbers_of(data, "intrins", None))[:4]
         focal = np.full(p * t, fx)
-        moved = _refocused(moved.reshape(-1, 3), focal, np.array([cx, cy]), camera)
+        moved = refocused(moved.reshape(-1, 3), focal, np.array([cx, cy]), camera)
     seen = np.ones((p, t), dtype=bool)
     if "track_mask" in data:
         seen = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
@@ -249,26 +260,26 @@ def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     for number, (_, one) in enumerate(
         sorted(people.items(), key=lambda kv: str(kv[0]))
     ):
-        root = _array(one, "smpl_orient_cam", (-1, 3))
+        root = numbers_of(one, "smpl_orient_cam", (-1, 3))
         n = len(root)
-        trans = _array(one, "root_trans_cam", (n, 3)) - _PELVIS_SMPL
+        trans = numbers_of(one, "root_trans_cam", (n, 3)) - _PELVIS_SMPL
         if "cam_K" in one:
-            K = np.broadcast_to(_array(one, "cam_K", None), (n, 3, 3))
-            pelvis = _refocused(trans + _PELVIS_SMPL, _focals(K), K[:, :2, 2], camera)
+            K = np.broadcast_to(numbers_of(one, "cam_K", None), (n, 3, 3))
+            pelvis = refocused(trans + _PELVIS_SMPL, focals(K), K[:, :2, 2], camera)
             trans = pelvis - _PELVIS_SMPL
-        poses = np.concatenate([root, _array(one, "smpl_pose", (n, 69))], axis=-1)
+        poses = np.concatenate([root, numbers_of(one, "smpl_pose", (n, 69))], axis=-1)
         seen = np.asarray(one.get("visible", np.ones(n))).astype(bool)
-        frame = _frames(one, "frames", n, num_frames)
+        frame = frames_of(one, "frames", n, num_frames)
         rows.append(
             Rows(
                 frame[seen],
                 np.full(int(seen.sum()), number),
                 poses[seen],
-                _betas(one, "smpl_beta", n)[seen],
+                betas_of(one, "smpl_beta", n)[seen],
                 trans[seen],
             )
         )
-    return _join(rows)
+    return join(rows)
 
 
 def from_amass(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
@@ -276,13 +287,13 @@ def from_amass(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
 
     A different rate is resampled to the video's number of frames.
     """
-    poses = _array(data, "poses", None)
+    poses = numbers_of(data, "poses", None)
     n = len(poses)
     if poses.ndim != 2 or poses.shape[1] < 66:
         raise Unfit(f"`poses` is {poses.shape}, not (t, 72) or (t, 156)")
     width = 72 if poses.shape[1] == 72 else 66
     poses = np.pad(poses[:, :width], [(0, 0), (0, 72 - width)])
-    trans = _array(data, "trans", (n, 3))
+    trans = numbers_of(data, "trans", (n, 3))
     at = np.arange(num_frames)
     if n != num_frames:
         at = np.round(np.linspace(0, n - 1, num_frames)).astype(np.int64)
@@ -291,7 +302,7 @@ def from_amass(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
             raise Unfit(
                 f"{n} frames at {rate:g}/s, but the video has {num_frames} frames"
             )
-    betas = np.ravel(_array(data, "betas", None))[:10]
+    betas = np.ravel(numbers_of(data, "betas", None))[:10]
     betas = np.pad(betas, (0, 10 - len(betas)))
     return Rows(
         np.arange(num_frames),
@@ -336,146 +347,3 @@ READERS: list[tuple[str, Callable[[dict], bool], Reader]] = [
     ("AMASS", _has("poses", "trans", "betas", "mocap_framerate"), from_amass),
 ]
 """Name, whether a file's content is that tool's, and how it is read."""
-
-
-def _array(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """A finite float64 array, of the shape given (-1: any length)."""
-    if not isinstance(data, dict) or key not in data:
-        raise Unfit(f"no `{key}`")
-    try:
-        array = np.asarray(data[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise Unfit(f"`{key}` does not hold numbers") from None
-    if not np.isfinite(array).all():
-        raise Unfit(f"`{key}` has NaN or infinity in it")
-    if shape is not None:
-        fits = array.ndim == len(shape) and all(
-            want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
-        )
-        if not fits:
-            expected = tuple("any" if n < 0 else n for n in shape)
-            raise Unfit(f"`{key}` is {array.shape}, not {expected}")
-    return array
-
-
-def _betas(data: dict, key: str, n: int) -> np.ndarray:
-    betas = _array(data, key, None)
-    betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
-    if betas.shape[1] < 10:
-        raise Unfit(f"`{key}` has {betas.shape[1]} numbers a body, not 10 or more")
-    return betas[:, :10].copy()
-
-
-def _people(data: dict, n: int) -> np.ndarray:
-    if "person" not in data:
-        return np.zeros(n, dtype=np.int64)
-    return _array(data, "person", (n,)).astype(np.int64)
-
-
-def _frames(data: dict, key: str, n: int, num_frames: int) -> np.ndarray:
-    if key in data:
-        return np.ravel(_array(data, key, None)).astype(np.int64)
-    if n != num_frames:
-        raise Unfit(
-            f"{n} bodies without `{key}`, but the video has {num_frames} frames"
-        )
-    return np.arange(n)
-
-
-def _frames_of_names(names: list[str]) -> np.ndarray:
-    """Frame numbers from image names; as many as there are names if they have none."""
-    numbers = [
-        re.findall(r"\d+", name.rsplit("/", 1)[-1].rsplit(".", 1)[0]) for name in names
-    ]
-    if not all(numbers):
-        raise Unfit("image names without a number")
-    found = np.array([int(n[-1]) for n in numbers])
-    # Tools that cut a video into images count from 1.
-    return found - 1 if len(found) and found.min() == 1 else found
-
-
-def _tell_apart(frame: np.ndarray) -> np.ndarray:
-    """Numbers people within a frame, where a tool does not say who is who."""
-    person = np.zeros(len(frame), dtype=np.int64)
-    count: dict[int, int] = {}
-    for i, k in enumerate(frame):
-        person[i] = count.get(int(k), 0)
-        count[int(k)] = person[i] + 1
-    return person
-
-
-def _as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
-    """Axis-angle (m, 3j) from matrices (m, j, 3, 3) or (j, 3, 3), or as it is."""
-    array = np.asarray(array, dtype=np.float64)
-    if array.shape[-2:] == (3, 3):
-        if joints is not None and array.size % (9 * joints):
-            raise Unfit(f"rotations {array.shape}, not of {joints} joints")
-        rotvec = Rotation.from_matrix(array.reshape(-1, 3, 3)).as_rotvec()
-        count = joints or array.shape[1]
-        return rotvec.reshape(-1, 3 * count)
-    return (
-        array.reshape(len(array), -1)
-        if joints is None
-        else array.reshape(-1, 3 * joints)
-    )
-
-
-def _rotations(data: dict, key: str, joints: int) -> np.ndarray:
-    array = _array(data, key, None)
-    if array.shape[1:] not in ((3 * joints,), (joints, 3), (joints, 3, 3)):
-        raise Unfit(f"`{key}` is {array.shape}, not rotations of {joints} joints")
-    return _as_rotvec(array, joints)
-
-
-def _middle(camera: Intrinsics) -> np.ndarray:
-    """Principal point of tools that put it in the middle of the image, px."""
-    return np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-
-
-def _refocused(
-    trans: np.ndarray, focal: np.ndarray, center: np.ndarray, camera: Intrinsics
-) -> np.ndarray:
-    """Moves bodies so that they look the same through the true camera.
-
-    Distance is proportional to focal length for the same size in the image.
-
-    Args:
-        focal: of the tool's camera, px: one number a body, or two (x, y).
-        center: its principal point, px: one for all, or one a body.
-    """
-    fx, fy, cx, cy = camera.params[:4]
-    focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
-    center = np.broadcast_to(center, (len(trans), 2))
-    z = trans[:, 2] * fx / focal[:, 0]
-    uv = center + focal * trans[:, :2] / trans[:, 2:]
-    xy = (uv - [cx, cy]) / [fx, fy] * z[:, None]
-    return np.concatenate([xy, z[:, None]], axis=-1)
-
-
-def _focals(K: np.ndarray) -> np.ndarray:
-    return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
-
-
-def _from_crops(
-    frame: np.ndarray,
-    person: np.ndarray,
-    poses: np.ndarray,
-    betas: np.ndarray,
-    crop: np.ndarray,
-    box: np.ndarray,
-    camera: Intrinsics,
-) -> Rows:
-    if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
-        raise Unfit("a weak-perspective camera or box with a size of 0 or less")
-    trans = full_translation(crop, box, camera)
-    root = turn_to_camera(poses[:, :3], box, camera)
-    return Rows(
-        frame, person, np.concatenate([root, poses[:, 3:]], axis=-1), betas, trans
-    )
-
-
-def _join(rows: list[Rows]) -> Rows:
-    if not rows:
-        raise Unfit("no person in it")
-    names = ("frame", "person", "poses", "betas", "trans")
-    return Rows(*(np.concatenate([getattr(r, name) for r in rows]) for name in names))

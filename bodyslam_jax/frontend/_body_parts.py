@@ -1,0 +1,160 @@
+"""Parts that the readers of regressed bodies share: checks, frames, rotations, cameras.
+
+An `Unfit` says what is wrong with the content; the caller adds the file's name.
+"""
+
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.frontend._perspective import full_translation, turn_to_camera
+from bodyslam_jax.frontend._rows import Rows
+from bodyslam_jax.sequence import Intrinsics
+
+
+class Unfit(ValueError):
+    """A file of a known tool that lacks something; the reader adds the file's name."""
+
+
+def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
+    """A finite float64 array, of the shape given (-1: any length)."""
+    if not isinstance(data, dict) or key not in data:
+        raise Unfit(f"no `{key}`")
+    try:
+        array = np.asarray(data[key], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise Unfit(f"`{key}` does not hold numbers") from None
+    if not np.isfinite(array).all():
+        raise Unfit(f"`{key}` has NaN or infinity in it")
+    if shape is not None:
+        fits = array.ndim == len(shape) and all(
+            want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
+        )
+        if not fits:
+            expected = tuple("any" if n < 0 else n for n in shape)
+            raise Unfit(f"`{key}` is {array.shape}, not {expected}")
+    return array
+
+
+def betas_of(data: dict, key: str, n: int) -> np.ndarray:
+    betas = numbers_of(data, key, None)
+    betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
+    if betas.shape[1] < 10:
+        raise Unfit(f"`{key}` has {betas.shape[1]} numbers a body, not 10 or more")
+    return betas[:, :10].copy()
+
+
+def people_of(data: dict, n: int) -> np.ndarray:
+    if "person" not in data:
+        return np.zeros(n, dtype=np.int64)
+    return numbers_of(data, "person", (n,)).astype(np.int64)
+
+
+def frames_of(data: dict, key: str, n: int, num_frames: int) -> np.ndarray:
+    if key in data:
+        return np.ravel(numbers_of(data, key, None)).astype(np.int64)
+    if n != num_frames:
+        raise Unfit(
+            f"{n} bodies without `{key}`, but the video has {num_frames} frames"
+        )
+    return np.arange(n)
+
+
+def frames_of_names(names: list[str]) -> np.ndarray:
+    """Frame numbers from image names; as many as there are names if they have none."""
+    numbers = [
+        re.findall(r"\d+", name.rsplit("/", 1)[-1].rsplit(".", 1)[0]) for name in names
+    ]
+    if not all(numbers):
+        raise Unfit("image names without a number")
+    found = np.array([int(n[-1]) for n in numbers])
+    # Tools that cut a video into images count from 1.
+    return found - 1 if len(found) and found.min() == 1 else found
+
+
+def tell_apart(frame: np.ndarray) -> np.ndarray:
+    """Numbers people within a frame, where a tool does not say who is who."""
+    person = np.zeros(len(frame), dtype=np.int64)
+    count: dict[int, int] = {}
+    for i, k in enumerate(frame):
+        person[i] = count.get(int(k), 0)
+        count[int(k)] = person[i] + 1
+    return person
+
+
+def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
+    """Axis-angle (m, 3j) from matrices (m, j, 3, 3) or (j, 3, 3), or as it is."""
+    array = np.asarray(array, dtype=np.float64)
+    if array.shape[-2:] == (3, 3):
+        if joints is not None and array.size % (9 * joints):
+            raise Unfit(f"rotations {array.shape}, not of {joints} joints")
+        rotvec = Rotation.from_matrix(array.reshape(-1, 3, 3)).as_rotvec()
+        count = joints or array.shape[1]
+        return rotvec.reshape(-1, 3 * count)
+    return (
+        array.reshape(len(array), -1)
+        if joints is None
+        else array.reshape(-1, 3 * joints)
+    )
+
+
+def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
+    array = numbers_of(data, key, None)
+    if array.shape[1:] not in ((3 * joints,), (joints, 3), (joints, 3, 3)):
+        raise Unfit(f"`{key}` is {array.shape}, not rotations of {joints} joints")
+    return as_rotvec(array, joints)
+
+
+def middle(camera: Intrinsics) -> np.ndarray:
+    """Principal point of tools that put it in the middle of the image, px."""
+    return np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+
+
+def refocused(
+    trans: np.ndarray, focal: np.ndarray, center: np.ndarray, camera: Intrinsics
+) -> np.ndarray:
+    """Moves bodies so that they look the same through the true camera.
+
+    Distance is proportional to focal length for the same size in the image.
+
+    Args:
+        focal: of the tool's camera, px: one number a body, or two (x, y).
+        center: its principal point, px: one for all, or one a body.
+    """
+    fx, fy, cx, cy = camera.params[:4]
+    focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
+    center = np.broadcast_to(center, (len(trans), 2))
+    z = trans[:, 2] * fx / focal[:, 0]
+    uv = center + focal * trans[:, :2] / trans[:, 2:]
+    xy = (uv - [cx, cy]) / [fx, fy] * z[:, None]
+    return np.concatenate([xy, z[:, None]], axis=-1)
+
+
+def focals(K: np.ndarray) -> np.ndarray:
+    return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
+
+
+def from_crops(
+    frame: np.ndarray,
+    person: np.ndarray,
+    poses: np.ndarray,
+    betas: np.ndarray,
+    crop: np.ndarray,
+    box: np.ndarray,
+    camera: Intrinsics,
+) -> Rows:
+    if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
+        raise Unfit("a weak-perspective camera or box with a size of 0 or less")
+    trans = full_translation(crop, box, camera)
+    root = turn_to_camera(poses[:, :3], box, camera)
+    return Rows(
+        frame, person, np.concatenate([root, poses[:, 3:]], axis=-1), betas, trans
+    )
+
+
+def join(rows: list[Rows]) -> Rows:
+    if not rows:
+        raise Unfit("no person in it")
+    names = ("frame", "person", "poses", "betas", "trans")
+    return Rows(*(np.concatenate([getattr(r, name) for r in rows]) for name in names))
