@@ -219,12 +219,13 @@ def report(name, problem, truth, start, schedule, repeats):
     run = lambda: solve(problem, start, schedule=schedule)
     solution, first, (wall, cpu) = timed(run, repeats)
     steps = sum(int(n) for n in solution.num_steps)
-    cost = float(problem.cost(solution.state))
+    cost_of = eqx.filter_jit(lambda p, s: p.cost(s))
+    cost = float(cost_of(problem, solution.state))
     print(
         f"{name:28s} {wall:7.2f} s (processor {cpu:.2f}) {wall / steps:6.3f} s/it "
         f"({cpu / steps:.3f}) {steps:3d} it  "
-        f"cost {float(problem.cost(start)):.4g} -> {cost:.8g} "
-        f"(truth {float(problem.cost(truth)):.6g}) "
+        f"cost {float(cost_of(problem, start)):.4g} -> {cost:.8g} "
+        f"(truth {float(cost_of(problem, truth)):.6g}) "
         f"s {float(solution.state.scale):.4f}/{float(truth.scale):.4f} "
         f"{solution.status}; compile {first[0] - wall:.1f} s "
         f"(processor {first[1] - cpu:.1f})",

@@ -19,15 +19,16 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 3.14, np.pi, 3.2])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi, 3.2])
 def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
     start = angle * jnp.array([0.6, 0.0, 0.8])
     step = jnp.array([0.02, -0.03, 0.05])
-    moved = g.retract_rotation(start, step)
-    matrix = lambda w: jaxlie.SO3.exp(w).as_matrix()
+    moved = jax.jit(g.retract_rotation)(start, step)
+    matrix = jax.jit(lambda w: jaxlie.SO3.exp(w).as_matrix())
     assert jnp.allclose(matrix(moved), matrix(start) @ matrix(step), atol=1e-12)
     assert jnp.linalg.norm(moved - start) < 0.2  # continuous also beyond pi
-    check_grads(lambda s: g.retract_rotation(start, s), (step,), order=1)
+    retract = jax.jit(lambda s: g.retract_rotation(start, jnp.asarray(s)))
+    check_grads(retract, (step,), order=1)
 
 
 @pytest.mark.parametrize("loss", [g.Squared(), g.Cauchy(1.5), g.GemanMcClure(2.0)])
@@ -47,13 +48,16 @@ def test_keypoint_jacobian_is_that_of_the_keypoints(rng):
     shape = jnp.asarray(rng.standard_normal(10))
     points = lambda w, b: local_keypoints(body, w, b, "body25", 0.7)
     moved = lambda s: points(g.retract_rotation(pose, s), shape)
-    found = keypoint_jacobian(body, pose, shape, "body25", 0.7)
+    found = jax.jit(lambda w, b: keypoint_jacobian(body, w, b, "body25", 0.7))(
+        pose, shape
+    )
     by_pose = jax.jit(jax.jacfwd(moved))(jnp.zeros((23, 3)))
-    assert jnp.allclose(found[0], points(pose, shape), atol=1e-12)
+    assert jnp.allclose(found[0], jax.jit(points)(pose, shape), atol=1e-12)
     assert jnp.allclose(
         found[1].transpose(1, 0, 2), by_pose.reshape(25, 3, 69), atol=1e-12
     )
-    assert jnp.allclose(found[2], jax.jacfwd(points, 1)(pose, shape), atol=1e-12)
+    by_shape = jax.jit(jax.jacfwd(points, 1))(pose, shape)
+    assert jnp.allclose(found[2], by_shape, atol=1e-12)
 
 
 def test_every_residual_has_the_derivative_of_finite_differences(rng):

@@ -39,6 +39,7 @@ from bodyslam_jax.graph._robust import lift as lift
 from bodyslam_jax.graph._state import State as State
 from bodyslam_jax.graph._state import Step as Step
 from bodyslam_jax.graph._state import gauge as gauge
+from bodyslam_jax.graph._state import inverse_right_jacobian as inverse_right_jacobian
 from bodyslam_jax.graph._state import retract_pose as retract_pose
 from bodyslam_jax.graph._state import retract_rotation as retract_rotation
 from bodyslam_jax.graph._state import world_from_root as world_from_root

@@ -20,7 +20,7 @@ from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.camera import project
 from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import State, compose
+from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
 from bodyslam_jax.motion import leg_length
 
 Touch = tuple[str, int]
@@ -30,9 +30,9 @@ Touch = tuple[str, int]
 class Frame(eqx.Module):
     """One frame of one person; people's fields are `None` for a camera's factor."""
 
-    camera: Float[Array, "4 4"]
-    root: Float[Array, "4 4"] | None
-    pose: Float[Array, "23 3"] | None
+    camera: Float[Array, "*b 4 4"]
+    root: Float[Array, "*b 4 4"] | None
+    pose: Float[Array, "*b 23 3"] | None
 
 
 class Shared(eqx.Module):
@@ -85,8 +85,8 @@ class AbstractFrameFactor(AbstractFactor):
 
     def jacobian(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
-    ) -> tuple[Float[Array, "*m d"], dict[str, Float[Array, "*m d n"]]] | None:
-        """The residual and, if known in closed form, its derivatives by variable."""
+    ) -> tuple[Float[Array, "*m d"], dict[Touch, Float[Array, "*m d n"]]] | None:
+        """The residual and, if known in closed form, its derivative by each touch."""
         return None
 
     @property
@@ -191,10 +191,10 @@ class JointReprojection(AbstractFrameFactor):
         # p_C = C Exp(ω) p_H + r: dp_C/dω = -C [p_H]x, row by row the cross product.
         turn = jnp.cross(p_H[:, None, :], by_H)
         return (seen - pixel) / sigma[:, None], {
-            "root": jnp.concatenate([turn, by_C], axis=-1),
-            "pose": jnp.einsum("kdi,ikm->kdm", by_H, by_pose),
-            "shape": by_H @ by_shape,
-            "intrinsics": by_intrinsics / sigma[:, None, None],
+            ("root", 0): jnp.concatenate([turn, by_C], axis=-1),
+            ("pose", 0): jnp.einsum("kdi,ikm->kdm", by_H, by_pose),
+            ("shape", 0): by_H @ by_shape,
+            ("intrinsics", 0): by_intrinsics / sigma[:, None, None],
         }
 
 
@@ -288,6 +288,20 @@ class Posture(AbstractFrameFactor):
             before = rotation_between(previous, window[1].pose)
             error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
         return error / sigma[:, None]
+
+    def jacobian(self, data, window, shared):
+        rotation, previous, sigma, correlation = data
+        error = rotation_between(rotation, window[0].pose)
+        by_now = inverse_right_jacobian(error) / sigma[:, None, None]
+        if not self.correlated:
+            return error / sigma[:, None], {("pose", 0): by_now}
+        before = rotation_between(previous, window[1].pose)
+        by_before = -correlation * inverse_right_jacobian(before) / sigma[:, None, None]
+        spread = jnp.sqrt(1 - correlation**2)
+        return (error - correlation * before) / (spread * sigma[:, None]), {
+            ("pose", 0): by_now / spread,
+            ("pose", 1): by_before / spread,
+        }
 
 
 class Shape(AbstractFrameFactor):

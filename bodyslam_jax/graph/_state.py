@@ -103,6 +103,25 @@ def retract_rotation(
     return jnp.where(far & flipped, moved * (1 - 2 * jnp.pi / angle), moved)
 
 
+def inverse_right_jacobian(
+    rotation: Float[Array, "*b 3"],
+) -> Float[Array, "*b 3 3"]:
+    """`d Log(Exp(θ) Exp(δ)) / dδ` at 0, `*b 3 3`; finite below a full turn."""
+    squared = jnp.sum(rotation**2, axis=-1)[..., None, None]
+    small = squared < 1e-4
+    safe = jnp.where(small, 1.0, squared)
+    angle = jnp.sqrt(safe)
+    half = 0.5 * angle
+    factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    factor = jnp.where(small, 1 / 12 + squared / 720, factor)
+    x, y, z = (rotation[..., i] for i in range(3))
+    zero = jnp.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    eye = jnp.eye(3, dtype=rotation.dtype)
+    return eye + 0.5 * skew + factor * (skew @ skew)
+
+
 def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
     """Hamilton's product; jaxlie's own mixes integers in, which strict types forbid."""
     a, b, c, d = (first.wxyz[..., i] for i in range(4))

@@ -100,20 +100,18 @@ def _place(blocks, frames_axis_cut):
     for lag, block in blocks.items():
         block = frames_axis_cut(block)
         h, n, _, p, q = block.shape
-        for target in (-1, 0, 1):
-            rows = [i for i in range(CHUNK) if (i - lag) // CHUNK == target]
-            if not rows:
-                continue
-            rows = jnp.array(rows)
-            place = jnp.zeros((h, n, CHUNK, CHUNK, p, q), block.dtype)
-            place = place.at[:, :, rows, (rows - lag) % CHUNK].set(block[:, :, rows])
-            place = place.swapaxes(3, 4).reshape(h, n, CHUNK * p, CHUNK * q)
-            if target == 0:
-                same = same + place
-            elif target < 0:
-                before = before + place
-            else:
-                after = after + place
+
+        def put(shift, block=block, lag=lag, h=h, n=n, p=p, q=q):
+            # Products with shifted identities: scatters of small blocks are slow.
+            where = jnp.eye(CHUNK, k=shift - lag, dtype=block.dtype)
+            wide = block[:, :, :, :, None, :] * where[:, None, :, None]
+            return wide.reshape(h, n, CHUNK * p, CHUNK * q)
+
+        same = same + put(0)
+        if lag > 0:
+            before = before + put(CHUNK)
+        if lag < 0:
+            after = after + put(-CHUNK)
     return same, before, after
 
 

@@ -261,8 +261,8 @@ def observability(problem: Problem, state: State, spread: Marginals) -> tuple[st
         lost = seen & ~(deviation(np.asarray(spread.landmarks)) < depth / 3)
         if lost.sum() > 0.5 * seen.sum():
             found.append(
-                f"depth of {int(lost.sum())} of {int(seen.sum())} landmarks: the camera "
-                "turns but does not move."
+                f"depth of {int(lost.sum())} of {int(seen.sum())} landmarks: the "
+                "camera turns but does not move."
             )
         elif lost.any():
             found.append(f"depth of {int(lost.sum())} landmarks: seen from one place.")

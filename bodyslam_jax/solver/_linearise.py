@@ -20,6 +20,7 @@ from bodyslam_jax.graph import (
     Reprojection,
     Shared,
     State,
+    inverse_right_jacobian,
 )
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
@@ -173,6 +174,7 @@ def _frames(problem, factor, state, sums):
         return
     local = [t for t in touches if t[0] in ("pose", "root", "camera")]
     common = [t[0] for t in touches if t[0] not in ("pose", "root", "camera")]
+    ordered = [*local, *((name, 0) for name in common)]
     joint = factor.per_joint
     width = {"pose": 3 if joint else 69, "root": 6, "camera": 6}
     own = {"scale": slice(0, 1), "intrinsics": slice(1, 1 + sizes.intrinsics)}
@@ -186,8 +188,7 @@ def _frames(problem, factor, state, sums):
         known = factor.jacobian(data, window, shared)
         if known is not None:
             residual, parts_of = known
-            names = [name for name, _ in local] + common
-            jac = jnp.concatenate([parts_of[name] for name in names], axis=-1)
+            jac = jnp.concatenate([parts_of[touch] for touch in ordered], axis=-1)
         else:
 
             def moved(step):
@@ -210,7 +211,7 @@ def _frames(problem, factor, state, sums):
 
     turns: tuple = (None,) * factor.num_lags
     if any(name == "pose" for name, _ in local):
-        turn = _inverse_right_jacobian(state.poses)
+        turn = inverse_right_jacobian(state.poses)
         turns = tuple(shift_back(turn, lag) for lag in range(factor.num_lags))
     jac, residual, rho = factor.map_frames(one, state, turns)
     sums.costs.append(0.5 * jnp.sum(rho))
@@ -300,23 +301,6 @@ def _nudge(pose, step):
     rotation = rotation + jnp.cross(rotation, jnp.broadcast_to(step[:3], (3, 3)))
     top = jnp.concatenate([rotation, (pose[:3, 3] + step[3:])[:, None]], axis=1)
     return jnp.concatenate([top, pose[3:]], axis=0)
-
-
-def _inverse_right_jacobian(rotation):
-    """`d Log(Exp(θ) Exp(δ)) / dδ` at 0, `*b 3 3`; finite below a full turn."""
-    squared = jnp.sum(rotation**2, axis=-1)[..., None, None]
-    small = squared < 1e-4
-    safe = jnp.where(small, 1.0, squared)
-    angle = jnp.sqrt(safe)
-    half = 0.5 * angle
-    factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
-    factor = jnp.where(small, 1 / 12 + squared / 720, factor)
-    x, y, z = (rotation[..., i] for i in range(3))
-    zero = jnp.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    eye = jnp.eye(3, dtype=rotation.dtype)
-    return eye + 0.5 * skew + factor * (skew @ skew)
 
 
 def _move_shared(shared, name, step):

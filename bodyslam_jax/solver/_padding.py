@@ -7,6 +7,7 @@ move.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bodyslam_jax.graph import CHUNK, Problem, Reprojection, State, Step, round_up
 
@@ -46,13 +47,14 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
 
 def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
     """Drops what `pad` added."""
+    cut = lambda x: x if isinstance(x, jax.core.Tracer) else np.asarray(x)
     return State(
         scale=state.scale,
-        cameras=state.cameras[:num_frames],
-        roots=state.roots[:, :num_frames],
-        poses=state.poses[:, :num_frames],
+        cameras=jnp.asarray(cut(state.cameras)[:num_frames]),
+        roots=jnp.asarray(cut(state.roots)[:, :num_frames]),
+        poses=jnp.asarray(cut(state.poses)[:, :num_frames]),
         shapes=state.shapes,
-        landmarks=state.landmarks[:num_landmarks],
+        landmarks=jnp.asarray(cut(state.landmarks)[:num_landmarks]),
         intrinsics=state.intrinsics,
     )
 
@@ -77,7 +79,10 @@ def _pad_factor(factor, frames):
 
 
 def _extend(x: jax.Array, axis: int, count: int, fill) -> jax.Array:
+    """Outside jit by NumPy: JAX would compile one small program per shape."""
     widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
+    traced = isinstance(x, jax.core.Tracer)
+    grow = jnp.pad if traced else lambda a, *w, **k: np.pad(np.asarray(a), *w, **k)
     if fill == "edge":
-        return jnp.pad(x, widths, mode="edge")
-    return jnp.pad(x, widths, constant_values=jnp.asarray(fill, x.dtype))
+        return jnp.asarray(grow(x, widths, mode="edge"))
+    return jnp.asarray(grow(x, widths, constant_values=np.asarray(fill, x.dtype)))

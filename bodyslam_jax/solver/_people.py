@@ -2,7 +2,7 @@
 
 Inside a chunk of B frames the 69 joint coordinates of all frames but the last go, frame
 after frame, the same step in all chunks and people at once. What they leave couples the
-`border` of the chunk: the last posture before it, its own last posture (the separators),
+`border` of the chunk: the last posture before it, its own last posture (separators),
 its roots, and the person's globals. Exact; about 7 MFLOP a frame.
 """
 
@@ -56,8 +56,9 @@ class Postures(eqx.Module):
     """Inverse of each pivot, `e = B - 1` eliminated frames."""
     solved: Float[Array, "h n e 69 b"]
     """Pivot inverse times border columns."""
-    link: Float[Array, "h n e 69 69"]
-    """Coupling of the next frame (rows) with each eliminated one."""
+    link: Float[Array, "h n e *joint r r"]
+    """Coupling of the next frame (rows) with each eliminated one; joint by joint (23
+    of 3 x 3) where joints do not interact over time."""
     separator: Float[Array, "h n 69 69"]
     separator_border: Float[Array, "h n 69 b"]
     border: Float[Array, "h n b b"]
@@ -73,23 +74,31 @@ def border_of(lin: Linearisation, sizes: Sizes) -> Border:
 
 
 def pose_blocks(lin: Linearisation) -> tuple[Array, Array]:
-    """`h t 69 69`: postures with themselves, and with those of the frame before."""
+    """Postures with themselves, `h t 69 69`, and with those of the frame before, like
+    `Postures.link`."""
     h, t = lin.gradient["pose"].shape[:2]
     dtype = lin.gradient["pose"].dtype
-    result = []
-    for d in range(2):
-        block = lin.blocks.get(
-            ("pose", "pose", d), jnp.zeros((h, t, POSE, POSE), dtype)
-        )
-        small = lin.blocks.get(("joint", "joint", d))
-        if small is not None:
-            # 23 blocks of 3 x 3 down the diagonal, laid out by a product with the
-            # identity: scatters of so many small blocks are slow.
-            eye = jnp.eye(23, dtype=dtype)
-            full = small[:, :, :, :, None, :] * eye[:, None, :, None]
-            block = block + full.reshape(h, t, POSE, POSE)
-        result.append(block)
-    return result[0], result[1]
+    own = lin.blocks.get(("pose", "pose", 0), jnp.zeros((h, t, POSE, POSE), dtype))
+    if ("joint", "joint", 0) in lin.blocks:
+        own = own + _to_dense(lin.blocks["joint", "joint", 0])
+    link = lin.blocks.get(("joint", "joint", 1), jnp.zeros((h, t, 23, 3, 3), dtype))
+    if ("pose", "pose", 1) in lin.blocks:
+        link = lin.blocks["pose", "pose", 1] + _to_dense(link)
+    return own, link
+
+
+def _to_dense(small: Float[Array, "*b 23 3 3"]) -> Float[Array, "*b 69 69"]:
+    """Blocks down the diagonal, by a product: scatters of so many are slow."""
+    eye = jnp.eye(23, dtype=small.dtype)
+    full = small[..., :, :, None, :] * eye[:, None, :, None]
+    return full.reshape(*small.shape[:-3], POSE, POSE)
+
+
+def _link_times(link: Array, x: Float[Array, "h n 69 c"]) -> Float[Array, "h n 69 c"]:
+    if link.ndim == 4:
+        return link @ x
+    rows = x.reshape(*x.shape[:2], 23, 3, x.shape[-1])
+    return jnp.einsum("hnjab,hnjbc->hnjac", link, rows).reshape(x.shape)
 
 
 def pose_diagonal(lin: Linearisation) -> Float[Array, "h t 69"]:
@@ -112,24 +121,26 @@ def eliminate_postures(
     own = own + damping[..., None] * jnp.eye(POSE, dtype=damping.dtype)
     cut = lambda x: x.reshape(h, n, CHUNK, *x.shape[2:])
     own, link = cut(own), cut(link)
-    raw = [_border_columns(lin, border, link, k, cut) for k in range(CHUNK)]
-    pivot, columns = own[:, :, 0], raw[0]
-    inverses, solved, kept = [], [], []
-    for k in range(CHUNK - 1):
+    raw = _border_columns(lin, border, link, cut)
+    inner_first = lambda x: jnp.moveaxis(x, 2, 0)
+
+    def step(carry, following):
+        pivot, columns = carry
+        next_own, forward, next_raw = following
         inverse = invert(pivot)
         product = inverse @ columns
-        inverses.append(inverse)
-        solved.append(product)
-        kept.append(columns)
-        forward = link[:, :, k + 1]
-        pivot = own[:, :, k + 1] - forward @ inverse @ forward.swapaxes(-1, -2)
-        columns = raw[k + 1] - forward @ product
-    stack = lambda arrays: jnp.stack(arrays, axis=2)
-    tall = lambda x: stack(x).reshape(h, n, (CHUNK - 1) * POSE, border.rhs + 1)
-    update = jnp.einsum("hnka,hnkb->hnab", tall(kept), tall(solved))
-    return Postures(
-        stack(inverses), stack(solved), link[:, :, 1:], pivot, columns, -update
-    )
+        half = _link_times(forward, inverse).swapaxes(-1, -2)
+        next_pivot = next_own - _link_times(forward, half)
+        next_columns = next_raw - _link_times(forward, product)
+        return (next_pivot, next_columns), (inverse, product, columns)
+
+    start = own[:, :, 0], raw[:, :, 0]
+    rest = tuple(inner_first(x[:, :, 1:]) for x in (own, link, raw))
+    (pivot, columns), kept = jax.lax.scan(step, start, rest)
+    inverse, product, kept = (jnp.moveaxis(x, 0, 2) for x in kept)
+    tall = lambda x: x.reshape(h, n, (CHUNK - 1) * POSE, border.rhs + 1)
+    update = jnp.einsum("hnka,hnkb->hnab", tall(kept), tall(product))
+    return Postures(inverse, product, link[:, :, 1:], pivot, columns, -update)
 
 
 def invert(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
@@ -140,26 +151,31 @@ def invert(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     return half.swapaxes(-1, -2) @ half
 
 
-def _border_columns(lin, border, link, k, cut):
-    """Columns of the k-th posture of each chunk against the chunk's border."""
-    get = lambda name, other, d: lin.blocks.get((name, other, d))
+def _border_columns(lin, border, link, cut):
+    """Columns of each posture of a chunk, `h n B 69 b`, against the chunk's border."""
     h, n = link.shape[:2]
     dtype = link.dtype
-    none = lambda width: jnp.zeros((h, n, POSE, width), dtype)
-    before = [link[:, :, 0] if k == 0 else none(POSE)]
+    none = lambda width: jnp.zeros((h, n, CHUNK, POSE, width), dtype)
+    is_first = jnp.eye(1, CHUNK, dtype=dtype)[0][:, None, None]
+    dense = link if link.ndim == 5 else _to_dense(link)
+    parts = [dense * is_first]
     if border.cross:
         for name in ("root", "camera"):
-            block = get("pose", name, 1)
-            use = k == 0 and block is not None
-            before.append(cut(block)[:, :, 0] if use else none(6))
-    parts = before
+            block = lin.blocks.get(("pose", name, 1))
+            parts.append(none(6) if block is None else cut(block) * is_first)
     for name in ("root", "camera") if border.cross else ("root",):
-        for i in range(CHUNK):
-            block = get("pose", name, k - i) if abs(k - i) <= 1 else None
-            parts.append(none(6) if block is None else cut(block)[:, :, k])
-    common = get("pose", "globals", 0)
-    parts.append(none(border.own_globals) if common is None else cut(common)[:, :, k])
-    parts.append(-cut(lin.gradient["pose"])[:, :, k, :, None])
+        total = none(6 * CHUNK)
+        for lag in (-1, 0, 1):
+            block = lin.blocks.get(("pose", name, lag))
+            if block is not None:
+                # Frame k of the chunk against frame k - lag of the same chunk.
+                place = jnp.eye(CHUNK, k=-lag, dtype=dtype)[:, None, :, None]
+                wide = cut(block)[:, :, :, :, None, :] * place
+                total = total + wide.reshape(total.shape)
+        parts.append(total)
+    common = lin.blocks.get(("pose", "globals", 0))
+    parts.append(none(border.own_globals) if common is None else cut(common))
+    parts.append(-cut(lin.gradient["pose"])[..., None])
     return jnp.concatenate(parts, axis=-1)
 
 
@@ -169,15 +185,18 @@ def substitute_postures(
     separator_step: Float[Array, "h n 69"],
 ) -> Float[Array, "h t 69"]:
     """Steps of all postures from those of the border (without the rhs column)."""
-    following = separator_step
-    steps = [separator_step]
-    for k in range(CHUNK - 2, -1, -1):
-        solved = postures.solved[:, :, k]
-        step = solved[..., -1]
-        step = step - jnp.einsum("hnab,hnb->hna", solved[..., :-1], border_step)
-        back = jnp.einsum("hnba,hnb->hna", postures.link[:, :, k], following)
-        step = step - jnp.einsum("hnab,hnb->hna", postures.inverse[:, :, k], back)
-        following = step
-        steps.append(step)
-    h, n = separator_step.shape[:2]
-    return jnp.stack(steps[::-1], axis=2).reshape(h, n * CHUNK, POSE)
+    inner_first = lambda x: jnp.moveaxis(x, 2, 0)
+
+    def step(following, kept):
+        inverse, solved, link = kept
+        here = solved[..., -1]
+        here = here - jnp.einsum("hnab,hnb->hna", solved[..., :-1], border_step)
+        back = _link_times(link.swapaxes(-1, -2), following[..., None])
+        here = here - (inverse @ back)[..., 0]
+        return here, here
+
+    kept = postures.inverse, postures.solved, postures.link
+    kept = tuple(inner_first(x) for x in kept)
+    _, steps = jax.lax.scan(step, separator_step, kept, reverse=True)
+    steps = jnp.concatenate([jnp.moveaxis(steps, 0, 2), separator_step[:, :, None]], 2)
+    return steps.reshape(steps.shape[0], -1, POSE)

@@ -1,0 +1,288 @@
+"""The structured solver against dense algebra, stock solvers and the truth."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from jax.flatten_util import ravel_pytree
+
+import bodyslam_jax.graph as g
+from bodyslam_jax.solver import Stage, marginals, observability, solve
+from bodyslam_jax.solver._levenberg_marquardt import lifted
+from bodyslam_jax.solver._linearise import gather, linearise, sizes_of
+from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver._padding import pad
+
+TIGHT = (Stage(rtol=1e-13, max_steps=60),)
+
+
+def make(seed, people=0, frames=7, landmarks=25, extras=False, noise=1.0, **options):
+    rng = np.random.default_rng(seed)
+    state = scenes.truth(rng, frames, people, landmarks)
+    factors = [scenes.reprojection(rng, state, noise=0.5 * noise)]
+    if people:
+        factors += scenes.person_factors(rng, state, noise=noise)
+    if extras:
+        factors += scenes.extra_factors(rng, state)
+    problem = g.make_problem(factors, state, **options)
+    return problem, state, scenes.perturb(rng, problem, state)
+
+
+def dense(problem, state):
+    """Jacobian and residual of a problem in its free coordinates, without structure."""
+    zero, unravel = ravel_pytree(state.zero_step())
+    mask, _ = ravel_pytree(problem.free)
+
+    @jax.jit
+    def residual(x):
+        rows = lifted(state.retract(unravel(x * mask)), problem)
+        return jnp.concatenate([r.reshape(-1) for r in rows])
+
+    return np.asarray(jax.jit(jax.jacfwd(residual))(zero)), np.asarray(residual(zero))
+
+
+@eqx.filter_jit
+def structured_step(problem, state, damping):
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state)
+    extra = damped(diagonals(lin, sizes), damping)
+    return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
+
+
+def unpadded(step, state):
+    t, l = len(state.cameras), len(state.landmarks)
+    cut = {
+        "cameras": step.cameras[:t],
+        "roots": step.roots[:, :t],
+        "poses": step.poses[:, :t],
+        "landmarks": step.landmarks[:l],
+    }
+    return g.Step(**{**vars(step), **cut})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"frames": 33, "landmarks": 60},
+        {"frames": 12, "people": 1},
+        pytest.param(
+            {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_step_is_that_of_the_dense_normal_equations(options):
+    problem, _, state = make(1, **options)
+    jac, residual = dense(problem, state)
+    hessian, damping = jac.T @ jac, 1e-3
+    diagonal = np.diag(hessian)
+    extra = np.where(diagonal > 1e-100, damping * diagonal, 1.0)
+    expected = np.linalg.solve(hessian + np.diag(extra), -jac.T @ residual)
+    step = structured_step(*pad(problem, state), jnp.asarray(damping))
+    found, _ = ravel_pytree(unpadded(step, state))
+    assert abs(found - expected).max() < 1e-9 * abs(expected).max()
+
+
+def test_all_second_order_solvers_reach_the_same_optimum():
+    problem, _, start = make(2, frames=5, landmarks=15)
+    costs = {
+        name: float(solve(problem, start, solver=name, schedule=TIGHT).cost)
+        for name in ("structured", "optimistix", "jaxopt_lm", "jaxopt_gn")
+    }
+    best = costs.pop("structured")
+    for name, cost in costs.items():
+        assert cost == pytest.approx(best, rel=1e-8), name
+
+
+@pytest.mark.slow
+def test_first_order_steps_lower_the_cost():
+    problem, _, start = make(2, frames=5, landmarks=15)
+    found = solve(problem, start, solver="adam", schedule=(Stage(max_steps=200),))
+    assert found.cost < 0.1 * problem.cost(start)
+
+
+def test_noise_free_scene_is_recovered_and_history_says_how():
+    problem, truth, start = make(3, noise=0.0, frames=7, landmarks=40)
+    found = solve(problem, start, schedule=TIGHT)
+    assert found.status == "converged"
+    assert found.cost < 1e-16
+    seen = jnp.unique(problem.factors[0].landmark)
+    error = (found.state.landmarks - truth.landmarks)[seen]
+    assert jnp.median(jnp.abs(error)) < 1e-8
+    steps = int(found.num_steps[0])
+    cost = found.histories[0].cost[: steps + 1]
+    assert (jnp.diff(cost) <= 0).all()
+    assert jnp.isclose(cost[0], problem.cost(start))
+
+
+@pytest.mark.slow
+def test_person_and_scale_are_recovered_from_ten_times_off_either_way():
+    problem, truth, start = make(4, people=1, frames=12, noise=0.0)
+    scales = []
+    for factor in (0.1, 1.0, 10.0):
+        off = eqx.tree_at(lambda s: s.scale, start, truth.scale * factor)
+        found = solve(problem, off, schedule=TIGHT)
+        assert found.status == "converged"
+        scales.append(float(found.state.scale))
+    assert np.allclose(scales, float(truth.scale), rtol=1e-5)
+
+
+def test_order_of_landmarks_does_not_matter():
+    problem, _, start = make(5)
+    count = len(start.landmarks)
+    order = np.random.default_rng(0).permutation(count)
+    factor = problem.factors[0]
+    renamed = jnp.asarray(np.argsort(order))[factor.landmark]
+    shuffled = eqx.tree_at(lambda f: f.landmark, factor, renamed)
+    other_start = eqx.tree_at(lambda s: s.landmarks, start, start.landmarks[order])
+    other = g.make_problem([shuffled], other_start, free=problem.free)
+    first = solve(problem, start, schedule=TIGHT)
+    second = solve(other, other_start, schedule=TIGHT)
+    assert jnp.isclose(first.cost, second.cost, rtol=1e-9)
+    moved = second.state.cameras - first.state.cameras
+    assert jnp.abs(moved).max() < 1e-6
+
+
+def test_the_world_and_unit_of_the_map_do_not_matter():
+    problem, _, start = make(6)
+    size, turn = 3.0, np.asarray(g.retract_pose(jnp.eye(4), jnp.arange(6) * 0.1))
+    cameras = jnp.asarray(turn) @ start.cameras
+    cameras = cameras.at[:, :3, 3].multiply(size)
+    points = size * (start.landmarks @ turn[:3, :3].T + turn[:3, 3])
+    moved = eqx.tree_at(lambda s: (s.cameras, s.landmarks), start, (cameras, points))
+    other = g.make_problem(problem.factors, moved)
+    first, second = (
+        solve(p, s, schedule=TIGHT) for p, s in ((problem, start), (other, moved))
+    )
+    assert jnp.isclose(first.cost, second.cost, rtol=1e-8)
+
+
+def test_starts_are_mapped_over_in_one_go():
+    problem, truth, start = make(7)
+    rng = np.random.default_rng(1)
+    starts = [scenes.perturb(rng, problem, truth, size=0.01) for _ in range(3)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
+    together = jax.vmap(lambda s: solve(problem, s, schedule=TIGHT).cost)(batch)
+    alone = [float(solve(problem, s, schedule=TIGHT).cost) for s in starts]
+    assert np.allclose(together, alone, rtol=1e-8)
+
+
+def test_single_precision_reaches_the_same_optimum():
+    problem, _, start = make(8)
+    half = lambda tree: jax.tree.map(
+        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree
+    )
+    double = solve(problem, start, schedule=TIGHT)
+    single = solve(half(problem), half(start))
+    assert single.state.cameras.dtype == jnp.float32
+    assert float(single.cost) == pytest.approx(float(double.cost), rel=1e-4)
+
+
+def test_marginal_covariances_are_blocks_of_the_inverse():
+    problem, _, state = make(9, frames=24, landmarks=60)
+    state = solve(problem, state, schedule=TIGHT).state
+    jac, _ = dense(problem, state)
+    hessian = jac.T @ jac
+    diagonal = np.diag(hessian)
+    extra = np.where(diagonal > 1e-100, 1e-11 * diagonal, 1.0)
+    mask = np.asarray(ravel_pytree(problem.free)[0])
+    inverse = np.linalg.inv(hessian + np.diag(extra)) * mask * mask[:, None]
+    zero, unravel = ravel_pytree(state.zero_step())
+
+    def metric(x):
+        moved = state.retract(unravel(x))
+        return moved.scale * moved.cameras[:, :3, 3], moved.scale * moved.landmarks
+
+    spread = marginals(problem, state)
+    found = spread.cameras, spread.landmarks
+    for by_step, block in zip(jax.jacfwd(metric)(zero), found, strict=True):
+        expected = np.einsum("lin,nm,ljm->lij", by_step, inverse, by_step)
+        known = np.trace(expected, axis1=1, axis2=2) < 100
+        assert np.allclose(block[known], expected[known], rtol=1e-4, atol=1e-9)
+
+
+def test_turning_on_the_spot_is_reported():
+    problem, truth, _ = make(10, frames=7, noise=0.0)
+    still = truth.cameras.at[:, :3, 3].multiply(1e-9)
+    state = eqx.tree_at(lambda s: s.cameras, truth, still)
+    rng = np.random.default_rng(3)
+    problem = g.make_problem([scenes.reprojection(rng, state)], state)
+    found = solve(problem, state)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(found.state))
+    report = observability(problem, state, marginals(problem, state))
+    assert any("landmarks" in line for line in report), report
+
+
+def test_gradient_of_a_solution_is_that_of_solving_again():
+    problem, _, start = make(11, frames=6, landmarks=30)
+    rng = np.random.default_rng(5)
+    along = jnp.asarray(rng.standard_normal((6, 3)))
+    toward = jnp.asarray(rng.standard_normal(problem.factors[0].pixel.shape))
+    start = solve(problem, start, schedule=TIGHT).state
+
+    def value(pixel):
+        there = eqx.tree_at(lambda p: p.factors[0].pixel, problem, pixel)
+        found = solve(there, start, schedule=(Stage(rtol=1e-15, max_steps=60),))
+        return jnp.sum(along * found.state.cameras[:, :3, 3])
+
+    pixel, size = problem.factors[0].pixel, 1e-4
+    slope = jnp.sum(jax.grad(value)(pixel) * toward)
+    numeric = value(pixel + size * toward) - value(pixel - size * toward)
+    assert float(slope) == pytest.approx(float(numeric) / (2 * size), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "case", ["no landmarks", "one observation each", "empty frame", "behind", "halves"]
+)
+def test_poor_data_gives_a_status_and_finite_numbers(case):
+    problem, truth, start = make(12, frames=7, landmarks=25)
+    factor = problem.factors[0]
+    sigma, landmarks = factor.sigma, start.landmarks
+    if case == "no landmarks":
+        sigma = jnp.full_like(sigma, jnp.inf)
+    elif case == "one observation each":
+        first = np.unique(np.asarray(factor.landmark), return_index=True)[1]
+        keep = np.zeros(len(sigma), bool)
+        keep[first] = True
+        sigma = jnp.where(jnp.asarray(keep), sigma, jnp.inf)
+    elif case == "empty frame":
+        sigma = jnp.where(factor.frame == 3, jnp.inf, sigma)
+    elif case == "behind":
+        landmarks = landmarks.at[:5].multiply(-1)
+    else:
+        early = factor.landmark < 12
+        sigma = jnp.where(early == (factor.frame < 4), sigma, jnp.inf)
+    problem = eqx.tree_at(lambda p: p.factors[0].sigma, problem, sigma)
+    start = eqx.tree_at(lambda s: s.landmarks, start, landmarks)
+    found = solve(problem, start)
+    assert isinstance(found.status, str)
+    assert found.cost <= problem.cost(start)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(found.state))
+
+
+@pytest.mark.slow
+def test_a_person_in_a_single_frame_and_no_landmarks():
+    rng = np.random.default_rng(13)
+    truth = scenes.truth(rng, 7, 1, 0)
+    factors = scenes.person_factors(rng, truth)
+    alone = jnp.arange(7) == 2
+    hide = lambda x: jnp.where(alone.reshape(-1, *[1] * (x.ndim - 2)), x, jnp.inf)
+    factors[0] = eqx.tree_at(lambda f: f.sigma, factors[0], replace_fn=hide)
+    factors[2] = eqx.tree_at(lambda f: f.sigma, factors[2], replace_fn=hide)
+    nothing = jnp.zeros_like(factors[1].whitening)
+    factors[1] = eqx.tree_at(lambda f: f.whitening, factors[1], nothing)
+    factors[2] = eqx.tree_at(lambda f: f.correlation, factors[2], jnp.zeros((1, 7)))
+    problem = g.make_problem(factors, truth)
+    start = scenes.perturb(rng, problem, truth)
+    found = solve(problem, start)
+    assert found.cost < problem.cost(start)
+    assert jnp.allclose(found.state.roots[:, 3:], start.roots[:, 3:])
+
+
+def test_another_size_of_state_is_refused():
+    problem, _, start = make(14)
+    short = eqx.tree_at(lambda s: s.cameras, start, start.cameras[:-1])
+    with pytest.raises(ValueError, match="6 frames"):
+        solve(problem, short)
