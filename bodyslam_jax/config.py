@@ -285,6 +285,8 @@ class Config:
     """Whether people are estimated; if not, cameras and map stay without a unit."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
+    uncertainty: bool = True
+    """Whether standard deviations, and what is not determined, are worked out."""
     association: Association = Association()
     tracking: Tracking = Tracking()
     structure: Structure = Structure()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import camera
+from bodyslam_jax import camera, export
 from bodyslam_jax.config import Config
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Sequence, Tracks
@@ -49,6 +49,10 @@ class Joint:
     scale_start: float
     scale_start_error: float
     scale_sigma: float
+    """Standard deviation of `scale`; NaN if it was not computed or not estimated."""
+    shape_covariance: Float[np.ndarray, "h 10 10"]
+    unobserved: tuple[str, ...]
+    """What the measurements do not determine, a line each."""
     cameras: Float[np.ndarray, "t 4 4"]
     roots: Float[np.ndarray, "h t 4 4"]
     poses: Float[np.ndarray, "h t 23 3"]
@@ -137,7 +141,7 @@ def summarise(
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """`summary.json`: what a person wants to know first, then everything else."""
-    warnings = [*sequence.warnings, *cameras.warnings]
+    warnings = [*sequence.warnings, *cameras.warnings, *joint.unobserved]
     status = "ok"
     if not joint.present.any():
         status = "no people: cameras and map have no unit"
@@ -147,30 +151,34 @@ def summarise(
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
         )
-    path = lambda x: float(np.linalg.norm(np.diff(x, axis=0), axis=-1).sum())
+    way = export.camera_facts(result)
     persons = []
     for h in range(len(result.poses)):
-        there = result.present[h]
-        pelvis = result.joints[h, there, 0]
-        duration = max(there.sum() - 1, 1) / sequence.fps
+        facts = export.person_facts(result, h)
+        tall, sigma = stature(body, result.betas[h], joint.shape_covariance[h])
         persons.append(
             {
-                "frames": int(there.sum()),
-                "path_m": path(pelvis),
-                "speed_m_s": path(pelvis) / duration,
-                "stature_m": stature(body, result.betas[h]),
+                "frames": int(result.present[h].sum()),
+                "path_m": facts.distance,
+                "speed_m_s": facts.distance / max(facts.seconds, 1e-9),
+                "stature_m": tall,
+                "stature_sigma_m": sigma,
             }
         )
     headline = [
         f"{sequence.name}: {status}",
-        f"camera: {path(result.T_WC[:, :3, 3]):.2f} m in "
-        f"{result.timestamps[-1] - result.timestamps[0]:.1f} s ({cameras.kind})",
+        f"camera: {way.distance:.2f} m in {way.seconds:.1f} s ({cameras.kind})",
     ]
-    headline += [
-        f"person {h}: {p['path_m']:.2f} m, {p['speed_m_s']:.2f} m/s, "
-        f"{100 * p['stature_m']:.0f} cm tall"
-        for h, p in enumerate(persons)
-    ]
+    for h, p in enumerate(persons):
+        sure = (
+            ""
+            if np.isnan(p["stature_sigma_m"])
+            else (f" ± {100 * p['stature_sigma_m']:.0f}")
+        )
+        headline.append(
+            f"person {h}: {p['path_m']:.2f} m at {p['speed_m_s']:.2f} m/s, "
+            f"{100 * p['stature_m']:.0f}{sure} cm tall"
+        )
     return {
         "status": status,
         "headline": headline,
@@ -206,11 +214,21 @@ def summarise(
     }
 
 
-def stature(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
-    """Height of the mesh in its rest pose, m."""
-    rest = jnp.zeros(72)
-    vertices = body_.vertices(body, rest, jnp.asarray(shape), jnp.zeros(3))
-    return float(vertices[:, 1].max() - vertices[:, 1].min())
+def stature(
+    body: body_.BodyModel,
+    shape: Float[np.ndarray, " 10"],
+    covariance: Float[np.ndarray, "10 10"],
+) -> tuple[float, float]:
+    """Height of the mesh in its rest pose and its standard deviation, m."""
+
+    def height(shape: np.ndarray) -> float:
+        nowhere = jnp.zeros(3)
+        y = body_.vertices(body, jnp.zeros(72), jnp.asarray(shape), nowhere)[:, 1]
+        return float(y.max() - y.min())
+
+    tall = height(shape)
+    slope = np.array([height(shape + e) - tall for e in np.eye(10)])
+    return tall, float(np.sqrt(slope @ covariance @ slope))
 
 
 def versions() -> dict[str, str]:

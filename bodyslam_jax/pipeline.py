@@ -210,11 +210,21 @@ def _joint(
     )
     solution = _solve(problem, state, config, "joint", stages)
     best = solution.state
+    spread, unobserved = None, ()
+    if config.uncertainty:
+        spread = solver.marginals(problem, best)
+        unobserved = solver.observability(problem, best, spread)
     return Joint(
         scale=float(best.scale),
         scale_start=start.value,
         scale_start_error=start.standard_error,
-        scale_sigma=float("nan"),
+        scale_sigma=float(spread.scale) ** 0.5 if spread and moving else np.nan,
+        shape_covariance=(
+            np.full((len(roots.present), 10, 10), np.nan)
+            if spread is None
+            else np.asarray(spread.shapes)
+        ),
+        unobserved=tuple(unobserved),
         cameras=np.asarray(best.cameras),
         roots=np.asarray(best.roots),
         poses=np.asarray(best.poses),

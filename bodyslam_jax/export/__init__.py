@@ -1,5 +1,8 @@
 """What is written: the run folder, the report, files for other programs."""
 
+from bodyslam_jax.export._facts import PathFacts as PathFacts
+from bodyslam_jax.export._facts import camera_facts as camera_facts
+from bodyslam_jax.export._facts import person_facts as person_facts
 from bodyslam_jax.export._meshes import write_bvh as write_bvh
 from bodyslam_jax.export._meshes import write_mesh as write_mesh
 from bodyslam_jax.export._meshes import write_trc as write_trc
