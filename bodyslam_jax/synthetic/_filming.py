@@ -65,7 +65,9 @@ def floor_path(
     angle = angle * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
     if family == "follow":
         phase = rng.uniform(0, 2 * np.pi, 3)
-        bumps = [0.10, 0.08, 0.05] * np.cos(np.outer(angle, [2, 3, 4]) + phase)
+        bumps = np.array([0.10, 0.08, 0.05]) * np.cos(
+            np.outer(angle, [2, 3, 4]) + phase
+        )
         radius = 11.0 * (1 + bumps.sum(axis=1))
         path = np.stack([radius * np.cos(angle), 0.8 * radius * np.sin(angle)], 1)
         return path, np.zeros(2)

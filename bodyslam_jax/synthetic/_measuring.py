@@ -69,7 +69,7 @@ NOISE = {
         *((0.8, 0.9), 0.15, (0.02, 0.03), 0.002, 1.5, (0.2, 0.4), 0.01),
     ),
     "real": Noise(
-        *(0.35, 0.92, 0.025, 0.01, 0.01, 0.06, 0.075, 0.98, 0.002, 0.075, 0.002),
+        *(0.35, 0.92, 0.025, 0.01, 0.01, 0.07, 0.078, 0.98, 0.002, 0.075, 0.002),
         *((0.5, 0.8), 0.3, (0.05, 0.10), 0.006, 4.0, (0.5, 1.0), 0.03),
     ),
 }
@@ -80,11 +80,11 @@ _HANDS_FEET = np.isin(np.arange(24), (7, 8, 10, 11, 20, 21, 22, 23))
 
 def ar1(
     rng: np.random.Generator, shape: tuple[int, ...], correlation: float
-) -> Float[np.ndarray, "t *rest"]:
+) -> Float[np.ndarray, "t ..."]:
     """Stationary first-order autoregressive noise along the first axis, deviation 1."""
     x = rng.standard_normal(shape)
     x[1:] *= np.sqrt(1 - correlation**2)
-    return lfilter([1.0], [1.0, -correlation], x, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -correlation], x, axis=0))
 
 
 def project(

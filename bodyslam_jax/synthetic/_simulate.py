@@ -97,7 +97,7 @@ def simulate(
     **Arguments:**
 
     - `settings`: which sequence, family, length, seed, motion and noise.
-    - `body`: the body model; the default body without it. Pose blend shapes are ignored.
+    - `body`: the body model, whose pose blend shapes are ignored; the default without.
 
     **Raises:** `FileNotFoundError` or `ValueError`, naming the file, if the motion
     cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames.

@@ -57,7 +57,9 @@ def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
             f"{source}: no walk of more than 1.4 s among {len(clips)} clips; expected "
             "walking to make long walks of."
         )
-    return resample(kept[:_MAX_CLIPS], FPS)
+    kept = kept[:_MAX_CLIPS]
+    is_right = all(c.fps == FPS for c in kept)  # nothing to compile for what ships
+    return tuple(kept) if is_right else resample(kept, FPS)
 
 
 def walk_along(
@@ -225,7 +227,7 @@ def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan
     now = int(rng.choice(entries[place[entries] < 10]))
     yaw, total = 0.0, 0
     while total < num_frames:
-        end = first[clip[now]] + count[clip[now]] - _BLEND
+        end = int(first[clip[now]] + count[clip[now]]) - _BLEND
         leave = np.arange(min(now + _PLAYED, end - 1), end)
         enter = entries[clip[entries] != clip[now]]
         d = squares[leave + half][:, None] + squares[enter + half]
