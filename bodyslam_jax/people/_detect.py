@@ -12,9 +12,9 @@ Everything but the networks is plain NumPy. Images are BGR, as OpenCV reads them
 
 import dataclasses
 import hashlib
+import importlib
 import logging
 import os
-import urllib.error
 import urllib.request
 from collections.abc import Iterable
 from pathlib import Path
@@ -258,7 +258,7 @@ def sample(
 
 def _session(own: str | None, model: Model, offline: bool) -> Any:
     try:
-        import onnxruntime
+        onnxruntime = importlib.import_module("onnxruntime")
     except ImportError as error:
         raise ValueError(
             "detect: onnxruntime is not installed; `pip install bodyslam-jax[detect]`, "

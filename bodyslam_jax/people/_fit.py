@@ -133,7 +133,7 @@ def pixels_per_metre(
     seen = np.isfinite(sigma)[..., None]
     low = np.min(np.where(seen, uv, np.inf), axis=1)
     high = np.max(np.where(seen, uv, -np.inf), axis=1)
-    diagonal = np.where(seen.any(1)[:, 0], np.linalg.norm(high - low, axis=-1), 0.0)
+    diagonal = np.where(seen.any(axis=(1, 2)), np.linalg.norm(high - low, axis=-1), 0.0)
     largest = maximum_filter1d(diagonal, 2 * round(fps / 2) + 1)
     overall = np.median(diagonal[diagonal > 0])
     return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
@@ -194,7 +194,7 @@ def _start(
         [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
     )
     fits, costs, joints = fit_frames(scene, uv[chosen], sigma_px[chosen])
-    path = best_path(costs, joints, fits.orientation, chosen / fps)
+    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps)
     fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
     broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST
@@ -202,7 +202,7 @@ def _start(
 
 
 def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) -> Fit:
-    """Between the fitted frames; across a break the nearer one."""
+    """Between the fitted frames; across a break the earlier one."""
     wanted = np.arange(total)
     after = np.clip(np.searchsorted(frame, wanted), 1, max(len(frame) - 1, 1))
     after = np.minimum(after, len(frame) - 1)
@@ -215,7 +215,8 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
         a[before] + share[:, None] * (a[after] - a[before])
         for a in (fit.position, fit.latent)
     )
-    turned = slerp(fit.orientation[before], fit.orientation[after], share)
+    orientation = np.asarray(fit.orientation)
+    turned = slerp(orientation[before], orientation[after], share)
     dtype = fit.position.dtype
     return Fit(*(jnp.asarray(a, dtype) for a in (turned, position, latent)))
 

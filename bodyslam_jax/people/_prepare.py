@@ -280,13 +280,13 @@ def _fill_gaps(roots: Roots, person: int, longest: float) -> None:
             continue
         share = np.arange(1, b - a) / (b - a)
         gap = slice(a + 1, b)
-        ends = np.broadcast_to(T_CH[[a, b], None, :3, :3], (2, len(share), 3, 3))
-        T_CH[gap, :3, :3] = slerp(*ends, share)
+        from_, to = np.broadcast_to(T_CH[[a, b], None, :3, :3], (2, len(share), 3, 3))
+        T_CH[gap, :3, :3] = slerp(from_, to, share)
         T_CH[gap, :3, 3] = T_CH[a, :3, 3] + share[:, None] * (
             T_CH[b, :3, 3] - T_CH[a, :3, 3]
         )
         size = (2, len(share), 23, 3, 3)
-        ends = np.broadcast_to(matrices(pose[[a, b]])[:, None], size)
+        from_, to = np.broadcast_to(matrices(pose[[a, b]])[:, None], size)
         joint_share = np.repeat(share[:, None], 23, axis=1)
-        pose[gap] = vectors(slerp(*ends, joint_share))
+        pose[gap] = vectors(slerp(from_, to, joint_share))
         roots.present[person, gap] = True

@@ -61,7 +61,7 @@ def load_posture_prior(
     polynomial = [np.array([1.0, -a1, -a2]) for a1, a2 in stored["autoregression"]]
     poles = np.array([np.roots(p) for p in polynomial]).astype(complex)
     poles = poles ** (_TRAINED_AT / fps)
-    moved = np.stack([poles.sum(1), -poles.prod(1)], axis=1).real
+    moved = np.real(np.stack([poles.sum(1), -poles.prod(1)], axis=1))
     dtype = np.dtype(dtype) if dtype else jnp.zeros(0).dtype
     fields = {name: stored[name] for name in _NAMES if name != "autoregression"}
     fields["autoregression"] = moved
