@@ -10,6 +10,8 @@ from bodyslam_jax.body._kinematics import local_joints as local_joints
 from bodyslam_jax.body._kinematics import local_keypoints as local_keypoints
 from bodyslam_jax.body._kinematics import rest_joints as rest_joints
 from bodyslam_jax.body._model import BodyModel as BodyModel
+from bodyslam_jax.body._show import draw_body as draw_body
+from bodyslam_jax.body._show import posture as posture
 from bodyslam_jax.body._show import save_picture as save_picture
 from bodyslam_jax.body._skeleton import DETECTOR_BIAS as DETECTOR_BIAS
 from bodyslam_jax.body._skeleton import JOINT_NAMES as JOINT_NAMES

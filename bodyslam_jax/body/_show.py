@@ -54,24 +54,28 @@ def save_picture(model: BodyModel, path: str | Path) -> None:
     """Draws shape components at ±2σ (front) and postures (side) to an image file."""
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
-    figure = Figure(figsize=(13, 8.5), layout="constrained")
-    axes = figure.subplots(2, 2 * NUM_SHAPES + 1, sharey="row")
-    for axis in axes.flat:
-        axis.set_axis_off()
-        axis.set_aspect("equal")
-    pose, trans = jnp.zeros(72, model.dtype), jnp.zeros(3, model.dtype)
-    faces = np.asarray(model.faces)
-    zero = jnp.zeros(10, model.dtype)
+    figure = Figure(figsize=(13, 7.5), layout="constrained")
+    rows = figure.subplots(2, 1)
+    trans, zero = jnp.zeros(3, model.dtype), jnp.zeros(10, model.dtype)
     columns = [(0.0, 0)] + [(s, k) for k in range(NUM_SHAPES) for s in (-2.0, 2.0)]
-    for axis, (amount, k) in zip(axes[0], columns, strict=True):
-        points = vertices(model, pose, zero.at[k].set(amount), trans)
-        draw_body(axis, np.asarray(points), faces, from_side=False)
-        axis.set_title(f"β{k} = {amount:+.0f}" if amount else "β = 0", fontsize=9)
-    views = [(name, side) for name in POSTURES for side in (False, True)]
-    for axis, (name, side) in zip(axes[1], views, strict=False):
-        points = vertices(model, posture(name, model.dtype), zero, trans)
-        draw_body(axis, np.asarray(points), faces, from_side=side)
-        axis.set_title(f"{name}{', side' if side else ''}", fontsize=9)
+    shapes = [
+        (f"β{k} = {s:+.0f}" if s else "β = 0", "arms down", zero.at[k].set(s), False)
+        for s, k in columns
+    ]
+    postures = [
+        (f"{name}, side" if side else name, name, zero, side)
+        for name in POSTURES
+        for side in (False, True)
+    ]
+    for axis, pictures in zip(rows, (shapes, postures), strict=True):
+        for at, (title, name, shape, from_side) in enumerate(pictures):
+            points = vertices(model, posture(name, model.dtype), shape, trans)
+            points = np.asarray(points) - np.asarray(model.joint_template[0])
+            draw_body(axis, points, np.asarray(model.faces), from_side, (1.1 * at, 0.0))
+            axis.text(1.1 * at, 0.98, title, ha="center", fontsize=9)
+        axis.set_aspect("equal")
+        axis.set_axis_off()
+        axis.autoscale_view()
     stature = float(np.ptp(np.asarray(model.template)[:, 1]))
     figure.suptitle(
         f"{model.name}: {model.num_vertices} vertices, β = 0 is {stature:.2f} m tall"
@@ -87,7 +91,9 @@ def posture(name: str, dtype=None):
     return jnp.asarray(pose.ravel(), dtype)
 
 
-def draw_body(axis, points, faces, from_side=False, colour=(0.75, 0.78, 0.85)) -> None:
+def draw_body(
+    axis, points, faces, from_side=False, at=(0.0, 0.0), colour=(0.75, 0.78, 0.85)
+) -> None:
     """Shaded triangles on matplotlib axes, seen from the front or the person's left."""
     from matplotlib.collections import PolyCollection
 
@@ -95,7 +101,7 @@ def draw_body(axis, points, faces, from_side=False, colour=(0.75, 0.78, 0.85)) -
         u, depth = -points[:, 2], points[:, 0]
     else:  # from +z: the subject's left is to the right
         u, depth = points[:, 0], points[:, 2]
-    seen = np.stack([u, points[:, 1], depth], -1)
+    seen = np.stack([u + at[0], points[:, 1] + at[1], depth], -1)
     corner = seen[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
@@ -110,4 +116,3 @@ def draw_body(axis, points, faces, from_side=False, colour=(0.75, 0.78, 0.85)) -
             antialiased=False,
         )
     )
-    axis.autoscale_view()
