@@ -307,7 +307,7 @@ def _pack(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "n levels 2"]]:
     """All images in one, on shelves, and where the origin of each is in it (x, y)."""
     padded = [
-        (i, k, cv2.copyMakeBorder(image, *[_BORDER] * 4, cv2.BORDER_REPLICATE))
+        (i, k, _bordered(image))
         for i, levels in enumerate(pyramids)
         for k, image in enumerate(levels)
     ]
@@ -327,6 +327,12 @@ def _pack(
     for (x, y), (_, _, image) in zip(where, padded, strict=True):
         atlas[y : y + image.shape[0], x : x + image.shape[1]] = image
     return atlas, places
+
+
+def _bordered(image: np.ndarray) -> np.ndarray:
+    """With its edge repeated, so that bilinear look-up never sees a neighbour."""
+    b = _BORDER
+    return cv2.copyMakeBorder(image, b, b, b, b, cv2.BORDER_REPLICATE)
 
 
 def write_video(

@@ -45,7 +45,7 @@ def _clouds(
     while cell >= 4:
         shape = (height // cell + 2, width // cell + 2)
         coarse = rng.standard_normal(shape).astype(np.float32)
-        total += weight * zoom(coarse, cell, order=1)[:height, :width]
+        total += weight * np.asarray(zoom(coarse, cell, order=1))[:height, :width]
         cell, weight = cell // 4, 0.6 * weight
     return total / 1.6
 
