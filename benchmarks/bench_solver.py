@@ -2,6 +2,7 @@
 
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
+    python benchmarks/bench_solver.py breakdown --frames 1000
 
 The generator is the project's own and seeded. Compilation is outside the clock and
 given by itself; all solvers' results are judged by one cost function. Set
@@ -10,6 +11,7 @@ is beside wall time, which on a shared machine says little.
 """
 
 import argparse
+import functools
 import time
 
 import equinox as eqx
@@ -21,6 +23,12 @@ import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
 from bodyslam_jax.camera import project
 from bodyslam_jax.solver import Stage, solve
+from bodyslam_jax.solver._chunks import assemble, factorise
+from bodyslam_jax.solver._landmarks import eliminate_landmarks
+from bodyslam_jax.solver._linearise import gather, linearise, sizes_of
+from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, solve_step
+from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._people import border_of, eliminate_postures
 
 INTRINSICS = np.array([900.0, 900.0, 640.0, 360.0])
 TRACK = 16.0
@@ -234,9 +242,44 @@ def report(name, problem, truth, start, schedule, repeats):
     return solution
 
 
+def breakdown(problem, state, repeats):
+    """Where an iteration spends its time: each part compiled and timed by itself."""
+    problem, state = pad(problem, state)
+    sizes = sizes_of(problem, state)
+    rows = []
+
+    def part(name, function, *arrays):
+        result, _, (wall, cpu) = timed(
+            functools.partial(eqx.filter_jit(function), *arrays), repeats
+        )
+        rows.append((name, wall, cpu))
+        print(f"  {name:24s} {wall:7.4f} s (processor {cpu:.4f})", flush=True)
+        return result
+
+    seen = gather(problem)
+    part("cost of a trial", lambda p, s: p.cost(s), problem, state)
+    lin = part("residuals and Jacobians", linearise, problem, seen, state)
+    damping = damped(diagonals(lin, sizes), jnp.asarray(1e-4, state.scale.dtype))
+    reduced = part(
+        "landmarks",
+        eliminate_landmarks,
+        problem,
+        lin.landmarks,
+        damping["landmarks"],
+        sizes,
+    )
+    postures, border = None, border_of(lin, sizes)
+    if "pose" in damping:
+        postures = part("postures", eliminate_postures, lin, sizes, damping["pose"])
+    chunks = part("assembly", assemble, lin, sizes, reduced, postures, border, damping)
+    factor = part("factorisation", factorise, chunks, sizes)
+    whole = Eliminated(damping, postures, border, factor)
+    part("back-substitution", solve_step, problem, state, lin, sizes, whole)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["landmarks", "joint"])
+    parser.add_argument("what", choices=["landmarks", "joint", "breakdown"])
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
     parser.add_argument("--repeats", type=int, default=3)
@@ -249,6 +292,10 @@ def main():
         problem, truth, start = make(frames, people, dtype=dtype)
         count = len(problem.factors[0].frame)
         name = f"{frames} / {len(truth.landmarks)} / {count} {np.dtype(dtype).name}"
+        if args.what == "breakdown":
+            print(name)
+            breakdown(problem, start, args.repeats)
+            continue
         schedule = (Stage(rtol=args.rtol),)
         report(name, problem, truth, start, schedule, args.repeats)
 

@@ -147,7 +147,7 @@ def test_order_of_landmarks_does_not_matter():
 
 def test_the_world_and_unit_of_the_map_do_not_matter():
     problem, _, start = make(6)
-    size, turn = 3.0, np.asarray(g.retract_pose(jnp.eye(4), jnp.arange(6) * 0.1))
+    size, turn = 3.0, np.asarray(g.retract_pose(jnp.eye(4), 0.1 * jnp.arange(6.0)))
     cameras = jnp.asarray(turn) @ start.cameras
     cameras = cameras.at[:, :3, 3].multiply(size)
     points = size * (start.landmarks @ turn[:3, :3].T + turn[:3, 3])

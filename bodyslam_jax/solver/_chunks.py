@@ -311,7 +311,7 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
         lower = jnp.linalg.cholesky(pivot, symmetrize_input=False)
         half = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
         side = half @ coupling
-        rest = _spread(front[q:, q:], head, middle, tail)
+        rest = _spread(front[q:, q:], head, middle)
         return rest - side.T @ side, (half, side)
 
     front = jnp.zeros((r, r), dtype)
@@ -319,7 +319,7 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     return Factor(half, side, chunks.corner + front[-tail:, -tail:])
 
 
-def _spread(rest, head, middle, tail):
+def _spread(rest, head, middle):
     """Makes room in the front for the people and cameras that enter it."""
     rows = [
         jnp.zeros((head, rest.shape[1]), rest.dtype),
@@ -334,7 +334,6 @@ def _spread(rest, head, middle, tail):
         jnp.zeros((tall.shape[0], CAMERAS), rest.dtype),
         tall[:, middle:],
     ]
-    del tail
     return jnp.concatenate(columns, axis=1)
 
 

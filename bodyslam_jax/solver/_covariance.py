@@ -278,6 +278,8 @@ def observability(problem: Problem, state: State, spread: Marginals) -> tuple[st
             place = np.asarray(world_from_root(state))[person, :, :3, 3]
             distance = np.linalg.norm(place - centres, axis=1)
             lost = ~(deviation(np.asarray(spread.people[person])) < distance / 3)
+            if problem.motion is not None:
+                lost &= np.asarray(problem.motion.present[person])
             if lost.any():
                 found.append(f"place of person {person} in {int(lost.sum())} frames.")
     return tuple(found)

@@ -33,9 +33,9 @@ MAX_DAMPING = 1e12
 class History(eqx.Module):
     """One entry an iteration, of which the first `num_steps` are filled."""
 
-    cost: Float[Array, " n+1"]
+    cost: Float[Array, " _"]
     """Before each iteration, and after the last."""
-    terms: Float[Array, "n+1 k"]
+    terms: Float[Array, "_ k"]
     """By factor, in the order of the problem."""
     damping: Float[Array, " n"]
     step: Float[Array, " n"]
@@ -74,11 +74,13 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         dtype = y.scale.dtype
         n, k = self.max_history, len(args.factors)
         observations = gather(args)
-        struct = eqx.filter_eval_shape(linearise, args, observations, y)
+        # Filled in by the first step: each part is compiled once.
+        struct = eqx.filter_eval_shape(_linearise_anew, args, observations, y)
+        empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
         return _Loop(
-            prediction=args.predict(y),
+            prediction=empty[1],
             observations=observations,
-            lin=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct),
+            lin=empty[0],
             stale=jnp.array(True),
             damping=jnp.asarray(self.damping, dtype),
             growth=jnp.asarray(2.0, dtype),
@@ -99,12 +101,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         dtype = y.scale.dtype
         sizes = sizes_of(args, y)
 
-        def anew(_):
-            seen = args.predict(y)
-            return linearise(args.with_prediction(seen), state.observations, y), seen
-
         lin, prediction = jax.lax.cond(
-            state.stale, anew, lambda _: (state.lin, state.prediction), None
+            state.stale,
+            lambda _: _linearise_anew(args, state.observations, y),
+            lambda _: (state.lin, state.prediction),
+            None,
         )
         problem: Problem = args.with_prediction(prediction)
         known = jnp.sum(lin.costs)
@@ -116,12 +117,13 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         predicted = 0.5 * (state.damping * length - _slope(problem, lin, move))
         finite = jnp.isfinite(predicted) & jnp.isfinite(length)
         move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
-        trial = y.retract(move)
-        terms = jnp.stack([f.cost(trial) for f in problem.factors])
+        slope = -_slope(problem, lin, move)
+        best, terms, gain = _search(problem, y, move, slope, predicted, lin.costs)
         cost = jnp.sum(terms)
-        gain = (known - cost) / jnp.where(predicted > 0, predicted, 1.0)
-        accept = finite & (predicted > 0) & (gain > GAIN)
+        accept = finite & (predicted > 0) & (known - cost > GAIN * best * predicted)
+        trial = y.retract(jax.tree.map(lambda x: best * x, move))
         shrink = jnp.maximum(1 - (2 * gain - 1) ** 3, 1 / 3)
+        shrink = jnp.where(gain < 0.25, 2.0, shrink)
         lower = jnp.maximum(state.damping * shrink, self.min_damping)
         higher = jnp.maximum(state.damping, self.min_damping) * state.growth
         # Below the rounding of the cost itself, no decrease can be seen.
@@ -165,6 +167,43 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {"history": state.history, "cost": state.cost}
+
+
+def _linearise_anew(problem, observations, state):
+    seen = problem.predict(state)
+    return linearise(problem.with_prediction(seen), observations, state), seen
+
+
+def _search(problem, state, move, slope, predicted, terms):
+    """The full step, and the one that a parabola through its cost finds better.
+
+    Robust losses bend more than `J^T J` knows: full steps then overshoot to and fro.
+    The second evaluation is a few per cent of an iteration. Returns the share of the
+    step, the terms there, and actual over predicted decrease of the full step.
+    """
+    known = jnp.sum(terms)
+
+    def one(carry, _):
+        share, best, best_terms, full = carry
+        moved = state.retract(jax.tree.map(lambda x: share * x, move))
+        new = jnp.stack([f.cost(moved) for f in problem.factors])
+        cost = jnp.sum(new)
+        cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        better = cost < jnp.sum(best_terms)
+        best = jnp.where(better, share, best)
+        best_terms = jnp.where(better, new, best_terms)
+        full = jnp.where(jnp.isnan(full), cost, full)
+        # cost(a) = known - slope a + bend a^2, through the full step
+        bend = full - known + slope
+        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
+        vertex = jnp.where(bend > 0, vertex, 2.0)
+        return (jnp.clip(vertex, 0.1, 2.0), best, best_terms, full), None
+
+    one_ = jnp.ones_like(known)
+    start = (one_, one_, terms, jnp.nan * one_)
+    (_, best, best_terms, full), _ = jax.lax.scan(one, start, length=2)
+    gain = (known - full) / jnp.where(predicted > 0, predicted, 1.0)
+    return best, best_terms, jnp.clip(gain, -1.0, 2.0)
 
 
 def _quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:

@@ -259,10 +259,8 @@ def _add_products(sums, local, columns, spread, residual, of_people, joint):
             block = shift(outer(columns[i], spread), lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if spread is not None:
-        axes = tuple(range(1, spread.ndim - 1))
         flat = spread.reshape(spread.shape[0], -1, spread.shape[-1])
         rows = residual.reshape(residual.shape[0], -1)
-        del axes
         for person in range(spread.shape[0]):
             n = sums.sizes.own_globals if of_people else 1 + sums.sizes.intrinsics
             columns_of = flat[person][:, :n]

@@ -102,13 +102,13 @@ def _link_times(link: Array, x: Float[Array, "h n 69 c"]) -> Float[Array, "h n 6
 
 
 def pose_diagonal(lin: Linearisation) -> Float[Array, "h t 69"]:
-    total = 0.0
+    total = jnp.zeros_like(lin.gradient["pose"])
     for kind in ("pose", "joint"):
         block = lin.blocks.get((kind, kind, 0))
         if block is not None:
             diagonal = jnp.diagonal(block, axis1=-2, axis2=-1)
-            total = total + diagonal.reshape(*diagonal.shape[:2], POSE)
-    return total  # type: ignore[return-value]
+            total = total + diagonal.reshape(total.shape)
+    return total
 
 
 def eliminate_postures(
