@@ -36,8 +36,9 @@ def walk(person, clips, path):
 def test_feet_stand_still_also_at_seams_and_in_turns(person, walk):
     sole = _walking.Soles(person)(walk.poses, walk.pelvis)
     step = np.linalg.norm(np.diff(sole, axis=0)[:, :, [0, 2]], axis=2).min(axis=1)
-    assert np.median(step) * 30 < 0.15  # m/s; the recordings themselves have 0.09
-    assert (step * 30).max() < 0.5
+    # m/s; a rolling foot, in the recordings 0.09, 0.19 and 0.38
+    slide = np.percentile(step * 30, [50, 90, 100])
+    assert (slide < [0.12, 0.22, 0.5]).all()
     assert abs(sole[:, :, 1].min(axis=1)).max() < 0.03  # m above or below the floor
 
 
@@ -82,10 +83,10 @@ def test_toes_bend_rather_than_go_through_the_floor(person, walk):
     toes = np.flatnonzero(person.weights[:, [10, 11]].max(axis=1) > 0.5)
     lowest = [
         person.vertices(g, y, toes)[:, 1].min()
-        for g, y in zip(G[::5], x[::5], strict=True)
+        for g, y in zip(G[::3], x[::3], strict=True)
     ]
-    assert min(lowest) > -0.05  # m
-    assert np.median(lowest) > -0.025
+    assert min(lowest) > -0.045  # m
+    assert np.mean(np.array(lowest) < -0.03) < 0.03
 
 
 def test_clips_are_walks_of_validation_subjects_if_there_are_any(clips):

@@ -10,9 +10,8 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.motion import FPS
 from bodyslam_jax.synthetic._scene import look_at
-
-FPS = 30.0
 
 
 @dataclasses.dataclass(frozen=True)

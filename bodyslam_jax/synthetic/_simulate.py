@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.motion import read_motion
+from bodyslam_jax.motion import FPS, read_motion
 from bodyslam_jax.sequence import Tracks
 from bodyslam_jax.synthetic._filming import (
-    FPS,
     HANDLING,
     film_following,
     film_room,

@@ -15,11 +15,10 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.motion import Clip, resample
+from bodyslam_jax.motion import FPS, Clip, resample
 from bodyslam_jax.motion._clips import leg_length, mirror
 from bodyslam_jax.synthetic._posing import Person
 
-FPS = 30.0
 _BLEND = 10
 """Frames over which two trials are blended."""
 _PLAYED = 18
