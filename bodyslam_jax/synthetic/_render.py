@@ -312,7 +312,9 @@ def _pack(
         for k, image in enumerate(levels)
     ]
     padded.sort(key=lambda item: -item[2].shape[0])
-    width = max(max(item[2].shape[1] for item in padded), 4096)
+    # OpenCV looks up images of up to 32767 rows and columns only: keep it square.
+    texels = sum(image.shape[0] * image.shape[1] for _, _, image in padded)
+    width = max(*(image.shape[1] for _, _, image in padded), int(texels**0.5))
     places = np.zeros((len(pyramids), _LEVELS, 2), np.float32)
     x = y = shelf = 0
     where = []
