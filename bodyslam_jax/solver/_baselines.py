@@ -115,7 +115,9 @@ def _jaxopt(name, problem, state, stage):
     if name == "LevenbergMarquardt":
         options |= {"solver": "cholesky", "materialize_jac": True, "xtol": 1e-14}
     method = getattr(jaxopt, name)(residual, **options)
-    found = method.run(start, arrays)
+    # jaxopt multiplies truth values and numbers.
+    with jax.numpy_dtype_promotion("standard"):
+        found = method.run(start, arrays)
     count = found.state.iter_num
     return flat.retract(unravel(found.params)), count, optx.RESULTS.successful
 

@@ -126,8 +126,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         shrink = jnp.where(gain < 0.25, 2.0, shrink)
         lower = jnp.maximum(state.damping * shrink, self.min_damping)
         higher = jnp.maximum(state.damping, self.min_damping) * state.growth
-        # Below the rounding of the cost itself, no decrease can be seen.
-        floor = 8 * jnp.finfo(dtype).eps * known
+        # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
+        eps = float(jnp.finfo(dtype).eps)
+        floor = 8 * eps * known + eps**1.25
         tiny = predicted <= floor
         small = predicted <= jnp.maximum(self.rtol * known, floor)
         done = finite & (tiny | (small & accept & (state.damping <= 1e-2)))
