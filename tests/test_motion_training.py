@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,8 @@ from bodyslam_jax.motion import _training as training
 from bodyslam_jax.motion import draw_history, train
 from bodyslam_jax.motion._network import PaperNetwork
 from bodyslam_jax.motion._sampling import corpus, draw
+
+draw = eqx.filter_jit(draw)
 
 SMALL = MotionTraining(
     past=4, width=(16, 8), epochs=3, segments=8, steps=4, learning_rate=1e-2

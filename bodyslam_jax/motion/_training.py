@@ -43,6 +43,9 @@ logger = logging.getLogger(__name__)
 _AVERAGING = 0.998
 """Of the running mean of weights that is validated and kept."""
 
+_MEASURED = 20
+"""Batches from which means and standard deviations are taken."""
+
 DRIFTS = (0.0, 5.0, 9.0)
 """Slow joint-angle errors (degrees) at which a model is judged."""
 
@@ -273,8 +276,7 @@ def train(
     key = jax.random.key(settings.seed)
     network = initial_network(jax.random.fold_in(key, 0), settings)
     stacked = jax.jit(lambda key: draw(key, data, body, settings))
-    measured = -(-40_000 // (settings.segments * settings.steps))
-    keys = jax.random.split(jax.random.fold_in(key, 2), measured)
+    keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
     network = _measure(network, [stacked(k) for k in keys])
     mask = _trainable(network)
     progress = Progress(
@@ -323,20 +325,18 @@ def train(
     return done, np.asarray(progress.history)
 
 
-def _score(ratios: Sequence[float], slopes: Sequence[float]) -> float:
+def _score(row: Float[np.ndarray, "6"]) -> float:
     """What validation prefers: small errors and slopes near 1 at every noise."""
-    parts = [r / t for r, t in zip(ratios, TARGETS, strict=True)]
-    return float(np.mean(parts) + 5 * np.mean(np.abs(np.array(slopes) - 1)))
+    return float(np.mean(row[:3] / TARGETS) + 5 * np.mean(np.abs(row[3:] - 1)))
 
 
 def _validate(progress, model, body, trials, epoch) -> Progress:
     runs = [
         summary(run_trials(model(progress.average), body, trials, d)) for d in DRIFTS
     ]
-    row = [run["ratio"] for run in runs] + [run["slope"] for run in runs]
+    row = np.array([run[k] for k in ("ratio", "slope") for run in runs])
     past = np.asarray(progress.history[:epoch, 1:])
-    earlier = [_score(r[:3], r[3:]) for r in past]
-    better = not earlier or _score(row[:3], row[3:]) < min(earlier)
+    better = _score(row) < min(map(_score, past), default=np.inf)
     return dataclasses.replace(
         progress,
         history=progress.history.at[epoch, 1:].set(jnp.asarray(row, jnp.float32)),
