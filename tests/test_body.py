@@ -39,18 +39,13 @@ def as_dtype(tree, dtype):
     return jax.tree.map(cast, tree)
 
 
-jit_joints = jax.jit(body.joints)
-jit_vertices = jax.jit(body.vertices)
-jit_keypoints = jax.jit(body.keypoints, static_argnames="layout")
-
-
 @pytest.mark.parametrize(
     ("dtype", "tolerance"), [("float64", 1e-10), ("float32", 1e-5)]
 )
 def test_equals_smpl_written_in_numpy(model, raw, dtype, tolerance):
     pose, beta, trans = some_bodies()
     args = as_dtype((model, pose, beta, trans), dtype)
-    joints, vertices = jit_joints(*args), jit_vertices(*args)
+    joints, vertices = body.joints(*args), body.vertices(*args)
     assert joints.dtype == vertices.dtype == dtype
     for n in range(N):
         J, V = smpl(raw, *(np.asarray(x[n], np.float64) for x in (pose, beta, trans)))
@@ -71,8 +66,8 @@ def test_default_body_equals_smpl_written_in_numpy(default):
         raw["weights"], (rows, np.asarray(default.skin_joint)), default.skin_weight
     )
     pose, beta, trans = some_bodies(1)
-    shared = jit_vertices(default, pose, beta[0], trans)
-    each = jit_vertices(default, pose, jnp.broadcast_to(beta[:1], (N, 10)), trans)
+    shared = body.vertices(default, pose, beta[0], trans)
+    each = body.vertices(default, pose, jnp.broadcast_to(beta[:1], (N, 10)), trans)
     for n in range(N):
         _, V = smpl(raw, np.asarray(pose[n]), np.asarray(beta[0]), np.asarray(trans[n]))
         np.testing.assert_allclose(shared[n], V, atol=1e-10)
@@ -91,12 +86,12 @@ def test_long_videos_go_through_in_chunks(model):
 
 def test_leading_axes_broadcast_and_vmap_agrees(model):
     pose, beta, trans = some_bodies(2)
-    table = jit_joints(model, pose[:, None], beta[None], jnp.zeros(3))
+    table = body.joints(model, pose[:, None], beta[None], jnp.zeros(3))
     assert table.shape == (N, N, 24, 3)
     one = body.joints(model, pose[1], beta[3], jnp.zeros(3))
     np.testing.assert_allclose(table[1, 3], one, atol=1e-12)
     for function in (body.joints, body.keypoints, body.vertices):
-        mapped = jax.vmap(function, (None, 0, 0, 0))(model, pose, beta, trans)
+        mapped = jax.jit(jax.vmap(function, (None, 0, 0, 0)))(model, pose, beta, trans)
         expected = function(model, pose, beta, trans)
         np.testing.assert_allclose(mapped, expected, atol=1e-12)
 
@@ -104,7 +99,7 @@ def test_leading_axes_broadcast_and_vmap_agrees(model):
 def test_root_turns_about_the_pelvis(model):
     pose, beta, trans = some_bodies(3)
     expected = body.rest_joints(model, beta)[:, 0] + trans
-    found = jit_joints(model, pose, beta, trans)[:, 0]
+    found = body.joints(model, pose, beta, trans)[:, 0]
     np.testing.assert_allclose(found, expected, atol=1e-12)
     local = body.local_joints(model, pose[:, 3:].reshape(N, 23, 3), beta)
     assert abs(local[:, 0]).max() == 0
@@ -145,7 +140,7 @@ def test_derivatives_of_each_joint_are_those_of_its_ancestors_alone(default):
 def test_bones_keep_their_lengths(default, seed, spread):
     pose, beta, trans = some_bodies(seed, spread)
     length = lambda x: np.linalg.norm(x[:, 1:] - x[:, body.PARENTS[1:]], axis=-1)
-    posed = np.asarray(jit_joints(default, pose, beta, trans))
+    posed = np.asarray(body.joints(default, pose, beta, trans))
     rest = np.asarray(body.rest_joints(default, beta))
     np.testing.assert_allclose(length(posed), length(rest), atol=1e-12)
 
@@ -153,9 +148,9 @@ def test_bones_keep_their_lengths(default, seed, spread):
 @pytest.mark.parametrize("layout", ["body25", "coco17", "halpe26"])
 def test_keypoints_are_the_joints_and_vertices_of_their_names(default, layout):
     pose, beta, trans = some_bodies(6)
-    points = jit_keypoints(default, pose, beta, trans, layout=layout)
-    joints = jit_joints(default, pose, beta, trans)
-    vertices = jit_vertices(default, pose, beta, trans)
+    points = body.keypoints(default, pose, beta, trans, layout=layout)
+    joints = body.joints(default, pose, beta, trans)
+    vertices = body.vertices(default, pose, beta, trans)
     names = body.KEYPOINT_NAMES[layout]
     assert points.shape == (N, len(names), 3)
     assert len(names) == len(body.KEYPOINT_SPREAD[layout])

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax.body._check import checked
-from bodyslam_jax.body._model import BodyModel, sparse_rows
+from bodyslam_jax.body._model import BodyModel, runs_of_vertices, sparse_rows
 from bodyslam_jax.body._skeleton import JOINT_NAMES, PARENTS, SURFACE_POINTS
 from bodyslam_jax.body._unpickle import read_pickle
 
@@ -215,6 +215,7 @@ def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
         "skin_joint": joint,
         "skin_weight": weight,
         "faces": raw["f"],
+        "blocks": runs_of_vertices(weights),
         "picks": raw["picks"] if "picks" in raw else _picks(template, regressor),
         "name": file.stem,
         "kind": "default" if file == DEFAULT else _KIND[num_joints],

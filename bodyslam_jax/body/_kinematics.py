@@ -8,6 +8,7 @@ Inside, the batch is the last axis: the 3x3 products are then plain arithmetic o
 vectors, one level of the tree at a time.
 """
 
+import functools
 import math
 
 import jax
@@ -29,6 +30,7 @@ from bodyslam_jax.body._skeleton import (
 _PARENT = np.array(PARENTS[1:])
 
 
+@jax.jit
 def rest_joints(
     model: BodyModel, shape: Float[Array, "*b 10"]
 ) -> Float[Array, "*b 24 3"]:
@@ -37,6 +39,7 @@ def rest_joints(
     return model.joint_template + moved.reshape(*shape.shape[:-1], 24, 3)
 
 
+@jax.jit
 def local_joints(
     model: BodyModel,
     body_pose: Float[Array, "*#b 23 3"],
@@ -52,6 +55,7 @@ def local_joints(
     return _unflatten(posed.x, batch)
 
 
+@jax.jit
 def joints(
     model: BodyModel,
     pose: Float[Array, "*#b 72"],
@@ -65,6 +69,7 @@ def joints(
     return _placed(model, pose, shape, trans, lambda posed, shape: posed.x)
 
 
+@functools.partial(jax.jit, static_argnames="layout")
 def local_keypoints(
     model: BodyModel,
     body_pose: Float[Array, "*#b 23 3"],
@@ -87,6 +92,7 @@ def local_keypoints(
     return _unflatten(_detected(model, posed, beta, layout, bias), batch)
 
 
+@functools.partial(jax.jit, static_argnames="layout")
 def keypoints(
     model: BodyModel,
     pose: Float[Array, "*#b 72"],

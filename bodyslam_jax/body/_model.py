@@ -31,6 +31,9 @@ class BodyModel(eqx.Module):
     faces: Int[Array, "f 3"]
     picks: Int[Array, " 12"]
     """The vertices of `SURFACE_POINTS`."""
+    blocks: tuple[tuple[int, int, tuple[int, ...]], ...] = eqx.field(static=True)
+    """Runs of vertices (first, one past the last) and the few joints that each follows:
+    skinning a run needs no others."""
     name: str = eqx.field(static=True)
     """Where the body comes from: the file's name."""
     kind: str = eqx.field(static=True)
@@ -53,3 +56,35 @@ def sparse_rows(
     joint = np.argsort(-np.abs(weights), axis=1, kind="stable")[:, :width]
     weight = np.take_along_axis(weights, joint, axis=1)
     return np.where(weight != 0, joint, 0).astype(np.int32), weight
+
+
+def runs_of_vertices(
+    weights: Float[np.ndarray, "v 24"],
+) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
+    """Cuts the vertices, in the order that they have, where other joints take over.
+
+    A mesh lists its parts one after another, so that long runs follow few joints. The
+    cuts have the least cost of (vertices x joints) by dynamic programming over cells of
+    vertices; a cut has its price too, so that there are about ten in a body.
+    """
+    v = len(weights)
+    cell, price = max(1, -(-v // 400)), 0.3 * v + 1000
+    starts = [*range(0, v, cell), v]
+    follows = [(weights[a:b] != 0).any(0) for a, b in zip(starts, starts[1:])]
+    best, back = [0.0], [0]
+    for end in range(1, len(starts)):
+        used, costs = np.zeros(weights.shape[1], bool), []
+        for start in range(end - 1, -1, -1):
+            used = used | follows[start]
+            size = starts[end] - starts[start]
+            costs.append((best[start] + size * int(used.sum()) + price, start))
+        cost, start = min(costs)
+        best.append(cost)
+        back.append(start)
+    runs, end = [], len(starts) - 1
+    while end > 0:
+        used = np.any(follows[back[end] : end], axis=0)
+        joints = tuple(int(j) for j in np.flatnonzero(used))
+        runs.append((starts[back[end]], starts[end], joints))
+        end = back[end]
+    return tuple(reversed(runs))
