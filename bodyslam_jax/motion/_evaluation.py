@@ -139,7 +139,9 @@ def run_trials(
     for i in range(0, len(trials), chunk):
         rows = np.arange(i, i + chunk).clip(max=len(trials) - 1)
         out = _steps(
-            model, body, *(x[rows] for x in (poses, estimated, trans, shape, present))
+            model,
+            body,
+            *(jnp.asarray(x[rows]) for x in (poses, estimated, trans, shape, present)),
         )
         keep = min(chunk, len(trials) - i)
         parts.append([np.asarray(x)[:keep] for x in out])
@@ -219,7 +221,7 @@ def evaluate_model(
     seeds: int = 3,
     root_drift: float = 0.0,
     skip: int = 0,
-    constant: Float[np.ndarray, "3"] | None = None,
+    constant: Float[np.ndarray, " 3"] | None = None,
 ) -> dict[str, dict[str, float]]:
     """Measures a model on clips, by motion class and over `all`, with the baselines.
 
@@ -262,7 +264,7 @@ def evaluate_model(
     return out
 
 
-def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, "3"]:
+def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, " 3"]:
     """Mean displacement of training clips in H_{k-1}, m a frame at 30 fps."""
     moves = []
     for clip in resample([clip for clip in dataset if clip.phase == 0], FPS):

@@ -118,7 +118,7 @@ def draw_errors(
 def draw_rollout(
     motion: Rollout,
     body: BodyModel,
-    shape: Float[np.ndarray, "10"],
+    shape: Float[np.ndarray, " 10"],
     path: Path,
     every: int = 15,
 ) -> None:

@@ -27,7 +27,7 @@ class Trial:
     """A clip on the body model."""
 
     clip: Clip
-    shape: Float[np.ndarray, "10"]
+    shape: Float[np.ndarray, " 10"]
     """β"""
     trans: Float[np.ndarray, "t 3"]
     """The body's pelvis joint, m: the path of the hips in proportion to leg length."""
@@ -35,7 +35,7 @@ class Trial:
 
 def fit_shape(
     body: BodyModel, offsets: Float[np.ndarray, "24 3"]
-) -> Float[np.ndarray, "10"]:
+) -> Float[np.ndarray, " 10"]:
     """β of the body whose limbs are as long as a subject's bones.
 
     Least squares on lengths (legs 1 cm, others 3 cm) with a standard normal prior on

@@ -53,7 +53,7 @@ def sequence_windows(
     body: BodyModel,
     orientation: Float[Array, "t 3 3"],
     body_pose: Float[Array, "t 23 3"],
-    shape: Float[Array, "10"],
+    shape: Float[Array, " 10"],
     past: int,
 ) -> Window:
     """The `t - past` windows of a sequence; the first one's target is frame `past`.
@@ -103,7 +103,7 @@ def predict(
     body: BodyModel,
     orientation: Float[Array, "t 3 3"],
     body_pose: Float[Array, "t 23 3"],
-    shape: Float[Array, "10"],
+    shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Prediction:
     """Predicts every step of one person's sequence from postures and shape alone.

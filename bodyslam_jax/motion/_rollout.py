@@ -43,7 +43,7 @@ def rollout(
     body: BodyModel,
     orientation: Float[Array, "p 3 3"],
     body_pose: Float[Array, "p 23 3"],
-    shape: Float[Array, "10"],
+    shape: Float[Array, " 10"],
     frames: int,
 ) -> Rollout:
     """Continues a motion by `frames` frames from `p` given postures.

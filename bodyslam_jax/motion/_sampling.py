@@ -184,7 +184,7 @@ def _mirrored(
 
 
 def _errors(
-    keys: Key[Array, "4"], s: int, frames: int, settings: MotionTraining
+    keys: Key[Array, " 4"], s: int, frames: int, settings: MotionTraining
 ) -> Float[Array, "s f 24 3"]:
     """Drift in equal steps from none to `drift_deg` after a clean share of segments.
 

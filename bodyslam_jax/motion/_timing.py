@@ -61,7 +61,7 @@ def predict_between(
     body: BodyModel,
     orientation: Float[Array, "t 3 3"],
     body_pose: Float[Array, "t 23 3"],
-    shape: Float[Array, "10"],
+    shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Prediction:
     """`predict` at the frames of a `Clock`: row k is the step from frame k-1 to k.

@@ -214,7 +214,7 @@ def run_epoch(
     key = jax.random.fold_in(key, progress.epoch.astype(jnp.int32))
     devices = jax.local_devices()
     count = max(d for d in range(1, len(devices) + 1) if settings.segments % d == 0)
-    mesh = jax.make_mesh((count,), ("data",), devices=devices[:count])
+    mesh = jax.sharding.Mesh(np.array(devices[:count]), ("data",))
     split = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("data"))
 
     def step(carry, number):
@@ -325,7 +325,7 @@ def train(
     return done, np.asarray(progress.history)
 
 
-def _score(row: Float[np.ndarray, "6"]) -> float:
+def _score(row: Float[np.ndarray, " 6"]) -> float:
     """What validation prefers: small errors and slopes near 1 at every noise."""
     return float(np.mean(row[:3] / TARGETS) + 5 * np.mean(np.abs(row[3:] - 1)))
 
@@ -385,7 +385,7 @@ def save_checkpoint(path: Path, progress: Progress, mark: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial.npz")
     with open(partial, "wb") as file:
-        np.savez(file, mark=np.array(mark), **leaves)
+        np.savez(file, allow_pickle=False, mark=np.array(mark), **leaves)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)

@@ -50,7 +50,8 @@ def save_motion_model(path: Path | str, model: MotionModel) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     with open(partial, "wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **leaves)
+        about = np.array(json.dumps(header))
+        np.savez_compressed(file, allow_pickle=False, header=about, **leaves)
     os.replace(partial, path)
 
 
