@@ -244,7 +244,7 @@ def per_frame(
     t = sequence.num_frames
     tracks, keep = cameras.tracks, cameras.keep
     count = np.bincount(tracks.frame, minlength=t)
-    found: dict[str, list[float | None]] = {"tracks": count.tolist()}
+    found: dict[str, list[float | None]] = {"tracks": count.astype(float).tolist()}
     intrinsics = jnp.asarray(joint.intrinsics)
     if cameras.kind == "moving":
         T = joint.cameras[tracks.frame]
@@ -252,7 +252,8 @@ def per_frame(
         p_C = np.einsum("mji,mj->mi", T[:, :3, :3], offset)
         error = np.asarray(camera.project(intrinsics, jnp.asarray(p_C))) - tracks.uv
         length = np.linalg.norm(error, axis=-1)
-        found["inliers"] = np.bincount(tracks.frame[keep], minlength=t).tolist()
+        inliers = np.bincount(tracks.frame[keep], minlength=t)
+        found["inliers"] = inliers.astype(float).tolist()
         found["reprojection_px"] = _means(tracks.frame[keep], length[keep], t)
     if sequence.keypoints is not None and joint.present.any():
         shapes = jnp.asarray(joint.shapes)[:, None]

@@ -201,7 +201,10 @@ def _joint(
             )
         )
     if not factors:
-        raise ValueError(f"{sequence.name}: no landmarks and no people to estimate.")
+        raise ValueError(
+            f"{sequence.name}: no landmarks and no people; expected a camera moving "
+            "before a textured background, or people's keypoints."
+        )
     problem = graph.make_problem(
         factors,
         state,
@@ -224,7 +227,7 @@ def _joint(
             if spread is None
             else np.asarray(spread.shapes)
         ),
-        unobserved=tuple(unobserved),
+        unobserved=tuple(f"not well determined: {line}" for line in unobserved),
         cameras=np.asarray(best.cameras),
         roots=np.asarray(best.roots),
         poses=np.asarray(best.poses),

@@ -6,12 +6,12 @@ path, and the path is read off at the times of the frames.
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion._predict import MotionModel, Prediction, predict
+from bodyslam_jax.motion._rotations import change, matrix, turned, vector
 
 
 class Clock(eqx.Module):
@@ -76,14 +76,13 @@ def predict_between(
     steps = clock.steps.astype(dtype)
     following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
 
-    def at_ticks(rotation: jaxlie.SO3) -> jaxlie.SO3:
-        first = jaxlie.SO3(rotation.wxyz[clock.frame])
-        second = jaxlie.SO3(rotation.wxyz[following])
-        share = between.reshape(-1, *(1,) * (rotation.wxyz.ndim - 1))
-        return first @ jaxlie.SO3.exp(share * (first.inverse() @ second).log())
+    def at_ticks(angles: Array) -> Array:
+        share = between.reshape(-1, *(1,) * (angles.ndim - 1))
+        step = change(angles[clock.frame], angles[following])
+        return turned(angles[clock.frame], share * step)
 
-    C = at_ticks(jaxlie.SO3.from_matrix(orientation)).as_matrix()
-    pose = at_ticks(jaxlie.SO3.exp(body_pose)).log()
+    C = matrix(at_ticks(vector(orientation)))
+    pose = at_ticks(body_pose)
     there = present[clock.frame] & (present[following] | (between == 0))
     seen = predict(network, body, C, pose, shape, there)
 
@@ -95,20 +94,17 @@ def predict_between(
     last = jnp.minimum(clock.tick + 1, len(path) - 1)
     place = path[clock.tick] + beyond[:, None] * (path[last] - path[clock.tick])
     moved = place - jnp.concatenate([place[:1], place[:-1]])
-    turned = jnp.concatenate([orientation[:1], orientation[:-1]])
+    started = jnp.concatenate([orientation[:1], orientation[:-1]])
     end = jnp.where(beyond > 0, last, clock.tick)
     start = jnp.concatenate([clock.tick[:1], clock.tick[:-1]])
     valid = (missing[end] == missing[start]) & (jnp.arange(len(steps)) > 0) & present
-    change = (
-        jaxlie.SO3.exp(pose[end - 1]).inverse() @ jaxlie.SO3.exp(seen.body_pose[end])
-    ).log()
+    step = change(pose[end - 1], seen.body_pose[end])
     previous = jnp.concatenate([body_pose[:1], body_pose[:-1]])
-    posture = jaxlie.SO3.exp(previous) @ jaxlie.SO3.exp(steps[:, None, None] * change)
     return Prediction(
-        translation=jnp.einsum("tji,tj->ti", turned, moved),
+        translation=jnp.einsum("tji,tj->ti", started, moved),
         covariance=seen.covariance[end] * (steps**2)[:, None, None]
         + jnp.where(valid, 0, 1)[:, None, None].astype(dtype) * jnp.eye(3, dtype=dtype),
-        body_pose=posture.log(),
+        body_pose=turned(previous, steps[:, None, None] * step),
         rotation=seen.rotation[end] * steps[:, None],
         valid=valid,
     )

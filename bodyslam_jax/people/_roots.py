@@ -37,12 +37,10 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
     T_CH[~present] = np.eye(4)
     body_pose = bodies.poses[..., 3:].reshape(*present.shape, 23, 3).astype(float)
     body_pose = np.where(present[..., None, None], body_pose, 0.0)
-    shape = np.stack(
-        [
-            np.median(s[p], axis=0) if p.any() else np.zeros(10)
-            for s, p in zip(bodies.shapes.astype(float), present)
-        ]
-    )
+    shape = np.zeros((len(present), 10))
+    for h, there in enumerate(present):
+        if there.any():
+            shape[h] = np.median(bodies.shapes[h, there].astype(float), axis=0)
     return Roots(present, T_CH, body_pose, shape)
 
 

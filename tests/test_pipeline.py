@@ -1,0 +1,99 @@
+"""The whole flow on simulated measurements, and what it leaves on disk."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from bodyslam_jax import evaluation, outcome, pipeline, synthetic
+from bodyslam_jax.config import Config, Simulation
+
+CONTRACT = {
+    "timestamps": (60,),
+    "T_WC": (60, 4, 4),
+    "scale": (),
+    "intrinsics": (4,),
+    "poses": (1, 60, 72),
+    "trans": (1, 60, 3),
+    "betas": (1, 10),
+    "joints": (1, 60, 24, 3),
+    "present": (1, 60),
+}
+
+
+@pytest.mark.slow
+def test_from_measurements_to_a_run_folder(tmp_path, caplog):
+    simulated = synthetic.simulate(
+        Simulation(sequence="M1", family="follow", length=60, noise="low")
+    )
+    sequence = synthetic.as_sequence(simulated)
+    out = tmp_path / "run"
+    result = pipeline.run_to_folder(sequence, out, Config())
+
+    found = evaluation.evaluate(result, synthetic.as_truth(simulated))
+    # The simulated errors are centimetres; so must be what is made of them.
+    assert float(found["c_ate_sim3"]) < 0.02
+    assert float(found["scale_error"]) < 0.1
+    assert float(found["h_ate_se3"]) < 0.15
+    assert result.summary["status"] == "ok"
+
+    with np.load(out / "result.npz", allow_pickle=False) as archive:
+        for name, shape in CONTRACT.items():
+            assert archive[name].shape == shape, name
+            assert np.isfinite(archive[name]).all(), name
+    for name in ("camera.tum", "body_0.npz", "landmarks.ply", "config.yaml"):
+        assert (out / name).stat().st_size > 0
+    assert "<html" in (out / "report.html").read_text().lower()
+    assert json.loads((out / "summary.json").read_text())["status"] == "ok"
+
+    # The same command again takes every stage from the folder, to the same result.
+    caplog.set_level("INFO")
+    again = pipeline.run_to_folder(sequence, out, Config())
+    assert caplog.text.count("taken from an earlier run") == 4
+    np.testing.assert_array_equal(again.joints, result.joints)
+
+    # A still camera: nothing but the bodies to go by, and the report says so.
+    still = dataclasses.replace(
+        sequence,
+        tracks=dataclasses.replace(
+            sequence.tracks,
+            uv=sequence.tracks.uv[
+                np.unique(sequence.tracks.landmark, return_index=True)[1]
+            ][np.unique(sequence.tracks.landmark, return_inverse=True)[1]],
+        ),
+    )
+    result = pipeline.run(still, Config(uncertainty=False))
+    assert result.summary["camera_motion"] == "static"
+    assert np.ptp(result.T_WC[:, :3, 3], axis=0).max() == 0
+    assert any("body alone" in text for text in result.summary["warnings"])
+
+
+def test_nothing_to_estimate_from_is_an_error():
+    simulated = synthetic.simulate(
+        Simulation(sequence="E1", length=30, noise="none", seed=1)
+    )
+    sequence = synthetic.as_sequence(simulated)
+    tracks = sequence.tracks
+    few = tracks.landmark < 3
+    bare = dataclasses.replace(
+        sequence,
+        keypoints=None,
+        bodies=None,
+        tracks=type(tracks)(tracks.frame[few], tracks.landmark[few], tracks.uv[few]),
+    )
+    with pytest.raises(ValueError, match="no landmarks and no people"):
+        pipeline.run(bare)
+
+
+def test_upright_puts_the_trunk_up_and_keeps_distances():
+    rng = np.random.default_rng(0)
+    T_WC = np.tile(np.eye(4), (5, 1, 1))
+    T_WC[:, :3, 3] = rng.normal(size=(5, 3))
+    T_WH = np.tile(np.eye(4), (1, 5, 1, 1))
+    T_WH[..., :3, 1] = np.array([0.6, 0.0, 0.8])
+    turn = outcome.upright(T_WC, T_WH, np.ones((1, 5), bool))
+    np.testing.assert_allclose(turn[:3, :3] @ [0.6, 0.0, 0.8], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)
+    np.testing.assert_allclose((turn @ T_WC[0])[:3, 3], 0, atol=1e-12)
