@@ -313,7 +313,7 @@ def main() -> None:
         if argv and not any(flag in argv for flag in ("-h", "--help")):
             _prepare_jax()
         code = tyro.extras.subcommand_cli_from_dict(
-            commands, prog=prog, description=__doc__.splitlines()[0], args=argv
+            commands, prog=prog, description=(__doc__ or "").split("\n")[0], args=argv
         )
     except (OSError, ValueError) as error:
         sys.exit(f"bodyslam: {_one_line(error)}")

@@ -65,5 +65,5 @@ def _models() -> list[tuple[str, str]]:
     for path in body.search_paths():
         rows.append(("body model", f"{path}: {'found' if path.exists() else 'no'}"))
     rows.append(("default body", body.load_body_model().name))
-    rows.append(("default motion model", motion.load_motion_model().name))
+    rows.append(("default motion model", f"for the {motion.load_motion_model().body}"))
     return rows

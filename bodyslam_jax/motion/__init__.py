@@ -8,6 +8,7 @@ from bodyslam_jax.motion._clips import FPS as FPS
 from bodyslam_jax.motion._clips import Clip as Clip
 from bodyslam_jax.motion._clips import resample as resample
 from bodyslam_jax.motion._clips import split as split
+from bodyslam_jax.motion._command import train_from_data as train_from_data
 from bodyslam_jax.motion._evaluation import evaluate_model as evaluate_model
 from bodyslam_jax.motion._figures import compare as compare
 from bodyslam_jax.motion._figures import draw_errors as draw_errors

@@ -249,7 +249,11 @@ def _join(lin, sizes, reduced, people, corner, damping):
     alone[0] = alone[0] + eye if 0 in alone else eye
     cut = lambda x: x.reshape(1, n, CHUNK, *x.shape[1:])
     own, following = _symmetric_place(alone, cut)
-    own = own[0] + reduced.band[..., :CAMERAS] + jnp.sum(people["camera_own"], axis=0)
+    own = (
+        jnp.asarray(own)[0]
+        + reduced.band[..., :CAMERAS]
+        + jnp.sum(people["camera_own"], axis=0)
+    )
     pivot = jnp.zeros((n, q, q), dtype).at[:, head:, head:].set(own)
     coupling = jnp.zeros((n, q, r), dtype)
     band = reduced.band[..., CAMERAS:]
