@@ -6,6 +6,7 @@ first, without those that reach behind the camera.
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import errno
 import os
 import sys
@@ -148,14 +149,19 @@ def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
     template = np.asarray(body.template)
     cells = np.floor(template / _CELL).astype(np.int64)
     _, kept, cluster = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    faces = cluster.reshape(-1)[np.asarray(body.faces)]
+    # In the body's own order, as runs of vertices are skinned together.
+    order = np.argsort(kept)
+    kept = kept[order]
+    faces = np.argsort(order)[cluster.reshape(-1)][np.asarray(body.faces)]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     arrays = lambda m: (
         [m.template, m.shape_dirs, m.pose_dirs, m.skin_joint] + [m.skin_weight]
     )
     coarse = eqx.tree_at(arrays, body, [x[kept] for x in arrays(body)])
-    return coarse, faces
+    place = lambda vertex: int(np.searchsorted(kept, vertex))
+    runs = tuple((place(i), place(j), joints) for i, j, joints in body.blocks)
+    return dataclasses.replace(coarse, blocks=runs), faces
 
 
 def _pictures(
