@@ -161,7 +161,8 @@ def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
     coarse = eqx.tree_at(arrays, body, [x[kept] for x in arrays(body)])
     place = lambda vertex: int(np.searchsorted(kept, vertex))
     runs = tuple((place(i), place(j), joints) for i, j, joints in body.blocks)
-    return dataclasses.replace(coarse, blocks=runs), faces
+    regressor = coarse.joint_regressor[:, kept]
+    return dataclasses.replace(coarse, blocks=runs, joint_regressor=regressor), faces
 
 
 def _pictures(
