@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import body as body_
@@ -18,12 +16,12 @@ from bodyslam_jax import (
     frontend,
     graph,
     initialisation,
-    motion,
     people,
     solver,
     synthetic,
     view,
 )
+from bodyslam_jax import joint as joint_
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config
 from bodyslam_jax.outcome import Cameras, Joint, assemble
@@ -73,7 +71,10 @@ def run(
     key = fingerprint(sequence, config)
     with watch("joint"):
         joint = cache.stage(
-            "joint", key, Joint, lambda: _joint(sequence, cameras, bodies, body, config)
+            "joint",
+            key,
+            Joint,
+            lambda: joint_.estimate(sequence, cameras, bodies, body, config),
         )
     return assemble(sequence, config, body, cameras, joint, watch.seconds)
 
@@ -152,122 +153,6 @@ def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies
     return people.fit_bodies(
         sequence.keypoints, sequence.intrinsics, body, sequence.fps, config.people_fit
     )
-
-
-def _joint(
-    sequence: Sequence,
-    cameras: Cameras,
-    bodies: Bodies,
-    body: body_.BodyModel,
-    config: Config,
-) -> Joint:
-    """The paper's graph: two steps, then the optimum of everything."""
-    roots = people.roots_from_bodies(bodies, body)
-    state = initialisation.first_state(
-        cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
-    )
-    model = motion.load_motion_model(config.motion_model)
-    predictor = graph.MotionPredictor(
-        motion.predict_between,
-        (model, motion.make_clock(sequence.timestamps, model.fps)),
-        body,
-        jnp.asarray(roots.present),
-    )
-    moving = cameras.kind == "moving"
-    start = initialisation.ScaleStart(1.0, float("inf"))
-    stages = []
-    factors = []
-    if moving:
-        factors.append(
-            initialisation.map_factor(
-                cameras.tracks, cameras.keep, cameras.pixel_sigma, config.weights
-            )
-        )
-    if len(roots.present):
-        seen = initialisation.people_factors(sequence, roots, config.weights, body)
-        alone = [f for f in seen if not isinstance(f, graph.RootSmoothness)]
-        problem = graph.make_problem(
-            alone, state, free=initialisation.free_people(state)
-        )
-        state = _solve(problem, state, config, "people", stages).state
-        factors += seen
-        if moving:
-            start = initialisation.scale_start(state, predictor)
-            log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
-            state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
-        factors.append(
-            initialisation.motion_factor(
-                predictor(state), state.shapes, body, config.weights
-            )
-        )
-    if not factors:
-        raise ValueError(
-            f"{sequence.name}: no landmarks and no people; expected a camera moving "
-            "before a textured background, or people's keypoints."
-        )
-    problem = graph.make_problem(
-        factors,
-        state,
-        motion=predictor if len(roots.present) else None,
-        free=None if moving else initialisation.free_people(state),
-    )
-    solution = _solve(problem, state, config, "joint", stages)
-    best = solution.state
-    spread, unobserved = None, ()
-    if config.uncertainty:
-        spread = solver.marginals(problem, best)
-        unobserved = solver.observability(problem, best, spread)
-    return Joint(
-        scale=float(best.scale),
-        scale_start=start.value,
-        scale_start_error=start.standard_error,
-        scale_sigma=float(spread.scale) ** 0.5 if spread and moving else np.nan,
-        shape_covariance=(
-            np.full((len(roots.present), 10, 10), np.nan)
-            if spread is None
-            else np.asarray(spread.shapes)
-        ),
-        unobserved=tuple(f"not well determined: {line}" for line in unobserved),
-        cameras=np.asarray(best.cameras),
-        roots=np.asarray(best.roots),
-        poses=np.asarray(best.poses),
-        shapes=np.asarray(best.shapes),
-        landmarks=np.asarray(best.landmarks),
-        intrinsics=np.asarray(best.intrinsics),
-        present=roots.present,
-        status=solution.status,
-        stages=tuple(stages),
-    )
-
-
-def _solve(
-    problem: graph.Problem,
-    state: graph.State,
-    config: Config,
-    name: str,
-    stages: list[dict],
-) -> solver.Solution:
-    """`solver.solve` with a line for the log and one for the report."""
-    start = time.perf_counter()
-    before = float(problem.cost(state))
-    schedule = solver.PAPER_SCHEDULE if name == "joint" else (solver.Stage(),)
-    solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
-    stages.append(
-        {
-            "name": name,
-            "cost_before": before,
-            "cost_after": float(solution.cost),
-            "iterations": int(sum(int(n) for n in solution.num_steps)),
-            "seconds": round(time.perf_counter() - start, 2),
-            "status": solution.status,
-        }
-    )
-    log.info(
-        "%s: cost %.4g -> %.4g in %d steps, %s",
-        *list(stages[-1].values())[:4],
-        solution.status,
-    )
-    return solution
 
 
 def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:

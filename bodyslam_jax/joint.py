@@ -1,0 +1,169 @@
+"""The joint estimate: cameras, people, map and scale in one problem (section 3.6)."""
+
+import dataclasses
+import logging
+import time
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import graph, initialisation, motion, people, solver
+from bodyslam_jax.config import Config
+from bodyslam_jax.initialisation import ScaleStart
+from bodyslam_jax.outcome import Cameras, Joint
+from bodyslam_jax.people import Roots
+from bodyslam_jax.sequence import Bodies, Sequence
+
+log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A joint problem and where its solution starts."""
+
+    problem: graph.Problem
+    state: graph.State
+    scale: ScaleStart
+    roots: Roots
+    moving: bool
+    """Whether the camera's path has a scale to be found."""
+    stages: tuple[dict, ...]
+    """What was solved on the way, for the report."""
+
+
+def prepare(
+    sequence: Sequence,
+    cameras: Cameras,
+    bodies: Bodies,
+    body: body_.BodyModel,
+    config: Config,
+) -> Prepared:
+    """People by themselves, the first scale in closed form, then the whole graph.
+
+    Postures are settled from keypoints before the motion model reads them: errors of a
+    regressor's orientations bias the displacements that it predicts.
+
+    **Raises:** `ValueError` if there is neither a moving camera nor a person.
+    """
+    roots = people.roots_from_bodies(bodies, body)
+    state = initialisation.first_state(
+        cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
+    )
+    model = motion.load_motion_model(config.motion_model)
+    predictor = graph.MotionPredictor(
+        motion.predict_between,
+        (model, motion.make_clock(sequence.timestamps, model.fps)),
+        body,
+        jnp.asarray(roots.present),
+    )
+    moving = cameras.kind == "moving"
+    start = ScaleStart(1.0, float("inf"))
+    stages = []
+    factors = []
+    if moving:
+        factors.append(
+            initialisation.map_factor(
+                cameras.tracks, cameras.keep, cameras.pixel_sigma, config.weights
+            )
+        )
+    if len(roots.present):
+        seen = initialisation.people_factors(sequence, roots, config.weights, body)
+        alone = [f for f in seen if not isinstance(f, graph.RootSmoothness)]
+        problem = graph.make_problem(
+            alone, state, free=initialisation.free_people(state)
+        )
+        solution, stage = solve_stage(problem, state, config, "people")
+        state = solution.state
+        stages.append(stage)
+        factors += seen
+        if moving:
+            start = initialisation.scale_start(state, predictor)
+            log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
+            state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
+        factors.append(
+            initialisation.motion_factor(
+                predictor(state), state.shapes, body, config.weights
+            )
+        )
+    if not factors:
+        raise ValueError(
+            f"{sequence.name}: no landmarks and no people; expected a camera moving "
+            "before a textured background, or people's keypoints."
+        )
+    problem = graph.make_problem(
+        factors,
+        state,
+        motion=predictor if len(roots.present) else None,
+        free=None if moving else initialisation.free_people(state),
+    )
+    return Prepared(problem, state, start, roots, moving, tuple(stages))
+
+
+def estimate(
+    sequence: Sequence,
+    cameras: Cameras,
+    bodies: Bodies,
+    body: body_.BodyModel,
+    config: Config,
+) -> Joint:
+    """The paper's graph: two steps, then the optimum of everything.
+
+    **Raises:** as `prepare`.
+    """
+    prepared = prepare(sequence, cameras, bodies, body, config)
+    problem = prepared.problem
+    solution, stage = solve_stage(problem, prepared.state, config, "joint")
+    best = solution.state
+    spread, unobserved = None, ()
+    if config.uncertainty:
+        spread = solver.marginals(problem, best)
+        unobserved = solver.observability(problem, best, spread)
+    return Joint(
+        scale=float(best.scale),
+        scale_start=prepared.scale.value,
+        scale_start_error=prepared.scale.standard_error,
+        scale_sigma=(
+            float(spread.scale) ** 0.5 if spread and prepared.moving else np.nan
+        ),
+        shape_covariance=(
+            np.full((len(best.shapes), 10, 10), np.nan)
+            if spread is None
+            else np.asarray(spread.shapes)
+        ),
+        unobserved=tuple(f"not well determined: {line}" for line in unobserved),
+        cameras=np.asarray(best.cameras),
+        roots=np.asarray(best.roots),
+        poses=np.asarray(best.poses),
+        shapes=np.asarray(best.shapes),
+        landmarks=np.asarray(best.landmarks),
+        intrinsics=np.asarray(best.intrinsics),
+        present=prepared.roots.present,
+        status=solution.status,
+        stages=(*prepared.stages, stage),
+    )
+
+
+def solve_stage(
+    problem: graph.Problem, state: graph.State, config: Config, name: str
+) -> tuple[solver.Solution, dict]:
+    """`solver.solve` with a line for the log and what the report says of it."""
+    start = time.perf_counter()
+    before = float(problem.cost(state))
+    schedule = solver.PAPER_SCHEDULE if name == "joint" else (solver.Stage(),)
+    solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
+    after = float(solution.cost)
+    steps = sum(int(n) for n in solution.num_steps)
+    status = solution.status
+    log.info(
+        "%s: cost %.4g -> %.4g in %d steps, %s", name, before, after, steps, status
+    )
+    return solution, {
+        "name": name,
+        "cost_before": before,
+        "cost_after": after,
+        "iterations": steps,
+        "seconds": round(time.perf_counter() - start, 2),
+        "status": status,
+    }
