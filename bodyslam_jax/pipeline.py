@@ -55,6 +55,30 @@ def run(
     """
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
+    cameras, bodies = before_joint(sequence, body, config, cache, watch)
+    key = fingerprint(sequence, config)
+    with watch("joint"):
+        joint = cache.stage(
+            "joint",
+            key,
+            Joint,
+            lambda: joint_.estimate(sequence, cameras, bodies, body, config),
+        )
+    return assemble(sequence, config, body, cameras, joint, watch.seconds)
+
+
+def before_joint(
+    sequence: Sequence,
+    body: body_.BodyModel,
+    config: Config,
+    cache: Cache = Cache(None),
+    watch: Stopwatch | None = None,
+) -> tuple[Cameras, Bodies]:
+    """Cameras and map up to scale, bodies in the camera: what the graph starts from.
+
+    **Raises:** as `run`.
+    """
+    watch = watch or Stopwatch()
     key = fingerprint(sequence, config.tracking)
     with watch("tracks"):
         tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
@@ -68,15 +92,7 @@ def run(
         bodies = cache.stage(
             "people", key, Bodies, lambda: _people(sequence, body, config)
         )
-    key = fingerprint(sequence, config)
-    with watch("joint"):
-        joint = cache.stage(
-            "joint",
-            key,
-            Joint,
-            lambda: joint_.estimate(sequence, cameras, bodies, body, config),
-        )
-    return assemble(sequence, config, body, cameras, joint, watch.seconds)
+    return cameras, bodies
 
 
 def _tracks(sequence: Sequence, config: Config) -> Tracks:
