@@ -317,3 +317,23 @@ class Detect:
     """Overlap of two boxes above which they are the same person."""
     max_people: int = 4
     """The largest ones in an image that are looked at."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What an experiment runs on; its own choice where nothing is said."""
+
+    sequences: tuple[
+        Literal["E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3"], ...
+    ] = ()
+    """Simulated sequences; without them the experiment's own."""
+    family: Literal["room", "follow", "both"] | None = None
+    """Of the simulated sequences; without it the experiment's own."""
+    frames: int | None = None
+    """Frames of each at 30 fps; without it the sequence's own, 600 to 1000."""
+    noise: Literal["none", "low", "real"] = "real"
+    """Errors of all measurements."""
+    motion: str | None = None
+    """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
+    seed: int | None = None
+    """Everything random follows from it; without it the sequence's own."""
