@@ -4,13 +4,14 @@ JAX is imported inside the commands, never for `--help`. Exit codes: 0 done; 1 b
 input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -135,19 +136,49 @@ def train_motion(
     /,
     *,
     out: Path,
+    preset: _Preset = "default",
     config: Annotated[MotionTraining, tyro.conf.arg(name="")] = MotionTraining(),
 ) -> None:
     """Trains a motion model on AMASS folders, BVH folders or CMU .npz files.
 
     Args:
         data: File or folder of motion.
-        out: Weights to write (.npz); training resumes from what is there.
+        out: Weights to write (.npz); an interrupted training is continued.
+        preset: `paper` is its network, loss, optimiser and choice of motion.
         config: Architecture and training.
     """
     from bodyslam_jax import motion
 
-    motion.train_from_data(data, out, config)
+    with _progress() as report:
+        motion.train_from_data(data, out, config, report)
     print(out)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
+    """A bar on a terminal, a line an epoch in a file."""
+    from rich import console, progress
+
+    terminal = console.Console(stderr=True)
+    columns = (
+        progress.TextColumn("epoch"),
+        progress.MofNCompleteColumn(),
+        progress.BarColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
+    )
+    with progress.Progress(
+        *columns, console=terminal, disable=not terminal.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=None)
+
+        def report(epoch: int, epochs: int, measures: dict[str, float]) -> None:
+            told = ", ".join(f"{name} {value:.3f}" for name, value in measures.items())
+            bar.update(task, completed=epoch, total=epochs, description=told)
+            if not terminal.is_terminal:
+                log.info("epoch %d of %d: %s", epoch, epochs, told)
+
+        yield report
 
 
 def doctor() -> None:
@@ -229,14 +260,15 @@ def base_config(argv: list[str]) -> Config:
     **Raises:** `ValueError` if the file is not a config.yaml.
     """
 
-    def value(flag: str) -> str | None:
-        joined = [a.partition("=")[2] for a in argv if a.startswith(f"{flag}=")]
-        after = [argv[i + 1] for i, a in enumerate(argv[:-1]) if a == flag]
-        return (joined + after + [None])[0]
-
-    config = Config.paper() if value("--preset") == "paper" else Config()
-    path = value("--settings")
+    config = Config.paper() if _option(argv, "--preset") == "paper" else Config()
+    path = _option(argv, "--settings")
     return config if path is None else read_settings(Path(path), config)
+
+
+def _option(argv: list[str], flag: str) -> str | None:
+    joined = [a.partition("=")[2] for a in argv if a.startswith(f"{flag}=")]
+    after = [argv[i + 1] for i, a in enumerate(argv[:-1]) if a == flag]
+    return (joined + after + [None])[0]
 
 
 def read_settings(path: Path, base: Config) -> Config:
@@ -279,12 +311,14 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     return dataclasses.replace(base, **changes)
 
 
-def _starting_from(command: Callable[..., Any], config: Config) -> Callable[..., Any]:
-    """The same command with another default of its `config`."""
+def _starting_from(
+    command: Callable[..., Any], config: Config | MotionTraining
+) -> Callable[..., Any]:
+    """The same command with another default of its `config`, if it is of that kind."""
     signature = inspect.signature(command)
     if "config" not in signature.parameters:
         return command
-    if not isinstance(signature.parameters["config"].default, Config):
+    if not isinstance(signature.parameters["config"].default, type(config)):
         return command
 
     @functools.wraps(command)
@@ -309,7 +343,14 @@ def main() -> None:
         commands, prog, argv = _BODY, "bodyslam body-model", argv[1:]
     try:
         base = base_config(argv)
-        commands = {name: _starting_from(c, base) for name, c in commands.items()}
+        if _option(argv, "--preset") == "paper":
+            training = MotionTraining.paper()
+        else:
+            training = MotionTraining()
+        commands = {
+            name: _starting_from(_starting_from(c, base), training)
+            for name, c in commands.items()
+        }
         if argv and not any(flag in argv for flag in ("-h", "--help")):
             _prepare_jax()
         code = tyro.extras.subcommand_cli_from_dict(

@@ -133,6 +133,8 @@ class MotionTraining:
     """Initial weights and every random choice follow from it."""
     epochs: int = 80
     """Each has as many windows as the data have 120 Hz starting points."""
+    validate_every: int = 1
+    """Epochs from one look at the validation subjects to the next."""
     segments: int = 128
     """Segments in a batch; each is of another person, speed and noise level."""
     steps: int = 16
@@ -143,6 +145,10 @@ class MotionTraining:
     """Whether the learning rate falls."""
     weight_decay: float = 1e-4
     """AdamW's."""
+    clip: float | None = 1.0
+    """Largest entry of a gradient; not limited without it."""
+    averaging: float = 0.998
+    """Share that the running mean of weights, which is kept, has of itself; 0: none."""
     slope_weight: float = 2.0
     """Penalty on the squared bias of displacement per noise level: bias is scale."""
     segment_weight: float = 0.5
@@ -159,6 +165,10 @@ class MotionTraining:
     """Standard deviation of each component of β."""
     strides: tuple[int, ...] = (3, 4, 4, 4, 5)
     """Steps through 120 Hz data, one drawn per segment: 4 is real speed."""
+    run_weight: float = 2.0
+    """How often a window of running is drawn beside one of walking: runs are few."""
+    other_weight: float = 0.15
+    """The same for all other motion, most of which is slow; 0 leaves it out."""
     mirror: bool = True
     """Whether half of the segments are mirrored."""
     sliding: bool = True
@@ -166,7 +176,7 @@ class MotionTraining:
 
     @staticmethod
     def paper() -> "MotionTraining":
-        """Section 3.4 of the paper: two frames of exact joint angles, 100 epochs."""
+        """Section 3.4 of the paper: two frames of exact joint angles, plain Adam."""
         return MotionTraining(
             network="paper",
             past=2,
@@ -177,11 +187,15 @@ class MotionTraining:
             steps=1,
             decay=False,
             weight_decay=0.0,
+            clip=None,
+            averaging=0.0,
             drift_deg=0.0,
             white_deg=0.0,
             root_drift=0.0,
             clean_share=0.0,
             strides=(4,),
+            run_weight=1.0,
+            other_weight=0.0,
             mirror=False,
             sliding=False,
         )
@@ -241,6 +255,12 @@ class Structure:
     """Extent of the path below which a camera only turns, of the distance of points."""
     min_shared: int = 12
     """Points that two successive frames must share, or there is a cut."""
+    focal_sigma: float = 0.2
+    """How wrong a guessed focal length may be: standard deviation, of the guess."""
+    focal_accuracy: float = 0.08
+    """Standard deviation, of the focal length, above which the guess is kept."""
+    focal_runs: float = 30.0
+    """Observations of a track that count for one, as its errors last."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ from bodyslam_jax.motion._command import train_from_data as train_from_data
 from bodyslam_jax.motion._evaluation import evaluate_model as evaluate_model
 from bodyslam_jax.motion._figures import compare as compare
 from bodyslam_jax.motion._figures import draw_errors as draw_errors
+from bodyslam_jax.motion._figures import draw_history as draw_history
 from bodyslam_jax.motion._figures import draw_rollout as draw_rollout
 from bodyslam_jax.motion._figures import write_table as write_table
 from bodyslam_jax.motion._noise import disturb as disturb
@@ -31,7 +32,6 @@ from bodyslam_jax.motion._scale import scale_from_motion as scale_from_motion
 from bodyslam_jax.motion._timing import Clock as Clock
 from bodyslam_jax.motion._timing import make_clock as make_clock
 from bodyslam_jax.motion._timing import predict_between as predict_between
-from bodyslam_jax.motion._training import draw_history as draw_history
 from bodyslam_jax.motion._training import train as train
 from bodyslam_jax.motion._weights import load_motion_model as load_motion_model
 from bodyslam_jax.motion._weights import save_motion_model as save_motion_model

@@ -13,7 +13,7 @@ from bodyslam_jax.motion._evaluation import baseline_mean, evaluate_model, run_t
 from bodyslam_jax.motion._placing import place
 from bodyslam_jax.motion._predict import MotionModel
 from bodyslam_jax.motion._rollout import Rollout
-from bodyslam_jax.motion._training import DRIFTS
+from bodyslam_jax.motion._selection import DRIFTS, TARGETS
 
 COLUMNS = (
     "error_mm step_mm ratio slope slope_30 spread nees coverage_95 posture_deg "
@@ -143,4 +143,26 @@ def draw_rollout(
         axis.set_aspect("equal")
     axis.set(xlabel="m ahead", ylabel="m to the left")
     figure.axes[0].set(ylabel="m up", title=f"every {every / FPS:g} s")
+    figure.savefig(path, dpi=120)
+
+
+def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
+    """Draws loss, validation error and slope over epochs to an image file."""
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure((9, 3), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    epochs = np.arange(1, len(history) + 1)
+    left.plot(epochs, history[:, 0], color="k")
+    left.set(title="training loss", xlabel="epoch")
+    judged = np.isfinite(history[:, 1])
+    at, seen = epochs[judged], history[judged]
+    for i, (drift_deg, target) in enumerate(zip(DRIFTS, TARGETS, strict=True)):
+        (line,) = middle.plot(at, seen[:, 1 + i], label=f"{drift_deg:g}° drift")
+        middle.axhline(target, color=line.get_color(), lw=0.7, ls=":")
+        right.plot(at, seen[:, 4 + i], color=line.get_color())
+    middle.set(title="validation error / step", xlabel="epoch", ylim=(0, 0.4))
+    middle.legend()
+    right.axhline(1, color="k", lw=0.7)
+    right.set(title="validation slope", xlabel="epoch", ylim=(0.8, 1.1))
     figure.savefig(path, dpi=120)

@@ -32,10 +32,6 @@ from bodyslam_jax.motion._rotations import matrix, transposed, vector
 DENSE = 4
 """Training data are kept at four times the model's rate: phases and speeds."""
 
-_CLASS_WEIGHT = {"walk": 1.0, "run": 2.0}
-_OTHER_WEIGHT = 0.15
-"""How often a class is drawn; runs are few, and what is neither is slow."""
-
 _ROOT_SHARE = 0.3
 """Share of segments in which the root's orientation errs too."""
 
@@ -76,9 +72,17 @@ class Batch(eqx.Module):
 def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
     """Gathers clips at `DENSE` times the model's rate.
 
-    **Raises:** `ValueError` if no clip is long enough for one window.
+    **Raises:** `ValueError` if no clip of a wanted class is as long as one window.
     """
-    dense = resample(interleave(clips), FPS * DENSE)
+    share = {"walk": 1.0, "run": settings.run_weight}
+    share_of = lambda clip: share.get(clip.motion, settings.other_weight)
+    wanted = [clip for clip in clips if share_of(clip) > 0]
+    if not wanted:
+        raise ValueError(
+            f"no usable sequence among {len(clips)}: none is named walk, run or jog; "
+            "train on all motion with a positive `other_weight`."
+        )
+    dense = resample(interleave(wanted), FPS * DENSE)
     span = settings.past * max(settings.strides)
     spacing = 1 if settings.sliding else (settings.past + 1) * DENSE
     starts, lasts, weights, offset = [], [], [], 0
@@ -88,8 +92,7 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
         first = first[first % spacing < DENSE] + offset
         starts.append(first)
         lasts.append(np.full(len(first), offset + t - 1))
-        share = _CLASS_WEIGHT.get(clip.motion, _OTHER_WEIGHT)
-        weights.append(np.full(len(first), share))
+        weights.append(np.full(len(first), share_of(clip)))
         offset += t
     weight = np.concatenate(weights)
     if len(weight) == 0:
