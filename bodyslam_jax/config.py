@@ -357,3 +357,5 @@ class Experiment:
     """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
     seed: int | None = None
     """Everything random follows from it; without it the sequence's own."""
+    motion_models: tuple[str, ...] = ()
+    """Other motion models' weights to compare with, for `ablation`."""
