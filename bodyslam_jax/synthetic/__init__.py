@@ -5,6 +5,7 @@ from bodyslam_jax.synthetic._scene import Scene as Scene
 from bodyslam_jax.synthetic._scene import look_at as look_at
 from bodyslam_jax.synthetic._scene import scene as scene
 from bodyslam_jax.synthetic._scene import walk as walk
+from bodyslam_jax.synthetic._simulate import LENGTH as LENGTH
 from bodyslam_jax.synthetic._simulate import SimulatedSequence as SimulatedSequence
 from bodyslam_jax.synthetic._simulate import simulate as simulate
 from bodyslam_jax.synthetic._writing import as_sequence as as_sequence

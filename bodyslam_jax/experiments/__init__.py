@@ -1,0 +1,36 @@
+"""The paper's experiments on simulated sequences, as functions of arrays.
+
+`bodyslam experiment NAME` is `run_experiment`.
+"""
+
+from bodyslam_jax.config import Experiment as Experiment
+from bodyslam_jax.experiments._ablation import ablate as ablate
+from bodyslam_jax.experiments._ablation import compare_orders as compare_orders
+from bodyslam_jax.experiments._ablation import with_motion_model as with_motion_model
+from bodyslam_jax.experiments._ablation import with_weights as with_weights
+from bodyslam_jax.experiments._case import Case as Case
+from bodyslam_jax.experiments._case import make_case as make_case
+from bodyslam_jax.experiments._command import run_experiment as run_experiment
+from bodyslam_jax.experiments._comparison import METHODS as METHODS
+from bodyslam_jax.experiments._comparison import compare_methods as compare_methods
+from bodyslam_jax.experiments._comparison import depth_scale as depth_scale
+from bodyslam_jax.experiments._learning import learn_and_test as learn_and_test
+from bodyslam_jax.experiments._problems import rescaled as rescaled
+from bodyslam_jax.experiments._problems import without_map as without_map
+from bodyslam_jax.experiments._scale import PERTURBATIONS as PERTURBATIONS
+from bodyslam_jax.experiments._scale import ScaleRecovery as ScaleRecovery
+from bodyslam_jax.experiments._scale import scale_recovery as scale_recovery
+from bodyslam_jax.experiments._score import errors as errors
+from bodyslam_jax.experiments._score import score as score
+from bodyslam_jax.experiments._score import trajectories as trajectories
+from bodyslam_jax.experiments._structure import landmark_ablation as landmark_ablation
+from bodyslam_jax.experiments._variants import VARIANTS as VARIANTS
+from bodyslam_jax.experiments._weights import WEIGHTS as WEIGHTS
+from bodyslam_jax.experiments._weights import Learned as Learned
+from bodyslam_jax.experiments._weights import Trial as Trial
+from bodyslam_jax.experiments._weights import learn_weights as learn_weights
+from bodyslam_jax.experiments._weights import make_trial as make_trial
+from bodyslam_jax.experiments._weights import names_of as names_of
+from bodyslam_jax.experiments._weights import outcome as outcome
+from bodyslam_jax.experiments._weights import reweighted as reweighted
+from bodyslam_jax.experiments._weights import training_error as training_error

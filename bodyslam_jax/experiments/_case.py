@@ -1,0 +1,103 @@
+"""A simulated sequence, brought to where experiments begin as the pipeline does it."""
+
+import dataclasses
+from collections.abc import Sequence as Ordered
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import evaluation, joint, pipeline, synthetic
+from bodyslam_jax.cache import Cache, fingerprint
+from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.experiments._score import truth_of
+from bodyslam_jax.outcome import Cameras
+from bodyslam_jax.sequence import Bodies, Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One sequence with its truth, reconstructed up to scale; bodies in the camera."""
+
+    name: str
+    """Such as `M2-room`."""
+    sequence: Sequence
+    truth: evaluation.Trajectories
+    body: body_.BodyModel
+    cameras: Cameras
+    bodies: Bodies
+    config: Config
+
+    @property
+    def map_scale(self) -> float:
+        """Metres per unit of the map: what s should be, by Sim(3) on the cameras."""
+        found = evaluation.umeyama(
+            self.truth.T_WC[:, :3, 3],
+            jnp.asarray(self.cameras.T_WC[:, :3, 3]),
+            jnp.asarray(self.cameras.registered, float),
+            with_scale=True,
+        )
+        return float(found.scale)
+
+    @property
+    def radius(self) -> float:
+        """RMS distance of the true camera from its mean place, m."""
+        centre = np.asarray(self.truth.T_WC[:, :3, 3])
+        return float(np.sqrt(((centre - centre.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+    def prepare(self, config: Config | None = None) -> joint.Prepared:
+        """The joint problem and its start, with other settings if they are given."""
+        return joint.prepare(
+            self.sequence, self.cameras, self.bodies, self.body, config or self.config
+        )
+
+
+def make_case(
+    settings: Simulation, config: Config = Config(), *, cache: Path | None = None
+) -> Case:
+    """Simulates, reconstructs and adjusts: the stages before the joint estimate.
+
+    `cache` is a folder in which stages are kept, one of its folders a sequence.
+
+    **Raises:** as `synthetic.simulate` and `pipeline.run`.
+    """
+    body = body_.load_body_model(config.body_model)
+    simulated = synthetic.simulate(settings, body)
+    sequence = synthetic.as_sequence(simulated)
+    name = f"{simulated.name}-{fingerprint(settings)}"
+    kept = Cache(None if cache is None else cache / name)
+    cameras, bodies = pipeline.before_joint(sequence, body, config, kept)
+    return Case(
+        name=simulated.name,
+        sequence=sequence,
+        truth=truth_of(synthetic.as_truth(simulated)),
+        body=body,
+        cameras=cameras,
+        bodies=bodies,
+        config=config,
+    )
+
+
+def simulations(
+    experiment: Experiment, sequences: Ordered[str], families: Ordered[str]
+) -> list[Simulation]:
+    """What an experiment runs on: its own sequences unless others were asked for."""
+    chosen = experiment.sequences or tuple(sequences)
+    kinds = families
+    if experiment.family is not None:
+        kinds = (
+            ("room", "follow") if experiment.family == "both" else (experiment.family,)
+        )
+    return [
+        Simulation(
+            sequence=sequence,  # pyright: ignore
+            family=family,  # pyright: ignore
+            length=experiment.frames,
+            seed=experiment.seed,
+            motion=experiment.motion,
+            noise=experiment.noise,
+        )
+        for family in kinds
+        for sequence in chosen
+    ]

@@ -1,0 +1,72 @@
+"""Variants of a joint problem: terms left out, variables held, states rescaled."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax import graph
+
+
+def drop(
+    problem: graph.Problem, state: graph.State, *kinds: type[graph.AbstractFactor]
+) -> graph.Problem:
+    """The problem without its terms of these kinds; what may move stays as it was."""
+    kept = [f for f in problem.factors if not isinstance(f, kinds)]
+    return rebuild(problem, state, kept)
+
+
+def rebuild(
+    problem: graph.Problem,
+    state: graph.State,
+    factors: list[graph.AbstractFactor],
+    free: graph.Step | None = None,
+) -> graph.Problem:
+    """A problem of other `factors`, with the predictor of this one."""
+    return graph.make_problem(
+        factors, state, motion=problem.motion, free=free or problem.free
+    )
+
+
+def hold(free: graph.Step, *names: str) -> graph.Step:
+    """The same mask with groups of variables held, by their names in `State`."""
+    held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
+    return dataclasses.replace(free, **held)
+
+
+def without_map(
+    problem: graph.Problem, state: graph.State, *, hold_cameras: bool
+) -> tuple[graph.Problem, graph.State]:
+    """Neither landmarks nor their term; with `hold_cameras` s alone moves the cameras.
+
+    Section 4.2 of the paper: what people say of the scale, or of the cameras, when
+    nothing else does.
+    """
+    bare = eqx.tree_at(lambda s: s.landmarks, state, state.landmarks[:0])
+    free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
+    if hold_cameras:
+        free = hold(free, "cameras")
+    kept = [f for f in problem.factors if not isinstance(f, graph.Reprojection)]
+    return rebuild(problem, bare, kept, free), bare
+
+
+def rescaled(state: graph.State, factor: Float[Array, ""] | float) -> graph.State:
+    """The map `factor` times as large, with s as it was: s should become smaller."""
+    grow = jnp.asarray(factor, state.scale.dtype)
+    return eqx.tree_at(
+        lambda s: (s.cameras, s.landmarks),
+        state,
+        (state.cameras.at[:, :3, 3].multiply(grow), state.landmarks * grow),
+    )
+
+
+def with_scale(state: graph.State, scale: Float[Array, ""] | float) -> graph.State:
+    """The same state with this s."""
+    return eqx.tree_at(lambda s: s.scale, state, jnp.asarray(scale, state.scale.dtype))
+
+
+def stacked(states: list[graph.State]) -> graph.State:
+    """States of one shape, one after the other along a new leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *states)

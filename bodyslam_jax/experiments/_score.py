@@ -1,0 +1,88 @@
+"""How far a state is from the truth: pure, so that it maps, jits and differentiates."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax import evaluation, graph
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.evaluation import Trajectories
+from bodyslam_jax.result import Result
+
+NAMES = (
+    "c_ate_se3",
+    "c_ate_sim3",
+    "h_ate_se3",
+    "h_ate_sim3",
+    "j_ate_se3",
+    "j_ate_sim3",
+    "scale",
+)
+"""Errors of the paper's table 1: mean over frames, m; `scale` is truth per estimate."""
+_FEET = (7, 10, 8, 11)
+_FRAMES = 100
+"""Numbers of frames are rounded up to this, so that lengths share what is compiled."""
+
+
+def truth_of(result: Result) -> Trajectories:
+    """A simulation's truth as what is compared with."""
+    joints = jnp.asarray(result.joints)
+    t = len(result.timestamps)
+    fps = (t - 1) / (result.timestamps[-1] - result.timestamps[0])
+    return Trajectories(
+        T_WC=jnp.asarray(result.T_WC),
+        camera_valid=jnp.ones(t, bool),
+        joints=joints,
+        present=jnp.asarray(result.present),
+        feet=joints[..., np.array(_FEET), :],
+        fps=jnp.asarray(fps),
+    )
+
+
+def trajectories(
+    state: graph.State,
+    body: BodyModel,
+    present: Bool[Array | np.ndarray, "h t"],
+    registered: Bool[Array | np.ndarray, " t"],
+    fps: Float[Array, ""],
+) -> Trajectories:
+    """Cameras, pelvis and joints of a state in metres, in the map's world frame."""
+    cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
+    T_WH = graph.world_from_root(state)
+    p_H = local_joints(body, state.poses, state.shapes[:, None])
+    turn, move = T_WH[..., :3, :3], T_WH[..., None, :3, 3]
+    joints = jnp.einsum("htij,htkj->htki", turn, p_H) + move
+    return Trajectories(
+        T_WC=cameras,
+        camera_valid=jnp.asarray(registered),
+        joints=joints,
+        present=jnp.asarray(present),
+        feet=joints[..., np.array(_FEET), :],
+        fps=fps,
+    )
+
+
+def errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
+    """The errors in `NAMES`; people are paired in the order in which they come."""
+    found = evaluation.evaluate_trajectories(estimate, truth)
+    return {name: found[name] for name in NAMES}
+
+
+def score(
+    state: graph.State,
+    truth: Trajectories,
+    body: BodyModel,
+    present: Bool[Array | np.ndarray, "h t"],
+    registered: Bool[Array | np.ndarray, " t"],
+) -> dict[str, float]:
+    """`errors` of one state as plain numbers, compiled once for many lengths."""
+    frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
+    estimate = trajectories(state, body, present, registered, truth.fps)
+    found = _errors(
+        evaluation.pad_frames(estimate, frames), evaluation.pad_frames(truth, frames)
+    )
+    return {name: float(value) for name, value in found.items()}
+
+
+_errors = eqx.filter_jit(errors)

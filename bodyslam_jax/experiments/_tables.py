@@ -1,0 +1,71 @@
+"""Rows as Markdown and CSV, with the paper's own figures beside ours."""
+
+import csv
+import dataclasses
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+Cell = str | float | int | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """What stands in a column, and how."""
+
+    title: str
+    key: str
+    factor: float = 1.0
+    """From the row's unit (SI) to the table's."""
+    digits: int = 1
+    average: bool = True
+    """Whether the last row has its mean."""
+
+    def value(self, row: dict[str, Any]) -> Cell:
+        found = row.get(self.key)
+        if isinstance(found, (int, float)) and not isinstance(found, bool):
+            return found * self.factor
+        return found
+
+    def text(self, value: Cell) -> str:
+        if value is None:
+            return "–"
+        return value if isinstance(value, str) else f"{value:.{self.digits}f}"
+
+
+def markdown(
+    columns: Sequence[Column], rows: Sequence[dict[str, Any]], *, mean: bool = False
+) -> str:
+    """A Markdown table, with the mean over rows at its end if it is wanted."""
+    lines = [[column.title for column in columns], ["---"] * len(columns)]
+    lines += [[c.text(c.value(row)) for c in columns] for row in rows]
+    if mean and rows:
+        last = []
+        for column in columns:
+            values = [column.value(row) for row in rows]
+            numbers = [v for v in values if isinstance(v, (int, float))]
+            known = column.average and len(numbers) == len(rows)
+            last.append(column.text(sum(numbers) / len(rows)) if known else "")
+        last[0] = "**mean**"
+        lines.append(last)
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def to_csv(columns: Sequence[Column], rows: Sequence[dict[str, Any]]) -> str:
+    """The same columns in full precision, units as in the titles."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([column.title for column in columns])
+    for row in rows:
+        cells = [column.value(row) for column in columns]
+        writer.writerow(["" if c is None else c for c in cells])
+    return out.getvalue()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)

@@ -1,0 +1,102 @@
+"""Other problems from the same measurements: terms off, terms on, variables held."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax import graph
+from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.experiments._problems import drop, hold, rebuild
+
+Variant = Callable[[graph.Problem, graph.State], graph.Problem]
+
+STANCE_SIGMA = 0.01
+"""m a frame: how still a foot that carries stands."""
+CAMERA_SIGMA = (0.02, 0.02)
+"""rad, m per frame squared: how steadily a hand moves a camera."""
+UP_SIGMA = 0.1
+"""rad: how upright people walk."""
+
+
+def without(*kinds: type[graph.AbstractFactor]) -> Variant:
+    """The problem without these terms."""
+    return lambda problem, state: drop(problem, state, *kinds)
+
+
+def held(*names: str) -> Variant:
+    """The problem with these groups of variables as they are at the start."""
+
+    def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
+        free = hold(problem.free, *names)
+        return rebuild(problem, state, list(problem.factors), free)
+
+    return variant
+
+
+def with_stance(problem: graph.Problem, state: graph.State) -> graph.Problem:
+    """Beside all else, the lowest point of the feet stands still."""
+    body, present = _person(problem)
+    low = carrying(body, state, present)
+    sigma = jnp.where(low, STANCE_SIGMA, jnp.inf)
+    more = graph.StanceFoot(body=body, sigma=sigma)
+    return rebuild(problem, state, [*problem.factors, more])
+
+
+def with_steady_camera(problem: graph.Problem, state: graph.State) -> graph.Problem:
+    """Beside all else, the camera keeps its velocity."""
+    turn, shift = CAMERA_SIGMA
+    sigma = jnp.array([turn, shift]) / jnp.array([1.0, float(state.scale)])
+    sigma = jnp.broadcast_to(sigma, (len(state.cameras), 2)).at[:2].set(jnp.inf)
+    more = graph.CameraSmoothness(sigma=sigma)
+    return rebuild(problem, state, [*problem.factors, more])
+
+
+def with_up(problem: graph.Problem, state: graph.State) -> graph.Problem:
+    """Beside all else, people stand along their mean up direction."""
+    _, present = _person(problem)
+    ups = graph.world_from_root(state)[..., :3, 1]
+    up = jnp.where(present[..., None], ups, 0.0).sum(axis=(0, 1))
+    more = graph.UpDirection(
+        up=up / jnp.linalg.norm(up), sigma=jnp.where(present, UP_SIGMA, jnp.inf)
+    )
+    return rebuild(problem, state, [*problem.factors, more])
+
+
+def carrying(
+    body: BodyModel, state: graph.State, present: Bool[Array, "h t"]
+) -> Bool[Array, "h t 4"]:
+    """Which of toes and heels is lowest, along the body's up axis, in k-1 and in k."""
+    points = local_keypoints(body, state.poses, state.shapes[:, None], "body25")
+    height: Float[Array, "h t 4"] = points[..., np.array(graph.BODY25_FEET), 1]
+    lowest = height == height.min(axis=-1, keepdims=True)
+    lowest = lowest & present[..., None]
+    before = jnp.concatenate([jnp.zeros_like(lowest[:, :1]), lowest[:, :-1]], axis=1)
+    return lowest & before
+
+
+def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
+    motion = problem.motion
+    if motion is None:
+        raise ValueError("the problem has no people; expected a moving person.")
+    return motion.body, motion.present
+
+
+VARIANTS: dict[str, Variant] = {
+    "full": lambda problem, state: problem,
+    "no motion model": without(graph.HumanMotion),
+    "no motion model, no smooth path": without(graph.HumanMotion, graph.RootSmoothness),
+    "no smooth path": without(graph.RootSmoothness),
+    "no keypoints": without(graph.JointReprojection),
+    "no regressed postures": without(graph.Posture),
+    "no regressed orientation": without(graph.RootOrientation),
+    "no steady turning": without(graph.RootTurning),
+    "no regressed shape": without(graph.Shape),
+    "β held at the regressor's": held("shapes"),
+    "cameras and map held": held("cameras", "landmarks"),
+    "with stance foot": with_stance,
+    "with steady camera": with_steady_camera,
+    "with up direction": with_up,
+}
+"""What `ablation` solves, from one start."""
