@@ -17,10 +17,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from bodyslam_jax.config import Config, MotionTraining, Simulation
+from bodyslam_jax.config import Config, Experiment, MotionTraining, Simulation
 
 _Input = tyro.conf.Positional[Path]
 _Preset = Literal["default", "paper"]
+_Experiment = Literal["table1", "scale", "landmarks", "motion", "ablation", "weights"]
 _Flat = Annotated[Config, tyro.conf.arg(name="")]
 log = logging.getLogger("bodyslam_jax")
 
@@ -181,6 +182,32 @@ def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
         yield report
 
 
+def experiment(
+    name: tyro.conf.Positional[_Experiment],
+    /,
+    *,
+    out: Path,
+    preset: _Preset = "default",
+    settings: Path | None = None,
+    on: Annotated[Experiment, tyro.conf.arg(name="")] = Experiment(),
+    config: _Flat = Config(),
+) -> None:
+    """Repeats one of the paper's experiments, or of ours, on simulated sequences.
+
+    Args:
+        name: Which one.
+        out: Folder for tables and figures; finished rows are kept there.
+        preset: `paper` has the weights and the first-order schedule of the paper.
+        settings: A config.yaml to start from; options beside it prevail.
+        on: What it runs on.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import experiments
+
+    for path in experiments.run_experiment(name, out, on, config):
+        print(path)
+
+
 def doctor() -> None:
     """Versions, devices, BRISK, codecs, and where body models were looked for."""
     from bodyslam_jax import doctor as _doctor
@@ -249,6 +276,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "simulate": simulate,
     "train-motion": train_motion,
+    "experiment": experiment,
     "body-model": body_model,
     "doctor": doctor,
 }
