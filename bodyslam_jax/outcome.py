@@ -36,9 +36,16 @@ class Cameras:
     pixel_sigma: float
     """Robust standard deviation of those, px."""
     intrinsics: Float[np.ndarray, " i"]
+    focal_sigma: float
+    """Standard deviation of a focal length that was found, px; NaN if it was not."""
     costs: tuple[float, float]
     """Before and after bundle adjustment."""
     warnings: tuple[str, ...]
+
+    @property
+    def focal(self) -> float:
+        """px"""
+        return float(self.intrinsics[0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +186,12 @@ def summarise(
             f"person {h}: {p['path_m']:.2f} m at {p['speed_m_s']:.2f} m/s, "
             f"{100 * p['stature_m']:.0f}{sure} cm tall"
         )
+    lens = focal_length(sequence, cameras)
+    if lens["guessed"]:
+        text = f"focal length: guess {lens['guess_px']:.0f} px"
+        if (sigma := lens["focal_sigma_px"]) is not None:
+            text += f", from the camera's path {lens['focal_px']:.0f} ± {sigma:.0f} px"
+        headline.append(text)
     return {
         "status": status,
         "headline": headline,
@@ -191,6 +204,7 @@ def summarise(
             "height": sequence.intrinsics.height,
             "intrinsics_guessed": sequence.intrinsics.is_guess,
         },
+        "intrinsics": lens,
         "camera_motion": cameras.kind,
         "scale": {
             "value": result.scale,
@@ -211,6 +225,21 @@ def summarise(
         "durations_s": seconds,
         "settings": dataclasses.asdict(config),
         "versions": versions(),
+    }
+
+
+def focal_length(sequence: Sequence, cameras: Cameras) -> dict[str, Any]:
+    """The focal length used, and how it was come by; px.
+
+    `focal_sigma_px` is `None` unless a guess could be refined.
+    """
+    guessed = sequence.intrinsics.is_guess
+    refined = np.isfinite(cameras.focal_sigma)
+    return {
+        "guessed": guessed,
+        "guess_px": float(sequence.intrinsics.params[0]) if guessed else None,
+        "focal_px": cameras.focal,
+        "focal_sigma_px": cameras.focal_sigma if refined else None,
     }
 
 

@@ -149,6 +149,7 @@ def extra_factors(rng, state):
         g.IntrinsicsPrior(
             intrinsics=state.intrinsics[None], sigma=jnp.full((1, 4), 20.0)
         ),
+        g.SquarePixels(sigma=jnp.array([3.0])),
         g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
         g.StanceFoot(body=body_model(), sigma=late(h, t, 4, skip=1)),

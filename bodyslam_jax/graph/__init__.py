@@ -7,6 +7,7 @@ from bodyslam_jax.graph._extras import IntrinsicsPrior as IntrinsicsPrior
 from bodyslam_jax.graph._extras import RootOrientation as RootOrientation
 from bodyslam_jax.graph._extras import RootSmoothness as RootSmoothness
 from bodyslam_jax.graph._extras import RootTurning as RootTurning
+from bodyslam_jax.graph._extras import SquarePixels as SquarePixels
 from bodyslam_jax.graph._extras import StanceFoot as StanceFoot
 from bodyslam_jax.graph._extras import UpDirection as UpDirection
 from bodyslam_jax.graph._factors import AbstractFactor as AbstractFactor

@@ -68,6 +68,30 @@ class IntrinsicsPrior(AbstractFrameFactor):
         return super().map_frames(function, first, extra)
 
 
+class SquarePixels(AbstractFrameFactor):
+    """One focal length for rows and columns, `(fx - fy) / σ`."""
+
+    sigma: Float[Array, " 1"]
+    """px"""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ()
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("intrinsics", 0),)
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        return (shared.intrinsics[:1] - shared.intrinsics[1:2]) / data
+
+    def map_frames(self, function, state, extra=None):
+        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
+        return super().map_frames(function, first, extra)
+
+
 class CameraSmoothness(AbstractFrameFactor):
     """The camera keeps its velocity: turn and shift, against those before.
 

@@ -39,6 +39,8 @@ class Marginals(eqx.Module):
     """Of camera centres `s r'`, m^2"""
     people: Float[Array, "h t 3 3"]
     """Of pelvis joints in the world, m^2"""
+    intrinsics: Float[Array, "i i"]
+    """px^2; without a coordinate where none is free."""
     shapes: Float[Array, "h 10 10"]
     landmarks: Float[Array, "l 3 3"]
     """Of `s l'`, m^2"""
@@ -70,6 +72,7 @@ def marginals(problem: Problem, state: State) -> Marginals:
         scale=common[0, 0],
         cameras=cameras[:t],
         people=people[:, :t],
+        intrinsics=common[1 : 1 + i, 1 : 1 + i],
         shapes=jnp.stack([shapes[p, :, p] for p in range(h)])
         if h
         else jnp.zeros((0, 10, 10), common.dtype),

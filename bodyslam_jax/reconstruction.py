@@ -1,0 +1,195 @@
+"""Tracks -> cameras and map up to scale, and the focal length if it was a guess.
+
+Structure from motion, then bundle adjustment of all frames and landmarks. A guessed
+focal length is a variable of that problem, with a wide prior around the guess: parallax
+and turns that do not fit together give it away. Distortion is not sought.
+"""
+
+import dataclasses
+import logging
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import frontend, graph, initialisation, solver
+from bodyslam_jax.config import Config, Structure
+from bodyslam_jax.outcome import Cameras
+from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
+
+log = logging.getLogger(__name__)
+
+_PER_SIGMA = 1.18
+"""The median of a two-dimensional normal error's length, in its sigma."""
+_HELD = 1e-6
+"""Prior's standard deviation, of the focal length, that holds it."""
+_MOVED = 0.02
+"""Change of the focal length after which structure from motion is done again."""
+_SQUARE = 1e-4
+"""How alike the pixels' sides are, of the focal length."""
+
+
+def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
+    """Cameras, map and intrinsics of a sequence, up to scale.
+
+    A camera that does not move, or only turns, is said to be that, and keeps the guess.
+    """
+    guess = sequence.intrinsics
+    found = _reconstruct(sequence, tracks, guess, config)
+    cameras = _unadjusted(found, guess, config)
+    if found.kind != "moving":
+        return cameras
+    if not guess.is_guess:
+        return _adjusted(cameras, 1.0, config, None)
+    sigma = _clipped(found.error / _PER_SIGMA)
+    for _ in range(3):
+        adjusted = _adjusted(cameras, sigma, config, guess)
+        if adjusted.focal_sigma > config.structure.focal_accuracy * adjusted.focal:
+            return _with_guess(sequence, tracks, adjusted, config)
+        if abs(adjusted.focal / cameras.focal - 1) < _MOVED:
+            break
+        better = dataclasses.replace(guess, params=adjusted.intrinsics)
+        again = _reconstruct(sequence, tracks, better, config)
+        if again.kind != "moving":
+            break
+        cameras, sigma = _unadjusted(again, better, config), adjusted.pixel_sigma
+    log.info(
+        "focal length: %.0f ± %.0f px, guess %.0f px",
+        adjusted.focal,
+        adjusted.focal_sigma,
+        guess.params[0],
+    )
+    return adjusted
+
+
+def with_intrinsics(
+    sequence: Sequence, intrinsics: Float[np.ndarray, " i"]
+) -> Sequence:
+    """The sequence as another focal length has it.
+
+    Regressed bodies stay where they are in the image, and as large: their depth was
+    read off their size, and is proportional to the focal length.
+    """
+    known = sequence.intrinsics
+    if np.array_equal(known.params, intrinsics):
+        return sequence
+    bodies = sequence.bodies
+    if bodies is not None:
+        ratio = np.array([1.0, 1.0, intrinsics[0] / known.params[0]])
+        bodies = dataclasses.replace(bodies, trans=bodies.trans * ratio)
+    return dataclasses.replace(
+        sequence,
+        intrinsics=dataclasses.replace(known, params=intrinsics),
+        bodies=bodies,
+    )
+
+
+def _reconstruct(
+    sequence: Sequence, tracks: Tracks, intrinsics: Intrinsics, config: Config
+) -> frontend.Reconstruction:
+    return frontend.reconstruct(
+        tracks, intrinsics, sequence.num_frames, config.structure
+    )
+
+
+def _unadjusted(
+    found: frontend.Reconstruction, intrinsics: Intrinsics, config: Config
+) -> Cameras:
+    return Cameras(
+        kind=found.kind,
+        T_WC=found.T_WC,
+        registered=found.registered,
+        landmarks=found.landmarks,
+        tracks=found.tracks,
+        keep=np.ones(len(found.tracks.frame), bool),
+        pixel_sigma=config.weights.pixel_sigma,
+        intrinsics=np.asarray(intrinsics.params, float),
+        focal_sigma=float("nan"),
+        costs=(0.0, 0.0),
+        warnings=tuple(found.warnings),
+    )
+
+
+def _with_guess(
+    sequence: Sequence, tracks: Tracks, adjusted: Cameras, config: Config
+) -> Cameras:
+    """The guess as it was, for a camera whose path does not tell the focal length."""
+    guess = sequence.intrinsics
+    found = _reconstruct(sequence, tracks, guess, config)
+    held = dataclasses.replace(config.structure, focal_sigma=_HELD)
+    cameras = _adjusted(
+        _unadjusted(found, guess, config),
+        adjusted.pixel_sigma,
+        dataclasses.replace(config, structure=held),
+        guess,
+    )
+    text = (
+        f"focal length not determined by the camera's path (± "
+        f"{100 * adjusted.focal_sigma / adjusted.focal:.0f} %): the guess of "
+        f"{guess.params[0]:.0f} px is kept; give camera.json if it is known."
+    )
+    log.warning("%s", text)
+    return dataclasses.replace(
+        cameras, focal_sigma=float("nan"), warnings=(*cameras.warnings, text)
+    )
+
+
+def _adjusted(
+    cameras: Cameras, sigma: float, config: Config, guess: Intrinsics | None
+) -> Cameras:
+    """Bundle adjustment; with a `guess` the focal length is free."""
+    nobody = initialisation.no_people(len(cameras.T_WC))
+    state = initialisation.first_state(
+        cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
+    )
+    factor = initialisation.map_factor(
+        cameras.tracks, cameras.keep, sigma, config.weights
+    )
+    problem = _problem(factor, state, config.structure, guess)
+    before = float(problem.cost(state))
+    solution = solver.solve(problem, state)
+    state = solution.state
+    focal_sigma = float("nan")
+    if guess is not None:
+        spread = solver.marginals(problem, state).intrinsics
+        focal_sigma = float(np.sqrt(config.structure.focal_runs * spread[0, 0]))
+    error = sigma * np.linalg.norm(np.asarray(factor.residual(state)), axis=-1)
+    keep = cameras.keep
+    found = _clipped(np.median(error[keep]) / _PER_SIGMA) if keep.any() else 1.0
+    return dataclasses.replace(
+        cameras,
+        T_WC=np.asarray(state.cameras),
+        landmarks=np.asarray(state.landmarks),
+        intrinsics=np.asarray(state.intrinsics),
+        focal_sigma=focal_sigma,
+        keep=keep & (error < 10 * found),
+        pixel_sigma=found,
+        costs=(before, float(solution.cost)),
+    )
+
+
+def _problem(
+    factor: graph.Reprojection,
+    state: graph.State,
+    structure: Structure,
+    guess: Intrinsics | None,
+) -> graph.Problem:
+    if guess is None:
+        return graph.make_problem([factor], state)
+    known = np.asarray(guess.params, float)
+    focal = known[0]
+    # Errors of a track last, so `focal_runs` observations count for one: here the
+    # prior's weight is multiplied, which is the same as dividing theirs.
+    sigma = np.full(len(known), _HELD * focal)
+    sigma[:2] = structure.focal_sigma * focal / np.sqrt(structure.focal_runs)
+    factors = [
+        factor,
+        graph.IntrinsicsPrior(jnp.asarray(known)[None], jnp.asarray(sigma)[None]),
+        graph.SquarePixels(jnp.asarray([_SQUARE * focal])),
+    ]
+    return graph.make_problem(factors, state, free_intrinsics=True)
+
+
+def _clipped(sigma: float) -> float:
+    low, high = initialisation.PIXEL_SIGMA_RANGE
+    return float(np.clip(sigma, low, high))

@@ -1,0 +1,45 @@
+"""The focal length when it was guessed: found where the camera's path tells it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_frontend_motion import CAMERA, camera_error, scene
+
+from bodyslam_jax import reconstruction
+from bodyslam_jax.config import Config
+from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence
+
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+NUM = 24
+
+
+def sequence(tracks, factor: float, num: int) -> Sequence:
+    params = CAMERA.params * [factor, factor, 1, 1]
+    guess = Intrinsics(params, CAMERA.width, CAMERA.height, is_guess=True)
+    return Sequence("a", None, np.arange(num) / 30, guess, tracks=tracks)
+
+
+def test_a_guess_off_by_a_fifth_is_corrected():
+    """Where the camera goes round something; the standard deviation says how well."""
+    tracks, truth = scene("orbit", num=NUM)
+    found = reconstruction.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
+    assert found.kind == "moving"
+    assert abs(found.focal / 260 - 1) < 0.03
+    assert abs(found.focal - 260) < 3 * found.focal_sigma < 0.15 * 260
+    np.testing.assert_allclose(found.intrinsics[1], found.focal, rtol=1e-3)
+    np.testing.assert_allclose(found.intrinsics[2:], CAMERA.params[2:], atol=0.01)
+    assert camera_error(found.T_WC, truth) < 0.03
+
+
+@pytest.mark.slow
+def test_a_guess_is_kept_where_the_path_says_nothing():
+    """Sideways before a wall, depth and focal length trade off against each other."""
+    tracks, _ = scene("sideways", num=NUM, planar=True)
+    found = reconstruction.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
+    assert found.kind == "moving" and np.isnan(found.focal_sigma)
+    np.testing.assert_allclose(
+        found.intrinsics, CAMERA.params * [0.8, 0.8, 1, 1], rtol=1e-4
+    )
+    assert any("focal length not determined" in text for text in found.warnings)
