@@ -202,6 +202,22 @@ class MotionTraining:
 
 
 @dataclasses.dataclass(frozen=True)
+class Detect:
+    """Finding people and keypoints in the images, for who has no keypoints."""
+
+    detector: str | None = None
+    """YOLOX of one's own, an ONNX file; by default YOLOX-S, fetched once."""
+    pose: str | None = None
+    """RTMPose of one's own, an ONNX file; by default DWPose-L 384x288, fetched once."""
+    min_score: float = 0.5
+    """Score of people that are looked at."""
+    max_overlap: float = 0.45
+    """Overlap of two boxes above which they are the same person."""
+    max_people: int = 4
+    """The largest ones in an image that are looked at."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Association:
     """Which detections in successive frames are the same person."""
 
@@ -303,10 +319,15 @@ class Config:
     """Motion model's weights; without them the ones that ship."""
     people: bool = True
     """Whether people are estimated; if not, cameras and map stay without a unit."""
+    detect: bool = False
+    """Whether people's keypoints are looked for in the images, if none are given."""
+    offline: bool = False
+    """Whether the network is never used: models must be there already."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
     uncertainty: bool = True
     """Whether standard deviations, and what is not determined, are worked out."""
+    detection: Detect = Detect()
     association: Association = Association()
     tracking: Tracking = Tracking()
     structure: Structure = Structure()
@@ -319,24 +340,6 @@ class Config:
     def paper(cls) -> "Config":
         """Weights and schedule of section 3.6 of the paper."""
         return cls(weights=GraphWeights.paper(), solver="adam")
-
-
-@dataclasses.dataclass(frozen=True)
-class Detect:
-    """Finding people and keypoints in the images, for who has no keypoints."""
-
-    detector: str | None = None
-    """YOLOX of one's own, an ONNX file; by default YOLOX-S, fetched once."""
-    pose: str | None = None
-    """RTMPose of one's own, an ONNX file; by default DWPose-L 384x288, fetched once."""
-    offline: bool = False
-    """Never use the network."""
-    min_score: float = 0.5
-    """Score of people that are looked at."""
-    max_overlap: float = 0.45
-    """Overlap of two boxes above which they are the same person."""
-    max_people: int = 4
-    """The largest ones in an image that are looked at."""
 
 
 @dataclasses.dataclass(frozen=True)

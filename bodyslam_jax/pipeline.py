@@ -8,16 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import (
     evaluation,
     export,
     frontend,
-    graph,
-    initialisation,
     people,
-    solver,
+    reconstruction,
     synthetic,
     view,
 )
@@ -29,6 +28,9 @@ from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Bodies, Sequence, Tracks
 
 log = logging.getLogger(__name__)
+
+_FEWEST_FRAMES = 3
+_SECONDS_BETWEEN_LINES = 5.0
 
 
 class Stopwatch:
@@ -46,6 +48,20 @@ class Stopwatch:
         log.info("%s: %.1f s", stage, self.seconds[stage])
 
 
+class Counter:
+    """A log line every few seconds: how many frames are done."""
+
+    def __init__(self, name: str, total: int) -> None:
+        self.name, self.total = name, total
+        self.told = time.perf_counter()
+
+    def __call__(self, done: int) -> None:
+        now = time.perf_counter()
+        if now - self.told > _SECONDS_BETWEEN_LINES:
+            log.info("%s: frame %d of %d", self.name, done, self.total)
+            self.told = now
+
+
 def run(
     sequence: Sequence, config: Config = Config(), *, cache: Cache = Cache(None)
 ) -> Result:
@@ -53,16 +69,19 @@ def run(
 
     **Raises:** `ValueError` if there is nothing to be estimated from, in one line.
     """
+    _check_length(sequence)
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
+    sequence = _detected(sequence, config, cache, watch)
     cameras, bodies = before_joint(sequence, body, config, cache, watch)
     key = fingerprint(sequence, config)
+    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     with watch("joint"):
         joint = cache.stage(
             "joint",
             key,
             Joint,
-            lambda: joint_.estimate(sequence, cameras, bodies, body, config),
+            lambda: joint_.estimate(seen, cameras, bodies, body, config),
         )
     return assemble(sequence, config, body, cameras, joint, watch.seconds)
 
@@ -85,8 +104,12 @@ def before_joint(
     key = fingerprint(key, config.structure, config.weights.landmark_loss)
     with watch("cameras"):
         cameras = cache.stage(
-            "cameras", key, Cameras, lambda: _cameras(sequence, tracks, config)
+            "cameras",
+            key,
+            Cameras,
+            lambda: reconstruction.estimate(sequence, tracks, config),
         )
+    sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     key = fingerprint(sequence, config.people_fit, config.people, config.body_model)
     with watch("people"):
         bodies = cache.stage(
@@ -95,55 +118,58 @@ def before_joint(
     return cameras, bodies
 
 
+def _check_length(sequence: Sequence) -> None:
+    if sequence.num_frames < _FEWEST_FRAMES:
+        raise ValueError(
+            f"{sequence.name}: {sequence.num_frames} frames, expected at least "
+            f"{_FEWEST_FRAMES}: size and motion come from what moves."
+        )
+
+
+def _detected(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """The sequence with keypoints found in its images, if asked for and none given."""
+    if not config.detect or sequence.keypoints is not None:
+        return sequence
+    key = fingerprint(sequence, config.detection)
+    with watch("detection"):
+        found = cache.stage(
+            "detection", key, Detections, lambda: _detections(sequence, config)
+        )
+    return frontend.with_detections(sequence, found.split(), config.association)
+
+
+@dataclasses.dataclass(frozen=True)
+class Detections:
+    """People found in all images, one after the other."""
+
+    count: Int[np.ndarray, " t"]
+    """People in each frame."""
+    points: Float[np.ndarray, "p 25 3"]
+    """u px, v px, confidence"""
+
+    def split(self) -> list[np.ndarray]:
+        """The people of each frame."""
+        return np.split(self.points, np.cumsum(self.count)[:-1])
+
+
+def _detections(sequence: Sequence, config: Config) -> Detections:
+    found = people.detect_people(
+        frontend.frames(sequence),
+        config.detection,
+        offline=config.offline,
+        progress=Counter("detection", sequence.num_frames),
+    )
+    count = np.array([len(points) for points in found])
+    return Detections(count, np.concatenate(found))
+
+
 def _tracks(sequence: Sequence, config: Config) -> Tracks:
     if sequence.tracks is not None:
         return sequence.tracks
-    return frontend.track(sequence, config.tracking)
-
-
-def _cameras(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
-    """Structure from motion, then bundle adjustment of all frames and landmarks."""
-    intrinsics = np.asarray(sequence.intrinsics.params, float)
-    found = frontend.reconstruct(
-        tracks, sequence.intrinsics, sequence.num_frames, config.structure
-    )
-    tracks = found.tracks
-    keep = np.ones(len(tracks.frame), bool)
-    cameras = Cameras(
-        kind=found.kind,
-        T_WC=found.T_WC,
-        registered=found.registered,
-        landmarks=found.landmarks,
-        tracks=tracks,
-        keep=keep,
-        pixel_sigma=config.weights.pixel_sigma,
-        intrinsics=intrinsics,
-        costs=(0.0, 0.0),
-        warnings=tuple(found.warnings),
-    )
-    if found.kind != "moving":
-        return cameras
-    nobody = initialisation.no_people(sequence.num_frames)
-    state = initialisation.first_state(found.T_WC, found.landmarks, nobody, intrinsics)
-    factor = initialisation.map_factor(tracks, keep, 1.0, config.weights)
-    problem = graph.make_problem([factor], state)
-    before = float(problem.cost(state))
-    solution = solver.solve(problem, state)
-    state = solution.state
-    error = np.linalg.norm(np.asarray(factor.residual(state)), axis=-1)
-    low, high = initialisation.PIXEL_SIGMA_RANGE
-    # The median of a two-dimensional normal error's length is 1.18 sigma.
-    sigma = (
-        float(np.clip(np.median(error[keep]) / 1.18, low, high)) if keep.any() else 1.0
-    )
-    return dataclasses.replace(
-        cameras,
-        T_WC=np.asarray(state.cameras),
-        landmarks=np.asarray(state.landmarks),
-        keep=keep & (error < 10 * sigma),
-        pixel_sigma=sigma,
-        costs=(before, float(solution.cost)),
-    )
+    counter = Counter("tracks", sequence.num_frames)
+    return frontend.track(sequence, config.tracking, lambda k, _: counter(k))
 
 
 def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies:

@@ -143,9 +143,9 @@ def test_networks_that_always_say_the_same(tmp_path):
     x[0, :, 30], y[0, :, 100] = 0.7, 0.8
     pose = tmp_path / "pose.onnx"
     pose.write_bytes(constant_network((1, 3, 64, 48), {"simcc_x": x, "simcc_y": y}))
-    settings = Detect(detector=str(detector), pose=str(pose), offline=True)
+    settings = Detect(detector=str(detector), pose=str(pose))
     image = np.zeros((128, 192, 3), np.uint8)  # twice the canvas
-    (found,) = detect_people([image], settings)
+    (found,) = detect_people([image], settings, offline=True)
     # The box is 30..50 by 12..52 on the canvas, twice that in the image: 40 x 80 px
     # about (80, 64). Times 1.25: 100 px high for 64 rows; columns follow.
     step = 100 / 64

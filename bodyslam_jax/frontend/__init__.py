@@ -7,5 +7,6 @@ from bodyslam_jax.frontend._features import brisk_status as brisk_status
 from bodyslam_jax.frontend._reconstruct import Reconstruction as Reconstruction
 from bodyslam_jax.frontend._reconstruct import reconstruct as reconstruct
 from bodyslam_jax.frontend._sequence import read_sequence as read_sequence
+from bodyslam_jax.frontend._sequence import with_detections as with_detections
 from bodyslam_jax.frontend._tracks import track as track
 from bodyslam_jax.frontend._video import frames as frames

@@ -12,7 +12,12 @@ from bodyslam_jax.config import Association
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
-from bodyslam_jax.frontend._keypoints import numbers, open_npz, read_detections
+from bodyslam_jax.frontend._keypoints import (
+    Detections,
+    numbers,
+    open_npz,
+    read_detections,
+)
 from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence, Tracks
 
@@ -72,6 +77,27 @@ def read_sequence(
     if parts.footage is None and parts.tracks is None:
         raise ValueError(f"{path}: no video.mp4, images/ or tracks.npz.")
     return _read_parts(Path(path), parts, config)
+
+
+def with_detections(
+    sequence: Sequence, detections: Detections, config: Association = Association()
+) -> Sequence:
+    """The sequence with people made of what a detector found in each of its frames.
+
+    **Raises:** `ValueError` if nobody was found in any frame.
+    """
+    if not any(len(found) for found in detections):
+        raise ValueError(f"{sequence.name}: no person detected in any frame.")
+    people, warnings = associate(detections, config, sequence.fps)
+    bodies = sequence.bodies
+    if bodies is not None:
+        people, bodies = _pair(people, bodies, sequence.intrinsics)
+    return dataclasses.replace(
+        sequence,
+        keypoints=people,
+        bodies=bodies,
+        warnings=(*sequence.warnings, *warnings),
+    )
 
 
 def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) -> Tracks:

@@ -16,7 +16,7 @@ import importlib
 import logging
 import os
 import urllib.request
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -71,25 +71,33 @@ _FEET = {
 
 
 def detect_people(
-    images: Iterable[UInt8[np.ndarray, "y x 3"]], settings: Detect = Detect()
+    images: Iterable[UInt8[np.ndarray, "y x 3"]],
+    settings: Detect = Detect(),
+    *,
+    offline: bool = False,
+    progress: Callable[[int], None] | None = None,
 ) -> list[Float[np.ndarray, "p 25 3"]]:
     """Keypoints (u, v in px, confidence) of the people in each image, in BODY_25 order.
 
     People are in no particular order; who is who over time is for the readers'
     association to say. One image is in memory at a time.
 
+    Args:
+        offline: never use the network; models must be in the cache, or one's own.
+        progress: called with the number of images done.
+
     **Raises:** `ValueError` if onnxruntime is not installed, a model cannot be had, or
     is not of the expected kind.
     """
-    detector = _session(settings.detector, DETECTOR, settings.offline)
-    pose = _session(settings.pose, POSE, settings.offline)
+    detector = _session(settings.detector, DETECTOR, offline)
+    pose = _session(settings.pose, POSE, offline)
     found = []
     for index, image in enumerate(images):
         boxes = find_boxes(detector, image, settings)
         points = [find_keypoints(pose, image, box) for box in boxes]
         found.append(np.array(points).reshape(-1, 25, 3))
-        if index % 100 == 99:
-            log.info("looked for people in %d images", index + 1)
+        if progress is not None:
+            progress(index + 1)
     return found
 
 
