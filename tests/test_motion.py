@@ -33,6 +33,7 @@ from bodyslam_jax.motion._network import (
 )
 from bodyslam_jax.motion._predict import leg_length
 from bodyslam_jax.motion._rotations import matrix, vector
+from bodyslam_jax.motion._turning import straightened
 
 T = 24
 
@@ -69,6 +70,18 @@ def test_the_world_may_be_turned_at_will(model, body, walk, key):
         found = run(model, body, world @ orientation, *rest)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_steady_turning_changes_no_step(model, body, walk):
+    orientation, *rest = walk
+    expected = run(model, body, orientation, *rest)
+    rate = jnp.full(T, -0.02)
+    found = run(model, body, straightened(orientation, rate), *rest)
+    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-3)
+    turn = lambda seen: vector(matrix(jnp.array([0, -0.02, 0.0])) @ matrix(seen))
+    np.testing.assert_allclose(
+        turn(found.rotation)[model.past :], expected.rotation[model.past :], atol=2e-3
+    )
 
 
 def test_no_prediction_looks_ahead(model, body, walk):

@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
 from bodyslam_jax.motion._network import MetricNetwork, PaperNetwork, Window
+from bodyslam_jax.motion._rotations import turned
+from bodyslam_jax.motion._turning import straightened, turning_rate
 
 
 class MotionModel(eqx.Module):
@@ -63,13 +65,13 @@ def sequence_windows(
     """
     leg = leg_length(body, shape)
     joints = local_joints(body, body_pose, shape) / leg
-    turned = jnp.einsum("tab,tjb->tja", orientation, joints)
+    facing = jnp.einsum("tab,tjb->tja", orientation, joints)
     rows = np.arange(len(body_pose) - past)[:, None] + np.arange(past + 1)
     before = orientation[rows[:, -2]]
     return Window(
         rotation=jnp.einsum("wba,wpbc->wpac", before, orientation[rows]),
         body_pose=body_pose[rows],
-        joints=jnp.einsum("wba,wpjb->wpja", before, turned[rows]),
+        joints=jnp.einsum("wba,wpjb->wpja", before, facing[rows]),
         shape=jnp.broadcast_to(shape, (len(rows), 10)),
         leg=jnp.broadcast_to(leg, (len(rows),)),
     )
@@ -110,7 +112,9 @@ def predict(
 
     `orientation` takes H to any one frame that is common to the sequence; `body_pose`
     is θ (rad) at the model's frame rate; `present` says which frames are to be used.
-    Needs no displacement, no heading and no gravity. Section 3.4 of the paper.
+    Needs no displacement, no heading and no gravity. Section 3.4 of the paper; but the
+    default network sees steady turning taken out (`_turning`), for which it looks at
+    orientations a second ahead.
 
     **Raises:** `ValueError` if the weights belong to another body model.
     """
@@ -120,12 +124,17 @@ def predict(
         identity = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (t, 3, 3))
         none = jnp.zeros((t, 3), dtype)
         return Prediction(none, identity, body_pose, none, jnp.zeros(t, bool))
+    rate = jnp.zeros(t, dtype)
+    if isinstance(model.network, MetricNetwork):
+        rate = turning_rate(orientation, present)
+        orientation = straightened(orientation, rate)
     window = sequence_windows(body, orientation, body_pose, shape, past)
     guess = in_dtype(model, dtype).network(window)
     factor = guess.cholesky
     covariance = jnp.einsum("wab,wcb->wac", factor, factor)
     rows = np.arange(t - past)[:, None] + np.arange(past + 1)
     valid = present[rows].all(-1)
+    turn = rate[past:, None] * jnp.array([0.0, 1.0, 0.0], dtype)
     front = lambda x, fill: jnp.concatenate([fill[:past], x])
     return Prediction(
         translation=front(guess.translation, jnp.zeros((t, 3), dtype)),
@@ -133,6 +142,6 @@ def predict(
             covariance, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (t, 3, 3))
         ),
         body_pose=front(guess.body_pose, body_pose),
-        rotation=front(guess.rotation, jnp.zeros((t, 3), dtype)),
+        rotation=front(turned(turn, guess.rotation), jnp.zeros((t, 3), dtype)),
         valid=jnp.concatenate([jnp.zeros(past, bool), valid]),
     )
