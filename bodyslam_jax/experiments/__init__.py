@@ -28,6 +28,7 @@ from bodyslam_jax.experiments._variants import VARIANTS as VARIANTS
 from bodyslam_jax.experiments._weights import WEIGHTS as WEIGHTS
 from bodyslam_jax.experiments._weights import Learned as Learned
 from bodyslam_jax.experiments._weights import Trial as Trial
+from bodyslam_jax.experiments._weights import error_and_gradient as error_and_gradient
 from bodyslam_jax.experiments._weights import learn_weights as learn_weights
 from bodyslam_jax.experiments._weights import make_trial as make_trial
 from bodyslam_jax.experiments._weights import names_of as names_of

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import evaluation, joint, pipeline, synthetic
+from bodyslam_jax import evaluation, joint, pipeline, reconstruction, synthetic
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments._score import truth_of
@@ -70,7 +70,7 @@ def make_case(
     cameras, bodies = pipeline.before_joint(sequence, body, config, kept)
     return Case(
         name=simulated.name,
-        sequence=sequence,
+        sequence=reconstruction.with_intrinsics(sequence, cameras.intrinsics),
         truth=truth_of(synthetic.as_truth(simulated)),
         body=body,
         cameras=cameras,

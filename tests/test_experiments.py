@@ -1,0 +1,224 @@
+"""Experiments on small made-up problems: variants, perturbations, weights, rows."""
+
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+
+import bodyslam_jax.graph as g
+from bodyslam_jax import experiments, solver
+from bodyslam_jax.config import Experiment
+from bodyslam_jax.experiments import _paper, _tables
+from bodyslam_jax.experiments._case import simulations
+from bodyslam_jax.experiments._journal import Journal
+from bodyslam_jax.experiments._structure import shake
+from bodyslam_jax.experiments._variants import carrying
+
+SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
+"""Postures held: compiled in a few seconds."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Twelve frames of one person, a start that is off, and the truth."""
+    rng = np.random.default_rng(5)
+    truth = scenes.truth(rng, frames=12, people=1, landmarks=30)
+    factors = [scenes.reprojection(rng, truth), *scenes.person_factors(rng, truth)]
+    problem = g.make_problem(factors, truth)
+    return problem, truth, scenes.perturb(rng, problem, truth)
+
+
+def test_mapped_perturbations_are_single_solves(scene):
+    problem, truth, start = scene
+    held, bare = experiments.without_map(problem, start, hold_cameras=True)
+    assert "cameras" not in held.variables and "landmarks" not in held.variables
+    factors = jnp.array([0.5, 1.0, 3.0])
+    traced = jax.jit(
+        jax.vmap(
+            lambda f: solver.trace(
+                held, experiments.rescaled(bare, f), lambda y: y.scale, schedule=SHORT
+            )
+        )
+    )
+    states, seen = traced(factors)
+    assert seen.shape == (3, 9)
+    np.testing.assert_array_equal(seen[:, 0], bare.scale)
+    np.testing.assert_array_equal(seen[:, -1], states.scale)
+    single = solver.solve(held, experiments.rescaled(bare, 3.0), schedule=SHORT)
+    # The same arithmetic in another order, eight steps long.
+    np.testing.assert_allclose(states.scale[2], single.state.scale, rtol=1e-6)
+    np.testing.assert_allclose(states.roots[2], single.state.roots, atol=1e-6)
+    # Cameras have not moved, and a map of thrice the size has a third of the scale.
+    np.testing.assert_array_equal(
+        states.cameras[2, :, :3, 3], 3.0 * bare.cameras[:, :3, 3]
+    )
+    np.testing.assert_allclose(states.scale[2] * 3, states.scale[1], rtol=2e-2)
+
+
+def test_variants_leave_out_and_add_what_they_say(scene):
+    problem, _, start = scene
+    predictor = g.MotionPredictor(
+        lambda *a: None, None, scenes.body_model(), jnp.ones((1, 12), bool)
+    )
+    problem = g.make_problem(problem.factors, start, motion=predictor)
+    full = {type(f) for f in problem.factors}
+    for name, variant in experiments.VARIANTS.items():
+        kinds = {type(f) for f in variant(problem, start).factors}
+        if name.startswith("no motion"):
+            assert full - kinds == {g.HumanMotion}, name
+        if name.startswith("with "):
+            assert len(kinds - full) == 1 and not full - kinds, name
+    held = experiments.VARIANTS["β held at the regressor's"](problem, start)
+    assert "shapes" not in held.variables and "poses" in held.variables
+    low = carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
+    assert low.shape == (1, 12, 4) and not low[:, 0].any()
+    assert (low.sum(axis=-1) <= 1).all()
+
+
+def test_shaking_keeps_what_holds_the_map(scene):
+    problem, _, start = scene
+    shaken = shake(start, problem.free, jax.random.key(0), shift=0.1, turn=0.01)
+    moved = float(start.scale) * (shaken.cameras - start.cameras)[:, :3, 3]
+    assert 0.05 < np.abs(moved).max() <= 0.1
+    np.testing.assert_array_equal(shaken.cameras[0], start.cameras[0])
+    held = np.asarray(problem.free.cameras[1:, 3:]) == 0
+    assert held.any() and not np.asarray(moved)[1:][held].any()
+
+
+def test_weights_scale_residuals_and_missing_stays_missing(scene):
+    problem, _, start = scene
+    names = experiments.names_of(problem)
+    assert set(names) == {
+        "keypoint",
+        "keypoint loss",
+        "motion",
+        "posture",
+        "shape",
+        "landmark",
+        "landmark loss",
+    }
+    log = jnp.log(2.0) * jnp.array([float(n in ("motion", "shape")) for n in names])
+
+    @jax.jit
+    def costs(log):
+        changed = experiments.reweighted(problem, names, log)
+        return changed.cost_by_term(start)
+
+    before, after = costs(jnp.zeros(len(names))), costs(log)
+    for name, value in before.items():
+        share = 4.0 if name in ("HumanMotion", "Shape") else 1.0
+        np.testing.assert_allclose(value, share * after[name], rtol=1e-12)
+    slope = jax.jit(jax.grad(lambda log: sum(costs(log).values())))
+    assert np.isfinite(slope(jnp.zeros(len(names)))).all()
+    twice = experiments.reweighted(problem, ("keypoint",), jnp.log(jnp.array([2.0])))
+    old, new = problem.factors[1].sigma, twice.factors[1].sigma
+    assert np.isinf(new)[np.isinf(old)].all()
+    with pytest.raises(ValueError, match="nosuch"):
+        experiments.reweighted(problem, ("nosuch",), jnp.zeros(1))
+
+
+def test_rows_are_computed_once(tmp_path):
+    journal = Journal(tmp_path / "rows")
+    calls = []
+
+    def compute():
+        calls.append(1)
+        return {"a": np.float64(1.5), "b": math.nan, "c": np.arange(2), "s": "text"}
+
+    row = journal.row("table1", "M2-room", (1, "x"), compute)
+    assert row == {"a": 1.5, "b": None, "c": [0, 1], "s": "text"}
+    assert journal.row("table1", "M2-room", (1, "x"), compute) == row
+    assert len(calls) == journal.computed == 1
+    journal.row("table1", "M2-room", (2, "x"), compute)
+    journal.row("table1", "no β", (1, "x"), compute)
+    assert len(calls) == 3
+    journal.path("table1", "M2-room", 1, "x").write_text("{")
+    journal.row("table1", "M2-room", (1, "x"), compute)
+    assert len(calls) == 4
+
+
+def test_tables_as_text():
+    columns = [
+        _tables.Column("sequence", "sequence"),
+        _tables.Column("error, mm", "error", 1e3),
+        _tables.Column("scale", "scale", digits=3),
+        _tables.Column("status", "status"),
+    ]
+    rows = [
+        {"sequence": "E1", "error": 0.0443, "scale": 0.94, "status": "converged"},
+        {"sequence": "E2", "error": 0.0508, "scale": None, "status": "converged"},
+    ]
+    assert _tables.markdown(columns, rows, mean=True).splitlines() == [
+        "| sequence | error, mm | scale | status |",
+        "| --- | --- | --- | --- |",
+        "| E1 | 44.3 | 0.940 | converged |",
+        "| E2 | 50.8 | – | converged |",
+        "| **mean** | 47.5 |  |  |",
+    ]
+    lines = _tables.to_csv(columns, rows).splitlines()
+    assert lines[1].split(",") == ["E1", "44.3", "0.94", "converged"]
+
+
+def test_papers_figures_are_the_papers():
+    row = _paper.table1_row("M3")
+    assert row["no_mm/c_ate_se3"] == pytest.approx(0.3921)
+    assert row["full/j_ate_sim3"] == pytest.approx(0.1719)
+    assert row["no_mm/scale"] == 0.354 and row["full/scale"] == 0.985
+    mean = np.mean([_paper.table1_row(s)["full/c_ate_se3"] for s in _paper.TABLE1])
+    assert mean == pytest.approx(0.0837, abs=1e-4)  # what the issue quotes
+    third = np.array(list(_paper.STRUCTURE.values())).mean(axis=0)
+    np.testing.assert_allclose(third[2:], [158.662, 155.572], atol=1e-3)
+
+
+def test_choice_of_sequences():
+    found = simulations(Experiment(family="both", frames=50), ("E2", "D1"), ("room",))
+    assert [(s.sequence, s.family) for s in found] == [
+        ("E2", "room"),
+        ("D1", "room"),
+        ("E2", "follow"),
+        ("D1", "follow"),
+    ]
+    assert {s.length for s in found} == {50}
+    one = simulations(Experiment(sequences=("M4",)), ("E2",), ("room", "follow"))
+    assert [(s.sequence, s.family) for s in one] == [("M4", "room"), ("M4", "follow")]
+
+
+def test_unknown_experiment_and_folder(tmp_path):
+    with pytest.raises(ValueError, match="nosuch.*table1"):
+        experiments.run_experiment("nosuch", tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot be written"):
+        experiments.run_experiment("motion", tmp_path / "file" / "out")
+
+
+@pytest.mark.slow
+def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
+    import sys
+
+    from bodyslam_jax import cli
+
+    argv = "bodyslam experiment table1 --sequences M1 --family follow --frames 40"
+    argv = [*argv.split(), "--noise", "low", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", argv)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    caplog.set_level("INFO")
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert not stopped.value.code
+    assert "1 rows, 0 of them done" in caplog.text
+    (row,) = (json.loads(p.read_text()) for p in (tmp_path / "rows").glob("*.json"))
+    assert row["full/scale"] == pytest.approx(1, abs=0.2)
+    assert row["full/j_ate_se3"] < row["per_frame/j_ate_se3"]
+    for name in ("table1.md", "table1.csv", "table1.png", "table1_paths.png"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert "| M1-follow |" in (tmp_path / "table1.md").read_text()
+    caplog.clear()
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "1 rows, 1 of them done" in caplog.text
+    assert "taken from an earlier run" in caplog.text
+    assert "joint: cost" not in caplog.text
