@@ -23,6 +23,7 @@ from bodyslam_jax import __version__
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 _EDGE = 1 << 20
+_SOURCE = "source.json"
 
 
 def fingerprint(*parts: Any) -> str:
@@ -68,6 +69,8 @@ class Cache:
     """A folder of stage results; `folder=None` keeps nothing."""
 
     folder: Path | None
+    source: dict[str, Any] | None = None
+    """What the stages are of, kept beside them for `owner`."""
 
     def stage(self, name: str, key: str, kind: type[T], compute: Callable[[], T]) -> T:
         """The result of stage `name`, from disk if `key` is the same as then."""
@@ -84,10 +87,21 @@ class Cache:
                 return found
         result = compute()
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self.source is not None:
+            (self.folder / _SOURCE).write_text(json.dumps(self.source))
         for old in self.folder.glob(f"{name}-*.npz"):
             old.unlink()
         save(path, result)
         return result
+
+    def owner(self) -> dict[str, Any] | None:
+        """The `source` that the folder was begun for, `None` if it was not begun."""
+        if self.folder is None:
+            return None
+        try:
+            return dict(json.loads((self.folder / _SOURCE).read_text()))
+        except (OSError, ValueError, TypeError):
+            return None
 
 
 def save(path: Path, value: Any) -> None:
@@ -96,9 +110,14 @@ def save(path: Path, value: Any) -> None:
     header = _encode(value, "", arrays)
     blob = np.frombuffer(json.dumps(header).encode(), np.uint8)
     partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez(file, __header__=blob, **arrays)  # pyright: ignore[reportArgumentType]
-    os.replace(partial, path)
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, __header__=blob, **arrays)  # pyright: ignore[reportArgumentType]
+        os.replace(partial, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def load(path: Path, kind: type[T]) -> T:

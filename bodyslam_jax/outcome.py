@@ -154,6 +154,8 @@ def summarise(
         status = "no people: cameras and map have no unit"
     elif not np.isfinite(result.T_WC).all():
         status = "failed"
+    elif cameras.kind == "failed":
+        status = "camera motion not found: people are placed as if it stood still"
     if cameras.kind != "moving":
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
@@ -197,11 +199,8 @@ def summarise(
         "headline": headline,
         "warnings": warnings,
         "input": {
-            "name": sequence.name,
-            "frames": sequence.num_frames,
+            **describe(sequence),
             "fps": sequence.fps,
-            "width": sequence.intrinsics.width,
-            "height": sequence.intrinsics.height,
             "intrinsics_guessed": sequence.intrinsics.is_guess,
         },
         "intrinsics": lens,
@@ -225,6 +224,16 @@ def summarise(
         "durations_s": seconds,
         "settings": dataclasses.asdict(config),
         "versions": versions(),
+    }
+
+
+def describe(sequence: Sequence) -> dict[str, Any]:
+    """By what an input is told from another."""
+    return {
+        "name": sequence.name,
+        "frames": sequence.num_frames,
+        "width": sequence.intrinsics.width,
+        "height": sequence.intrinsics.height,
     }
 
 

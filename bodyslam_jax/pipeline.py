@@ -15,6 +15,7 @@ from bodyslam_jax import (
     evaluation,
     export,
     frontend,
+    motion,
     people,
     reconstruction,
     synthetic,
@@ -23,7 +24,7 @@ from bodyslam_jax import (
 from bodyslam_jax import joint as joint_
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config
-from bodyslam_jax.outcome import Cameras, Joint, assemble
+from bodyslam_jax.outcome import Cameras, Joint, assemble, describe
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Bodies, Sequence, Tracks
 
@@ -72,6 +73,7 @@ def run(
     _check_length(sequence)
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
+    motion.load_motion_model(config.motion_model)  # now, before minutes are spent
     sequence = _detected(sequence, config, cache, watch)
     cameras, bodies = before_joint(sequence, body, config, cache, watch)
     key = fingerprint(sequence, config)
@@ -202,11 +204,12 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
 
     Where the sequence has a ground truth, the report says how far off the result is.
 
-    **Raises:** `ValueError` if `out` cannot be written.
+    **Raises:** `ValueError` if `out` cannot be written or holds something else.
     """
-    export.check_folder(out)
+    cache = Cache(out / ".cache", describe(sequence))
+    export.check_folder(out, cache.source, cache.owner())
     body = body_.load_body_model(config.body_model)
-    result = run(sequence, config, cache=Cache(out / ".cache"))
+    result = run(sequence, config, cache=cache)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         result.summary["errors"] = errors(result, truth)
@@ -236,7 +239,7 @@ def demo(out: Path, config: Config = Config()) -> Result:
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
-    export.check_folder(out)
+    export.check_folder(out, {"name": "scene"}, Cache(out / ".cache").owner())
     watch = Stopwatch()
     with watch("rendering"):
         scene = synthetic.demo_scene(out / "scene")

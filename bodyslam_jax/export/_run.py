@@ -30,13 +30,45 @@ _OWN = ("result.npz", "camera.tum", "body_*.npz", "landmarks.ply", _LAST, "confi
 _OWN += ("report.html", "overlay.webm")
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(
+    folder: Path,
+    source: dict[str, Any] | None = None,
+    begun_for: dict[str, Any] | None = None,
+) -> None:
     """Fails early, before anything is computed, where a run could not be written.
 
-    **Raises:** `ValueError` naming the folder and what is wrong with it.
+    Args:
+        source: what will be run, by the names of `input` in `summary.json`.
+        begun_for: the same of an unfinished run in `folder`.
+
+    **Raises:** `ValueError` naming the folder and what is wrong with it: not writable,
+    a full disk, files that are no run's, or the run of another input.
     """
+    owner = begun_for or _finished_for(folder)
+    if owner is None:
+        theirs = sorted(file.name for p in _OWN for file in folder.glob(p))
+        if theirs:
+            raise ValueError(
+                f"{folder}: has {', '.join(theirs[:3])}, but is not the folder of a "
+                "run; give another folder."
+            )
+    elif source and (differ := [k for k in source if owner.get(k) != source[k]]):
+        was = ", ".join(f"{k} {owner.get(k)}" for k in differ)
+        now = ", ".join(f"{k} {source[k]}" for k in differ)
+        raise ValueError(
+            f"{folder}: is the run of another input ({was}, not {now}); give another "
+            "folder, or delete this one."
+        )
     with _partial(folder) as partial:
         (partial / _LAST).write_text("{}")
+
+
+def _finished_for(folder: Path) -> dict[str, Any] | None:
+    """The input of the finished run in a folder, `None` if there is none."""
+    try:
+        return dict(json.loads((folder / _LAST).read_text())["input"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 @contextlib.contextmanager
@@ -65,11 +97,13 @@ def _partial(folder: Path) -> Iterator[Path]:
     existed = folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
         try:
-            yield partial
+            partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
+            try:
+                yield partial
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
             if not existed:
                 with contextlib.suppress(OSError):
                     folder.rmdir()
