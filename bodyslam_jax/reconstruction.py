@@ -34,6 +34,28 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 
     A camera that does not move, or only turns, is said to be that, and keeps the guess.
     """
+    cameras = _estimate(sequence, tracks, config)
+    for text in cameras.warnings:
+        log.warning("%s", text)
+    log.info(
+        "cameras: %s, %d of %d frames located, %d landmarks, noise %.2f px",
+        cameras.kind,
+        cameras.registered.sum(),
+        len(cameras.registered),
+        len(cameras.landmarks),
+        cameras.pixel_sigma,
+    )
+    if np.isfinite(cameras.focal_sigma):
+        log.info(
+            "focal length: %.0f ± %.0f px, guess %.0f px",
+            cameras.focal,
+            cameras.focal_sigma,
+            sequence.intrinsics.params[0],
+        )
+    return cameras
+
+
+def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     guess = sequence.intrinsics
     found = _reconstruct(sequence, tracks, guess, config)
     cameras = _unadjusted(found, guess, config)
@@ -50,15 +72,10 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
             break
         better = dataclasses.replace(guess, params=adjusted.intrinsics)
         again = _reconstruct(sequence, tracks, better, config)
-        if again.kind != "moving":
-            break
         cameras, sigma = _unadjusted(again, better, config), adjusted.pixel_sigma
-    log.info(
-        "focal length: %.0f ± %.0f px, guess %.0f px",
-        adjusted.focal,
-        adjusted.focal_sigma,
-        guess.params[0],
-    )
+        if again.kind != "moving":
+            # With its focal length wrong, a camera that turns had seemed to move.
+            return dataclasses.replace(cameras, focal_sigma=adjusted.focal_sigma)
     return adjusted
 
 
@@ -128,7 +145,6 @@ def _with_guess(
         f"{100 * adjusted.focal_sigma / adjusted.focal:.0f} %): the guess of "
         f"{guess.params[0]:.0f} px is kept; give camera.json if it is known."
     )
-    log.warning("%s", text)
     return dataclasses.replace(
         cameras, focal_sigma=float("nan"), warnings=(*cameras.warnings, text)
     )
@@ -148,6 +164,7 @@ def _adjusted(
     problem = _problem(factor, state, config.structure, guess)
     before = float(problem.cost(state))
     solution = solver.solve(problem, state)
+    log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
     state = solution.state
     focal_sigma = float("nan")
     if guess is not None:

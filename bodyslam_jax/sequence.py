@@ -72,7 +72,10 @@ class Sequence:
     bodies: Bodies | None = None
     tracks: Tracks | None = None
     masks: Path | None = None
-    """Folder of person masks, one image per frame in order; non-zero is person."""
+    """Folder of person masks, one image per frame of the video, whose order they have;
+    non-zero is person."""
+    picks: Int[np.ndarray, " t"] | None = None
+    """Which frames of the video these are, if not all: its rate varied."""
     groundtruth: Path | None = None
     warnings: tuple[str, ...] = ()
     """What was guessed or dropped while reading, for the report."""

@@ -4,6 +4,7 @@ import json
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from bodyslam_jax.sequence import Intrinsics
@@ -48,7 +49,7 @@ def read_camera(path: Path) -> tuple[Intrinsics, float | None]:
         raise ValueError(
             f"{path}: {params.size} params for {model}, not {_NUM_PARAMS[model]}."
         )
-    params = _as_opencv(model, params)
+    params = _from_colmap(model, params)
     if not np.isfinite(params).all() or (params[:2] <= 0).any():
         raise ValueError(f"{path}: params {params.tolist()} are not those of a camera.")
     if width <= 0 or height <= 0:
@@ -71,7 +72,23 @@ def guess_camera(width: int, height: int, image: Path | None = None) -> Intrinsi
     return Intrinsics(params, width, height, is_guess=True)
 
 
-def _as_opencv(model: str, params: np.ndarray) -> np.ndarray:
+def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
+    """Pixels of points (m, 3) in the camera frame; far away if behind the camera."""
+    front = p_C[:, 2] > 0.05
+    safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
+    K, distortion = as_opencv(intrinsics.params)
+    uv = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    return np.where(front[:, None], uv, 1e5)
+
+
+def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Camera matrix and distortion coefficients, as cv2 wants them."""
+    fx, fy, cx, cy = params[:4]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return K, params[4:] if len(params) == 8 else np.zeros(4)
+
+
+def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
     if model == "SIMPLE_PINHOLE":
         f, cx, cy = params
         return np.array([f, f, cx, cy])

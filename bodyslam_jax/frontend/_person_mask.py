@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from bodyslam_jax.frontend._video import frames, list_images
+from bodyslam_jax.frontend._video import frames, list_images, picked
 from bodyslam_jax.sequence import Keypoints, Sequence
 
 # BODY_25 limbs and their half widths, of the person's height.
@@ -65,7 +65,10 @@ def person_masks(
             cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
         )
         names = list_images(sequence.masks)
-        for name, image in zip(names, frames(sequence.masks, gray=True), strict=True):
+        masks = zip(names, frames(sequence.masks, gray=True), strict=True)
+        if sequence.picks is not None:
+            masks = picked(masks, sequence.picks)
+        for name, image in masks:
             if image.shape != size:
                 raise ValueError(
                     f"{name}: {image.shape[1]}x{image.shape[0]} px, but the video is "

@@ -1,7 +1,6 @@
 """Tracks and intrinsics -> a camera pose for every frame and a map, up to scale."""
 
 import dataclasses
-import logging
 from typing import Literal
 
 import cv2
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.frontend._bundle import Scene, Views, errors
+from bodyslam_jax.frontend._calibration import as_opencv
 from bodyslam_jax.frontend._camera_motion import (
     choose_keyframes,
     find_cuts,
@@ -18,11 +18,8 @@ from bodyslam_jax.frontend._camera_motion import (
     rotations_only,
     stillness,
 )
-from bodyslam_jax.frontend._sequence import as_opencv
 from bodyslam_jax.frontend._structure import Builder, Growing, Refine
 from bodyslam_jax.sequence import Intrinsics, Tracks
-
-_log = logging.getLogger(__name__)
 
 Kind = Literal["moving", "rotation", "static", "failed"]
 
@@ -257,8 +254,6 @@ def _pack(
         views = problem.views[np.flatnonzero(inlier)]
         found = errors(scene, Views(views.frame, tracks.landmark, views.xy))
         error = float(np.median(found)) * problem.focal
-    for text in warnings:
-        _log.warning("%s", text)
     return Reconstruction(
         kind=kind,
         T_WC=T_WC,

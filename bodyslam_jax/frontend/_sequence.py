@@ -4,27 +4,21 @@ import dataclasses
 import logging
 from pathlib import Path
 
-import cv2
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.config import Association
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
-from bodyslam_jax.frontend._keypoints import (
-    Detections,
-    numbers,
-    open_npz,
-    read_detections,
-)
+from bodyslam_jax.frontend._given_tracks import read_tracks
+from bodyslam_jax.frontend._keypoints import Detections, read_detections
+from bodyslam_jax.frontend._pairing import pair
 from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence, Tracks
+from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
 
 _log = logging.getLogger(__name__)
 
 _FPS_TOLERANCE = 0.02
-_MID_HIP = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,56 +85,13 @@ def with_detections(
     people, warnings = associate(detections, config, sequence.fps)
     bodies = sequence.bodies
     if bodies is not None:
-        people, bodies = _pair(people, bodies, sequence.intrinsics)
+        people, bodies = pair(people, bodies, sequence.intrinsics)
     return dataclasses.replace(
         sequence,
         keypoints=people,
         bodies=bodies,
         warnings=(*sequence.warnings, *warnings),
     )
-
-
-def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) -> Tracks:
-    """Reads `frame`, `landmark` and `uv` (px) of point tracks made elsewhere.
-
-    **Raises:** `ValueError`, naming the file, if they do not fit the video.
-    """
-    with open_npz(path) as archive:
-        missing = [k for k in ("frame", "landmark", "uv") if k not in archive.files]
-        if missing:
-            raise ValueError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
-        frame, landmark, uv = (
-            numbers(path, archive, k) for k in ("frame", "landmark", "uv")
-        )
-    if (
-        uv.ndim != 2
-        or uv.shape[1] != 2
-        or not frame.shape == landmark.shape == (len(uv),)
-    ):
-        raise ValueError(
-            f"{path}: frame {frame.shape}, landmark {landmark.shape}, uv {uv.shape}; "
-            "expected (m,), (m,), (m, 2)."
-        )
-    if not len(uv):
-        raise ValueError(f"{path}: no observation.")
-    if (frame % 1 != 0).any() or (landmark % 1 != 0).any() or frame.min() < 0:
-        raise ValueError(f"{path}: frame and landmark must be whole numbers from 0.")
-    if num_frames is not None and frame.max() >= num_frames:
-        raise ValueError(
-            f"{path}: tracks up to frame {frame.max():.0f}, but the video has "
-            f"{num_frames} frames."
-        )
-    outside = ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
-    if outside > 0.1:
-        raise ValueError(
-            f"{path}: {100 * outside:.0f} % of the points outside the image of "
-            f"{size[0]}x{size[1]} px: of another video?"
-        )
-    _, index = np.unique(landmark, return_inverse=True)
-    frame = frame.astype(np.int64)
-    if len(np.unique(frame * (index.max() + 1) + index)) < len(frame):
-        raise ValueError(f"{path}: a landmark seen twice in one frame.")
-    return Tracks(frame, index.astype(np.int64), uv)
 
 
 def _find_parts(path: Path) -> _Parts:
@@ -193,13 +144,13 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
 
     found_tracks = None
     if parts.tracks:
-        count = len(footage.timestamps) if footage else None
+        count = footage.num_read if footage else None
         found_tracks = read_tracks(parts.tracks, num_frames=count, size=size)
     stamps = footage.timestamps if footage else _made_up_times(parts, found_tracks, fps)
-    num_frames = len(stamps)
+    num_frames = footage.num_read if footage else len(stamps)
 
     people = None
-    rate = (num_frames - 1) / (stamps[-1] - stamps[0]) if num_frames > 1 else 30.0
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 30.0
     if parts.keypoints:
         detections = read_detections(
             parts.keypoints, num_frames=num_frames, width=size[0], height=size[1]
@@ -212,12 +163,12 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
             parts.bodies, num_frames=num_frames, intrinsics=intrinsics
         )
         if people is not None:
-            people, regressed = _pair(people, regressed, intrinsics)
+            people, regressed = pair(people, regressed, intrinsics)
     if parts.masks:
         _check_masks(parts.masks, num_frames)
     for text in warnings:
         _log.warning("%s: %s", parts.name, text)
-    return Sequence(
+    sequence = Sequence(
         name=parts.name,
         frames=parts.footage,
         timestamps=stamps,
@@ -228,6 +179,32 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         masks=parts.masks,
         groundtruth=parts.groundtruth,
         warnings=warnings,
+    )
+    picks = footage.picks if footage else None
+    return sequence if picks is None else _thinned(sequence, picks)
+
+
+def _thinned(sequence: Sequence, picks: np.ndarray) -> Sequence:
+    """Only these frames of what was read for all of them; times are theirs already."""
+    cut = lambda bundle: (
+        None
+        if bundle is None
+        else type(bundle)(
+            *(getattr(bundle, f.name)[:, picks] for f in dataclasses.fields(bundle))
+        )
+    )
+    tracks = sequence.tracks
+    if tracks is not None:
+        kept = np.isin(tracks.frame, picks)
+        _, landmark = np.unique(tracks.landmark[kept], return_inverse=True)
+        frame = np.searchsorted(picks, tracks.frame[kept])
+        tracks = Tracks(frame, landmark.astype(np.int64), tracks.uv[kept])
+    return dataclasses.replace(
+        sequence,
+        keypoints=cut(sequence.keypoints),
+        bodies=cut(sequence.bodies),
+        tracks=tracks,
+        picks=picks,
     )
 
 
@@ -268,71 +245,3 @@ def _check_masks(folder: Path, num_frames: int) -> None:
         raise ValueError(
             f"{folder}: {found} masks, but the video has {num_frames} frames."
         )
-
-
-def _pair(
-    keypoints: Keypoints, bodies: Bodies, intrinsics: Intrinsics
-) -> tuple[Keypoints, Bodies]:
-    """Puts keypoints and bodies of the same person at the same index.
-
-    By the distance of the projected pelvis from the hips in the image. Whoever has only
-    one of the two is kept, with confidence 0 or not present.
-    """
-    num_k, num_b = len(keypoints.uv), len(bodies.present)
-    cost = np.full((num_k, num_b), 1e6)
-    for j in range(num_b):
-        # The pelvis of a body of average size; only the difference of people matters.
-        pelvis = bodies.trans[j] + np.array([0.0, -0.2, 0.0])
-        pixel = project_points(intrinsics, pelvis)
-        for i in range(num_k):
-            both = bodies.present[j] & (keypoints.confidence[i, :, _MID_HIP] > 0)
-            if both.any():
-                away = np.linalg.norm(
-                    keypoints.uv[i, both, _MID_HIP] - pixel[both], axis=-1
-                )
-                size = np.ptp(keypoints.uv[i, both][..., 1], axis=-1).clip(20)
-                cost[i, j] = np.median(away / size) - 1e-3 * np.sqrt(both.sum())
-    rows, columns = linear_sum_assignment(cost)
-    matched = {
-        int(j): int(i) for i, j in zip(rows, columns, strict=True) if cost[i, j] < 1
-    }
-    target = np.empty(num_b, dtype=np.int64)
-    extra = num_k
-    for j in range(num_b):
-        if j in matched:
-            target[j] = matched[j]
-        else:
-            target[j], extra = extra, extra + 1
-
-    def spread(array: np.ndarray, index: np.ndarray) -> np.ndarray:
-        out = np.zeros((extra, *array.shape[1:]), dtype=array.dtype)
-        out[index] = array
-        return out
-
-    return (
-        Keypoints(
-            *(spread(a, np.arange(num_k)) for a in (keypoints.uv, keypoints.confidence))
-        ),
-        Bodies(
-            *(
-                spread(a, target)
-                for a in (bodies.present, bodies.poses, bodies.shapes, bodies.trans)
-            )
-        ),
-    )
-
-
-def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
-    """Pixels of points (m, 3) in the camera frame; far away if behind the camera."""
-    front = p_C[:, 2] > 0.05
-    safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
-    K, distortion = as_opencv(intrinsics.params)
-    uv = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
-    return np.where(front[:, None], uv, 1e5)
-
-
-def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera matrix and distortion coefficients, as cv2 wants them."""
-    fx, fy, cx, cy = params[:4]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return K, params[4:] if len(params) == 8 else np.zeros(4)

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from bodyslam_jax.config import Tracking
+from bodyslam_jax.frontend._calibration import as_opencv
 from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, match, spread
 from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.frontend._sequence import as_opencv
 from bodyslam_jax.frontend._video import frames
 from bodyslam_jax.sequence import Sequence, Tracks
 

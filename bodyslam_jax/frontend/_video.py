@@ -3,12 +3,13 @@
 import dataclasses
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.sequence import Sequence
 
@@ -30,6 +31,10 @@ class Footage:
     width: int
     height: int
     warnings: tuple[str, ...] = ()
+    num_read: int = 0
+    """Frames in the file, of which some may be left out."""
+    picks: Int[np.ndarray, " t"] | None = None
+    """Which of them are used, in order; all without it."""
 
 
 def look_at(path: Path, fps: float | None = None) -> Footage:
@@ -53,23 +58,37 @@ def frames(
 ) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
     """The images of a sequence in order: BGR, or gray; one in memory at a time.
 
+    Of a `Sequence` only the frames it uses, of a file or folder all.
+
     **Raises:** `ValueError` if the sequence has no images or one cannot be read.
     """
     path = source.frames if isinstance(source, Sequence) else source
     if path is None:
         raise ValueError(f"{getattr(source, 'name', source)}: has no video or images.")
-    if path.is_dir():
-        yield from _read_images(path, gray)
-    else:
-        capture = _open(path)
-        try:
-            while True:
-                ok, image = capture.read()
-                if not ok:
-                    break
-                yield cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image
-        finally:
-            capture.release()
+    picks = source.picks if isinstance(source, Sequence) else None
+    images = _read_images(path, gray) if path.is_dir() else _read_video(path, gray)
+    yield from images if picks is None else picked(images, picks)
+
+
+T = TypeVar("T")
+
+
+def picked(items: Iterable[T], picks: Int[np.ndarray, " t"]) -> Iterator[T]:
+    """Those of `items` whose places are in `picks`, which increases."""
+    wanted = set(picks.tolist())
+    return (item for k, item in enumerate(items) if k in wanted)
+
+
+def _read_video(path: Path, gray: bool) -> Iterator[np.ndarray]:
+    capture = _open(path)
+    try:
+        while True:
+            ok, image = capture.read()
+            if not ok:
+                break
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image
+    finally:
+        capture.release()
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
@@ -107,31 +126,45 @@ def _look_at_video(path: Path) -> Footage:
             times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000)
     finally:
         capture.release()
-    stamps, warnings = _checked_times(path, np.asarray(times), nominal)
+    stamps, picks, warnings = resampled(path, np.asarray(times), nominal)
     # One frame more or less is what containers get wrong; more is a damaged file.
     if announced > len(times) + max(2, 0.02 * announced):
         warnings += (f"{path.name}: {announced} frames announced, {len(times)} read.",)
-    return Footage(path, stamps, image.shape[1], image.shape[0], warnings)
+    size = (image.shape[1], image.shape[0])
+    return Footage(path, stamps, *size, warnings, len(times), picks)
 
 
-def _checked_times(
-    path: Path, times: np.ndarray, nominal: float
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Times from 0; made up from the nominal rate where the file's are unusable."""
+def resampled(
+    path: Path, times: Float[np.ndarray, " n"], nominal: float
+) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
+    """Times from 0 (s), which frames they are of, and what there is to be said.
+
+    Where the rate varies, the frames nearest to the ticks of a clock of the median rate
+    are used: what is denser is thinned out. Frames are not repeated, so gaps stay, with
+    their true times. Unusable times are made up from the nominal rate (1/s).
+    """
     step = np.diff(times)
     if len(times) == 1:
-        return np.zeros(1), ()
+        return np.zeros(1), None, ()
     if not np.isfinite(times).all() or (step <= 0).any():
         if not 1 <= nominal <= 1000:
             nominal = 30.0
         warning = f"{path.name}: times do not increase; {nominal:g} frames/s taken."
-        return np.arange(len(times)) / nominal, (warning,)
+        return np.arange(len(times)) / nominal, None, (warning,)
     median = float(np.median(step))
-    if np.abs(step - median).max() > _MAX_JITTER * median:
-        slow, fast = 1 / step.max(), 1 / step.min()
-        text = f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s."
-        return times - times[0], (text,)
-    return times - times[0], ()
+    times = times - times[0]
+    if np.abs(step - median).max() <= _MAX_JITTER * median:
+        return times, None, ()
+    ticks = np.arange(0.0, times[-1] + 0.5 * median, median)
+    after = np.clip(np.searchsorted(times, ticks), 1, len(times) - 1)
+    nearest = after - (ticks - times[after - 1] < times[after] - ticks)
+    picks = np.unique(nearest)
+    slow, fast = 1 / step.max(), 1 / step.min()
+    text = (
+        f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s; "
+        f"resampled to {1 / median:.3g}, {len(picks)} of {len(times)} frames used."
+    )
+    return times[picks], picks if len(picks) < len(times) else None, (text,)
 
 
 def _look_at_images(folder: Path, fps: float | None) -> Footage:
@@ -143,7 +176,8 @@ def _look_at_images(folder: Path, fps: float | None) -> Footage:
     if fps is None:
         fps = 30.0
         warnings = (f"{folder.name}: frame rate not given, 30 frames/s assumed.",)
-    return Footage(folder, np.arange(len(images)) / fps, width, height, warnings)
+    times = np.arange(len(images)) / fps
+    return Footage(folder, times, width, height, warnings, len(images))
 
 
 def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:
