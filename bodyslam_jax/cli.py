@@ -63,6 +63,7 @@ def run(
         camera=camera,
         tracks=tracks,
         masks=masks,
+        config=config.association,
     )
     return _finish(pipeline.run_to_folder(sequence, out, config), out)
 
@@ -128,6 +129,7 @@ def simulate(
     """
     from bodyslam_jax import synthetic
 
+    out.mkdir(parents=True, exist_ok=True)  # or it is said now, not after a minute
     synthetic.write_sequence(out, synthetic.simulate(config))
     print(out)
 
@@ -384,16 +386,30 @@ def main() -> None:
         code = tyro.extras.subcommand_cli_from_dict(
             commands, prog=prog, description=(__doc__ or "").split("\n")[0], args=argv
         )
-    except (OSError, ValueError) as error:
-        sys.exit(f"bodyslam: {_one_line(error)}")
     except KeyboardInterrupt:
         print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
         sys.exit(130)
+    except Exception as error:
+        if os.environ.get("BODYSLAM_DEBUG"):
+            raise
+        if isinstance(error, (OSError, ValueError)):
+            sys.exit(f"bodyslam: {_one_line(error)}")
+        # Memory, the linear algebra library, a bug: no fault of the input.
+        print(f"bodyslam: failed: {_one_line(error)}; {_WHERE}", file=sys.stderr)
+        sys.exit(3)
     sys.exit(code or 0)
 
 
+_WHERE = "BODYSLAM_DEBUG=1 says where"
+
+
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file'}: {error.strerror}."
+    text = " ".join(str(error).split())
+    if isinstance(error, (OSError, ValueError)) and text:
+        return text
+    return f"{type(error).__name__}: {text[:300]}"
 
 
 def _prepare_jax() -> None:
