@@ -139,6 +139,7 @@ def train_motion(
     /,
     *,
     out: Path,
+    body_model: Path | None = None,
     preset: _Preset = "default",
     config: Annotated[MotionTraining, tyro.conf.arg(name="")] = MotionTraining(),
 ) -> None:
@@ -147,13 +148,14 @@ def train_motion(
     Args:
         data: File or folder of motion.
         out: Weights to write (.npz); an interrupted training is continued.
+        body_model: Body to train for, if not the one that `doctor` names.
         preset: `paper` is its network, loss, optimiser and choice of motion.
         config: Architecture and training.
     """
     from bodyslam_jax import motion
 
     with _progress() as report:
-        motion.train_from_data(data, out, config, report)
+        motion.train_from_data(data, out, config, report, body_model)
     print(out)
 
 

@@ -8,7 +8,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from bodyslam_jax.body import load_body_model, rest_joints
+from bodyslam_jax.body import PARENTS, load_body_model, rest_joints
 from bodyslam_jax.motion import disturb, drift, fit_shape, place, read_motion, resample
 from bodyslam_jax.motion._clips import (
     Clip,
@@ -20,6 +20,8 @@ from bodyslam_jax.motion._clips import (
 )
 from bodyslam_jax.motion._noise import CORRELATION
 from bodyslam_jax.motion._readers import gender
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def make_clip(t=50, fps=30.0, seed=0, **changes):
@@ -53,9 +55,7 @@ def write_cmu(path, clips, **changes):
         poses=np.concatenate([clip.poses for clip in clips]),
         trans=np.concatenate([clip.trans for clip in clips]),
         fps=np.int32(30),
-        parents=np.array(
-            [-1, 0, 0, 0, *range(1, 10), 9, 9, *range(12, 15), *range(16, 22)]
-        ),
+        parents=np.array(PARENTS),
         seq_start=np.cumsum([0, *lengths[:-1]]),
         seq_length=np.array(lengths),
         seq_name=np.array([clip.name for clip in clips]),
@@ -275,40 +275,14 @@ def test_fitted_shape_has_the_legs_of_the_subject():
     body = load_body_model()
     shape = jnp.asarray([1.0, -0.5, 0.3, 0, 0, 0, 0, 0, 0, 0], body.template.dtype)
     rest = np.asarray(rest_joints(body, shape), float)
-    parents = [
-        -1,
-        0,
-        0,
-        0,
-        1,
-        2,
-        3,
-        4,
-        5,
-        6,
-        7,
-        8,
-        9,
-        9,
-        9,
-        12,
-        13,
-        14,
-        16,
-        17,
-        18,
-        19,
-        20,
-        21,
-    ]
     offsets = np.zeros((24, 3))
     for k in range(1, 24):
-        offsets[k] = rest[k] - rest[parents[k]]
+        offsets[k] = rest[k] - rest[PARENTS[k]]
     found = fit_shape(body, offsets)
     fitted = np.asarray(rest_joints(body, jnp.asarray(found, shape.dtype)))
     assert leg_length(fitted) == pytest.approx(leg_length(rest), abs=2e-3)
     np.testing.assert_allclose(
-        rest_from_offsets(offsets, parents), rest - rest[0], atol=1e-12
+        rest_from_offsets(offsets, PARENTS), rest - rest[0], atol=1e-12
     )
 
 

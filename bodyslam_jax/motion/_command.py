@@ -1,6 +1,7 @@
 """Training from files to files: what `bodyslam train-motion` does."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion._clips import split
 from bodyslam_jax.motion._figures import draw_history
 from bodyslam_jax.motion._readers import read_motion
+from bodyslam_jax.motion._selection import kept, named
 from bodyslam_jax.motion._training import train
 from bodyslam_jax.motion._weights import save_motion_model
 
@@ -18,14 +20,16 @@ def train_from_data(
     out: Path,
     settings: MotionTraining,
     report: Callable[[int, int, dict[str, float]], None] | None = None,
+    body_model: Path | None = None,
 ) -> None:
     """Trains on the motion in `data` and writes weights, and a picture of how it went.
 
     A checkpoint beside `out` is taken up again after an interruption; `report(epoch,
-    epochs, measures)` is called after each epoch.
+    epochs, measures)` is called after each epoch. The model will know the skeleton of
+    `body_model`, by default the one that `load_body_model` finds, and no other.
 
-    **Raises:** `ValueError` if there is no usable motion in `data`, or if `out` is no
-    name of an `.npz` file.
+    **Raises:** `FileNotFoundError`; `ValueError` if there is no usable motion in
+    `data`, no usable body model, or if `out` does not end in `.npz`.
     """
     if out.suffix != ".npz":
         raise ValueError(f"{out}: weights are an .npz file; name it so.")
@@ -33,16 +37,19 @@ def train_from_data(
     checkpoint = out.with_suffix(".ckpt.npz")
     model, history = train(
         known,
-        load_body_model(),
+        load_body_model(body_model),
         settings,
         validation=validation,
         checkpoint=checkpoint,
         report=report,
-        about={
-            "data": f"{len(known)} clips of {data.name}",
-            "settings": dataclasses.asdict(settings),
-        },
     )
-    save_motion_model(out, model)
+    epoch = kept(history, settings.drift_deg)
+    about = {
+        "data": f"{len(known)} clips of {data.name}",
+        "licence": "not stated; that of the data applies",
+        "settings": dataclasses.asdict(settings),
+        "metrics": {} if epoch is None else named(history[epoch, 1:]),
+    }
+    save_motion_model(out, dataclasses.replace(model, about=json.dumps(about)))
     draw_history(history, out.with_suffix(".png"))
     checkpoint.unlink()  # only now is nothing lost without it

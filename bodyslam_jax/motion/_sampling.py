@@ -111,6 +111,7 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
     )
 
 
+@eqx.filter_jit
 def draw(
     key: PRNGKeyArray, data: Corpus, body: BodyModel, settings: MotionTraining
 ) -> Batch:

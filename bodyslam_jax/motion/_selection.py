@@ -28,6 +28,18 @@ def validated(
     return np.array([run[k] for k in ("ratio", "slope") for run in runs])
 
 
+def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
+    """The figures of `validated` by name."""
+    names = [f"{what} at {d:g}°" for what in ("ratio", "slope") for d in DRIFTS]
+    return dict(zip(names, map(float, row), strict=True))
+
+
+def kept(history: Float[np.ndarray, "e 7"], drift_deg: float) -> int | None:
+    """The epoch, from 0, whose weights were kept; none if none was judged."""
+    scores = np.array([score(row, drift_deg) for row in history[:, 1:]])
+    return None if np.isnan(scores).all() else int(np.nanargmin(scores))
+
+
 def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
     """What validation prefers: small errors and slopes near 1 at noise as trained."""
     seen = np.array(DRIFTS) <= drift_deg

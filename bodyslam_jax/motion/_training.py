@@ -31,7 +31,7 @@ from bodyslam_jax.motion._network import (
 from bodyslam_jax.motion._placing import Trial, place
 from bodyslam_jax.motion._predict import MotionModel, in_dtype
 from bodyslam_jax.motion._sampling import Batch, Corpus, corpus, draw
-from bodyslam_jax.motion._selection import DRIFTS, calibrated, score, validated
+from bodyslam_jax.motion._selection import calibrated, named, score, validated
 
 logger = logging.getLogger(__name__)
 
@@ -213,9 +213,8 @@ def train(
     steps = -(-data.num_windows // (settings.segments * settings.steps))
     key = jax.random.key(settings.seed)
     network = initial_network(jax.random.fold_in(key, 0), settings)
-    stacked = jax.jit(lambda key: draw(key, data, body, settings))
     keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
-    network = _measure(network, [stacked(k) for k in keys])
+    network = _measure(network, [draw(k, data, body, settings) for k in keys])
     mask = trainable(network)
     progress = Progress(
         network=network,
@@ -244,9 +243,7 @@ def train(
         if trials and (last or (epoch + 1) % settings.validate_every == 0):
             now = model(progress.average)
             progress = _validate(progress, now, body, trials, settings)
-            row = np.asarray(progress.history[epoch, 1:])
-            names = [f"{k} at {d:g}°" for k in ("ratio", "slope") for d in DRIFTS]
-            measures |= dict(zip(names, map(float, row), strict=True))
+            measures |= named(np.asarray(progress.history[epoch, 1:]))
         elif not trials:
             progress = dataclasses.replace(progress, best=progress.average)
         if checkpoint is not None:
