@@ -1,6 +1,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from bodyslam_jax import cli
@@ -85,3 +86,41 @@ def test_written_settings_are_read_back(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(export.to_yaml(config))
     assert cli.read_settings(path, Config()) == config
+
+
+def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
+    trajectory, motion = tmp_path / "camera.txt", tmp_path / "walk.npz"
+    trajectory.write_text("0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n")
+    np.savez(motion, poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
+    out = tmp_path / "sequence"
+    argv = ("convert-dataset", "tum-amass", trajectory, motion, out)
+    code, said, _ = _run(monkeypatch, capsys, *argv)
+    assert code == 0 and str(out) in said
+    truth = out / "groundtruth"
+    assert (truth / "camera.txt").read_text() == trajectory.read_text()
+    assert (truth / "body.npz").read_bytes() == motion.read_bytes()
+    argv = ("convert-dataset", "3dpw", tmp_path / "none.pkl", tmp_path / "other")
+    code, _, err = _run(monkeypatch, capsys, *argv)
+    assert code == 1 and "none.pkl: not there; 3DPW is given to researchers" in err
+    assert not (tmp_path / "other").exists()
+    assert _run(monkeypatch, capsys, "convert-dataset", "nosuch")[0] == 2
+
+
+def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
+    import jax
+
+    from bodyslam_jax.cli import _run as commands
+
+    kept = jax.config.jax_compilation_cache_dir
+    caplog.set_level("INFO")
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
+        commands._say_that_it_compiles()
+        assert "first run: programs are compiled" in caplog.text
+        caplog.clear()
+        (tmp_path / "compiled").mkdir()
+        (tmp_path / "compiled" / "program").write_text("compiled")
+        commands._say_that_it_compiles()
+        assert caplog.text == ""
+    finally:
+        jax.config.update("jax_compilation_cache_dir", kept)

@@ -1,0 +1,126 @@
+"""The command line: plain typed functions, their docstrings the help.
+
+JAX is imported inside the commands, never for `--help`. Exit codes: 0 done; 1 bad
+input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from bodyslam_jax.cli._body import ACTIONS
+from bodyslam_jax.cli._datasets import DATASETS
+from bodyslam_jax.cli._make import experiment, simulate, train_motion
+from bodyslam_jax.cli._run import demo, evaluate, run
+from bodyslam_jax.cli._settings import base_config, option, starting_from
+from bodyslam_jax.cli._settings import read_settings as read_settings
+from bodyslam_jax.config import MotionTraining
+
+
+def doctor() -> None:
+    """Versions, devices, BRISK, codecs, and where body models were looked for."""
+    from bodyslam_jax import doctor as _doctor
+
+    rows = _doctor.report()
+    width = max(len(name) for name, _ in rows)
+    for name, finding in rows:
+        print(f"{name:<{width}}  {finding}")
+
+
+def body_model(
+    action: tyro.conf.Positional[Literal["show", "convert", "check"]],
+) -> None:
+    """Shows, converts or checks a body model file; see `bodyslam body-model --help`."""
+    raise AssertionError(f"dispatched before tyro saw it: {action}")
+
+
+def convert_dataset(
+    dataset: tyro.conf.Positional[Literal["emdb", "3dpw", "rich", "tum-amass"]],
+) -> None:
+    """Makes a sequence folder of a dataset's; see `bodyslam convert-dataset --help`."""
+    raise AssertionError(f"dispatched before tyro saw it: {dataset}")
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "run": run,
+    "demo": demo,
+    "evaluate": evaluate,
+    "simulate": simulate,
+    "train-motion": train_motion,
+    "experiment": experiment,
+    "convert-dataset": convert_dataset,
+    "body-model": body_model,
+    "doctor": doctor,
+}
+_GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
+    "body-model": ACTIONS,
+    "convert-dataset": DATASETS,
+}
+
+
+def main() -> None:
+    """Runs one command and turns its outcome into an exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("jax").setLevel(logging.WARNING)
+    argv = sys.argv[1:]
+    commands, prog = _COMMANDS, "bodyslam"
+    if argv and argv[0] in _GROUPS:
+        commands, prog, argv = _GROUPS[argv[0]], f"bodyslam {argv[0]}", argv[1:]
+    try:
+        base = base_config(argv)
+        if option(argv, "--preset") == "paper":
+            training = MotionTraining.paper()
+        else:
+            training = MotionTraining()
+        commands = {
+            name: starting_from(starting_from(c, base), training)
+            for name, c in commands.items()
+        }
+        if argv and not any(flag in argv for flag in ("-h", "--help")):
+            _prepare_jax()
+        code = tyro.extras.subcommand_cli_from_dict(
+            commands, prog=prog, description=(__doc__ or "").split("\n")[0], args=argv
+        )
+    except KeyboardInterrupt:
+        print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        if os.environ.get("BODYSLAM_DEBUG"):
+            raise
+        if isinstance(error, (OSError, ValueError)):
+            sys.exit(f"bodyslam: {_one_line(error)}")
+        # Memory, the linear algebra library, a bug: no fault of the input.
+        print(f"bodyslam: failed: {_one_line(error)}; {_WHERE}", file=sys.stderr)
+        sys.exit(3)
+    sys.exit(code or 0)
+
+
+_WHERE = "BODYSLAM_DEBUG=1 says where"
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file'}: {error.strerror}."
+    text = " ".join(str(error).split())
+    if isinstance(error, (OSError, ValueError)) and text:
+        return text
+    return f"{type(error).__name__}: {text[:300]}"
+
+
+def _prepare_jax() -> None:
+    """64-bit, and compiled programs kept between runs."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    cache = os.environ.get("BODYSLAM_CACHE") or Path(
+        os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "bodyslam_jax"
+    )
+    jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

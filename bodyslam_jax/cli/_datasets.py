@@ -1,0 +1,84 @@
+"""`bodyslam convert-dataset`: sequences of public datasets -> sequence folders."""
+
+from pathlib import Path
+
+import tyro
+
+from bodyslam_jax.cli._types import Input
+
+_Out = tyro.conf.Positional[Path]
+
+
+def emdb(source: Input, out: _Out, /, *, body_model: Path | None = None) -> None:
+    """One sequence of EMDB: camera, images and ground truth.
+
+    Args:
+        source: Folder with *_data.pkl and images/.
+        out: Sequence folder to write.
+        body_model: SMPL of the subject's gender; it makes the true joints.
+    """
+    from bodyslam_jax import body, evaluation
+
+    print(evaluation.convert_emdb(source, out, body.load_body_model(body_model)))
+
+
+def threedpw(source: Input, out: _Out, /) -> None:
+    """One sequence of 3DPW: camera, images, keypoints and ground truth.
+
+    Args:
+        source: sequenceFiles/SPLIT/NAME.pkl, with imageFiles/ beside sequenceFiles/.
+        out: Sequence folder to write.
+    """
+    from bodyslam_jax import evaluation
+
+    print(evaluation.convert_3dpw(source, out))
+
+
+def rich(
+    root: Input,
+    out: _Out,
+    /,
+    *,
+    split: str,
+    sequence: str,
+    camera: int,
+    body_model: Path | None = None,
+) -> None:
+    """One still camera's view of a RICH sequence: camera, images and ground truth.
+
+    Args:
+        root: Folder with bodies/, images/ and scan_calibration/.
+        out: Sequence folder to write.
+        split: train, val or test.
+        sequence: Name of the sequence.
+        camera: Number of the camera.
+        body_model: SMPL-X of the subject's gender; it makes the true joints.
+    """
+    from bodyslam_jax import body, evaluation
+
+    model = body.load_body_model(body_model)
+    print(evaluation.convert_rich(root, split, sequence, camera, out, model))
+
+
+def tum_amass(
+    trajectory: Input,
+    motion: tyro.conf.Positional[Path],
+    out: _Out,
+    /,
+    *,
+    images: Path | None = None,
+) -> None:
+    """A trajectory in TUM's format and a motion in AMASS', one ground truth.
+
+    Args:
+        trajectory: Camera to world, a line a frame.
+        motion: AMASS file (.npz).
+        out: Sequence folder to write.
+        images: Folder of images, if there are any.
+    """
+    from bodyslam_jax import evaluation
+
+    print(evaluation.convert_tum_amass(trajectory, motion, out, images))
+
+
+DATASETS = {"emdb": emdb, "3dpw": threedpw, "rich": rich, "tum-amass": tum_amass}

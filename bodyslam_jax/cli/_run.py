@@ -1,0 +1,111 @@
+"""From a video to a run folder, and what is said of it."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from bodyslam_jax.cli._types import Flat, Input, Preset
+from bodyslam_jax.config import Config
+
+log = logging.getLogger(__name__)
+
+
+def run(
+    input: Input,
+    /,
+    *,
+    out: Path,
+    keypoints: Path | None = None,
+    bodies: Path | None = None,
+    camera: Path | None = None,
+    tracks: Path | None = None,
+    masks: Path | None = None,
+    preset: Preset = "default",
+    settings: Path | None = None,
+    config: Flat = Config(),
+) -> int:
+    """Estimates cameras, people and map, in metres, from a video or sequence folder.
+
+    Args:
+        input: Sequence folder, video file or folder of images.
+        out: Run folder to write; an interrupted one is finished.
+        keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
+        bodies: Regressed bodies of any supported tool, if not in the input.
+        camera: camera.json, if not in the input.
+        tracks: tracks.npz made elsewhere, if not in the input.
+        masks: Folder of person masks, if not in the input.
+        preset: `paper` has the weights and the first-order schedule of the paper.
+        settings: A config.yaml to start from; options beside it prevail.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import frontend, pipeline
+
+    sequence = frontend.read_sequence(
+        input,
+        keypoints=keypoints,
+        bodies=bodies,
+        camera=camera,
+        tracks=tracks,
+        masks=masks,
+        config=config.association,
+    )
+    _say_that_it_compiles()
+    return _finish(pipeline.run_to_folder(sequence, out, config), out)
+
+
+def demo(
+    *,
+    out: Path = Path("bodyslam_demo"),
+    preset: Preset = "default",
+    settings: Path | None = None,
+    config: Flat = Config(),
+) -> int:
+    """Renders a walker filmed by a moving camera and runs the whole pipeline on it.
+
+    Args:
+        out: Run folder to write.
+        preset: `paper` has the weights and the first-order schedule of the paper.
+        settings: A config.yaml to start from; options beside it prevail.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import pipeline
+
+    _say_that_it_compiles()
+    return _finish(pipeline.demo(out, config), out)
+
+
+def _finish(result: Any, out: Path) -> int:
+    for line in result.summary["headline"]:
+        print(line)
+    for warning in result.summary["warnings"]:
+        print(f"warning: {warning}")
+    print(f"{out / 'report.html'}")
+    return 0 if result.summary["status"] == "ok" else 3
+
+
+def evaluate(
+    run: Input, groundtruth: tyro.conf.Positional[Path], /, *, json: bool = False
+) -> None:
+    """Errors of a run folder against a ground truth: cameras, people, joints, scale.
+
+    Args:
+        run: Run folder.
+        groundtruth: Folder with camera.txt (TUM) and body.npz (AMASS style).
+        json: Print JSON instead of a table.
+    """
+    import bodyslam_jax as bs
+    from bodyslam_jax import evaluation
+
+    truth = evaluation.read_groundtruth(groundtruth, bs.load_body_model())
+    found = evaluation.evaluate(evaluation.read_result(run), truth)
+    print(evaluation.to_json(found) if json else evaluation.to_table(found))
+
+
+def _say_that_it_compiles() -> None:
+    import jax
+
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    if folder and not (Path(folder).is_dir() and any(Path(folder).iterdir())):
+        log.info("first run: programs are compiled, which takes minutes, and kept")

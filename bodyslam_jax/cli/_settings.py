@@ -1,0 +1,89 @@
+"""Where options start: presets and files of settings."""
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax.config import Config, MotionTraining
+
+
+def base_config(argv: list[str]) -> Config:
+    """The settings that `--preset` and `--settings` start from.
+
+    **Raises:** `ValueError` if the file is not a config.yaml.
+    """
+
+    config = Config.paper() if option(argv, "--preset") == "paper" else Config()
+    path = option(argv, "--settings")
+    return config if path is None else read_settings(Path(path), config)
+
+
+def option(argv: list[str], flag: str) -> str | None:
+    joined = [a.partition("=")[2] for a in argv if a.startswith(f"{flag}=")]
+    after = [argv[i + 1] for i, a in enumerate(argv[:-1]) if a == flag]
+    return (joined + after + [None])[0]
+
+
+def read_settings(path: Path, base: Config) -> Config:
+    """`base` with what a config.yaml says.
+
+    **Raises:** `ValueError`, naming file and key, if it is not one.
+    """
+    import yaml
+
+    try:
+        found = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not YAML ({error}).") from error
+    return _merged(found, base, str(path))
+
+
+def _merged(found: Any, base: Any, where: str) -> Any:
+    if not isinstance(found, dict):
+        raise ValueError(f"{where}: found {found!r}, expected settings by name.")
+    known = {field.name for field in dataclasses.fields(base)}
+    changes = {}
+    for name, value in found.items():
+        if name not in known:
+            raise ValueError(
+                f"{where}: no setting `{name}`; expected one of {sorted(known)}."
+            )
+        old = getattr(base, name)
+        if dataclasses.is_dataclass(old):
+            value = _merged(value, old, f"{where}: {name}")
+        elif isinstance(old, tuple) and isinstance(value, list):
+            value = tuple(value)
+        elif old is not None and value is not None and type(value) is not type(old):
+            if not (isinstance(old, float) and type(value) is int):
+                raise ValueError(
+                    f"{where}: {name}: found {value!r}, expected "
+                    f"{type(old).__name__} as in {old!r}."
+                )
+            value = float(value)
+        changes[name] = value
+    return dataclasses.replace(base, **changes)
+
+
+def starting_from(
+    command: Callable[..., Any], config: Config | MotionTraining
+) -> Callable[..., Any]:
+    """The same command with another default of its `config`, if it is of that kind."""
+    signature = inspect.signature(command)
+    if "config" not in signature.parameters:
+        return command
+    if not isinstance(signature.parameters["config"].default, type(config)):
+        return command
+
+    @functools.wraps(command)
+    def started(*args: Any, **kwargs: Any) -> Any:
+        return command(*args, **kwargs)
+
+    parameters = [
+        p.replace(default=config) if p.name == "config" else p
+        for p in signature.parameters.values()
+    ]
+    started.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
+    return started

@@ -1,0 +1,13 @@
+"""Kinds of arguments that several commands have."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bodyslam_jax.config import Config
+
+Input = tyro.conf.Positional[Path]
+Preset = Literal["default", "paper"]
+Flat = Annotated[Config, tyro.conf.arg(name="")]
+"""Settings whose names are options: `--weights.pixel-sigma`."""
