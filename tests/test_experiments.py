@@ -65,15 +65,18 @@ def test_variants_leave_out_and_add_what_they_say(scene):
         lambda *a: None, None, scenes.body_model(), jnp.ones((1, 12), bool)
     )
     problem = g.make_problem(problem.factors, start, motion=predictor)
-    full = {type(f) for f in problem.factors}
-    for name, variant in experiments.VARIANTS.items():
-        kinds = {type(f) for f in variant(problem, start).factors}
-        if name.startswith("no motion"):
-            assert full - kinds == {g.HumanMotion}, name
-        if name.startswith("with "):
-            assert len(kinds - full) == 1 and not full - kinds, name
+    full = problem.cost_by_term(start)
+    for name in ("no keypoints", "no motion model", "no regressed postures"):
+        found = experiments.VARIANTS[name](problem, start).cost_by_term(start)
+        off = {k for k, v in found.items() if v != full[k]}
+        assert len(off) == 1 and float(found[off.pop()]) == 0, name
+    for name in ("with stance foot", "with steady camera", "with up direction"):
+        found = experiments.VARIANTS[name](problem, start).cost_by_term(start)
+        assert len(found) == len(full) + 1
+    still = experiments.VARIANTS["no motion model, no smooth path"](problem, start)
+    assert not still.free.scale.any() and still.free.poses.all()
     held = experiments.VARIANTS["β held at the regressor's"](problem, start)
-    assert "shapes" not in held.variables and "poses" in held.variables
+    assert not held.free.shapes.any() and held.free.poses.all()
     low = carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
     assert low.shape == (1, 12, 4) and not low[:, 0].any()
     assert (low.sum(axis=-1) <= 1).all()

@@ -21,7 +21,7 @@ def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> 
 
     `paper` has the paper's row for each of ours, or `None`.
     """
-    figure = _figure(1.5 + 0.55 * len(rows), 7.5)
+    figure = _figure(max(7.0, 1.5 + 0.55 * len(rows)), 7.5)
     axes = figure.subplots(4, 1, sharex=True)
     at = np.arange(len(rows))
     names = ("c_ate_se3", "h_ate_se3", "j_ate_se3")
@@ -47,7 +47,8 @@ def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> 
             )
         axis.set(ylabel=label, yscale="log")
         axis.grid(axis="y", alpha=0.3)
-    axes[0].legend(ncols=3, fontsize=8, title="simulated sequences, SE(3)")
+    axes[0].set_title("simulated sequences, after SE(3)", fontsize=10)
+    axes[0].legend(ncols=3, fontsize=7, loc="upper left")
     scale = axes[3]
     scale.axhline(1, color=_TRUTH, lw=1)
     scale.plot(at, [r.get("full/scale") or np.nan for r in rows], "s", color=_OURS)
@@ -119,7 +120,7 @@ def draw_structure(
     path: Path, rows: Sequence[Row], paper: Sequence[Row | None]
 ) -> None:
     """C-ATE of the shaken cameras, and after both optimisations."""
-    figure = _figure(1.5 + 1.1 * len(rows), 3.4)
+    figure = _figure(max(6.0, 1.5 + 1.1 * len(rows)), 3.4)
     axis = figure.subplots()
     stages = ("perturbed", "no_landmarks", "landmarks")
     colors = ("#999999", _BASELINE, _OURS)

@@ -10,12 +10,21 @@ from jaxtyping import Array, Float
 from bodyslam_jax import graph
 
 
-def drop(
-    problem: graph.Problem, state: graph.State, *kinds: type[graph.AbstractFactor]
-) -> graph.Problem:
-    """The problem without its terms of these kinds; what may move stays as it was."""
-    kept = [f for f in problem.factors if not isinstance(f, kinds)]
-    return rebuild(problem, state, kept)
+def mute(problem: graph.Problem, *kinds: type[graph.AbstractFactor]) -> graph.Problem:
+    """The problem with its terms of these kinds weighing nothing.
+
+    Their measurements become missing ones: the shapes stay, so nothing is compiled
+    anew.
+    """
+    factors = tuple(_missing(f) if isinstance(f, kinds) else f for f in problem.factors)
+    return eqx.tree_at(lambda p: p.factors, problem, factors)
+
+
+def _missing(factor: graph.AbstractFactor) -> graph.AbstractFactor:
+    field = "whitening" if isinstance(factor, graph.HumanMotion) else "sigma"
+    old = getattr(factor, field)
+    value = 0.0 if field == "whitening" else jnp.inf
+    return eqx.tree_at(lambda f: getattr(f, field), factor, jnp.full_like(old, value))
 
 
 def rebuild(

@@ -1,5 +1,6 @@
 """Other problems from the same measurements: terms off, terms on, variables held."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.experiments._problems import drop, hold, rebuild
+from bodyslam_jax.experiments._problems import hold, mute, rebuild
 
 Variant = Callable[[graph.Problem, graph.State], graph.Problem]
 
@@ -21,16 +22,22 @@ UP_SIGMA = 0.1
 
 
 def without(*kinds: type[graph.AbstractFactor]) -> Variant:
-    """The problem without these terms."""
-    return lambda problem, state: drop(problem, state, *kinds)
+    """The problem without these terms; s is held where nothing is left to see it."""
+
+    def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
+        muted = mute(problem, *kinds)
+        if {graph.HumanMotion, graph.RootSmoothness} <= set(kinds):
+            muted = dataclasses.replace(muted, free=hold(muted.free, "scale"))
+        return muted
+
+    return variant
 
 
 def held(*names: str) -> Variant:
     """The problem with these groups of variables as they are at the start."""
 
     def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
-        free = hold(problem.free, *names)
-        return rebuild(problem, state, list(problem.factors), free)
+        return dataclasses.replace(problem, free=hold(problem.free, *names))
 
     return variant
 
