@@ -73,7 +73,9 @@ def run(
     _check_length(sequence)
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
-    motion.load_motion_model(config.motion_model)  # now, before minutes are spent
+    model = motion.load_motion_model(config.motion_model)
+    if config.people:  # now, before minutes are spent
+        motion.check_compatible(model, body, model.fps)
     sequence = _detected(sequence, config, cache, watch)
     cameras, bodies = before_joint(sequence, body, config, cache, watch)
     key = fingerprint(sequence, config)
