@@ -56,6 +56,14 @@ def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
     )
 
 
+def _lengthened(clock: Clock, frames: int) -> Clock:
+    """For postures padded at the end: what is added stands at the last tick."""
+    more = frames - len(clock.tick)
+    fields = (clock.tick, clock.beyond, clock.steps)
+    tick, beyond, steps = (jnp.pad(x, (0, more), mode="edge") for x in fields)
+    return Clock(clock.frame, clock.between, tick, beyond, steps, clock.same)
+
+
 def predict_between(
     model: tuple[MotionModel, Clock],
     body: BodyModel,
@@ -71,6 +79,7 @@ def predict_between(
     network, clock = model
     if clock.same:
         return predict(network, body, orientation, body_pose, shape, present)
+    clock = _lengthened(clock, len(body_pose))
     dtype = body_pose.dtype
     between, beyond = clock.between.astype(dtype), clock.beyond.astype(dtype)
     steps = clock.steps.astype(dtype)
