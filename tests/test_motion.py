@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from test_motion_data import make_clip
 
+from bodyslam_jax import cli, frontend
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.motion import (
     MotionModel,
@@ -24,16 +26,14 @@ from bodyslam_jax.motion import (
     save_motion_model,
     scale_from_motion,
 )
-from bodyslam_jax.motion._network import (
-    MetricNetwork,
-    PaperNetwork,
-    cosine_basis,
-    lower_triangle,
-    nearest_turn,
-)
+from bodyslam_jax.motion._measures import Steps, error_correlation
+from bodyslam_jax.motion._metric import MetricNetwork, cosine_basis, nearest_turn
+from bodyslam_jax.motion._network import lower_triangle
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._predict import leg_length
 from bodyslam_jax.motion._rotations import matrix, vector
 from bodyslam_jax.motion._turning import straightened
+from bodyslam_jax.sequence import Intrinsics, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -224,6 +224,9 @@ def test_weights_of_something_else_are_refused(tmp_path, model, body):
     with pytest.raises(ValueError, match="not a motion model"):
         load_motion_model(tmp_path / "other.npz")
     save_motion_model(tmp_path / "m.npz", model)
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "m.npz").read_bytes()[:5000])
+    with pytest.raises(ValueError, match="not a motion model"):
+        load_motion_model(tmp_path / "torn.npz")
     with np.load(tmp_path / "m.npz") as archive:
         arrays = dict(archive)
     np.savez(tmp_path / "cut.npz", **(arrays | {"array_0": np.zeros((3, 3))}))
@@ -233,10 +236,42 @@ def test_weights_of_something_else_are_refused(tmp_path, model, body):
     np.savez(tmp_path / "nan.npz", **(arrays | {"array_0": nan}))
     with pytest.raises(ValueError, match="NaN"):
         load_motion_model(tmp_path / "nan.npz")
+    header = json.loads(str(arrays["header"]))
+    for changes, told in (
+        ({"fps": 0}, "0 frames per second"),
+        ({"sizes": {"past": 16}}, "header lacks or misstates 'width'"),
+        ({"format": "bodyslam-motion-9"}, "format 'bodyslam-motion-9'"),
+    ):
+        changed = np.array(json.dumps(header | changes))
+        np.savez(tmp_path / "header.npz", **(arrays | {"header": changed}))
+        with pytest.raises(ValueError, match=told):
+            load_motion_model(tmp_path / "header.npz")
     with pytest.raises(ValueError, match="25"):
         check_compatible(model, body, 25.0)
     with pytest.raises(ValueError, match="trained on body 'smpl', not 'default'"):
         check_compatible(dataclasses.replace(model, body="smpl"), body, 30.0)
+
+
+def test_weights_for_another_body_stop_a_run_at_its_door(
+    monkeypatch, capsys, tmp_path, model
+):
+    save_motion_model(tmp_path / "m.npz", dataclasses.replace(model, body="smpl"))
+    sequence = Sequence(
+        name="video",
+        frames=None,
+        timestamps=np.arange(30) / 30,
+        intrinsics=Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480),
+    )
+    monkeypatch.setattr(frontend, "read_sequence", lambda *_, **__: sequence)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    argv = ["bodyslam", "run", "video", "--out", str(tmp_path / "run")]
+    argv += ["--motion-model", str(tmp_path / "m.npz")]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    told = str(stopped.value.code)  # text: exit code 1
+    assert "trained on body 'smpl', not 'default'" in told
+    assert len(told.splitlines()) == 1
 
 
 def test_the_shipped_weights_say_what_they_are(model):
@@ -299,6 +334,7 @@ def test_evaluation_of_a_perfect_and_a_shrunken_model(body, model):
     assert set(found) == {"all", "walk", "run", "constant velocity"}
     assert found["all"]["steps"] == 2 * (60 - model.past)
     assert found["constant velocity"]["slope"] == pytest.approx(1, abs=0.1)
+    assert -1 <= found["all"]["corr_30"] <= found["all"]["corr_1"] <= 1
     halved = eqx.tree_at(
         lambda m: m.network.gain, model, jnp.asarray(0.5 * model.network.gain)
     )
@@ -306,6 +342,32 @@ def test_evaluation_of_a_perfect_and_a_shrunken_model(body, model):
     assert half["all"]["slope"] == pytest.approx(0.5 * found["all"]["slope"], rel=1e-5)
     with pytest.raises(ValueError, match="no usable sequence among 1"):
         evaluate_model(model, body, [make_clip(5)], 0.0)
+
+
+def test_correlation_of_errors_is_that_of_what_made_them():
+    """Errors of an AR(1) process, with gaps whose neighbours do not count."""
+    rng, rho, (c, t) = np.random.default_rng(0), 0.8, (60, 200)
+    error = rng.normal(0, 1, (c, t, 3))
+    for k in range(1, t):
+        error[:, k] = rho * error[:, k - 1] + 0.6 * error[:, k]
+    valid = rng.random((c, t)) < 0.8
+    none = np.zeros((c, t))
+    found = error_correlation(
+        Steps(
+            predicted=np.where(valid[..., None], error, 1e3),
+            true=np.zeros((c, t, 3)),
+            previous=np.zeros((c, t, 3)),
+            covariance=np.broadcast_to(np.eye(3), (c, t, 3, 3)),
+            frame=np.broadcast_to(np.eye(3), (c, t, 3, 3)),
+            angle=none,
+            root_angle=none,
+            place=none,
+            valid=valid,
+        )
+    )
+    # three standard errors of 60 sequences are about 0.02
+    for lag in (1, 2, 4, 8):
+        assert found[f"corr_{lag}"] == pytest.approx(rho**lag, abs=0.02)
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,12 @@ from bodyslam_jax.motion._clips import (
     leg_length,
     mirror,
     rest_from_offsets,
+    root_matrices,
     split,
 )
 from bodyslam_jax.motion._noise import CORRELATION
 from bodyslam_jax.motion._readers import gender
+from bodyslam_jax.motion._rotations import matrix, vector
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -99,6 +101,25 @@ def test_amass_both_spellings_of_the_rate(tmp_path, key):
     assert clip.leg_length == pytest.approx(0.8, abs=0.03)
 
 
+def test_amass_with_z_up_holds_the_same_steps(tmp_path):
+    """A world turned so that z is up: from the body, nothing has changed."""
+    clip = make_clip(40)
+    turn = matrix(jnp.array([np.pi / 2, 0.0, 0.0]))
+    root = vector(turn @ matrix(jnp.asarray(clip.poses[:, 0], jnp.float64)))
+    poses = np.zeros((40, 156))
+    poses[:, :66] = clip.poses[:, :22].reshape(40, 66)
+    poses[:, :3] = root
+    trans = clip.trans @ np.asarray(turn).T
+    np.testing.assert_allclose(trans[:, 2], clip.trans[:, 1], atol=1e-6)
+    write_amass(tmp_path / "s" / "walk.npz", 40, 30.0, poses=poses, trans=trans)
+    (found,) = read_motion(tmp_path)
+    steps = lambda c: np.einsum(
+        "tba,tb->ta", root_matrices(c)[:-1], np.diff(c.trans, axis=0)
+    )
+    np.testing.assert_allclose(steps(found), steps(clip), atol=1e-5)
+    assert found.leg_length == pytest.approx(0.86 * 0.9, abs=0.01)
+
+
 @pytest.mark.parametrize("value", [np.array(b"female"), np.array("female")])
 def test_gender_as_text_or_bytes(tmp_path, value):
     write_amass(tmp_path / "s" / "a.npz", gender=value)
@@ -145,8 +166,16 @@ def test_a_folder_without_motion(tmp_path):
         read_motion(tmp_path)
     with pytest.raises(FileNotFoundError):
         read_motion(tmp_path / "nowhere")
-    (tmp_path / "broken.npz").write_bytes(b"PK not really")
-    with pytest.raises(ValueError, match="broken.npz: not a readable"):
+    write_amass(tmp_path / "broken.npz")
+    whole = (tmp_path / "broken.npz").read_bytes()
+    for torn in (b"PK not really", b"", whole[: len(whole) // 2]):
+        (tmp_path / "broken.npz").write_bytes(torn)
+        with pytest.raises(ValueError, match="broken.npz: not a readable"):
+            read_motion(tmp_path)
+    flipped = bytearray(whole)
+    flipped[1000] ^= 255  # within `poses`: the archive's checksum notices
+    (tmp_path / "broken.npz").write_bytes(flipped)
+    with pytest.raises(ValueError, match="broken.npz: `poses` is damaged"):
         read_motion(tmp_path)
 
 

@@ -20,7 +20,7 @@ from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion import load_motion_model, read_motion, split, train
 from bodyslam_jax.motion._losses import loss
-from bodyslam_jax.motion._network import PaperNetwork
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._sampling import corpus, draw
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -226,9 +226,10 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path, body, clips):
     np.savez(file, mark=np.array("something else"))
     with pytest.raises(ValueError, match="other settings or data"):
         train(clips, body, NOISY, checkpoint=file)
-    file.write_bytes(b"torn")
-    with pytest.raises(ValueError, match="not a training checkpoint"):
-        train(clips, body, NOISY, checkpoint=file)
+    for torn in (b"torn", file.read_bytes()[:100]):
+        file.write_bytes(torn)
+        with pytest.raises(ValueError, match="not a training checkpoint"):
+            train(clips, body, NOISY, checkpoint=file)
 
 
 def test_clips_that_are_too_short_are_one_line(body):

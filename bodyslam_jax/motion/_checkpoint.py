@@ -6,6 +6,7 @@ import json
 import os
 from pathlib import Path
 from typing import TypeVar
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -47,10 +48,10 @@ def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:
     **Raises:** `ValueError` if it is damaged or of another run.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             found = str(archive["mark"])
             leaves = [archive[f"leaf_{i}"] for i in range(len(archive.files) - 1)]
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
         raise ValueError(f"{path}: not a training checkpoint ({error}).") from None
     if found != mark:
         raise ValueError(

@@ -1,11 +1,6 @@
-"""How far a motion model can be trusted: error, bias, spread and calibration.
-
-Slope is the projection of predicted on true displacement: 1 is unbiased, and its
-error becomes the error of a scale estimated with the model.
-"""
+"""How far a motion model can be trusted: its predictions of captured motion, judged."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,37 +10,11 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.motion._clips import FPS, Clip, resample
+from bodyslam_jax.motion._measures import Steps, summary
 from bodyslam_jax.motion._noise import disturb, drift
 from bodyslam_jax.motion._placing import Trial, place
 from bodyslam_jax.motion._predict import MotionModel, Prediction, in_dtype, predict
 from bodyslam_jax.motion._rotations import change, matrix, transposed, vector
-
-WINDOW = 30
-"""Frames of the longer slope: one second."""
-
-_CHI2_95 = 7.815
-"""95 % of a chi-square variable with 3 degrees of freedom lies below."""
-
-
-class Steps(NamedTuple):
-    """All valid predictions of a data set, `n` steps in `c` sequences padded to `t`."""
-
-    predicted: Float[np.ndarray, "c t 3"]
-    """Displacement in H_{k-1}, m."""
-    true: Float[np.ndarray, "c t 3"]
-    """The same, from the capture."""
-    previous: Float[np.ndarray, "c t 3"]
-    """The step before, in H_{k-2}: constant velocity."""
-    covariance: Float[np.ndarray, "c t 3 3"]
-    frame: Float[np.ndarray, "c t 3 3"]
-    """True C_{W H_{k-1}}."""
-    angle: Float[np.ndarray, "c t"]
-    """Mean over joints of the predicted posture's error, rad."""
-    root_angle: Float[np.ndarray, "c t"]
-    """Error of the predicted root rotation, rad."""
-    place: Float[np.ndarray, "c t"]
-    """Mean over joints of the predicted posture's error, m."""
-    valid: Bool[np.ndarray, "c t"]
 
 
 @eqx.filter_jit
@@ -152,64 +121,6 @@ def run_trials(
 def _disturbed(poses, keys, sigma, white, root):
     noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
     return disturb(poses, noise.at[:, :, 0].multiply(root))
-
-
-def slope(
-    predicted: Float[np.ndarray, "*n 3"], true: Float[np.ndarray, "*n 3"]
-) -> float:
-    """Projection of predicted on true displacement."""
-    return float((predicted * true).sum() / max(float((true * true).sum()), 1e-12))
-
-
-def summary(
-    steps: Steps, predicted: Float[np.ndarray, "c t 3"] | None = None
-) -> dict[str, float]:
-    """The measures of displacement; `predicted` replaces the model's (baselines)."""
-    valid = steps.valid
-    guess = steps.predicted if predicted is None else predicted
-    error = np.linalg.norm(guess - steps.true, axis=-1)[valid]
-    size = np.linalg.norm(steps.true, axis=-1)[valid]
-    per_sequence = np.array(
-        [
-            slope(g[v], d[v])
-            for g, d, v in zip(guess, steps.true, valid, strict=True)
-            if v.any() and np.linalg.norm(d[v], axis=-1).mean() > 0.01
-        ]
-    )
-    long_guess, long_true = _longer(guess, steps), _longer(steps.true, steps)
-    out = {
-        "steps": float(valid.sum()),
-        "error_mm": 1e3 * float(error.mean()),
-        "step_mm": 1e3 * float(size.mean()),
-        "ratio": float(error.mean() / size.mean()),
-        "slope": slope(guess[valid], steps.true[valid]),
-        "slope_30": slope(long_guess, long_true) if len(long_true) else float("nan"),
-        "spread": float(per_sequence.std()) if len(per_sequence) else float("nan"),
-    }
-    if predicted is None:
-        residual = (steps.predicted - steps.true)[valid].astype(float)
-        covariance = steps.covariance[valid].astype(float)
-        nees = (
-            residual * np.linalg.solve(covariance, residual[..., None])[..., 0]
-        ).sum(-1)
-        out |= {
-            "nees": float(nees.mean() / 3),
-            "coverage_95": float((nees < _CHI2_95).mean()),
-            "posture_deg": float(np.rad2deg(steps.angle[valid].mean())),
-            "root_deg": float(np.rad2deg(steps.root_angle[valid].mean())),
-            "posture_mm": 1e3 * float(steps.place[valid].mean()),
-        }
-    return out
-
-
-def _longer(
-    moves: Float[np.ndarray, "c t 3"], steps: Steps
-) -> Float[np.ndarray, "n 3"]:
-    """Displacements over `WINDOW` frames in the world, wherever all steps are valid."""
-    world = np.einsum("ctab,ctb->cta", steps.frame, moves)
-    sums = np.lib.stride_tricks.sliding_window_view(world, WINDOW, 1).sum(-1)
-    whole = np.lib.stride_tricks.sliding_window_view(steps.valid, WINDOW, 1).all(-1)
-    return sums[whole]
 
 
 def evaluate_model(

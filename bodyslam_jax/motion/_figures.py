@@ -16,8 +16,8 @@ from bodyslam_jax.motion._rollout import Rollout
 from bodyslam_jax.motion._selection import DRIFTS, TARGETS
 
 COLUMNS = (
-    "error_mm step_mm ratio slope slope_30 spread nees coverage_95 posture_deg "
-    "posture_mm"
+    "error_mm step_mm ratio slope slope_30 spread nees coverage_95 corr_1 corr_30 "
+    "posture_deg posture_mm"
 ).split()
 
 
@@ -155,14 +155,21 @@ def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
     epochs = np.arange(1, len(history) + 1)
     left.plot(epochs, history[:, 0], color="k")
     left.set(title="training loss", xlabel="epoch")
+    if (history[:, 0] > 0).all():  # a likelihood may be negative
+        left.set_yscale("log")
     judged = np.isfinite(history[:, 1])
     at, seen = epochs[judged], history[judged]
     for i, (drift_deg, target) in enumerate(zip(DRIFTS, TARGETS, strict=True)):
         (line,) = middle.plot(at, seen[:, 1 + i], label=f"{drift_deg:g}° drift")
         middle.axhline(target, color=line.get_color(), lw=0.7, ls=":")
         right.plot(at, seen[:, 4 + i], color=line.get_color())
-    middle.set(title="validation error / step", xlabel="epoch", ylim=(0, 0.4))
-    middle.legend()
+    middle.set(title="validation error / step", xlabel="epoch")
     right.axhline(1, color="k", lw=0.7)
-    right.set(title="validation slope", xlabel="epoch", ylim=(0.8, 1.1))
+    right.set(title="validation slope", xlabel="epoch")
+    if len(seen):  # the first epochs may be far out
+        middle.legend()
+        late = seen[len(seen) // 5 :]
+        middle.set_ylim(0, 1.1 * max(*TARGETS, late[:, 1:4].max()))
+        low, high = late[:, 4:].min(), late[:, 4:].max()
+        right.set_ylim(min(low, 0.95) - 0.02, max(high, 1.05) + 0.02)
     figure.savefig(path, dpi=120)

@@ -11,12 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.config import MotionTraining
-from bodyslam_jax.motion._network import (
-    MetricNetwork,
-    PaperNetwork,
-    apply_layers,
-    lower_triangle,
-)
+from bodyslam_jax.motion._metric import MetricNetwork
+from bodyslam_jax.motion._network import apply_layers, lower_triangle
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._rotations import change
 from bodyslam_jax.motion._sampling import Batch
 

@@ -10,7 +10,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
-from bodyslam_jax.motion._network import MetricNetwork, PaperNetwork, Window
+from bodyslam_jax.motion._metric import MetricNetwork
+from bodyslam_jax.motion._network import Window
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._rotations import turned
 from bodyslam_jax.motion._turning import straightened, turning_rate
 

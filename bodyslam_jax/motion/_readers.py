@@ -7,6 +7,7 @@ finite numbers, right widths, a rate; errors are one line that names the file.
 import itertools
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -49,12 +50,12 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
 def _read_file(path: Path) -> tuple[Clip, ...]:
     if path.suffix.lower() == ".bvh":
         return (read_bvh(path),)
-    try:
-        opened = np.load(path, allow_pickle=False)
-    except (OSError, EOFError, ValueError):
-        raise ValueError(f"{path}: not a readable .npz file.") from None
-    with opened as archive:
-        names = set(archive.files)
+    with open(path, "rb") as file:
+        try:
+            archive = np.load(file, allow_pickle=False)
+            names = set(archive.files)
+        except (OSError, EOFError, AttributeError, ValueError, BadZipFile):
+            raise ValueError(f"{path}: not a readable .npz file.") from None
         if "seq_start" in names:
             return _read_cmu(path, _taker(path, archive))
         if "trans" in names and names & {"poses", "root_orient", "pose_body"}:
@@ -70,6 +71,8 @@ def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
             raise ValueError(f"{path}: no array `{name}`, only {archive.files}.")
         try:
             return archive[name]
+        except BadZipFile:
+            raise ValueError(f"{path}: `{name}` is damaged; copy it again.") from None
         except ValueError:
             raise ValueError(
                 f"{path}: `{name}` is a pickled object; expected a plain array."

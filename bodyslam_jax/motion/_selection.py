@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.motion._evaluation import run_trials, summary
-from bodyslam_jax.motion._network import PaperNetwork
+from bodyslam_jax.motion._evaluation import run_trials
+from bodyslam_jax.motion._measures import summary
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._placing import Trial
 from bodyslam_jax.motion._predict import MotionModel
 

@@ -22,12 +22,9 @@ from bodyslam_jax.motion._checkpoint import (
 )
 from bodyslam_jax.motion._clips import FPS, Clip, resample
 from bodyslam_jax.motion._losses import loss, posture_goal
-from bodyslam_jax.motion._network import (
-    MetricNetwork,
-    Normalisation,
-    PaperNetwork,
-    normalisation,
-)
+from bodyslam_jax.motion._metric import MetricNetwork
+from bodyslam_jax.motion._network import Normalisation, normalisation
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._placing import Trial, place
 from bodyslam_jax.motion._predict import MotionModel, in_dtype
 from bodyslam_jax.motion._sampling import Batch, Corpus, corpus, draw
@@ -114,6 +111,19 @@ def optimiser(settings: MotionTraining, steps: int) -> optax.GradientTransformat
     adam = optax.adamw(schedule, weight_decay=settings.weight_decay)
     limit = optax.identity() if settings.clip is None else optax.clip(settings.clip)
     return optax.chain(limit, adam)
+
+
+def start(network: MetricNetwork | PaperNetwork, settings: MotionTraining) -> Progress:
+    """Before the first epoch."""
+    moving = eqx.filter(network, trainable(network))
+    return Progress(
+        network=network,
+        average=network,
+        best=network,
+        optimiser=optimiser(settings, 1000).init(moving),  # steps do not matter here
+        history=jnp.full((settings.epochs, 7), jnp.nan, jnp.float32),
+        epoch=jnp.zeros((), jnp.float32),
+    )
 
 
 @eqx.filter_jit
@@ -215,15 +225,7 @@ def train(
     network = initial_network(jax.random.fold_in(key, 0), settings)
     keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
     network = _measure(network, [draw(k, data, body, settings) for k in keys])
-    mask = trainable(network)
-    progress = Progress(
-        network=network,
-        average=network,
-        best=network,
-        optimiser=optimiser(settings, 1000).init(eqx.filter(network, mask)),
-        history=jnp.full((settings.epochs, 7), jnp.nan, jnp.float32),
-        epoch=jnp.zeros((), jnp.float32),
-    )
+    progress = start(network, settings)
     mark = fingerprint(settings, data, body)
     if checkpoint is not None and checkpoint.exists():
         progress = load_checkpoint(checkpoint, progress, mark)

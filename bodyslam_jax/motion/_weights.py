@@ -7,13 +7,15 @@ and metrics.
 import json
 import os
 from pathlib import Path
+from zipfile import BadZipFile
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax.motion._network import MetricNetwork, PaperNetwork
+from bodyslam_jax.motion._metric import MetricNetwork
+from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._predict import MotionModel
 
 _FORMAT = "bodyslam-motion-1"
@@ -64,30 +66,23 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such motion model.")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))
             arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
         raise ValueError(f"{path}: not a motion model ({error}).") from None
     if header.get("format") != _FORMAT:
         raise ValueError(
             f"{path}: format {header.get('format')!r}; expected {_FORMAT!r}."
         )
-    sizes = header["sizes"]
-    key = jax.random.key(0)
-    if header["network"] == "paper":
-        make = lambda: PaperNetwork.init(key, sizes["past"], sizes["width"])
-    else:
-        make = lambda: MetricNetwork.init(
-            key,
-            sizes["past"],
-            tuple(sizes["width"]),
-            sizes["members"],
-            sizes["future"],
-            sizes["posture_frames"],
-            sizes["posture_width"],
-        )
-    like = eqx.filter_eval_shape(make)
+    try:
+        like = _untrained(header)
+        body, fps, about = header["body"], float(header["fps"]), header["about"]
+        past = int(header["sizes"]["past"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: header lacks or misstates {error}.") from None
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"{path}: {fps:g} frames per second; expected more than none.")
     wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
     found = [array.shape for array in arrays]
     if wanted != found:
@@ -100,10 +95,22 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
     network = jax.tree.unflatten(
         jax.tree.structure(like), [jnp.asarray(a, jnp.float32) for a in arrays]
     )
-    return MotionModel(
-        network=network,
-        body=header["body"],
-        fps=float(header["fps"]),
-        past=int(sizes["past"]),
-        about=json.dumps(header["about"]),
-    )
+    return MotionModel(network, body, fps, past, json.dumps(about))
+
+
+def _untrained(header: dict) -> MetricNetwork | PaperNetwork:
+    """Shapes and types of the network that a header describes."""
+    sizes, key = header["sizes"], jax.random.key(0)
+    if header["network"] == "paper":
+        make = lambda: PaperNetwork.init(key, sizes["past"], sizes["width"])
+    else:
+        make = lambda: MetricNetwork.init(
+            key,
+            sizes["past"],
+            tuple(sizes["width"]),
+            sizes["members"],
+            sizes["future"],
+            sizes["posture_frames"],
+            sizes["posture_width"],
+        )
+    return eqx.filter_eval_shape(make)

@@ -1,0 +1,115 @@
+"""What is said of predicted displacements: error, bias, spread, calibration, memory.
+
+Slope is the projection of predicted on true displacement: 1 is unbiased, and its
+error becomes the error of a scale estimated with the model.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+WINDOW = 30
+"""Frames of the longer slope: one second."""
+
+LAGS = (1, 2, 4, 8, 15, 30)
+"""Frames between two errors whose correlation is measured."""
+
+_CHI2_95 = 7.815
+"""95 % of a chi-square variable with 3 degrees of freedom lies below."""
+
+
+class Steps(NamedTuple):
+    """All valid predictions of a data set, `n` steps in `c` sequences padded to `t`."""
+
+    predicted: Float[np.ndarray, "c t 3"]
+    """Displacement in H_{k-1}, m."""
+    true: Float[np.ndarray, "c t 3"]
+    """The same, from the capture."""
+    previous: Float[np.ndarray, "c t 3"]
+    """The step before, in H_{k-2}: constant velocity."""
+    covariance: Float[np.ndarray, "c t 3 3"]
+    frame: Float[np.ndarray, "c t 3 3"]
+    """True C_{W H_{k-1}}."""
+    angle: Float[np.ndarray, "c t"]
+    """Mean over joints of the predicted posture's error, rad."""
+    root_angle: Float[np.ndarray, "c t"]
+    """Error of the predicted root rotation, rad."""
+    place: Float[np.ndarray, "c t"]
+    """Mean over joints of the predicted posture's error, m."""
+    valid: Bool[np.ndarray, "c t"]
+
+
+def slope(
+    predicted: Float[np.ndarray, "*n 3"], true: Float[np.ndarray, "*n 3"]
+) -> float:
+    """Projection of predicted on true displacement."""
+    return float((predicted * true).sum() / max(float((true * true).sum()), 1e-12))
+
+
+def summary(
+    steps: Steps, predicted: Float[np.ndarray, "c t 3"] | None = None
+) -> dict[str, float]:
+    """The measures of displacement; `predicted` replaces the model's (baselines)."""
+    valid = steps.valid
+    guess = steps.predicted if predicted is None else predicted
+    error = np.linalg.norm(guess - steps.true, axis=-1)[valid]
+    size = np.linalg.norm(steps.true, axis=-1)[valid]
+    per_sequence = np.array(
+        [
+            slope(g[v], d[v])
+            for g, d, v in zip(guess, steps.true, valid, strict=True)
+            if v.any() and np.linalg.norm(d[v], axis=-1).mean() > 0.01
+        ]
+    )
+    long_guess, long_true = _longer(guess, steps), _longer(steps.true, steps)
+    out = {
+        "steps": float(valid.sum()),
+        "error_mm": 1e3 * float(error.mean()),
+        "step_mm": 1e3 * float(size.mean()),
+        "ratio": float(error.mean() / size.mean()),
+        "slope": slope(guess[valid], steps.true[valid]),
+        "slope_30": slope(long_guess, long_true) if len(long_true) else float("nan"),
+        "spread": float(per_sequence.std()) if len(per_sequence) else float("nan"),
+    }
+    if predicted is None:
+        residual = (steps.predicted - steps.true)[valid].astype(float)
+        covariance = steps.covariance[valid].astype(float)
+        nees = (
+            residual * np.linalg.solve(covariance, residual[..., None])[..., 0]
+        ).sum(-1)
+        out |= {
+            "nees": float(nees.mean() / 3),
+            "coverage_95": float((nees < _CHI2_95).mean()),
+            "posture_deg": float(np.rad2deg(steps.angle[valid].mean())),
+            "root_deg": float(np.rad2deg(steps.root_angle[valid].mean())),
+            "posture_mm": 1e3 * float(steps.place[valid].mean()),
+        }
+        out |= error_correlation(steps)
+    return out
+
+
+def error_correlation(steps: Steps) -> dict[str, float]:
+    """Correlation of errors in H_{k-1} that are `LAGS` frames apart, as `corr_<lag>`.
+
+    No mean is removed: what is constant over a sequence is an error like another.
+    """
+    error = np.where(steps.valid[..., None], steps.predicted - steps.true, 0.0)
+    found = {}
+    for lag in LAGS:
+        a, b = error[:, :-lag], error[:, lag:]
+        both = steps.valid[:, :-lag] & steps.valid[:, lag:]
+        a, b = a[both], b[both]
+        size = np.sqrt(float((a * a).sum()) * float((b * b).sum()))
+        found[f"corr_{lag}"] = float((a * b).sum()) / size if size > 0 else np.nan
+    return found
+
+
+def _longer(
+    moves: Float[np.ndarray, "c t 3"], steps: Steps
+) -> Float[np.ndarray, "n 3"]:
+    """Displacements over `WINDOW` frames in the world, wherever all steps are valid."""
+    world = np.einsum("ctab,ctb->cta", steps.frame, moves)
+    sums = np.lib.stride_tricks.sliding_window_view(world, WINDOW, 1).sum(-1)
+    whole = np.lib.stride_tricks.sliding_window_view(steps.valid, WINDOW, 1).all(-1)
+    return sums[whole]
