@@ -70,6 +70,11 @@ def run(
 
     **Raises:** `ValueError` if there is nothing to be estimated from, in one line.
     """
+    return _run(sequence, config, cache)[0]
+
+
+def _run(sequence: Sequence, config: Config, cache: Cache) -> tuple[Result, Tracks]:
+    """`run`, and the points of the map as they were seen."""
     _check_length(sequence)
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
@@ -87,7 +92,9 @@ def run(
             Joint,
             lambda: joint_.estimate(seen, cameras, bodies, body, config),
         )
-    return assemble(sequence, config, body, cameras, joint, watch.seconds)
+    result = assemble(sequence, config, body, cameras, joint, watch.seconds)
+    points, keep = cameras.tracks, cameras.keep
+    return result, Tracks(points.frame[keep], points.landmark[keep], points.uv[keep])
 
 
 def before_joint(
@@ -211,7 +218,7 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
     cache = Cache(out / ".cache", describe(sequence))
     export.check_folder(out, cache.source, cache.owner())
     body = body_.load_body_model(config.body_model)
-    result = run(sequence, config, cache=cache)
+    result, tracks = _run(sequence, config, cache)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         result.summary["errors"] = errors(result, truth)
@@ -220,7 +227,11 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
         if config.overlay and sequence.frames is not None:
             with watch("overlay"):
                 view.write_overlay(
-                    partial / "overlay.webm", frontend.frames(sequence), result, body
+                    partial / "overlay.webm",
+                    frontend.frames(sequence),
+                    result,
+                    body,
+                    tracks,
                 )
         result.summary["durations_s"] |= watch.seconds
         export.write_files(partial, result, config)

@@ -104,6 +104,20 @@ def test_missing_parts_are_left_out(tmp_path, body, result):
     assert "Warnings" not in text and "Error against" not in text
 
 
+def test_a_focal_length_that_was_guessed_has_a_card(tmp_path, body):
+    lens = {"guessed": True, "guess_px": 600.0, "focal_px": 512.4}
+    card = lambda lens: _text(
+        _write(
+            tmp_path, dataclasses.replace(_walk(), summary={"intrinsics": lens}), body
+        )
+    )
+    found = card(lens | {"focal_sigma_px": 9.6})
+    assert "512 ± 10 px" in found and "the guess was 600 px" in found
+    kept = card(lens | {"focal_px": 600.0, "focal_sigma_px": None})
+    assert "600 px" in kept and "guessed from the image" in kept
+    assert "Focal length" not in card({"guessed": False, "focal_px": 500.0})
+
+
 def test_absent_people_and_no_map(tmp_path, body):
     result = _walk(people=2)
     present = result.present.copy()

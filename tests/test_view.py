@@ -12,6 +12,7 @@ from bodyslam_jax import view
 from bodyslam_jax.body import joints, load_body_model
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Tracks
+from bodyslam_jax.view import _video
 
 WIDTH, HEIGHT = 160, 120
 
@@ -147,7 +148,7 @@ def test_points_and_their_trails(tmp_path, body):
         np.array([[20.0, 80], [30, 80], [40, 80], [20, 20]]),
     )
     pictures = list(
-        view._pictures(
+        _video.pictures(
             None, iter(()), result, body, tracks, (WIDTH, HEIGHT), np.ones(2)
         )
     )
@@ -159,7 +160,7 @@ def test_the_inset_follows_camera_and_person(body):
     result = _scene(body, num=30)
     result.T_WC[:, 0, 3] = np.linspace(0, 3, 30)
     moving = list(
-        view._pictures(None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2))
+        _video.pictures(None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2))
     )
     corner = np.s_[10:50, -50:-10]
     assert np.abs(moving[29][corner].astype(int) - moving[0][corner]).max() > 60
@@ -171,7 +172,7 @@ def test_a_video_cut_short_is_an_error(tmp_path, body):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(OSError, match="frames written; disk full"):
-        view._check(path, 30)
+        _video.check_length(path, 30)
 
 
 def test_one_frame_and_nobody(tmp_path, body):

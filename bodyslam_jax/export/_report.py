@@ -1,7 +1,6 @@
 """One HTML file that opens offline: what was found, how sure, and how it came about."""
 
 import html
-import math
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -10,11 +9,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bodyslam_jax import evaluation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.export import _facts as facts
 from bodyslam_jax.export import _figures as figures
+from bodyslam_jax.export._cards import cards
 from bodyslam_jax.export._run import plain
+from bodyslam_jax.export._tables import errors_section, folded, table
 from bodyslam_jax.result import Result
 
 
@@ -26,6 +26,7 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
 
     - `stages`: a list of `name`, `cost_before`, `cost_after`, `iterations`, `seconds`;
     - `scale`: `value`, `sigma` (of the value);
+    - `intrinsics`: `guessed`, `guess_px`, `focal_px`, `focal_sigma_px`;
     - `people`: a list, with `stature_sigma_m` if known;
     - `per_frame`: lists of one number (or `None`) per frame, `reprojection_px`,
         `keypoint_px`, `tracks`, `inliers`;
@@ -38,9 +39,9 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     source = summary.get("input") or {}
     name = source.get("name") if isinstance(source, dict) else str(source)
     sections = [
-        _cards(result, summary, camera, people, body),
+        cards(result, summary, camera, people, body),
         _warnings(summary.get("warnings") or []),
-        _errors(summary.get("errors") or {}),
+        errors_section(summary.get("errors") or {}),
         _trajectories(result),
         _motion(result, camera, people),
         _stages(summary),
@@ -101,134 +102,11 @@ def _subtitle(result: Result, source: Any) -> str:
     return " · ".join(words)
 
 
-def _cards(
-    result: Result,
-    summary: Mapping[str, Any],
-    camera: facts.PathFacts,
-    people: Sequence[facts.PathFacts],
-    body: BodyModel,
-) -> str:
-    """The summary that a person understands: how far, how fast, how tall, how sure."""
-    cards = [
-        _card(
-            "Camera",
-            f"{camera.distance:.1f} m",
-            "camera",
-            f"way over the ground, {camera.mean_speed:.2f} m/s on average",
-            f"held {camera.height:.2f} m above the floor",
-        )
-    ]
-    known = summary.get("people") or []
-    for person, way in enumerate(people):
-        near, far = facts.distance_to_camera(result, person)
-        here = f"there for {way.seconds:.1f} s, {near:.1f} to {far:.1f} m away"
-        cards.append(
-            _card(
-                f"Person {person}",
-                f"{way.distance:.1f} m",
-                f"person-{person % 4}",
-                f"way over the ground, {way.mean_speed:.2f} m/s on average",
-                here,
-            )
-        )
-        tall = facts.stature(body, result.betas[person])
-        sigma = known[person].get("stature_sigma_m") if person < len(known) else None
-        plus_minus = "" if sigma is None else f" ± {100 * sigma:.0f}"
-        cards.append(
-            _card(
-                f"Stature of person {person}",
-                f"{100 * tall:.0f}{plus_minus} cm",
-                f"person-{person % 4}",
-                "barefoot, from the estimated shape",
-                "feet on the floor move at "
-                f"{100 * facts.foot_skating(result, person):.0f} cm/s (0 is perfect)",
-            )
-        )
-    scale = summary.get("scale") or {}
-    sigma = scale.get("sigma") if isinstance(scale, dict) else None
-    if sigma is not None and result.scale > 0:
-        percent = 100 * sigma / result.scale
-        cards.append(
-            _card(
-                "How sure are the metres?",
-                f"± {percent:.1f} %",
-                "",
-                "one standard deviation of the scale, as the estimate itself sees it",
-                f"scale {result.scale:.4g} m per unit of the unscaled map",
-            )
-        )
-    else:
-        cards.append(
-            _card(
-                "Scale",
-                f"{result.scale:.4g}",
-                "",
-                "metres per unit of the unscaled map",
-                "its uncertainty was not computed",
-            )
-        )
-    return f'<section class="cards">{"".join(cards)}</section>'
-
-
-def _card(title: str, value: str, color: str, *notes: str) -> str:
-    dot = f'<i style="background: var(--{color})"></i>' if color else ""
-    lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
-    return (
-        f'<div class="card"><h3>{dot}{title}</h3><strong>{value}</strong>{lines}</div>'
-    )
-
-
 def _warnings(warnings: Sequence[str]) -> str:
     if not warnings:
         return ""
     items = "".join(f"<li>{html.escape(str(w))}</li>" for w in warnings)
     return f'<section class="warnings"><h2>Warnings</h2><ul>{items}</ul></section>'
-
-
-def _errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Errors against the truth, one column per estimate that was evaluated."""
-    if not errors:
-        return ""
-    first = [row for row in evaluation.ROWS if row[0] in _FIRST]
-    others = [row for row in evaluation.ROWS if row[0] not in _FIRST]
-    return (
-        "<section><h2>Error against the truth</h2>"
-        "<p>Means over all frames. SE(3) keeps the size that was estimated; Sim(3) "
-        "corrects it with the truth, which is not to be had in the wild.</p>"
-        f"{_error_table(errors, first)}"
-        f"{_folded('More errors', _error_table(errors, others))}</section>"
-    )
-
-
-_FIRST = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe")
-_FIRST += ("wa_mpjpe", "pa_mpjpe", "rte")
-
-
-def _error_table(
-    errors: Mapping[str, Mapping[str, Any]],
-    chosen: Sequence[tuple[str, str, str, float]],
-) -> str:
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in errors)
-    rows = []
-    for key, label, unit, factor in chosen:
-        values = [found.get(key) for found in errors.values()]
-        if any(value is not None for value in values):
-            cells = "".join(f"<td>{_number(v, factor)}</td>" for v in values)
-            name = f"{html.escape(label)}{f', {unit}' if unit else ''}"
-            rows.append(f"<tr><th>{name}</th>{cells}</tr>")
-    return (
-        f'<div class="wide"><table><thead><tr><th></th>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
-
-
-def _number(value: Any, factor: float = 1.0) -> str:
-    if not isinstance(value, (int, float)) or not math.isfinite(value):
-        return "–"
-    value *= factor
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
-    return f"{value:.3g}"
 
 
 def _figure(svg: str, caption: str, kind: str = "full") -> str:
@@ -272,34 +150,11 @@ def _stages(summary: Mapping[str, Any]) -> str:
     parts.append('<div class="two">')
     if stages:
         columns = list(dict.fromkeys(key for stage in stages for key in stage))
-        parts.append(_table(columns, [[s.get(c) for c in columns] for s in stages]))
+        parts.append(table(columns, [[s.get(c) for c in columns] for s in stages]))
     if durations:
         total = ("total", sum(durations.values()))
-        parts.append(_table(["step", "seconds"], [*durations.items(), total]))
+        parts.append(table(["step", "seconds"], [*durations.items(), total]))
     return "".join(parts) + "</div></section>"
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    head = "".join(f"<th>{html.escape(_words(str(c)))}</th>" for c in columns)
-    body = "".join(
-        "<tr>"
-        + "".join(
-            f"<td>{_number(v)}</td>"
-            if isinstance(v, (int, float)) and not isinstance(v, bool)
-            else f"<th>{html.escape(_words('' if v is None else str(v)))}</th>"
-            for v in row
-        )
-        + "</tr>"
-        for row in rows
-    )
-    return (
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
 
 
 _CURVES = (
@@ -307,7 +162,7 @@ _CURVES = (
         "How well it fits",
         "error, px",
         {"reprojection_px": "landmarks", "keypoint_px": "keypoints"},
-        "Median reprojection error of each frame.",
+        "Mean reprojection error of each frame.",
     ),
     (
         "What was seen",
@@ -342,7 +197,7 @@ def _details(result: Result, summary: Mapping[str, Any]) -> str:
         (label, round(float(value), 5))
         for label, value in zip(labels, result.intrinsics, strict=False)
     ]
-    parts = [_folded("Camera intrinsics (px)", _table(["parameter", "value"], lens))]
+    parts = [folded("Camera intrinsics (px)", table(["parameter", "value"], lens))]
     for title, key in (
         ("Counts", "counts"),
         ("Versions", "versions"),
@@ -350,9 +205,5 @@ def _details(result: Result, summary: Mapping[str, Any]) -> str:
     ):
         if summary.get(key):
             text = yaml.safe_dump(summary[key], sort_keys=False)
-            parts.append(_folded(title, f"<pre>{html.escape(text)}</pre>"))
+            parts.append(folded(title, f"<pre>{html.escape(text)}</pre>"))
     return f"<section><h2>Details</h2>{''.join(parts)}</section>"
-
-
-def _folded(title: str, content: str) -> str:
-    return f"<details><summary>{title}</summary>{content}</details>"

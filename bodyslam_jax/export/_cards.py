@@ -1,0 +1,100 @@
+"""The report's first row: how far, how fast, how tall, how sure."""
+
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.export import _facts as facts
+from bodyslam_jax.result import Result
+
+
+def cards(
+    result: Result,
+    summary: Mapping[str, Any],
+    camera: facts.PathFacts,
+    people: Sequence[facts.PathFacts],
+    body: BodyModel,
+) -> str:
+    """The summary that a person understands: how far, how fast, how tall, how sure."""
+    found = [
+        _card(
+            "Camera",
+            f"{camera.distance:.1f} m",
+            "camera",
+            f"way over the ground, {camera.mean_speed:.2f} m/s on average",
+            f"held {camera.height:.2f} m above the floor",
+        )
+    ]
+    known = summary.get("people") or []
+    for person, way in enumerate(people):
+        near, far = facts.distance_to_camera(result, person)
+        here = f"there for {way.seconds:.1f} s, {near:.1f} to {far:.1f} m away"
+        found.append(
+            _card(
+                f"Person {person}",
+                f"{way.distance:.1f} m",
+                f"person-{person % 4}",
+                f"way over the ground, {way.mean_speed:.2f} m/s on average",
+                here,
+            )
+        )
+        tall = facts.stature(body, result.betas[person])
+        sigma = known[person].get("stature_sigma_m") if person < len(known) else None
+        plus_minus = "" if sigma is None else f" ± {100 * sigma:.0f}"
+        found.append(
+            _card(
+                f"Stature of person {person}",
+                f"{100 * tall:.0f}{plus_minus} cm",
+                f"person-{person % 4}",
+                "barefoot, from the estimated shape",
+                "feet on the floor move at "
+                f"{100 * facts.foot_skating(result, person):.0f} cm/s (0 is perfect)",
+            )
+        )
+    scale = summary.get("scale") or {}
+    sigma = scale.get("sigma") if isinstance(scale, dict) else None
+    if sigma is not None and result.scale > 0:
+        percent = 100 * sigma / result.scale
+        found.append(
+            _card(
+                "How sure are the metres?",
+                f"± {percent:.1f} %",
+                "",
+                "one standard deviation of the scale, as the estimate itself sees it",
+                f"scale {result.scale:.4g} m per unit of the unscaled map",
+            )
+        )
+    else:
+        found.append(
+            _card(
+                "Scale",
+                f"{result.scale:.4g}",
+                "",
+                "metres per unit of the unscaled map",
+                "its uncertainty was not computed",
+            )
+        )
+    found += _focal_length(summary.get("intrinsics") or {})
+    return f'<section class="cards">{"".join(found)}</section>'
+
+
+def _focal_length(lens: Mapping[str, Any]) -> list[str]:
+    """A card only where the focal length was not given."""
+    if not lens.get("guessed"):
+        return []
+    guess, sigma = lens["guess_px"], lens.get("focal_sigma_px")
+    if sigma is None:
+        notes = ("guessed from the image's size", "depths are as wrong as it is")
+        return [_card("Focal length", f"{guess:.0f} px", "", *notes)]
+    value = f"{lens['focal_px']:.0f} ± {sigma:.0f} px"
+    notes = ("found from the camera's path", f"the guess was {guess:.0f} px")
+    return [_card("Focal length", value, "", *notes)]
+
+
+def _card(title: str, value: str, color: str, *notes: str) -> str:
+    dot = f'<i style="background: var(--{color})"></i>' if color else ""
+    lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    return (
+        f'<div class="card"><h3>{dot}{title}</h3><strong>{value}</strong>{lines}</div>'
+    )

@@ -1,0 +1,81 @@
+"""Tables of the report, as HTML."""
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bodyslam_jax import evaluation
+
+
+def errors_section(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    """Errors against the truth, one column per estimate that was evaluated."""
+    if not errors:
+        return ""
+    first = [row for row in evaluation.ROWS if row[0] in _FIRST]
+    others = [row for row in evaluation.ROWS if row[0] not in _FIRST]
+    return (
+        "<section><h2>Error against the truth</h2>"
+        "<p>Means over all frames. SE(3) keeps the size that was estimated; Sim(3) "
+        "corrects it with the truth, which is not to be had in the wild.</p>"
+        f"{_error_table(errors, first)}"
+        f"{folded('More errors', _error_table(errors, others))}</section>"
+    )
+
+
+_FIRST = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe")
+_FIRST += ("wa_mpjpe", "pa_mpjpe", "rte")
+
+
+def _error_table(
+    errors: Mapping[str, Mapping[str, Any]],
+    chosen: Sequence[tuple[str, str, str, float]],
+) -> str:
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in errors)
+    rows = []
+    for key, label, unit, factor in chosen:
+        values = [found.get(key) for found in errors.values()]
+        if any(value is not None for value in values):
+            cells = "".join(f"<td>{number(v, factor)}</td>" for v in values)
+            name = f"{html.escape(label)}{f', {unit}' if unit else ''}"
+            rows.append(f"<tr><th>{name}</th>{cells}</tr>")
+    return (
+        f'<div class="wide"><table><thead><tr><th></th>{head}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def number(value: Any, factor: float = 1.0) -> str:
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        return "–"
+    value *= factor
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    head = "".join(f"<th>{html.escape(words(str(c)))}</th>" for c in columns)
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f"<td>{number(v)}</td>"
+            if isinstance(v, (int, float)) and not isinstance(v, bool)
+            else f"<th>{html.escape(words('' if v is None else str(v)))}</th>"
+            for v in row
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def folded(title: str, content: str) -> str:
+    return f"<details><summary>{title}</summary>{content}</details>"
