@@ -82,6 +82,7 @@ for axis in axes:
 #
 # ## What remains
 # The deviation that all six share is no matter of convergence. It is what the motion
-# model makes of these postures on this sequence: regressed postures err slowly, smoother
-# legs step shorter, and a shorter step is a smaller world. `bodyslam experiment scale`
+# model makes of these postures on this sequence: how far a step goes is read off legs
+# that a regressor got wrong, slowly varying, and four seconds are few steps to average
+# over. `bodyslam experiment scale`
 # does the same on longer sequences, `bodyslam experiment table1` with everything free.
