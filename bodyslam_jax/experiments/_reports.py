@@ -79,6 +79,7 @@ def write_table1(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         Column("its standard error", "start_sigma", digits=3),
         Column("estimated / true scale", "scale_ratio", digits=3),
         Column("|1 − s|", "scale_error", digits=3),
+        Column("leg / true leg", "full/leg_ratio", digits=3),
         Column("steps", "steps", digits=0),
         Column("status", "status"),
     ]
@@ -231,6 +232,7 @@ def write_ablation(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         Column("J-ATE SE(3), mm", "j_ate_se3", _MM),
         Column("J-ATE Sim(3), mm", "j_ate_sim3", _MM),
         Column("estimated / true scale", "scale_ratio", digits=3),
+        Column("leg / true leg", "leg_ratio", digits=3),
         Column("steps", "steps", digits=0),
         Column("seconds", "seconds"),
         Column("cost", "cost", digits=0),

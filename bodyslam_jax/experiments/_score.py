@@ -76,13 +76,26 @@ def score(
     present: Bool[Array | np.ndarray, "h t"],
     registered: Bool[Array | np.ndarray, " t"],
 ) -> dict[str, float]:
-    """`errors` of one state as plain numbers, compiled once for many lengths."""
+    """`errors` of one state as plain numbers, compiled once for many lengths.
+
+    `leg_ratio` is the length of the first person's legs over what it should be.
+    """
     frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
     estimate = trajectories(state, body, present, registered, truth.fps)
     found = _errors(
         evaluation.pad_frames(estimate, frames), evaluation.pad_frames(truth, frames)
     )
-    return {name: float(value) for name, value in found.items()}
+    ratio = leg_of(estimate) / leg_of(truth)
+    return {name: float(value) for name, value in found.items()} | {
+        "leg_ratio": float(ratio)
+    }
+
+
+def leg_of(people: Trajectories) -> Float[Array, ""]:
+    """Hip to knee to ankle of the first person, m: a pose does not change it."""
+    first = people.joints[0, 0]
+    bones = first[np.array([4, 5, 7, 8])] - first[np.array([1, 2, 4, 5])]
+    return jnp.sqrt((bones**2).sum(-1)).sum() / 2
 
 
 _errors = eqx.filter_jit(errors)
