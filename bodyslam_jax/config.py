@@ -335,11 +335,14 @@ class Config:
     weights: GraphWeights = GraphWeights()
     solver: Literal["structured", "adam"] = "structured"
     """Second order, or the paper's 200 + 100 first-order steps."""
+    smoothing_hz: float | None = 6.0
+    """People's motion faster than this is taken for noise in the result, Hz; nothing
+    is smoothed without it."""
 
     @classmethod
     def paper(cls) -> "Config":
         """Weights and schedule of section 3.6 of the paper."""
-        return cls(weights=GraphWeights.paper(), solver="adam")
+        return cls(weights=GraphWeights.paper(), solver="adam", smoothing_hz=None)
 
 
 @dataclasses.dataclass(frozen=True)

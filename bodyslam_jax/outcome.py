@@ -14,6 +14,7 @@ from bodyslam_jax import camera, export
 from bodyslam_jax.config import Config
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Sequence, Tracks
+from bodyslam_jax.smoothing import low_pass, low_pass_rotations
 
 FEET = (10, 11)
 """SMPL's foot joints."""
@@ -88,8 +89,9 @@ def assemble(
     landmarks = joint.scale * joint.landmarks @ turn[:3, :3].T + turn[:3, 3]
     root = np.asarray(jaxlie.SO3.from_matrix(jnp.asarray(T_WH[..., :3, :3])).log())
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
+    poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(joint.shapes)))
-    trans = T_WH[..., :3, 3] - rest[:, None, 0]
+    trans = pelvis - rest[:, None, 0]
     shapes = jnp.asarray(joint.shapes)[:, None]
     joints = np.array(
         body_.joints(body, jnp.asarray(poses), shapes, jnp.asarray(trans))
@@ -113,6 +115,19 @@ def assemble(
     )
     summary = summarise(sequence, config, body, cameras, joint, result, seconds)
     return dataclasses.replace(result, summary=summary)
+
+
+def _smoothed(sequence, config, present, poses, pelvis):
+    """People's rotations and paths in the world without what is too fast for them."""
+    if config.smoothing_hz is None:
+        return poses, pelvis
+    how = (sequence.fps, config.smoothing_hz)
+    poses, pelvis = poses.copy(), pelvis.copy()
+    for h, there in enumerate(present):
+        joints = poses[h].reshape(-1, 24, 3)
+        poses[h] = low_pass_rotations(joints, there, *how).reshape(-1, 72)
+        pelvis[h] = low_pass(pelvis[h], there, *how)
+    return poses, pelvis
 
 
 def upright(

@@ -1,0 +1,77 @@
+"""A low pass for postures and paths of people, as gait laboratories apply it.
+
+The optimum follows each frame's keypoints, noise included, and the graph holds
+postures together only by the regressor's correlated errors: to smooth more there would
+shrink the swing of the legs, on which scale rests. So noise is taken out after scale is
+known. Whittaker's smoother minimises `|x - y|² + λ |D² x|²` over each stretch of frames;
+its gain at frequency f is `1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, keeps
+constant speed as it is, and halves amplitudes at the cutoff.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import solveh_banded
+from scipy.spatial.transform import Rotation
+
+
+def low_pass(
+    values: Float[np.ndarray, "t *c"],
+    present: Bool[np.ndarray, " t"],
+    fps: float,
+    cutoff: float,
+) -> Float[np.ndarray, "t *c"]:
+    """Smooths every channel over each run of frames that are `present`.
+
+    `cutoff` is in Hz; from half of `fps` on nothing changes, nor do runs of fewer than
+    three frames.
+    """
+    out = values.astype(float).copy()
+    if cutoff >= fps / 2:
+        return out
+    weight = (2 - 2 * np.cos(2 * np.pi * cutoff / fps)) ** -2
+    edges = np.flatnonzero(np.diff(present.astype(int), prepend=0, append=0))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        n = stop - start
+        if n < 3:
+            continue
+        second = np.diff(np.eye(min(n, 5)), 2, axis=0)
+        corner = weight * second.T @ second
+        bands = np.zeros((3, n))
+        for k in range(3):
+            # Rows repeat between the two ends, where they are those of a short run.
+            row = np.diagonal(corner, k)
+            middle = row[len(row) // 2]
+            full = np.full(n - k, middle)
+            ends = min(2, len(row))
+            full[:ends], full[n - k - ends :] = row[:ends], row[len(row) - ends :]
+            bands[2 - k, k:] = full
+        bands[2] += 1.0
+        flat = out[start:stop].reshape(n, -1)
+        out[start:stop] = solveh_banded(bands, flat).reshape(out[start:stop].shape)
+    return out
+
+
+def low_pass_rotations(
+    angles: Float[np.ndarray, "t *j 3"],
+    present: Bool[np.ndarray, " t"],
+    fps: float,
+    cutoff: float,
+) -> Float[np.ndarray, "t *j 3"]:
+    """`low_pass` of rotation vectors, rad, through their quaternions.
+
+    Signs of quaternions are chosen so that they change little from frame to frame; a
+    rotation may pass through π.
+    """
+    shape = angles.shape
+    q = (
+        Rotation.from_rotvec(angles.reshape(-1, 3))
+        .as_quat()
+        .reshape(len(angles), -1, 4)
+    )
+    same = np.sign((q[1:] * q[:-1]).sum(-1))
+    sign = np.cumprod(np.where(same < 0, -1.0, 1.0), axis=0)
+    q[1:] *= sign[..., None]
+    smooth = low_pass(q, present, fps, cutoff).reshape(-1, 4)
+    found = Rotation.from_quat(smooth).as_rotvec().reshape(shape)
+    keep = present.reshape(-1, *(1,) * (angles.ndim - 1))
+    return np.where(keep, found, angles)
