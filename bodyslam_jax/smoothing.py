@@ -2,8 +2,8 @@
 
 The optimum follows each frame's keypoints, noise included, and the graph holds
 postures together only by the regressor's correlated errors: to smooth more there would
-shrink the swing of the legs, on which scale rests. So noise is taken out after scale is
-known. Whittaker's smoother minimises `|x - y|² + λ |D² x|²` over each stretch of frames;
+shrink the swing of the legs, on which scale rests. So noise is taken out after scale
+is known. Whittaker's smoother minimises `|x - y|² + λ |D² x|²` over each run of frames;
 its gain at frequency f is `1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, keeps
 constant speed as it is, and halves amplitudes at the cutoff.
 """
@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 
 def low_pass(
-    values: Float[np.ndarray, "t *c"],
+    values: Float[np.ndarray, " t *channels"],
     present: Bool[np.ndarray, " t"],
     fps: float,
     cutoff: float,
-) -> Float[np.ndarray, "t *c"]:
+) -> Float[np.ndarray, " t *channels"]:
     """Smooths every channel over each run of frames that are `present`.
 
     `cutoff` is in Hz; from half of `fps` on nothing changes, nor do runs of fewer than
