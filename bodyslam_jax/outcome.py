@@ -18,6 +18,8 @@ from bodyslam_jax.smoothing import low_pass, low_pass_rotations
 
 FEET = (10, 11)
 """SMPL's foot joints."""
+_GROUND_DOUBT, _GROUND_DISTRUST = 1.15, 1.4
+"""Factors between the map's size and that of the people on its ground."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,6 +177,17 @@ def summarise(
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
         )
+    ground = export.ground_scale(result) if cameras.kind == "moving" else None
+    apart = max(ground, 1 / ground) if ground else 1.0
+    if apart > _GROUND_DOUBT:
+        text = (
+            f"the ground of the map would be under the people's feet if the map were "
+            f"{ground:.2f} times as large: scale, postures or focal length are off, or "
+            "they stand on something else."
+        )
+        warnings.append(text)
+        if status == "ok" and apart > _GROUND_DISTRUST:
+            status = "not to be trusted: people do not stand on the ground of the map"
     way = export.camera_facts(result)
     persons = []
     for h in range(len(result.poses)):
@@ -225,6 +238,7 @@ def summarise(
             "sigma": joint.scale_sigma,
             "start": joint.scale_start,
             "start_standard_error": joint.scale_start_error,
+            "ground_factor": ground,
         },
         "people": persons,
         "counts": {

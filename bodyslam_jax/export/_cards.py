@@ -63,6 +63,7 @@ def cards(
                 "",
                 "one standard deviation of the scale, as the estimate itself sees it",
                 f"scale {result.scale:.4g} m per unit of the unscaled map",
+                *_on_the_ground(scale.get("ground_factor")),
             )
         )
     else:
@@ -77,6 +78,13 @@ def cards(
         )
     found += _focal_length(summary.get("intrinsics") or {})
     return f'<section class="cards">{"".join(found)}</section>'
+
+
+def _on_the_ground(factor: float | None) -> list[str]:
+    """What the ground of the map says of the scale, which was found without it."""
+    if factor is None:
+        return []
+    return [f"people on the map's ground would make it {100 * (factor - 1):+.0f} %"]
 
 
 def _focal_length(lens: Mapping[str, Any]) -> list[str]:
