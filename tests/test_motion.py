@@ -295,9 +295,9 @@ def made_up_track(prediction, orientation, scale, rng, outliers=0.0):
     return camera, offset + np.where(wrong[:, None], rng.normal(0, 1, (t, 3)), 0.0)
 
 
-@pytest.mark.parametrize(("outliers", "tolerance"), [(0.0, 1e-6), (0.1, 0.05)])
-def test_scale_is_found_by_regression(outliers, tolerance):
-    rng, t = np.random.default_rng(0), 200
+def made_up_walk(seed, t, outliers):
+    """Prediction, orientation, camera and offset, where the scale is 2.5."""
+    rng = np.random.default_rng(seed)
     orientation = np.asarray(matrix(jnp.asarray(rng.normal(0, 1, (t, 3)))))
     prediction = Prediction(
         translation=jnp.asarray(rng.normal(0.02, 0.01, (t, 3))),
@@ -306,12 +306,24 @@ def test_scale_is_found_by_regression(outliers, tolerance):
         rotation=jnp.zeros((t, 3)),
         valid=jnp.arange(t) > 7,
     )
-    camera, offset = made_up_track(prediction, orientation, 2.5, rng, outliers)
+    track = made_up_track(prediction, orientation, 2.5, rng, outliers)
+    return prediction, orientation, *track
+
+
+@pytest.mark.parametrize(("outliers", "tolerance"), [(0.0, 1e-6), (0.1, 0.05)])
+def test_scale_is_found_by_regression(outliers, tolerance):
+    prediction, orientation, camera, offset = made_up_walk(0, 200, outliers)
     found = scale_from_motion(prediction, orientation, camera, offset)
     assert found.value == pytest.approx(2.5, rel=tolerance)
     assert found.standard_error < 0.2
     still = scale_from_motion(prediction, orientation, 0 * camera, offset)
     assert np.isnan(still.value) and np.isinf(still.standard_error)
+
+
+def test_the_scale_of_a_few_seconds_has_a_standard_error():
+    """Windows of two seconds are too few in them to tell; shorter ones are not."""
+    found = [scale_from_motion(*made_up_walk(seed, 100, 0.1)) for seed in range(8)]
+    assert all(0 < scale.standard_error < 0.2 for scale in found)
 
 
 def test_a_rollout_stays_a_motion(model, body, walk):

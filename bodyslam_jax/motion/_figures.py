@@ -142,7 +142,7 @@ def draw_rollout(
                 axis.plot(ends @ heading, ends @ vertical, color=color, lw=1)
         axis.set_aspect("equal")
     axis.set(xlabel="m ahead", ylabel="m to the left")
-    figure.axes[0].set(ylabel="m up", title=f"every {every / FPS:g} s")
+    figure.axes[0].set(ylabel="m up", title=f"every {every / FPS:.2g} s")
     figure.savefig(path, dpi=120)
 
 

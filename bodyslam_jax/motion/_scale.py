@@ -65,7 +65,9 @@ def scale_from_motion(
         return Scale(float("nan"), float("inf"), {})
     chosen = [n for n in found if n >= 5] or list(found)
     value = float(np.median([found[n] for n in chosen]))
-    best = min(chosen, key=lambda n: abs(found[n] - value))
+    # a short sequence has too few long windows for an error of theirs
+    sure = [n for n in chosen if np.isfinite(errors[n])] or chosen
+    best = min(sure, key=lambda n: abs(found[n] - value))
     apart = np.std([found[n] for n in chosen])
     parts = (errors[best], apart, _MODEL_SPREAD * told[best])
     return Scale(value, float(np.linalg.norm(parts)), found)
