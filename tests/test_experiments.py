@@ -148,7 +148,7 @@ def test_tables_as_text():
     columns = [
         _tables.Column("sequence", "sequence"),
         _tables.Column("error, mm", "error", 1e3),
-        _tables.Column("scale", "scale", digits=3),
+        _tables.Column("|1 - s|", "scale", digits=3),
         _tables.Column("status", "status"),
     ]
     rows = [
@@ -156,7 +156,7 @@ def test_tables_as_text():
         {"sequence": "E2", "error": 0.0508, "scale": None, "status": "converged"},
     ]
     assert _tables.markdown(columns, rows, mean=True).splitlines() == [
-        "| sequence | error, mm | scale | status |",
+        r"| sequence | error, mm | \|1 - s\| | status |",
         "| --- | --- | --- | --- |",
         "| E1 | 44.3 | 0.940 | converged |",
         "| E2 | 50.8 | – | converged |",

@@ -50,7 +50,8 @@ def markdown(
             last.append(column.text(sum(numbers) / len(rows)) if known else "")
         last[0] = "**mean**"
         lines.append(last)
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
 
 
 def to_csv(columns: Sequence[Column], rows: Sequence[dict[str, Any]]) -> str:
