@@ -356,7 +356,8 @@ def test_kill_9_loses_nothing(tmp_path, data):
     while not checkpoint.exists() and killed.poll() is None:
         time.sleep(0.01)
     killed.send_signal(signal.SIGKILL)
-    assert killed.wait() == -signal.SIGKILL
+    killed.communicate()
+    assert killed.returncode == -signal.SIGKILL
     assert checkpoint.exists() and not (tmp_path / "killed.npz").exists()
     again = start("killed.npz")
     told = again.communicate()[1].decode()

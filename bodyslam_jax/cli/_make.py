@@ -68,7 +68,7 @@ def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
     columns = (
         progress.TextColumn("epoch"),
         progress.MofNCompleteColumn(),
-        progress.BarColumn(),
+        progress.BarColumn(bar_width=16),
         progress.TimeRemainingColumn(),
         progress.TextColumn("{task.description}"),
     )
@@ -79,7 +79,9 @@ def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
 
         def report(epoch: int, epochs: int, measures: dict[str, float]) -> None:
             told = ", ".join(f"{name} {value:.3f}" for name, value in measures.items())
-            bar.update(task, completed=epoch, total=epochs, description=told)
+            ratios = [f"{v:.2f}" for name, v in measures.items() if "ratio" in name]
+            brief = " ".join([f"loss {measures['loss']:.3g}", *ratios])
+            bar.update(task, completed=epoch, total=epochs, description=brief)
             if not terminal.is_terminal:
                 log.info("epoch %d of %d: %s", epoch, epochs, told)
 
