@@ -35,7 +35,8 @@ plt.rcParams["figure.dpi"] = 70
 # %% [markdown]
 # ## A short sequence
 # Cameras are held where bundle adjustment left them and landmarks are left out: what is
-# looked at is how the person is weighed, and a solve takes a second.
+# looked at is how the person is weighed, and a solve takes a second. `make_trial` solves
+# the problem once; with other weights the solution is near.
 
 # %%
 case = experiments.make_case(Simulation(sequence="M2", family="follow", length=80))
@@ -76,11 +77,13 @@ axes[1].set(ylabel="estimated / true scale")
 axes[2].set(ylabel="J-ATE after SE(3), mm")
 for axis in axes:
     axis.set(xlabel="factor on σ", xscale="log")
+    axis.set_xticks(factors, [f"{factor:g}" for factor in factors])
+    axis.minorticks_off()
     axis.grid(alpha=0.3)
 _ = axes[0].legend(fontsize=8)
 
 # %% [markdown]
-# The cost says nothing about weights: it falls whenever a σ grows. The error does.
+# The cost says nothing about weights: it falls wherever a σ grows. The error does.
 #
 # ## Its gradient, through the solver
 # By the implicit function theorem, beside central differences of the solves above.

@@ -40,13 +40,13 @@ WEIGHTS: dict[str, tuple[type[graph.AbstractFactor], str]] = {
 SCALE_UNIT, JOINT_UNIT = 0.05, 0.05
 """What counts as an error of 1: in log s, and in J-ATE, m."""
 SCHEDULE = (solver.Stage(),)
-"""People have been solved for alone before: no first step is needed."""
+"""From a solution with other weights no first step is needed."""
 PRIOR = 0.02
 """Cost of a weight that is off by a factor e: few sequences decide little."""
 
 
 class Trial(eqx.Module):
-    """A problem, where it starts, and what is true: one sequence of training."""
+    """A problem, a state near its solution, and the truth: one sequence of training."""
 
     problem: graph.Problem
     state: graph.State
@@ -68,12 +68,16 @@ class Learned:
 
 
 def make_trial(case: Case, prepared: joint.Prepared, *, hold_cameras: bool) -> Trial:
-    """The problem of a case; with `hold_cameras` without landmarks, and far cheaper."""
+    """The problem of a case and its solution with the weights as they are.
+
+    With `hold_cameras` there are no landmarks, and a solve is far cheaper.
+    """
     problem, state = prepared.problem, prepared.state
     if hold_cameras:
         problem, state = without_map(problem, state, hold_cameras=True)
+    solution = solver.solve(problem, state, schedule=solver.PAPER_SCHEDULE)
     registered = jnp.asarray(case.cameras.registered)
-    return Trial(problem, state, case.truth, case.body, registered)
+    return Trial(problem, solution.state, case.truth, case.body, registered)
 
 
 def names_of(problem: graph.Problem) -> tuple[str, ...]:
