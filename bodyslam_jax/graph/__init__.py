@@ -1,5 +1,10 @@
 """What is estimated, and why: state, error terms, problem."""
 
+from bodyslam_jax.graph._abstract import AbstractFactor as AbstractFactor
+from bodyslam_jax.graph._abstract import AbstractFrameFactor as AbstractFrameFactor
+from bodyslam_jax.graph._abstract import Frame as Frame
+from bodyslam_jax.graph._abstract import Shared as Shared
+from bodyslam_jax.graph._abstract import residual_of as residual_of
 from bodyslam_jax.graph._extras import BODY25_FEET as BODY25_FEET
 from bodyslam_jax.graph._extras import CameraPrior as CameraPrior
 from bodyslam_jax.graph._extras import CameraSmoothness as CameraSmoothness
@@ -10,16 +15,12 @@ from bodyslam_jax.graph._extras import RootTurning as RootTurning
 from bodyslam_jax.graph._extras import SquarePixels as SquarePixels
 from bodyslam_jax.graph._extras import StanceFoot as StanceFoot
 from bodyslam_jax.graph._extras import UpDirection as UpDirection
-from bodyslam_jax.graph._factors import AbstractFactor as AbstractFactor
-from bodyslam_jax.graph._factors import AbstractFrameFactor as AbstractFrameFactor
-from bodyslam_jax.graph._factors import Frame as Frame
 from bodyslam_jax.graph._factors import HumanMotion as HumanMotion
 from bodyslam_jax.graph._factors import JointReprojection as JointReprojection
 from bodyslam_jax.graph._factors import OrientationChange as OrientationChange
 from bodyslam_jax.graph._factors import Posture as Posture
 from bodyslam_jax.graph._factors import Reprojection as Reprojection
 from bodyslam_jax.graph._factors import Shape as Shape
-from bodyslam_jax.graph._factors import Shared as Shared
 from bodyslam_jax.graph._factors import displacement as displacement
 from bodyslam_jax.graph._factors import rotation_between as rotation_between
 from bodyslam_jax.graph._factors import runs as runs

@@ -5,12 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph._factors import (
-    AbstractFrameFactor,
-    Touch,
-    _log,
-    unit_length,
-)
+from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
+from bodyslam_jax.graph._factors import _log, unit_length
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 
 BODY25_FEET = (19, 21, 22, 24)

@@ -1,14 +1,7 @@
 """Error terms of the factor graph, in the order of Section 3.6 of the paper.
 
-A residual is prediction minus measurement in standard deviations, so that
-`0.5 * sum(rho(|residual|^2))` is a negative log-likelihood. Missing is `sigma = inf` on
-a finite value. A factor over frames is written once, for one frame of one person
-(`local`), with the variables it touches; the rest (all frames at once, blocks of the
-Jacobian) follows from that. Henning et al., BodySLAM, ECCV 2022.
+Henning et al., BodySLAM, ECCV 2022. What they have in common is in `_abstract.py`.
 """
-
-import abc
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,110 +11,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.camera import project
+from bodyslam_jax.graph._abstract import (
+    AbstractFactor,
+    AbstractFrameFactor,
+    Frame,
+    Shared,
+    Touch,
+)
+from bodyslam_jax.graph._displacement import before, displacements
 from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
 from bodyslam_jax.motion import leg_length
-
-Touch = tuple[str, int]
-"""A variable and how many frames back: `("camera", 1)` is the previous camera."""
-
-
-class Frame(eqx.Module):
-    """One frame of one person; people's fields are `None` for a camera's factor."""
-
-    camera: Float[Array, "*b 4 4"]
-    root: Float[Array, "*b 4 4"] | None
-    pose: Float[Array, "*b 23 3"] | None
-
-
-class Shared(eqx.Module):
-    """What all frames of one person share."""
-
-    scale: Float[Array, ""]
-    shape: Float[Array, " 10"] | None
-    intrinsics: Float[Array, " i"]
-
-
-class AbstractFactor(eqx.Module):
-    """Measurements of one kind, and how far a state is from explaining them."""
-
-    loss: eqx.AbstractVar[AbstractLoss]
-
-    @abc.abstractmethod
-    def residual(self, state: State) -> Float[Array, "*m d"]:
-        """Whitened, before the loss; one measurement has the last axis."""
-
-    def cost(self, state: State) -> Float[Array, ""]:
-        """Negative log-likelihood: `0.5 sum rho(|r|^2)`."""
-        s = jnp.sum(self.residual(state) ** 2, axis=-1)
-        return 0.5 * jnp.sum(self.loss.rho(s))
-
-
-class AbstractFrameFactor(AbstractFactor):
-    """A factor for each frame of each person, or of the camera."""
-
-    of_people: eqx.AbstractClassVar[bool]
-    frame_fields: eqx.AbstractClassVar[tuple[str, ...]]
-    """Fields with leading axes `h t` (or `t`): what is padded to a common length."""
-    per_joint = False
-    """Whether row j of the residual depends on joint j of the touched poses alone."""
-
-    @property
-    @abc.abstractmethod
-    def touches(self) -> tuple[Touch, ...]:
-        """Among `camera`, `root`, `pose` with a lag, and `scale`, `shape`,
-        `intrinsics` with lag 0."""
-
-    @abc.abstractmethod
-    def data(self) -> Any:
-        """Measurements, leading axes `h t` (or `t`, for a factor of the camera)."""
-
-    @abc.abstractmethod
-    def local(
-        self, data: Any, window: tuple[Frame, ...], shared: Shared
-    ) -> Float[Array, "*m d"]:
-        """The residual of one frame; `window[lag]` is the frame that far back."""
-
-    def jacobian(
-        self, data: Any, window: tuple[Frame, ...], shared: Shared
-    ) -> tuple[Float[Array, "*m d"], dict[Touch, Float[Array, "*m d n"]]] | None:
-        """The residual and, if known in closed form, its derivative by each touch."""
-        return None
-
-    @property
-    def num_lags(self) -> int:
-        return 1 + max(lag for _, lag in self.touches)
-
-    def map_frames(self, function, state: State, extra: Any = None):
-        """`function(data, window, shared, extra)` over frames, and people if any.
-
-        A window repeats the first frame where there is none before; factors carry no
-        weight there.
-        """
-
-        def back(x, lag):
-            return x[jnp.maximum(jnp.arange(x.shape[0]) - lag, 0)]
-
-        def one(data, extra, roots, poses, shape):
-            windows = tuple(
-                Frame(
-                    back(state.cameras, lag),
-                    None if roots is None else back(roots, lag),
-                    None if poses is None else back(poses, lag),
-                )
-                for lag in range(self.num_lags)
-            )
-            shared = Shared(state.scale, shape, state.intrinsics)
-            over = lambda d, w, e: function(d, w, shared, e)
-            return jax.vmap(over)(data, windows, extra)
-
-        if not self.of_people:
-            return one(self.data(), extra, None, None, None)
-        return jax.vmap(one)(self.data(), extra, state.roots, state.poses, state.shapes)
-
-    def residual(self, state: State) -> Float[Array, "*m d"]:
-        return self.map_frames(lambda d, w, s, _: self.local(d, w, s), state)
 
 
 class Reprojection(AbstractFactor):
@@ -165,14 +66,15 @@ class JointReprojection(AbstractFrameFactor):
     def data(self):
         return self.pixel, self.sigma
 
+    def residual(self, state: State) -> Float[Array, "h t j 2"]:
+        shape = state.shapes[:, None]
+        p_H = local_keypoints(self.body, state.poses, shape, self.layout, self.bias)
+        root = state.roots
+        p_C = p_H @ root[..., :3, :3].swapaxes(-1, -2) + root[..., None, :3, 3]
+        return (project(state.intrinsics, p_C) - self.pixel) / self.sigma[..., None]
+
     def local(self, data, window, shared):
-        pixel, sigma = data
-        (frame,) = window
-        p_H = local_keypoints(
-            self.body, frame.pose, shared.shape, self.layout, self.bias
-        )
-        p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
-        return (project(shared.intrinsics, p_C) - pixel) / sigma[:, None]
+        return self.jacobian(data, window, shared)[0]
 
     def jacobian(self, data, window, shared):
         pixel, sigma = data
@@ -192,7 +94,11 @@ class JointReprojection(AbstractFrameFactor):
         turn = jnp.cross(p_H[:, None, :], by_H)
         return (seen - pixel) / sigma[:, None], {
             ("root", 0): jnp.concatenate([turn, by_C], axis=-1),
-            ("pose", 0): jnp.einsum("kdi,ikm->kdm", by_H, by_pose),
+            # Fused products: a matrix product for each keypoint would be too small.
+            ("pose", 0): sum(
+                (by_H[..., i, None] * by_pose[i][:, None] for i in (1, 2)),
+                by_H[..., 0, None] * by_pose[0][:, None],
+            ),
             ("shape", 0): by_H @ by_shape,
             ("intrinsics", 0): by_intrinsics / sigma[:, None, None],
         }
@@ -245,9 +151,38 @@ class HumanMotion(AbstractFrameFactor):
         leg = unit_length(self.body, shared)
         error = displacement(window[1], window[0], shared.scale) / leg - translation
         if self.correlated:
-            before = displacement(window[2], window[1], shared.scale) / leg - previous
-            error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
+            last = displacement(window[2], window[1], shared.scale) / leg - previous
+            error = (error - correlation * last) / jnp.sqrt(1 - correlation**2)
         return whitening @ error
+
+    def jacobians(self, state):
+        d, parts = displacements(state)
+        jac = jnp.concatenate(list(parts.values()), axis=-1)
+        leg = jnp.ones_like(state.shapes[:, :1])
+        if self.body is not None:
+            one = jax.value_and_grad(lambda b: leg_length(self.body, b))
+            leg, by_shape = jax.vmap(one)(state.shapes)
+            leg = leg[:, None]
+            by_shape = -d[..., None] * (by_shape / leg**2)[:, None, None]
+            jac = jnp.concatenate([jac / leg[..., None, None], by_shape], axis=-1)
+        error = d / leg[..., None] - self.translation
+        whitening, last = self.whitening, jnp.zeros_like(jac)
+        if self.correlated:
+            rho = self.correlation[..., None]
+            error = error - rho * before(error)
+            whitening = whitening / jnp.sqrt(1 - rho**2)[..., None]
+            last = -rho[..., None] * before(jac)
+        now, last = whitening @ jac, whitening @ last
+        six = lambda x, i: x[..., 6 * i : 6 * i + 6]
+        touches: dict[Touch, Array] = {("scale", 0): (now + last)[..., 24:25]}
+        for i, name in enumerate(("camera", "root")):
+            touches[name, 0] = six(now, 2 * i)
+            touches[name, 1] = six(now, 2 * i + 1) + six(last, 2 * i)
+            if self.correlated:
+                touches[name, 2] = six(last, 2 * i + 1)
+        if self.body is not None:
+            touches["shape", 0] = (now + last)[..., 25:]
+        return (whitening @ error[..., None])[..., 0], touches
 
 
 class Posture(AbstractFrameFactor):
@@ -285,23 +220,30 @@ class Posture(AbstractFrameFactor):
         rotation, previous, sigma, correlation = data
         error = rotation_between(rotation, window[0].pose)
         if self.correlated:
-            before = rotation_between(previous, window[1].pose)
-            error = (error - correlation * before) / jnp.sqrt(1 - correlation**2)
+            last = rotation_between(previous, window[1].pose)
+            error = (error - correlation * last) / jnp.sqrt(1 - correlation**2)
         return error / sigma[:, None]
 
-    def jacobian(self, data, window, shared):
-        rotation, previous, sigma, correlation = data
-        error = rotation_between(rotation, window[0].pose)
-        by_now = inverse_right_jacobian(error) / sigma[:, None, None]
+    def residual(self, state: State) -> Float[Array, "h t 23 3"]:
+        return self._innovation(rotation_between(self.rotation, state.poses))[0]
+
+    def jacobians(self, state):
+        error = rotation_between(self.rotation, state.poses)
+        residual, now, earlier = self._innovation(error)
+        by_error = inverse_right_jacobian(error)
+        parts: dict[Touch, Array] = {("pose", 0): now[..., None] * by_error}
+        if self.correlated:
+            parts["pose", 1] = earlier[..., None] * before(by_error)
+        return residual, parts
+
+    def _innovation(self, error):
+        """The residual, and what it takes of this frame's error and the last one's."""
+        rho = self.correlation[..., None, None]
+        now = 1 / (self.sigma[..., None] * jnp.sqrt(1 - rho**2))
+        earlier = -rho * now
         if not self.correlated:
-            return error / sigma[:, None], {("pose", 0): by_now}
-        before = rotation_between(previous, window[1].pose)
-        by_before = -correlation * inverse_right_jacobian(before) / sigma[:, None, None]
-        spread = jnp.sqrt(1 - correlation**2)
-        return (error - correlation * before) / (spread * sigma[:, None]), {
-            ("pose", 0): by_now / spread,
-            ("pose", 1): by_before / spread,
-        }
+            return error / self.sigma[..., None], 1 / self.sigma[..., None], earlier
+        return now * error + earlier * before(error), now, earlier
 
 
 class Shape(AbstractFrameFactor):

@@ -6,7 +6,6 @@ turn `R_j Exp(δ_j)` of joint j carries what hangs below it:
 add to a vertex. Forward differentiation of the chain takes twenty times as long.
 """
 
-import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -19,7 +18,7 @@ from bodyslam_jax.body import (
     BodyModel,
     rest_joints,
 )
-from bodyslam_jax.body._skeleton import KEYPOINT_JOINT, LEVELS, SURFACE_POINTS
+from bodyslam_jax.body._skeleton import KEYPOINT_JOINT, SURFACE_POINTS
 
 
 def _ancestors() -> np.ndarray:
@@ -56,26 +55,45 @@ def keypoint_jacobian(
     )
     features = body.pose_dirs.shape[-1]
 
-    def points(shape):
-        rest = rest_joints(body, shape)
-        G, x = _chain(R, rest)
-        shaped = body.template[vertex] + body.shape_dirs[vertex] @ shape
-        if features:
-            change = (R - jnp.eye(3, dtype=dtype)).reshape(207)[:features]
-            shaped = shaped + body.pose_dirs[vertex] @ change
-        on_skin = shaped[:, None] - rest[joint]
-        at_joint = jnp.asarray(bias, dtype) * jnp.asarray(offset, dtype)
-        arm = jnp.where(skinned[:, None, None], on_skin, at_joint[:, None])
-        placed = x[joint] + jnp.einsum("knij,knj->kni", G[joint], arm)
-        return jnp.sum(weight[..., None] * placed, axis=1), (placed, G, x)
-
-    by_shape, (placed, G, x) = jax.jacfwd(points, has_aux=True)(shape)
-    position = jnp.sum(weight[..., None] * placed, axis=1)
-    below = jnp.asarray(_ancestors()[1:], dtype)[:, joint] * weight
-    mass = jnp.sum(below, axis=-1)
-    moment = jnp.einsum("jkn,kni->jki", below, placed) - mass[..., None] * x[1:, None]
+    rest = rest_joints(body, shape)
+    by_shape_rest = body.joint_shape_dirs.reshape(24, 3, 10)
+    G = _turns(R)
+    # Places are linear in the offsets of joints from their parents, and these in shape.
+    parent = jnp.array(PARENTS[1:])
+    by_shape_offset = by_shape_rest[1:] - by_shape_rest[parent]
+    carried = _times(G[parent], by_shape_offset).reshape(23, 30)
+    path = jnp.asarray(_ancestors()[1:], dtype)
+    offsets = (rest[1:] - rest[parent])[..., None]
+    x = path.T @ _times(G[parent], offsets)[..., 0]
+    by_shape_x = path.T @ carried
+    shaped = body.template[vertex] + body.shape_dirs[vertex] @ shape
+    if features:
+        change = (R - jnp.eye(3, dtype=dtype)).reshape(207)[:features]
+        shaped = shaped + body.pose_dirs[vertex] @ change
+    at_joint = jnp.asarray(bias, dtype) * jnp.asarray(offset, dtype)
+    on_skin = skinned[:, None, None]
+    arm = jnp.where(on_skin, shaped[:, None] - rest[joint], at_joint[:, None])
+    # What each joint carries of each keypoint: dense, as gathered 3 x 3 are slow.
+    carries = (joint[..., None] == jnp.arange(24, dtype=joint.dtype)).astype(
+        dtype
+    ) * weight[..., None]
+    share = jnp.sum(carries, axis=1).T
+    lever = jnp.einsum("kni,knc->ikc", carries, arm)
+    placed = share[..., None] * x[:, None] + _times(lever, G.swapaxes(-1, -2))
+    position = jnp.sum(placed, axis=0)
+    by_shape_arm = jnp.where(
+        on_skin[..., None], body.shape_dirs[vertex][:, None] - by_shape_rest[joint], 0.0
+    )
+    by_shape_lever = jnp.einsum("kni,kncs->icks", carries, by_shape_arm)
+    moved = G.swapaxes(0, 1).reshape(3, 72) @ by_shape_lever.reshape(72, -1)
+    by_shape = (share.T @ by_shape_x).reshape(-1, 3, 10)
+    by_shape = by_shape + moved.reshape(3, -1, 10).swapaxes(0, 1)
+    # All that hangs below a joint, about that joint.
+    moment = (path @ placed.reshape(24, -1)).reshape(23, -1, 3)
+    moment = moment - (path @ share)[..., None] * x[1:, None]
     # One column for each axis of each joint, 69 in a row.
-    arm = [jnp.repeat(moment[..., i].T, 3, axis=1) for i in range(3)]
+    wide = jnp.broadcast_to(moment[:, :, :, None], (*moment.shape, 3))
+    arm = [wide[:, :, i].swapaxes(0, 1).reshape(-1, 69) for i in range(3)]
     axis = [G[1:, i, :].reshape(69) for i in range(3)]
     by_pose = [
         axis[1] * arm[2] - axis[2] * arm[1],
@@ -89,24 +107,24 @@ def keypoint_jacobian(
         dirs = jnp.pad(body.pose_dirs[vertex], ((0, 0), (0, 0), (0, 207 - features)))
         dirs = dirs.reshape(len(names), 3, 23, 9)
         bent = jnp.einsum("kcjp,jap->kcja", dirs, turned.reshape(23, 3, 9))
-        frame = jnp.einsum("kn,knij->kij", weight, G[joint])
+        frame = (share.T @ G.reshape(24, 9)).reshape(-1, 3, 3)
         moved = jnp.einsum("kic,kcm->ikm", frame, bent.reshape(len(names), 3, 69))
         moved = jnp.where(skinned[:, None], moved, 0.0)
         by_pose = [by_pose[i] + moved[i] for i in range(3)]
     return position, jnp.stack(by_pose), by_shape
 
 
-def _chain(R, rest):
-    """Rotations `24 3 3` and places `24 3` of the joints, one level of the tree at a
-    time; the levels are in the order of the joints."""
-    offset = rest[1:] - rest[jnp.array(PARENTS[1:])]
-    G = jnp.eye(3, dtype=R.dtype)[None]
-    x = jnp.zeros((1, 3), R.dtype)
-    for level in LEVELS:
-        parent = jnp.array([PARENTS[k] for k in level])
-        here = slice(level[0] - 1, level[-1])
-        x = jnp.concatenate(
-            [x, x[parent] + jnp.einsum("kij,kj->ki", G[parent], offset[here])]
-        )
-        G = jnp.concatenate([G, jnp.einsum("kij,kjl->kil", G[parent], R[here])])
-    return G, x
+def _turns(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
+    """Rotations of the joints in H: each doubles the length of path it has covered."""
+    G = jnp.concatenate([jnp.eye(3, dtype=R.dtype)[None], R])
+    above = np.maximum(np.array(PARENTS), 0)
+    for _ in range(4):  # 2^4 is more than the depth of the tree
+        G = _times(G[above], G)
+        above = above[above]
+    return G
+
+
+def _times(a: Float[Array, "*b i c"], b: Float[Array, "*b c j"]) -> Array:
+    """A product of many small matrices, fused: a call for each would take longer."""
+    term = lambda c: a[..., :, c, None] * b[..., c, None, :]
+    return sum((term(c) for c in range(1, a.shape[-1])), term(0))

@@ -69,15 +69,20 @@ def make_layout(
     widths = _choose_widths(span[seen], num_chunks)
     order = np.lexsort((frame, landmark))
     begin = np.searchsorted(landmark[order], np.arange(num_landmarks + 1))
-    buckets = []
-    lower = 0
-    for width in widths:
+    parts = []
+    for lower, width in zip((0, *widths), widths):
         members = np.flatnonzero(seen & (span > lower) & (span <= width))
-        lower = width
         if len(members):
-            buckets.append(
-                _fill(members, start, width, num_chunks, frame, order, begin)
-            )
+            chunk = np.minimum(start[members], num_chunks - width)
+            parts.append((members, chunk, width))
+    size = min(
+        (16, 32, 48, 64),
+        key=lambda g: sum(
+            np.sum(-(-np.bincount(chunk) // g)) * (g * width + 8)
+            for _, chunk, width in parts
+        ),
+    )
+    buckets = [_fill(*part, size, frame, order, begin) for part in parts]
     return Layout(tuple(buckets), num_chunks, max(widths[-1], 2))
 
 
@@ -97,16 +102,12 @@ def _choose_widths(span, num_chunks):
     return best
 
 
-def _fill(members, start, width, num_chunks, frame, order, begin):
+def _fill(members, chunk, width, size, frame, order, begin):
     """The tables of one bucket: landmarks by first chunk, `size` to a group."""
     num_rows, num_landmarks = len(order), len(begin) - 1
-    chunk = np.minimum(start[members], num_chunks - width)
     members = members[np.argsort(chunk, kind="stable")]
     chunk = np.sort(chunk)
     counts = np.bincount(chunk)
-    size = min(
-        (16, 32, 48, 64), key=lambda g: np.sum(-(-counts // g)) * (g * width + 8)
-    )
     rank = np.arange(len(members)) - np.searchsorted(chunk, chunk)
     groups_before = np.concatenate([[0], np.cumsum(-(-counts // size))])
     group = groups_before[chunk] + rank // size

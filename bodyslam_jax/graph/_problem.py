@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
 from bodyslam_jax.graph._factors import (
-    AbstractFactor,
-    AbstractFrameFactor,
     HumanMotion,
     OrientationChange,
     Posture,

@@ -49,10 +49,13 @@ class State(eqx.Module):
 
     def retract(self, step: Step) -> "State":
         """Moves by `step`: rotations through the exponential map, the rest added."""
+        poses = jnp.concatenate([self.cameras[None], self.roots])
+        steps = jnp.concatenate([step.cameras[None], step.roots])
+        moved = retract_pose(poses, steps)
         return State(
             scale=self.scale + step.scale,
-            cameras=retract_pose(self.cameras, step.cameras),
-            roots=retract_pose(self.roots, step.roots),
+            cameras=moved[0],
+            roots=moved[1:],
             poses=retract_rotation(self.poses, step.poses),
             shapes=self.shapes + step.shapes,
             landmarks=self.landmarks + step.landmarks,

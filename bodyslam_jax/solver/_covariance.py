@@ -13,21 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, world_from_root
-from bodyslam_jax.solver._chunks import CAMERAS, Factor
-from bodyslam_jax.solver._landmarks import half_inverse
-from bodyslam_jax.solver._linearise import (
-    Linearisation,
-    Sizes,
-    gather,
-    linearise,
-    own_to_global,
-    sizes_of,
-)
-from bodyslam_jax.solver._normal import damped, diagonals, eliminate
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
+from bodyslam_jax.solver._chunks import Factor
+from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
+from bodyslam_jax.solver._levenberg_marquardt import Final, little
+from bodyslam_jax.solver._normal import damped, diagonals
 from bodyslam_jax.solver._padding import pad
-
-RELATIVE_DAMPING = {"float64": 1e-11, "float32": 1e-6}
-"""Keeps a direction that nothing determines finite, and its variance enormous."""
+from bodyslam_jax.solver._solve import method_of, run
 
 
 class Marginals(eqx.Module):
@@ -46,21 +38,29 @@ class Marginals(eqx.Module):
     """Of `s l'`, m^2"""
 
 
-@eqx.filter_jit
 def marginals(problem: Problem, state: State) -> Marginals:
     """Marginal covariances at a solution: the inverse of `J^T J`.
 
     They count for as much as the weights do: sigmas that are standard deviations, and
-    correlated errors modelled as such.
+    correlated errors modelled as such. The equations are set up by the program that
+    `solve` has compiled, in a schedule without steps.
     """
     t, l = len(state.cameras), len(state.landmarks)
     problem, state = pad(problem, state)
-    problem = problem.refresh(state)
+    method = method_of((), 0.0, state.scale.dtype, keep=True)
+    _, final = run(problem, state, method)
+    spread = _marginals(problem, state, final)
+    cut = {"cameras": spread.cameras[:t], "people": spread.people[:, :t]}
+    return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})
+
+
+@eqx.filter_jit
+def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)
-    lin = linearise(problem, gather(problem), state)
-    little = jnp.asarray(RELATIVE_DAMPING[state.scale.dtype.name], state.scale.dtype)
-    damping = damped(diagonals(lin, sizes), little)
-    factor = eliminate(problem, lin, sizes, damping).factor
+    lin, factor = final.lin, final.factor
+    damping = damped(
+        diagonals(lin, sizes), jnp.asarray(little(state.scale.dtype), state.scale.dtype)
+    )
     fronts, windows, common = _selected_inverse(factor, sizes)
     common = common * _outer(_free_globals(problem, sizes))
     cameras, people = _centres(problem, state, sizes, fronts)
@@ -70,13 +70,13 @@ def marginals(problem: Problem, state: State) -> Marginals:
     shapes = common[1 + i :, 1 + i :].reshape(h, 10, h, 10)
     return Marginals(
         scale=common[0, 0],
-        cameras=cameras[:t],
-        people=people[:, :t],
+        cameras=cameras,
+        people=people,
         intrinsics=common[1 : 1 + i, 1 : 1 + i],
         shapes=jnp.stack([shapes[p, :, p] for p in range(h)])
         if h
         else jnp.zeros((0, 10, 10), common.dtype),
-        landmarks=landmarks[:l],
+        landmarks=landmarks,
     )
 
 

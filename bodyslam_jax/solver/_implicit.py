@@ -14,8 +14,10 @@ import jax.numpy as jnp
 
 from bodyslam_jax.graph import Problem, Reprojection, State, Step
 from bodyslam_jax.solver._baselines import mask_of
-from bodyslam_jax.solver._linearise import Linearisation, gather, linearise, sizes_of
+from bodyslam_jax.solver._blocks import Linearisation, sizes_of
+from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver._tables import gather
 
 _LITTLE = {"float64": 1e-9, "float32": 1e-5}
 

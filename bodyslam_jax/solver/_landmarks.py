@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK, Problem
-from bodyslam_jax.solver._linearise import LandmarkBlocks, Sizes, frames_of
+from bodyslam_jax.solver._blocks import LandmarkBlocks, Sizes
+from bodyslam_jax.solver._tables import frames_of
 
 CAMERAS = 6 * CHUNK
 

@@ -11,15 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, Step
-from bodyslam_jax.solver._chunks import (
+from bodyslam_jax.solver._assembly import assemble
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global
+from bodyslam_jax.solver._chunks import Factor, back_substitute, factorise
+from bodyslam_jax.solver._landmarks import (
     CAMERAS,
-    Factor,
-    assemble,
-    back_substitute,
-    factorise,
+    eliminate_landmarks,
+    substitute_landmarks,
 )
-from bodyslam_jax.solver._landmarks import eliminate_landmarks, substitute_landmarks
-from bodyslam_jax.solver._linearise import Linearisation, Sizes, own_to_global
 from bodyslam_jax.solver._people import (
     POSE,
     Border,
@@ -73,6 +72,7 @@ def damped(diagonal: dict, damping: Float[Array, ""]) -> dict:
     return jax.tree.map(add, diagonal)
 
 
+@eqx.filter_jit
 def eliminate(
     problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
 ) -> Eliminated:
@@ -86,6 +86,7 @@ def eliminate(
     return Eliminated(damping, postures, border, factorise(chunks, sizes))
 
 
+@eqx.filter_jit
 def solve_step(
     problem: Problem,
     state: State,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.solver._linearise import Linearisation, Sizes
+from bodyslam_jax.solver._blocks import Linearisation, Sizes
 
 POSE = 69
 
@@ -52,11 +52,11 @@ class Border(eqx.Module):
 class Postures(eqx.Module):
     """What elimination leaves, and what back-substitution needs; axes `h n`."""
 
-    inverse: Float[Array, "h n e 69 69"]
+    inverse: Float[Array, "e h n 69 69"]
     """Inverse of each pivot, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "h n e 69 b"]
+    solved: Float[Array, "e h n 69 b"]
     """Pivot inverse times border columns."""
-    link: Float[Array, "h n e *joint r r"]
+    link: Float[Array, "e h n *joint r r"]
     """Coupling of the next frame (rows) with each eliminated one; joint by joint (23
     of 3 x 3) where joints do not interact over time."""
     separator: Float[Array, "h n 69 69"]
@@ -98,7 +98,9 @@ def _link_times(link: Array, x: Float[Array, "h n 69 c"]) -> Float[Array, "h n 6
     if link.ndim == 4:
         return link @ x
     rows = x.reshape(*x.shape[:2], 23, 3, x.shape[-1])
-    return jnp.einsum("hnjab,hnjbc->hnjac", link, rows).reshape(x.shape)
+    # Three fused products: a matrix product for each joint would be far too small.
+    term = lambda b: link[..., b, None] * rows[..., b, None, :]
+    return (term(0) + term(1) + term(2)).reshape(x.shape)
 
 
 def pose_diagonal(lin: Linearisation) -> Float[Array, "h t 69"]:
@@ -125,30 +127,60 @@ def eliminate_postures(
     inner_first = lambda x: jnp.moveaxis(x, 2, 0)
 
     def step(carry, following):
-        pivot, columns = carry
+        pivot, columns, update = carry
         next_own, forward, next_raw = following
         inverse = invert(pivot)
         product = inverse @ columns
+        update = update - jnp.einsum("hnka,hnkb->hnab", columns, product)
         half = _link_times(forward, inverse).swapaxes(-1, -2)
         next_pivot = next_own - _link_times(forward, half)
         next_columns = next_raw - _link_times(forward, product)
-        return (next_pivot, next_columns), (inverse, product, columns)
+        return (next_pivot, next_columns, update), (inverse, product)
 
-    start = own[:, :, 0], raw[:, :, 0]
+    width = border.rhs + 1
+    start = own[:, :, 0], raw[:, :, 0], jnp.zeros((h, n, width, width), own.dtype)
     rest = tuple(inner_first(x[:, :, 1:]) for x in (own, link, raw))
-    (pivot, columns), kept = jax.lax.scan(step, start, rest)
-    inverse, product, kept = (jnp.moveaxis(x, 0, 2) for x in kept)
-    tall = lambda x: x.reshape(h, n, (CHUNK - 1) * POSE, border.rhs + 1)
-    update = jnp.einsum("hnka,hnkb->hnab", tall(kept), tall(product))
-    return Postures(inverse, product, link[:, :, 1:], pivot, columns, -update)
+    (pivot, columns, update), (inverse, product) = jax.lax.scan(step, start, rest)
+    return Postures(inverse, product, rest[1], pivot, columns, update)
 
 
 def invert(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """Inverse of a positive definite matrix; NaN if it is not."""
-    lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
-    eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
-    half = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
+    """Inverse of positive definite matrices; NaN where one is not."""
+    half = _invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
     return half.swapaxes(-1, -2) @ half
+
+
+def _invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """Inverse of triangular matrices, halved until little is left: matrix products are
+    ten times as fast as substitution.
+
+    Without LAPACK's: two of jaxlib's batched solves at the same time (0.10.2, on two
+    cores) wait for each other's threads for ever.
+    """
+    n = lower.shape[-1]
+    if n <= 24:
+        return _substitute(lower)
+    cut = n // 2
+    first = _invert_lower(lower[..., :cut, :cut])
+    last = _invert_lower(lower[..., cut:, cut:])
+    mixed = -last @ (lower[..., cut:, :cut] @ first)
+    top = jnp.concatenate([first, jnp.zeros_like(mixed.swapaxes(-1, -2))], axis=-1)
+    return jnp.concatenate([top, jnp.concatenate([mixed, last], axis=-1)], axis=-2)
+
+
+def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """The same, one row after another taken from all below it."""
+    index = jnp.arange(lower.shape[-1])
+
+    def one(k, inverse):
+        column = jax.lax.dynamic_index_in_dim(lower, k, -1)
+        pivot = jax.lax.dynamic_index_in_dim(column, k, -2)
+        row = jax.lax.dynamic_index_in_dim(inverse, k, -2) / pivot
+        below = jnp.where((index > k)[:, None], column, 0.0)
+        return jnp.where((index == k)[:, None], row, inverse - below * row)
+
+    eye = jnp.broadcast_to(jnp.eye(len(index), dtype=lower.dtype), lower.shape)
+    return jax.lax.fori_loop(0, len(index), one, eye)
 
 
 def _border_columns(lin, border, link, cut):
@@ -185,7 +217,6 @@ def substitute_postures(
     separator_step: Float[Array, "h n 69"],
 ) -> Float[Array, "h t 69"]:
     """Steps of all postures from those of the border (without the rhs column)."""
-    inner_first = lambda x: jnp.moveaxis(x, 2, 0)
 
     def step(following, kept):
         inverse, solved, link = kept
@@ -196,7 +227,6 @@ def substitute_postures(
         return here, here
 
     kept = postures.inverse, postures.solved, postures.link
-    kept = tuple(inner_first(x) for x in kept)
     _, steps = jax.lax.scan(step, separator_step, kept, reverse=True)
     steps = jnp.concatenate([jnp.moveaxis(steps, 0, 2), separator_step[:, :, None]], 2)
     return steps.reshape(steps.shape[0], -1, POSE)

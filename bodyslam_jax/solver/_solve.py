@@ -13,6 +13,7 @@ from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
 from bodyslam_jax.solver._levenberg_marquardt import (
+    Final,
     History,
     StructuredLevenbergMarquardt,
     lifted,
@@ -40,6 +41,10 @@ PAPER_SCHEDULE = (
 """Section 3.6: first where cameras and people are, then everything."""
 
 
+HISTORY = 64
+"""The length of a history is a multiple of this: schedules share a compilation."""
+
+
 class Solution(eqx.Module):
     """The best state found. What failed says so in `status`; a state is never NaN."""
 
@@ -51,6 +56,8 @@ class Solution(eqx.Module):
     """Of each stage."""
     num_steps: tuple[Array, ...]
     """Iterations of each stage, accepted or not."""
+    first_cost: Float[Array, ""]
+    """Negative log-likelihood at the start, with the motion predicted there."""
 
     @property
     def status(self) -> str:
@@ -99,37 +106,71 @@ def solve(
     )
 
 
+def method_of(
+    schedule: tuple[Stage, ...], damping: float, dtype, *, keep: bool = False
+) -> StructuredLevenbergMarquardt:
+    """The solver of a schedule: of two stages at least, of which one may be idle, so
+    that one stage, two, and none (for covariances) are the same program."""
+    idle = Stage(max_steps=0)
+    stages = (*schedule, *(idle,) * (2 - len(schedule)))
+    longest = max(stage.max_steps for stage in stages)
+    return StructuredLevenbergMarquardt(
+        free=jnp.asarray([[v in s.free for v in VARIABLES] for s in stages], dtype),
+        limit=jnp.asarray([s.max_steps for s in stages]),
+        rtol=jnp.asarray([s.rtol for s in stages], dtype),
+        damping=jnp.asarray(damping, dtype),
+        keep=jnp.asarray(keep),
+        length=HISTORY * max(1, -(-longest // HISTORY)),
+    )
+
+
 @eqx.filter_jit
-def _solve_padded(problem, state, schedule, damping):
-    histories, counts = [], []
-    result = optx.RESULTS.successful
-    cost = problem.cost(state)
-    for stage in schedule:
-        now = restrict(problem, stage.free)
-        method = StructuredLevenbergMarquardt(
-            rtol=stage.rtol, damping=damping, max_history=stage.max_steps
-        )
-        found = optx.least_squares(
-            lifted, method, state, now, max_steps=stage.max_steps, throw=False
-        )
-        better = jnp.isfinite(found.stats["cost"])
-        state = jax.tree.map(
-            lambda new, old, b=better: jnp.where(b, new, old), found.value, state
-        )
-        cost, result = found.stats["cost"], found.result
-        histories.append(found.stats["history"])
-        counts.append(found.stats["num_steps"])
-    return Solution(state, result, cost, tuple(histories), tuple(counts))
+def run(
+    problem: Problem, state: State, method: StructuredLevenbergMarquardt
+) -> tuple[Solution, Final]:
+    """All stages on a padded problem, and the equations where they end."""
+    found = optx.least_squares(
+        lifted, method, state, problem, max_steps=None, throw=False
+    )
+    stats = found.stats
+    better = jnp.isfinite(stats["cost"])
+    best = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old), found.value, state
+    )
+    stages = range(len(method.limit))
+    histories = tuple(jax.tree.map(lambda x: x[i], stats["history"]) for i in stages)
+    counts = tuple(stats["steps"][i] for i in stages)
+    solution = Solution(
+        state=best,
+        result=found.result,
+        cost=stats["cost"],
+        histories=histories,
+        num_steps=counts,
+        first_cost=stats["first_cost"],
+    )
+    return solution, stats["final"]
 
 
 @eqx.filter_custom_vjp
 def _differentiable(problem, state, schedule, damping):
-    return _solve_padded(problem, state, schedule, damping)
+    return _solve(problem, state, schedule, damping)
+
+
+def _solve(problem, state, schedule, damping):
+    method = method_of(schedule, damping, state.scale.dtype)
+    now = restrict(problem, tuple(name for stage in schedule for name in stage.free))
+    solution, _ = run(now, state, method)
+    used = len(schedule)
+    return dataclasses.replace(
+        solution,
+        histories=solution.histories[:used],
+        num_steps=solution.num_steps[:used],
+    )
 
 
 @_differentiable.def_fwd
 def _forward(perturbed, problem, state, schedule, damping):
-    solution = _solve_padded(problem, state, schedule, damping)
+    solution = _solve(problem, state, schedule, damping)
     return solution, solution.state
 
 
@@ -160,10 +201,10 @@ def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
 
 
 def _solve_baseline(problem, state, solver, schedule):
-    run = getattr(_baselines, solver)
+    run, first = getattr(_baselines, solver), problem.cost(state)
     counts = []
     result = optx.RESULTS.successful
     for stage in schedule:
         state, count, result = run(restrict(problem, stage.free), state, stage)
         counts.append(count)
-    return Solution(state, result, problem.cost(state), (), tuple(counts))
+    return Solution(state, result, problem.cost(state), (), tuple(counts), first)

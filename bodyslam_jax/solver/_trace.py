@@ -9,12 +9,9 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.solver._levenberg_marquardt import (
-    StructuredLevenbergMarquardt,
-    lifted,
-)
+from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._padding import pad, unpad
-from bodyslam_jax.solver._solve import Stage, restrict
+from bodyslam_jax.solver._solve import Stage, method_of, restrict
 
 
 def trace(
@@ -43,9 +40,7 @@ def trace(
 
 
 def _stage(problem, state, see, stage, damping):
-    method = StructuredLevenbergMarquardt(
-        rtol=stage.rtol, damping=damping, max_history=stage.max_steps
-    )
+    method = method_of((stage,), damping, state.scale.dtype)
     start = method.init(lifted, state, problem, {}, None, None, frozenset())
     arrays, static = eqx.partition(start, eqx.is_array)
 

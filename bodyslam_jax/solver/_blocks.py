@@ -1,0 +1,115 @@
+"""The blocks of the normal equations, and how many of them there are.
+
+Names of blocks: `("pose", "root", d)` couples the pose of frame k with the root of
+frame k - d; `alone` is a camera without a person.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bodyslam_jax.graph import Problem, State
+
+
+class Sizes(eqx.Module):
+    """Static sizes of a linearised problem."""
+
+    people: int = eqx.field(static=True)
+    chunks: int = eqx.field(static=True)
+    bandwidth: int = eqx.field(static=True)
+    intrinsics: int = eqx.field(static=True)
+    """0 where they are held."""
+    variables: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def own_globals(self) -> int:
+        """Scale, intrinsics and the shape of one person."""
+        return 1 + self.intrinsics + 10
+
+    @property
+    def globals(self) -> int:
+        """Scale, intrinsics and all shapes."""
+        return 1 + self.intrinsics + 10 * self.people
+
+
+class LandmarkBlocks(eqx.Module):
+    """One bucket: `n` groups of `g` landmarks over `f` frames."""
+
+    cross: Float[Array, "n f 6 3 g"]
+    """Camera against landmark."""
+    cross_intrinsics: Float[Array, "n i 3 g"]
+    own: Float[Array, "n 3 3 g"]
+    gradient: Float[Array, "n 3 g"]
+
+
+class Linearisation(eqx.Module):
+    """Blocks of `J^T J` and of the gradient `J^T r` at a state, and its cost."""
+
+    blocks: dict[tuple[str, str, int], Array]
+    """Per person (but for cameras alone) and frame."""
+    gradient: dict[str, Array]
+    globals: Float[Array, "g g"]
+    globals_gradient: Float[Array, " g"]
+    landmarks: tuple[LandmarkBlocks, ...]
+    costs: Float[Array, " k"]
+    """Of each factor."""
+
+
+class Observations(eqx.Module):
+    """Measurements of landmarks, gathered once per solve.
+
+    The tables of all buckets, one after another, cut into `u` pieces of a chunk's `b`
+    frames by `g` landmarks.
+    """
+
+    pixel: Float[Array, "u b 2 g"]
+    weight: Float[Array, "u b g"]
+    """1 / sigma; 0 in the holes."""
+    chunk: Int[Array, " u"]
+    landmark: Int[Array, "u g"]
+
+
+class Sums:
+    """Adds blocks up by name, while tracing."""
+
+    def __init__(self, sizes: Sizes, state: State):
+        self.sizes = sizes
+        self.blocks: dict[tuple[str, str, int], Array] = {}
+        self.gradient: dict[str, Array] = {}
+        self.costs: list[Array] = []
+        dtype = state.scale.dtype
+        self.globals = jnp.zeros((sizes.globals, sizes.globals), dtype)
+        self.globals_gradient = jnp.zeros(sizes.globals, dtype)
+
+    def add(self, key: tuple[str, str, int], value: Array) -> None:
+        known = self.blocks.get(key)
+        self.blocks[key] = value if known is None else known + value
+
+    def add_gradient(self, name: str, value: Array) -> None:
+        known = self.gradient.get(name)
+        self.gradient[name] = value if known is None else known + value
+
+    def add_globals(self, person: int | None, hessian: Array, gradient: Array) -> None:
+        """Adds what one person's own globals (or the camera's) gathered."""
+        index = own_to_global(self.sizes, person)
+        self.globals = self.globals.at[index[:, None], index[None, :]].add(hessian)
+        self.globals_gradient = self.globals_gradient.at[index].add(gradient)
+
+
+def sizes_of(problem: Problem, state: State) -> Sizes:
+    held = "intrinsics" not in problem.variables
+    return Sizes(
+        people=state.roots.shape[0],
+        chunks=problem.layout.num_chunks,
+        bandwidth=problem.layout.bandwidth,
+        intrinsics=0 if held else state.intrinsics.shape[0],
+        variables=problem.variables,
+    )
+
+
+def own_to_global(sizes: Sizes, person: int | None) -> Array:
+    """Where scale, intrinsics and the shape of a person stand among all globals."""
+    common = jnp.arange(1 + sizes.intrinsics)
+    if person is None:
+        return common
+    return jnp.concatenate([common, len(common) + 10 * person + jnp.arange(10)])
