@@ -3,6 +3,7 @@
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
     python benchmarks/bench_solver.py breakdown --frames 1000
+    python benchmarks/bench_solver.py peers --peer-python PYTHON
 
 The generator is the project's own and seeded. Compilation is outside the clock and
 given by itself; all solvers' results are judged by one cost function. Set
@@ -12,7 +13,10 @@ is beside wall time, which on a shared machine says little.
 
 import argparse
 import functools
+import subprocess
+import tempfile
 import time
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -22,13 +26,16 @@ import numpy as np
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
 from bodyslam_jax.camera import project
-from bodyslam_jax.solver import Stage, solve
-from bodyslam_jax.solver._chunks import assemble, factorise
+from bodyslam_jax.solver import Stage, marginals, solve
+from bodyslam_jax.solver._assembly import assemble
+from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._chunks import factorise
 from bodyslam_jax.solver._landmarks import eliminate_landmarks
-from bodyslam_jax.solver._linearise import gather, linearise, sizes_of
+from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, solve_step
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._people import border_of, eliminate_postures
+from bodyslam_jax.solver._tables import gather
 
 INTRINSICS = np.array([900.0, 900.0, 640.0, 360.0])
 TRACK = 16.0
@@ -99,8 +106,8 @@ def make_tracks(frames, cameras, scale, rng, per_frame=9.6):
     return points, frame, landmark
 
 
-def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03):
-    """A problem, its true state, and a start."""
+def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03, loss=None, draw=0):
+    """A problem, its true state, and a start; `draw` numbers the noise on one scene."""
     rng = np.random.default_rng(seed)
     scale, cameras, roots, poses = make_scene(frames, people, rng)
     points, frame, landmark = make_tracks(frames, cameras, scale, rng)
@@ -120,6 +127,8 @@ def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03):
     )
     pixel = np.array(project(truth.intrinsics, array(p_C)), float)
     seen = p_C[:, 2] > 0.3
+    missing = rng.random((people, frames, 25)) < 0.1
+    rng = np.random.default_rng((seed, draw))
     pixel += rng.standard_normal(pixel.shape)
     wrong = rng.random(len(pixel)) < outliers
     pixel[wrong] += rng.uniform(-80, 80, (wrong.sum(), 2))
@@ -130,24 +139,23 @@ def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03):
             landmark=jnp.asarray(landmark),
             pixel=array(pixel),
             sigma=array(np.ones(len(frame))),
-            loss=g.Cauchy(1.5),
+            loss=g.Cauchy(1.5) if loss is None else loss,
         )
     ]
     if people:
-        factors += person(truth, rng, array)
+        factors += person(truth, missing, rng, array, loss)
     problem = g.make_problem(factors, truth)
     return problem, truth, start_of(problem, truth, rng, array)
 
 
-def person(truth, rng, array):
+def person(truth, missing, rng, array, loss):
     h, t = truth.roots.shape[:2]
     body = load_body_model(dtype=truth.scale.dtype)
     p_H = local_keypoints(body, truth.poses, truth.shapes[:, None], "body25")
     p_C = jnp.einsum("htij,htkj->htki", truth.roots[..., :3, :3], p_H)
     pixel = project(truth.intrinsics, p_C + truth.roots[..., None, :3, 3])
     pixel = np.asarray(pixel, float) + 4.0 * rng.standard_normal(pixel.shape)
-    sigma = np.full((h, t, 25), 4.0)
-    sigma[rng.random(sigma.shape) < 0.1] = np.inf
+    sigma = np.where(missing, np.inf, 4.0)
     blank = g.HumanMotion(
         translation=array(np.zeros((h, t, 3))),
         whitening=array(np.zeros((h, t, 3, 3))),
@@ -165,7 +173,10 @@ def person(truth, rng, array):
     measured = truth.shapes[:, None] + array(0.5 * rng.standard_normal((h, 1, 10)))
     return [
         g.JointReprojection(
-            body=body, pixel=array(pixel), sigma=array(sigma), loss=g.GemanMcClure(16.0)
+            body=body,
+            pixel=array(pixel),
+            sigma=array(sigma),
+            loss=g.GemanMcClure(16.0) if loss is None else loss,
         ),
         g.HumanMotion(
             translation=moved + array(slow(0.01, 0.8, (h, t, 3))),
@@ -242,6 +253,107 @@ def report(name, problem, truth, start, schedule, repeats):
     return solution
 
 
+def peers(frames, python, repeats, rtol):
+    """Ceres and this solver, in turn, on one problem; costs by one function."""
+    problem, truth, start = make(frames, 0)
+    (factor,) = (f for f in problem.factors if isinstance(f, g.Reprojection))
+    assert isinstance(factor.loss, g.Cauchy)
+    cost_of = eqx.filter_jit(lambda s: problem.cost(s))
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "problem.npz", Path(folder) / "result.npz"
+        np.savez(
+            given,
+            cameras=start.cameras,
+            points=start.landmarks,
+            intrinsics=start.intrinsics,
+            frame=factor.frame,
+            landmark=factor.landmark,
+            pixel=factor.pixel,
+            loss=factor.loss.scale,
+            rtol=rtol,
+        )
+        script = Path(__file__).with_name("peer_ceres.py")
+        times = []
+        for _ in range(repeats):
+            subprocess.run([python, str(script), str(given), str(found)], check=True)
+            with np.load(found) as archive:
+                result = dict(archive)
+            times.append((float(result["seconds"]), float(result["processor"])))
+    fields = lambda s: (s.cameras, s.landmarks)
+    there = jnp.asarray(result["cameras"]), jnp.asarray(result["points"])
+    cost = float(cost_of(eqx.tree_at(fields, start, there)))
+    wall, cpu = np.median(times, axis=0)
+    solves = int(result["solves"])
+    print(
+        f"{frames:5d} Ceres ({result['versions']}) {wall:7.2f} s (processor {cpu:.2f}) "
+        f"{solves} solves, {wall / solves:.3f} s each; cost {cost:.8g}",
+        flush=True,
+    )
+    for dtype in (np.float64, np.float32):
+        half = lambda tree, dtype=dtype: jax.tree.map(
+            lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree
+        )
+        run = lambda: solve(half(problem), half(start), schedule=(Stage(rtol=rtol),))
+        solution, first, (wall, cpu) = timed(run, repeats)
+        steps = int(solution.num_steps[0])
+        mine = float(cost_of(half(solution.state, np.float64)))
+        print(
+            f"{frames:5d} structured {np.dtype(dtype).name} {wall:7.2f} s "
+            f"(processor {cpu:.2f}) {steps} steps, {wall / steps:.3f} s each; "
+            f"cost {mine:.8g} ({mine / cost - 1:+.2%}); {solution.status}; "
+            f"compile {first[0] - wall:.1f} s (processor {first[1] - cpu:.1f})",
+            flush=True,
+        )
+
+
+def calibration(frames, draws):
+    """Errors over what the covariances say, on simulated noise that is as the weights
+    have it: per group the mean normalised error squared (1 is right) and the share of
+    coordinates within 1.96 standard deviations (0.95 is right)."""
+    squares, inside = {}, {}
+    for draw in range(draws):
+        scene = make(frames, outliers=0.0, loss=g.Squared(), draw=draw)
+        problem, truth, _ = scene
+        found = solve(problem, truth, schedule=(Stage(rtol=1e-9),)).state
+        spread = marginals(problem, found)
+        place = lambda s: g.world_from_root(s)[..., :3, 3]
+        rows = {
+            "scale": (found.scale - truth.scale, spread.scale[None]),
+            "cameras": (
+                metric(found, "cameras") - metric(truth, "cameras"),
+                spread.cameras,
+            ),
+            "people": (place(found) - place(truth), spread.people),
+            "shape": (found.shapes - truth.shapes, spread.shapes),
+            "landmarks": (
+                metric(found, "landmarks") - metric(truth, "landmarks"),
+                spread.landmarks,
+            ),
+        }
+        for name, (error, covariance) in rows.items():
+            error, covariance = np.atleast_1d(error), np.asarray(covariance)
+            d = error.shape[-1]
+            error = error.reshape(-1, d)
+            covariance = covariance.reshape(-1, d, d)
+            deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+            # The gauge is exact, and what is not seen is not known at all.
+            known = (deviation > 1e-9).all(axis=1) & (deviation < 1.0).all(axis=1)
+            solved = np.linalg.solve(covariance[known], error[known][..., None])[..., 0]
+            squares.setdefault(name, []).extend(np.sum(error[known] * solved, 1) / d)
+            share = abs(error[known]) < 1.96 * deviation[known]
+            inside.setdefault(name, []).extend(share.ravel())
+    print(f"{frames} frames, {draws} draws of the noise")
+    for name, values in squares.items():
+        print(f"  {name:10s} {np.mean(values):6.3f} {np.mean(inside[name]):6.3f}")
+    return {name: (np.mean(v), np.mean(inside[name])) for name, v in squares.items()}
+
+
+def metric(state, name):
+    """Camera centres or landmarks in metres."""
+    value = getattr(state, name)
+    return state.scale * (value[:, :3, 3] if name == "cameras" else value)
+
+
 def breakdown(problem, state, repeats):
     """Where an iteration spends its time: each part compiled and timed by itself."""
     problem, state = pad(problem, state)
@@ -279,18 +391,29 @@ def breakdown(problem, state, repeats):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["landmarks", "joint", "breakdown"])
+    parser.add_argument(
+        "what", choices=["landmarks", "joint", "breakdown", "peers", "calibration"]
+    )
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rtol", type=float, default=1e-6)
+    parser.add_argument("--peer-python", help="has pyceres and pycolmap")
     args = parser.parse_args()
     dtype = np.float32 if args.float32 else np.float64
     jax.config.update("jax_enable_x64", not args.float32)
     for frames in args.frames:
+        if args.what == "calibration":
+            calibration(frames, args.repeats)
+            continue
+        if args.what == "peers":
+            peers(frames, args.peer_python, args.repeats, args.rtol)
+            continue
         people = 0 if args.what == "landmarks" else 1
         problem, truth, start = make(frames, people, dtype=dtype)
-        count = len(problem.factors[0].frame)
+        count = sum(
+            len(f.frame) for f in problem.factors if isinstance(f, g.Reprojection)
+        )
         name = f"{frames} / {len(truth.landmarks)} / {count} {np.dtype(dtype).name}"
         if args.what == "breakdown":
             print(name)
