@@ -150,10 +150,9 @@ def solve_stage(
 ) -> tuple[solver.Solution, dict]:
     """`solver.solve` with a line for the log and what the report says of it."""
     start = time.perf_counter()
-    before = float(problem.cost(state))
     schedule = solver.PAPER_SCHEDULE if name == "joint" else (solver.Stage(),)
     solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
-    after = float(solution.cost)
+    before, after = float(solution.first_cost), float(solution.cost)
     steps = sum(int(n) for n in solution.num_steps)
     status = solution.status
     log.info(

@@ -162,8 +162,8 @@ def _adjusted(
         cameras.tracks, cameras.keep, sigma, config.weights
     )
     problem = _problem(factor, state, config.structure, guess)
-    before = float(problem.cost(state))
     solution = solver.solve(problem, state)
+    before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
     state = solution.state
     focal_sigma = float("nan")
