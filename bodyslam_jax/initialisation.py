@@ -204,13 +204,12 @@ class ScaleStart:
     """Infinite if the people's motion says nothing."""
 
 
-def scale_start(state: graph.State, predictor: graph.MotionPredictor) -> ScaleStart:
+def scale_start(state: graph.State, seen: motion.Prediction) -> ScaleStart:
     """Robust regression of predicted on observed displacements, people averaged.
 
     1 with an infinite error where the motion model says nothing, so that the map stays
     in its own unit.
     """
-    seen = predictor(state)
     C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
     turn = C_WC @ state.roots[..., :3, :3]
     offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])

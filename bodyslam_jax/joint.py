@@ -68,37 +68,48 @@ def prepare(
                 cameras.tracks, cameras.keep, cameras.pixel_sigma, config.weights
             )
         )
-    if len(roots.present):
-        seen = initialisation.people_factors(sequence, roots, config.weights, body)
-        alone = [f for f in seen if not isinstance(f, graph.RootSmoothness)]
-        problem = graph.make_problem(
-            alone, state, free=initialisation.free_people(state)
+    anybody = len(roots.present) > 0
+    free = None if moving else initialisation.free_people(state)
+    make = lambda factors, state: graph.make_problem(
+        factors, state, motion=predictor if anybody else None, free=free
+    )
+    if anybody:
+        factors += initialisation.people_factors(sequence, roots, config.weights, body)
+        walked = lambda seen, state: initialisation.motion_factor(
+            seen, state.shapes, body, config.weights
         )
-        solution, stage = solve_stage(problem, state, config, "people")
-        state = solution.state
+        problem = make([*factors, walked(_predict(predictor, state), state)], state)
+        state, stage = _settle_people(problem, state, config)
         stages.append(stage)
-        factors += seen
+        seen = _predict(predictor, state)
         if moving:
-            start = initialisation.scale_start(state, predictor)
+            start = initialisation.scale_start(state, seen)
             log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
-        factors.append(
-            initialisation.motion_factor(
-                predictor(state), state.shapes, body, config.weights
-            )
-        )
+        factors.append(walked(seen, state))
     if not factors:
         raise ValueError(
             f"{sequence.name}: no landmarks and no people; expected a camera moving "
             "before a textured background, or people's keypoints."
         )
-    problem = graph.make_problem(
-        factors,
-        state,
-        motion=predictor if len(roots.present) else None,
-        free=None if moving else initialisation.free_people(state),
-    )
+    problem = make(factors, state)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
+
+
+_predict = eqx.filter_jit(lambda predictor, state: predictor(state))
+
+
+def _settle_people(
+    problem: graph.Problem, state: graph.State, config: Config
+) -> tuple[graph.State, dict]:
+    """People alone in the camera's frame: the same program with all else held."""
+    alone = graph.mute(
+        problem, graph.Reprojection, graph.HumanMotion, graph.RootSmoothness
+    )
+    rest = ("scale", "cameras", "landmarks", "intrinsics")
+    alone = dataclasses.replace(alone, free=graph.hold(alone.free, *rest))
+    solution, stage = solve_stage(alone, state, config, "people")
+    return solution.state, stage
 
 
 def estimate(

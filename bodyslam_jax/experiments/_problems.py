@@ -10,23 +10,6 @@ from jaxtyping import Array, Float
 from bodyslam_jax import graph
 
 
-def mute(problem: graph.Problem, *kinds: type[graph.AbstractFactor]) -> graph.Problem:
-    """The problem with its terms of these kinds weighing nothing.
-
-    Their measurements become missing ones: the shapes stay, so nothing is compiled
-    anew.
-    """
-    factors = tuple(_missing(f) if isinstance(f, kinds) else f for f in problem.factors)
-    return eqx.tree_at(lambda p: p.factors, problem, factors)
-
-
-def _missing(factor: graph.AbstractFactor) -> graph.AbstractFactor:
-    field = "whitening" if isinstance(factor, graph.HumanMotion) else "sigma"
-    old = getattr(factor, field)
-    value = 0.0 if field == "whitening" else jnp.inf
-    return eqx.tree_at(lambda f: getattr(f, field), factor, jnp.full_like(old, value))
-
-
 def rebuild(
     problem: graph.Problem,
     state: graph.State,
@@ -37,12 +20,6 @@ def rebuild(
     return graph.make_problem(
         factors, state, motion=problem.motion, free=free or problem.free
     )
-
-
-def hold(free: graph.Step, *names: str) -> graph.Step:
-    """The same mask with groups of variables held, by their names in `State`."""
-    held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
-    return dataclasses.replace(free, **held)
 
 
 def without_map(
@@ -56,7 +33,7 @@ def without_map(
     bare = eqx.tree_at(lambda s: s.landmarks, state, state.landmarks[:0])
     free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
     if hold_cameras:
-        free = hold(free, "cameras")
+        free = graph.hold(free, "cameras")
     kept = [f for f in problem.factors if not isinstance(f, graph.Reprojection)]
     return rebuild(problem, bare, kept, free), bare
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.experiments._problems import hold, mute, rebuild
+from bodyslam_jax.experiments._problems import rebuild
 
 Variant = Callable[[graph.Problem, graph.State], graph.Problem]
 
@@ -25,9 +25,9 @@ def without(*kinds: type[graph.AbstractFactor]) -> Variant:
     """The problem without these terms; s is held where nothing is left to see it."""
 
     def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
-        muted = mute(problem, *kinds)
+        muted = graph.mute(problem, *kinds)
         if {graph.HumanMotion, graph.RootSmoothness} <= set(kinds):
-            muted = dataclasses.replace(muted, free=hold(muted.free, "scale"))
+            muted = dataclasses.replace(muted, free=graph.hold(muted.free, "scale"))
         return muted
 
     return variant
@@ -37,7 +37,7 @@ def held(*names: str) -> Variant:
     """The problem with these groups of variables as they are at the start."""
 
     def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
-        return dataclasses.replace(problem, free=hold(problem.free, *names))
+        return dataclasses.replace(problem, free=graph.hold(problem.free, *names))
 
     return variant
 

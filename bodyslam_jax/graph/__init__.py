@@ -45,3 +45,5 @@ from bodyslam_jax.graph._state import inverse_right_jacobian as inverse_right_ja
 from bodyslam_jax.graph._state import retract_pose as retract_pose
 from bodyslam_jax.graph._state import retract_rotation as retract_rotation
 from bodyslam_jax.graph._state import world_from_root as world_from_root
+from bodyslam_jax.graph._variants import hold as hold
+from bodyslam_jax.graph._variants import mute as mute

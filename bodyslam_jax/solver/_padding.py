@@ -43,7 +43,14 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
         landmarks=_extend(state.landmarks, 0, landmarks, 0.0),
         intrinsics=state.intrinsics,
     )
-    return Problem(factors, free, motion, problem.layout, problem.variables), padded
+    padded_problem = Problem(factors, free, motion, problem.layout, problem.variables)
+    return _typed((padded_problem, padded))
+
+
+def _typed(tree):
+    """The same numbers, none of them weakly typed: that alone would compile anew."""
+    strong = lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x
+    return jax.tree.map(strong, tree)
 
 
 def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
