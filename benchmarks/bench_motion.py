@@ -100,7 +100,7 @@ def in_jax(rounds):
         yield f"whole epoch, {name} postures, share of the product rate", share(rate)
 
     rows = jax.random.normal(jax.random.key(2), (FRAMES, SIZES[0][0]), jnp.float32)
-    forward = jax.jit(network.normalised)
+    forward = jax.jit(lambda rows: network.normalised(rows))
     seconds = clock(lambda: wait(forward(rows)), rounds)
     yield f"paper's network: prediction of {FRAMES} frames, ms", 1e3 * seconds
     moved = jax.jit(jax.vmap(jax.jacrev(lambda row: network.normalised(row)[:3])))
@@ -194,8 +194,8 @@ def worker(python, name, rounds):
     command = [python, __file__, "--worker", name, "--rounds", str(rounds)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
-        print(f"{name} left out: {last[0]}", file=sys.stderr)
+        told = [line for line in done.stderr.splitlines() if "Error" in line]
+        print(f"{name} left out: {(told or ['no message'])[-1]}", file=sys.stderr)
         return {}
     return json.loads(done.stdout.splitlines()[-1])
 
