@@ -237,6 +237,36 @@ def test_the_path_prefers_continuity_to_the_cheaper_jump():
     assert path.tolist() == [0, 0, 1, 1, 1]
 
 
+def test_legs_go_on_where_they_cross():
+    """Seen from behind, either leg may be in front: the two ends of every frame are
+    mirrored, and the cheaper one turns back each time that the legs pass each other."""
+    time = np.arange(30) / 10
+    swing = 0.35 * np.sin(2 * np.pi * 0.9 * time + 0.4)
+    joints = np.zeros((30, 2, 24, 3))
+    for side, joint in ((1, 4), (1, 7), (1, 10), (-1, 5), (-1, 8), (-1, 11)):
+        reach = 0.5 if joint < 6 else 1.0
+        joints[:, 0, joint, 2] = side * reach * swing
+    joints[:, 1] = joints[:, 0] * [1, 1, -1]
+    forward = np.where(swing > 0, 0, 1)
+    costs = np.zeros((30, 2))
+    costs[np.arange(30), 1 - forward] = 1.0  # the left leg in front is a little cheaper
+    upright = np.tile(np.eye(3), (30, 2, 1, 1))
+    path = _starts.best_path(costs, joints, upright, time)
+    left = joints[np.arange(30), path, 7, 2]
+    # Either all of it or none is mirrored, but for where both are the same anyway.
+    away = [np.abs(left - sign * swing).max() for sign in (1, -1)]
+    assert min(away) < 0.1
+
+
+def test_a_path_of_one_or_two_frames():
+    joints, costs = np.zeros((2, 3, 24, 3)), np.array([[2.0, 1, 3], [0, 1, 2]])
+    upright = np.tile(np.eye(3), (2, 3, 1, 1))
+    one = _starts.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
+    assert one.tolist() == [1]
+    two = _starts.best_path(costs, joints, upright, np.arange(2) / 10)
+    assert two.tolist() == [1, 0]
+
+
 def test_roots_and_back(truth, body):
     present = truth.present.copy()
     present[0, 5:9] = False
