@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +11,13 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
-from bodyslam_jax import experiments, solver
-from bodyslam_jax.config import Experiment
-from bodyslam_jax.experiments import _paper, _tables
+from bodyslam_jax import cli, experiments, solver
+from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.experiments import _paper, _reports, _tables
 from bodyslam_jax.experiments._case import simulations
 from bodyslam_jax.experiments._journal import Journal
+from bodyslam_jax.experiments._plans import PLANS
+from bodyslam_jax.experiments._score import NAMES
 from bodyslam_jax.experiments._structure import shake
 from bodyslam_jax.experiments._variants import carrying
 
@@ -198,20 +201,95 @@ def test_unknown_experiment_and_folder(tmp_path):
         experiments.run_experiment("motion", tmp_path / "file" / "out")
 
 
-@pytest.mark.slow
-def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
-    import sys
+def _made_up(label):
+    """A row as `compare_methods` gives it, of no real sequence."""
+    row = {"sequence": label, "frames": 300, "radius": 0.5, "registered": 1.0}
+    row |= {"start_ratio": 1.1, "start_sigma": 0.1, "scale_ratio": 1.25, "steps": 40}
+    row |= {"status": "converged", "seconds": 9.0}
+    for method in experiments.METHODS:
+        row |= {f"{method}/{name}": 0.0125 for name in NAMES} | {f"{method}/scale": 0.8}
+    circle = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]]).tolist()
+    names = ("truth", "no_mm", "full")
+    paths = {f"{k}/{n}": circle for k in ("camera", "human") for n in names}
+    return {**row, "paths": paths}
 
-    from bodyslam_jax import cli
 
-    argv = "bodyslam experiment table1 --sequences M1 --family follow --frames 40"
-    argv = [*argv.split(), "--noise", "low", "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", argv)
+def _run(monkeypatch, argv):
+    monkeypatch.setattr(sys, "argv", ["bodyslam", "experiment", *argv])
     monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
-    caplog.set_level("INFO")
     with pytest.raises(SystemExit) as stopped:
         cli.main()
-    assert not stopped.value.code
+    return stopped.value.code
+
+
+def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
+    on = Experiment(sequences=("E1", "M2"), family="room", frames=300)
+    plan = PLANS["table1"](on, Config(), tmp_path / "stages")
+    journal = Journal(tmp_path / "rows")
+    for job in plan.jobs:
+        journal.row("table1", job.label, job.key, lambda j=job: _made_up(j.label))
+    argv = "table1 --sequences E1 M2 --family room --frames 300 --out".split()
+    caplog.set_level("INFO")
+    assert not _run(monkeypatch, [*argv, str(tmp_path)])
+    assert "2 rows, 2 of them done; about 0 min" in caplog.text
+    assert not (tmp_path / "stages").exists()
+    written = capsys.readouterr().out.split()
+    names = ["table1.md", "table1.csv", "table1.png", "table1_paths.png"]
+    assert [p.rsplit("/", 1)[1] for p in written] == names
+    text = (tmp_path / "table1.md").read_text()
+    assert "Simulated sequences" in text and "other data" in text
+    # Ours in mm, then the paper's own row of E1.
+    ours = "| E1-room |" + 12 * " 12.5 |" + " 0.800 | 0.800 |"
+    assert text.count(ours) == 1
+    assert "| E1 | 108.1 | 44.3 | 42.4 | 43.5 | 114.0 |" in text
+    (tmp_path / "table1.md").unlink()
+    code = _run(monkeypatch, ["nosuch", "--out", str(tmp_path)])
+    assert code == 2 and not (tmp_path / "table1.md").exists()
+
+
+def test_reports_of_made_up_rows(tmp_path):
+    p = [5.0, 0.1]
+    curve = [[0.9, 0.1], [2.0, 0.1]]
+    row = {"sequence": "M2-room", "perturbation": p, "scale": [5.1, 0.102]}
+    row |= {"deviation": [0.02, 0.02], "spread": 1e-5}
+    row |= {"history": [[1.0, 5.1], [1.0, 0.102]], "h_ate": curve}
+    _reports.write_scale(tmp_path, [row], noise="real")
+    text = (tmp_path / "scale.md").read_text()
+    assert "| M2-room | 5.0 | 5.1000 | 2.00 | 900.0 | 100.0 | 3.673 | 26.5 |" in text
+
+    row = {"sequence": "E2-room", "status": "converged", "status_no_landmarks": "-"}
+    stages = ("original", "start", "perturbed", "no_landmarks", "landmarks")
+    row |= {name: 0.1 for name in stages} | {f"{n}/scale": 1.0 for n in stages}
+    _reports.write_structure(tmp_path, [row], noise="real")
+    text = (tmp_path / "landmarks.md").read_text()
+    assert "| E2-room | 100.0 | 100.0 |" in text
+    assert "| E2-room | 193.0 | 213.1 | 139.7 | 138.5 |" in text
+
+    row = {"sequence": "M2-room", "label": "no keypoints", "status": "converged"}
+    row |= {name: 0.02 for name in NAMES} | {"scale_ratio": None, "cost": 12.0}
+    (*_, picture) = _reports.write_ablation(tmp_path, [row], noise="low")
+    assert picture.name == "ablation_M2-room.png" and picture.stat().st_size > 0
+    text = (tmp_path / "ablation.md").read_text()
+    assert "| no keypoints | 20.0 | 20.0 | 20.0 | 20.0 | – |" in text
+
+    names = ["motion", "shape"]
+    row = {"names": names, "log": [0.0, 0.7], "factor": [1.0, 2.0]}
+    row |= {"history": [2.0, 1.5], "path": [[0.0, 0.0], [0.0, 0.7]]}
+    one = {"sequence": "E1-room", "set": "training"}
+    for when in ("before", "after"):
+        one |= {f"{when}/{k}": 0.5 for k in ("error", "scale", "j_ate_se3")}
+    row["rows"] = [one, {**one, "set": "test", "sequence": "D1-room"}]
+    _reports.write_weights(tmp_path, [row], noise="real")
+    text = (tmp_path / "weights.md").read_text()
+    assert "| shape | 2.00 | 0.25 |" in text and "## test sequences" in text
+
+
+@pytest.mark.slow
+def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
+    argv = "table1 --sequences M1 --family follow --frames 40 --noise low --out"
+    argv = [*argv.split(), str(tmp_path)]
+    caplog.set_level("INFO")
+    assert not _run(monkeypatch, argv)
     assert "1 rows, 0 of them done" in caplog.text
     (row,) = (json.loads(p.read_text()) for p in (tmp_path / "rows").glob("*.json"))
     assert row["full/scale"] == pytest.approx(1, abs=0.2)
@@ -220,8 +298,7 @@ def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
         assert (tmp_path / name).stat().st_size > 0
     assert "| M1-follow |" in (tmp_path / "table1.md").read_text()
     caplog.clear()
-    with pytest.raises(SystemExit):
-        cli.main()
+    assert not _run(monkeypatch, argv)
     assert "1 rows, 1 of them done" in caplog.text
     assert "taken from an earlier run" in caplog.text
     assert "joint: cost" not in caplog.text

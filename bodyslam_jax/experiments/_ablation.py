@@ -56,7 +56,7 @@ def with_motion_model(case: Case, file: str) -> dict[str, float | str]:
         prepared.problem, prepared.state, config, "joint"
     )
     past = prepared.problem.motion.model[0].past  # pyright: ignore
-    return {"past": past, **_row(case, prepared, solution.state, stage)}
+    return {"past": float(past), **_row(case, prepared, solution.state, stage)}
 
 
 def compare_orders(

@@ -65,7 +65,7 @@ def draw_paths(path: Path, rows: Sequence[Row]) -> None:
     rows = [row for row in rows if row.get("paths")]
     if not rows:
         return
-    figure = _figure(8, 3.4 * len(rows))
+    figure = _figure(8.0, 3.4 * len(rows))
     axes = figure.subplots(len(rows), 2, squeeze=False)
     for row, pair in zip(rows, axes, strict=True):
         for axis, what in zip(pair, ("camera", "human"), strict=True):
@@ -82,7 +82,7 @@ def draw_paths(path: Path, rows: Sequence[Row]) -> None:
 
 def draw_scale(path: Path, rows: Sequence[Row]) -> None:
     """H-ATE under SE(3), and s over what it should be, after each iteration."""
-    figure = _figure(9, 3.0 * len(rows))
+    figure = _figure(9.0, 3.0 * len(rows))
     axes = figure.subplots(len(rows), 2, squeeze=False, sharex=True)
     for row, (left, right) in zip(rows, axes, strict=True):
         for i, p in enumerate(row["perturbation"]):
@@ -147,7 +147,7 @@ def draw_structure(
 
 def draw_learning(path: Path, row: Row) -> None:
     """The error on the training sequences by step, and the weights on the way."""
-    figure = _figure(9, 3)
+    figure = _figure(9.0, 3.0)
     left, right = figure.subplots(1, 2)
     left.plot(row["history"], "o-", color=_OURS)
     left.set(xlabel="step", ylabel="training error, 1")

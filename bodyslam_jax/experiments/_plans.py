@@ -87,7 +87,7 @@ def _by_sequence(
 def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """All methods on all ten sequences, both families."""
     jobs = _by_sequence(
-        experiment, config, stages, ALL, ("room", "follow"), compare_methods, (2, 4)
+        experiment, config, stages, ALL, ("room", "follow"), compare_methods, (2.0, 4.0)
     )
     return Plan(jobs, functools.partial(_reports.write_table1, noise=experiment.noise))
 
@@ -110,7 +110,7 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("E2", "M2", "D2"),
         ("room",),
         compute,
-        (len(PERTURBATIONS) * 1.5, 3),
+        (len(PERTURBATIONS) * 1.5, 3.0),
     )
     return Plan(jobs, functools.partial(_reports.write_scale, noise=experiment.noise))
 
@@ -124,7 +124,7 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
         tuple(STRUCTURE),
         ("room",),
         landmark_ablation,
-        (2.5, 4),
+        (2.5, 4.0),
     )
     return Plan(
         jobs, functools.partial(_reports.write_structure, noise=experiment.noise)
@@ -179,7 +179,7 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
             lambda s=s: _ablation.compare_orders(case(s), prepared(s))
         )
         for order in _ablation.ORDERS:
-            add(s, order, lambda o=order, f=orders: f()[o], solves=2)
+            add(s, order, lambda o=order, f=orders: f()[o], solves=2.0)
         for noise in ("none", "low", "real"):
             quiet = dataclasses.replace(s, noise=noise)
             one = lambda q=quiet: _ablation.ablate(case(q), prepared(q), "full")
@@ -201,7 +201,9 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
         make = lambda s: make_case(s, config, cache=stages)
         return learn_and_test([make(s) for s in training], [make(s) for s in test])
 
-    seconds = sum(_cost(s, 8, 1) for s in training) + sum(_cost(s, 2, 1) for s in test)
+    seconds = sum(_cost(s, 8.0, 1.0) for s in training) + sum(
+        _cost(s, 2.0, 1.0) for s in test
+    )
     key = (tuple(training), tuple(test), config)
     job = Job("weights", key, seconds, compute)
     return Plan(

@@ -74,7 +74,7 @@ def write_table1(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         Column("sequence", "sequence"),
         Column("frames", "frames", digits=0),
         Column("camera's RMS radius, m", "radius", digits=2),
-        Column("C-ATE SE(3), % of it", "share", 100, 2),
+        Column("C-ATE SE(3), % of it", "share", 100.0, 2),
         Column("start / true scale", "start_ratio", digits=3),
         Column("its standard error", "start_sigma", digits=3),
         Column("estimated / true scale", "scale_ratio", digits=3),
@@ -133,7 +133,7 @@ def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         Column("sequence", "sequence"),
         Column("perturbation 1/s'", "perturbation"),
         Column("estimated s", "scale", digits=4),
-        Column("deviation, %", "deviation", 100, 2),
+        Column("deviation, %", "deviation", 100.0, 2),
         Column("H-ATE before, mm", "h_before", _MM),
         Column("H-ATE after, mm", "h_after", _MM),
         Column("the paper's s, its own data", "paper", digits=3),
@@ -141,7 +141,7 @@ def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
     ]
     spread = [
         Column("sequence", "sequence"),
-        Column("largest difference between answers, %", "spread", 100, 4),
+        Column("largest difference between answers, %", "spread", 100.0, 4),
     ]
     head = _intro(
         "Scale recovery from perturbed cameras",
