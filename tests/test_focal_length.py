@@ -1,15 +1,12 @@
 """The focal length when it was guessed: found where the camera's path tells it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
 from bodyslam_jax import reconstruction
 from bodyslam_jax.config import Config
-from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence
-
+from bodyslam_jax.sequence import Intrinsics, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 NUM = 24
