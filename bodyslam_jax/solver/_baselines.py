@@ -136,7 +136,9 @@ def _adam(flat, start, count):
     def one(carry, _):
         step, memory = carry
         gradient = jax.grad(flat.cost)(step)
-        change, memory = method.update(gradient, memory)
+        # optax takes powers of Python's numbers.
+        with jax.numpy_dtype_promotion("standard"):
+            change, memory = method.update(gradient, memory)
         return (optax.apply_updates(step, change), memory), None
 
     (step, _), _ = jax.lax.scan(one, (start, method.init(start)), length=count)
