@@ -12,6 +12,7 @@ import logging
 import os
 import typing
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +25,8 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 _EDGE = 1 << 20
 _SOURCE = "source.json"
+_UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
+_UNREADABLE += (zipfile.BadZipFile, zlib.error)
 
 
 def fingerprint(*parts: Any) -> str:
@@ -80,7 +83,7 @@ class Cache:
         if path.exists():
             try:
                 found = load(path, kind)
-            except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+            except _UNREADABLE as error:
                 log.warning("%s: not readable (%s); computed again", path, error)
             else:
                 log.info("%s: taken from an earlier run", name)
@@ -121,7 +124,10 @@ def save(path: Path, value: Any) -> None:
 
 
 def load(path: Path, kind: type[T]) -> T:
-    """Reads what `save` wrote."""
+    """Reads what `save` wrote.
+
+    **Raises:** `ValueError` if `kind` has other fields now than when it was saved.
+    """
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         header = json.loads(archive["__header__"].tobytes())
         return _decode(header, kind, archive)
@@ -156,8 +162,13 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
     if "tuple" in header:
         return tuple(_decode(item, None, archive) for item in header["tuple"])
     if "fields" in header:
-        kinds = typing.get_type_hints(kind)
         fields = header["fields"]
+        # Also where a new field has a default, which need not be what was computed.
+        if not dataclasses.is_dataclass(kind) or fields.keys() != {
+            field.name for field in dataclasses.fields(kind)
+        }:
+            raise ValueError(f"fields {', '.join(fields)} of another version")
+        kinds = typing.get_type_hints(kind)
         return kind(
             **{n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}
         )

@@ -46,6 +46,25 @@ def test_a_damaged_stage_is_computed_again(tmp_path, caplog):
     assert found.uv.shape == (2, 2) and "computed again" in caplog.text
 
 
+@pytest.mark.parametrize("names", ["frame", "frame landmark uv more"])
+def test_a_stage_with_other_fields_is_computed_again(tmp_path, caplog, names):
+    """A stage file of another state of the package that calls itself the same."""
+    then = dataclasses.make_dataclass("Tracks", names.split())
+    save(tmp_path / "tracks-a.npz", then(*(np.zeros(1) for _ in names.split())))
+    cache = Cache(tmp_path)
+    found = cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    assert found.uv.shape == (2, 2) and "computed again" in caplog.text
+
+
+def test_a_field_with_a_default_is_missed_too(tmp_path):
+    then = dataclasses.make_dataclass("Numbers", [("a", int)])
+    now = dataclasses.make_dataclass("Numbers", [("a", int), ("b", int, 0)])
+    save(tmp_path / "x.npz", then(1))
+    assert load(tmp_path / "x.npz", then).a == 1
+    with pytest.raises(ValueError, match="another version"):
+        load(tmp_path / "x.npz", now)
+
+
 @pytest.mark.parametrize("change", ["name", "array", "setting"])
 def test_fingerprint_sees_every_change(change):
     base = _sequence()

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -29,6 +30,28 @@ def test_help_imports_no_jax():
         "assert 'jax' not in sys.modules, 'jax was imported'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_help_says_what_the_tool_does_and_its_commands(monkeypatch, capsys):
+    code, out, _ = _run(monkeypatch, capsys, "--help")
+    assert code == 0 and "in metres" in out and "bodyslam demo" in out
+    for command in ("run", "demo", "evaluate", "doctor"):
+        assert f"• {command}" in out
+    code, out, _ = _run(monkeypatch, capsys, "body-model", "--help")
+    assert code == 0 and "SMPL" in out
+
+
+def test_a_reader_that_leaves_is_no_error():
+    """As `head` does, once it has its lines."""
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-m", "bodyslam_jax", "--help"],
+        stdout=write,
+        stderr=subprocess.PIPE,
+    )
+    os.close(write)
+    assert done.stderr == b"" and done.returncode == 141
 
 
 @pytest.mark.parametrize(

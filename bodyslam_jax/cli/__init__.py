@@ -63,6 +63,17 @@ _GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
 }
 
 
+_ABOUT = {
+    "bodyslam": """\
+Cameras, people and a map in metres, from a video that one moving camera took of people.
+
+Without any file: `bodyslam demo`. A video of your own: `bodyslam run VIDEO.mp4
+--keypoints FOLDER --out RUN`. What a command takes: `bodyslam COMMAND --help`.""",
+    "bodyslam body-model": "Body model files: SMPL-shaped, SMPL, SMPL-H, SMPL-X.",
+    "bodyslam convert-dataset": "Sequence folders with ground truth from datasets.",
+}
+
+
 def main() -> None:
     """Runs one command and turns its outcome into an exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
@@ -83,9 +94,12 @@ def main() -> None:
         }
         if argv and not any(flag in argv for flag in ("-h", "--help")):
             _prepare_jax()
-        code = tyro.extras.subcommand_cli_from_dict(
-            commands, prog=prog, description=(__doc__ or "").split("\n")[0], args=argv
-        )
+        code = _call(commands, prog, argv)
+    except BrokenPipeError:
+        # Whoever read our output has left, as in `bodyslam ... | head`: no error, and
+        # nothing that the interpreter should try to write once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_CLOSED_PIPE)
     except KeyboardInterrupt:
         print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
         sys.exit(130)
@@ -101,6 +115,18 @@ def main() -> None:
 
 
 _WHERE = "BODYSLAM_DEBUG=1 says where"
+_CLOSED_PIPE = 128 + 13
+"""What a shell says of a program that SIGPIPE ended."""
+
+
+def _call(commands: dict[str, Callable[..., Any]], prog: str, argv: list[str]) -> Any:
+    """The command that `argv` names; all that it printed has left when it returns."""
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            commands, prog=prog, description=_ABOUT[prog], args=argv
+        )
+    finally:
+        sys.stdout.flush()
 
 
 def _one_line(error: BaseException) -> str:
