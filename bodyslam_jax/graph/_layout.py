@@ -41,11 +41,12 @@ class Layout(eqx.Module):
     """Chunks that a landmark, or a factor over frames, can connect; 2 or more."""
 
 
-def round_up(count: int) -> int:
-    """The next of a few sizes, each at most a quarter above the one before."""
-    if count <= 4:
+def round_up(count: int, parts: int = 4) -> int:
+    """The next of a few sizes, each above the one before by at most one in `parts` (a
+    power of 2)."""
+    if count <= parts:
         return max(count, 1)
-    step = 2 ** max(int(np.log2(count)) - 2, 0)
+    step = max(2 ** int(np.log2(count)) // parts, 1)
     return -(-count // step) * step
 
 
@@ -56,7 +57,7 @@ def make_layout(
     landmark: Int[np.ndarray, " m"],
 ) -> Layout:
     """Groups `m` observations of landmarks; every index is known to be in range."""
-    num_chunks = round_up(-(-num_frames // CHUNK))
+    num_chunks = round_up(-(-num_frames // CHUNK), parts=8)
     if len(frame) == 0:
         return Layout((), num_chunks, 2)
     first = np.full(num_landmarks, num_frames)

@@ -15,6 +15,8 @@ from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation, Sizes
 
 POSE = 69
+GROUP = 16
+"""Chunks eliminated together, at most."""
 
 
 class Border(eqx.Module):
@@ -52,11 +54,11 @@ class Border(eqx.Module):
 class Postures(eqx.Module):
     """What elimination leaves, and what back-substitution needs; axes `h n`."""
 
-    inverse: Float[Array, "e h n 69 69"]
-    """Inverse of each pivot, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "e h n 69 b"]
-    """Pivot inverse times border columns."""
-    link: Float[Array, "e h n *joint r r"]
+    half: Float[Array, "h n e 69 69"]
+    """`L^-1` of each pivot `L L^T`, `e = B - 1` eliminated frames."""
+    solved: Float[Array, "h n e 69 b"]
+    """`L^-1` times border columns."""
+    link: Float[Array, "h n e *joint r r"]
     """Coupling of the next frame (rows) with each eliminated one; joint by joint (23
     of 3 x 3) where joints do not interact over time."""
     separator: Float[Array, "h n 69 69"]
@@ -73,17 +75,19 @@ def border_of(lin: Linearisation, sizes: Sizes) -> Border:
     return Border(cross, sizes.own_globals)
 
 
-def pose_blocks(lin: Linearisation) -> tuple[Array, Array]:
-    """Postures with themselves, `h t 69 69`, and with those of the frame before, like
+def _pose_blocks(blocks: dict, damping: Float[Array, "*b 69"]) -> tuple[Array, Array]:
+    """Postures with themselves, `*b 69 69`, and with those of the frame before, like
     `Postures.link`."""
-    h, t = lin.gradient["pose"].shape[:2]
-    dtype = lin.gradient["pose"].dtype
-    own = lin.blocks.get(("pose", "pose", 0), jnp.zeros((h, t, POSE, POSE), dtype))
-    if ("joint", "joint", 0) in lin.blocks:
-        own = own + _to_dense(lin.blocks["joint", "joint", 0])
-    link = lin.blocks.get(("joint", "joint", 1), jnp.zeros((h, t, 23, 3, 3), dtype))
-    if ("pose", "pose", 1) in lin.blocks:
-        link = lin.blocks["pose", "pose", 1] + _to_dense(link)
+    dtype = damping.dtype
+    own = damping[..., None] * jnp.eye(POSE, dtype=dtype)
+    if ("pose", "pose", 0) in blocks:
+        own = own + blocks["pose", "pose", 0]
+    if ("joint", "joint", 0) in blocks:
+        own = own + _to_dense(blocks["joint", "joint", 0])
+    none = jnp.zeros((*damping.shape[:-1], 23, 3, 3), dtype)
+    link = blocks.get(("joint", "joint", 1), none)
+    if ("pose", "pose", 1) in blocks:
+        link = blocks["pose", "pose", 1] + _to_dense(link)
     return own, link
 
 
@@ -94,10 +98,10 @@ def _to_dense(small: Float[Array, "*b 23 3 3"]) -> Float[Array, "*b 69 69"]:
     return full.reshape(*small.shape[:-3], POSE, POSE)
 
 
-def _link_times(link: Array, x: Float[Array, "h n 69 c"]) -> Float[Array, "h n 69 c"]:
-    if link.ndim == 4:
+def _link_times(link: Array, x: Float[Array, "*b 69 c"]) -> Float[Array, "*b 69 c"]:
+    if link.ndim == x.ndim:
         return link @ x
-    rows = x.reshape(*x.shape[:2], 23, 3, x.shape[-1])
+    rows = x.reshape(*x.shape[:-2], 23, 3, x.shape[-1])
     # Three fused products: a matrix product for each joint would be far too small.
     term = lambda b: link[..., b, None] * rows[..., b, None, :]
     return (term(0) + term(1) + term(2)).reshape(x.shape)
@@ -119,38 +123,53 @@ def eliminate_postures(
     """Eliminates all postures but the last of each chunk; `damping` joins diagonals."""
     border = border_of(lin, sizes)
     h, n = sizes.people, sizes.chunks
-    own, link = pose_blocks(lin)
-    own = own + damping[..., None] * jnp.eye(POSE, dtype=damping.dtype)
-    cut = lambda x: x.reshape(h, n, CHUNK, *x.shape[2:])
-    own, link = cut(own), cut(link)
-    raw = _border_columns(lin, border, link, cut)
-    inner_first = lambda x: jnp.moveaxis(x, 2, 0)
-
-    def step(carry, following):
-        pivot, columns, update = carry
-        next_own, forward, next_raw = following
-        inverse = invert(pivot)
-        product = inverse @ columns
-        update = update - jnp.einsum("hnka,hnkb->hnab", columns, product)
-        half = _link_times(forward, inverse).swapaxes(-1, -2)
-        next_pivot = next_own - _link_times(forward, half)
-        next_columns = next_raw - _link_times(forward, product)
-        return (next_pivot, next_columns, update), (inverse, product)
-
-    width = border.rhs + 1
-    start = own[:, :, 0], raw[:, :, 0], jnp.zeros((h, n, width, width), own.dtype)
-    rest = tuple(inner_first(x[:, :, 1:]) for x in (own, link, raw))
-    (pivot, columns, update), (inverse, product) = jax.lax.scan(step, start, rest)
-    return Postures(inverse, product, rest[1], pivot, columns, update)
+    blocks = {k: v for k, v in lin.blocks.items() if k[0] in ("pose", "joint")}
+    given = blocks, lin.gradient["pose"], damping
+    together = group_size(h * n)
+    cut = lambda x: x.reshape(-1, together, CHUNK, *x.shape[2:])
+    found = jax.lax.map(
+        lambda x: _eliminate_group(border, *x), jax.tree.map(cut, given)
+    )
+    return jax.tree.map(lambda x: x.reshape(h, n, *x.shape[2:]), found)
 
 
-def invert(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """Inverse of positive definite matrices; NaN where one is not."""
-    half = _invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
-    return half.swapaxes(-1, -2) @ half
+def group_size(count: int) -> int:
+    """How many chunks are eliminated together: enough that small steps do not wait for
+    each other, few enough that what they work on stays in the processor's cache."""
+    return max(size for size in range(1, GROUP + 1) if count % size == 0)
 
 
-def _invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+def _eliminate_group(border: Border, blocks: dict, gradient: Array, damping: Array):
+    """The same for chunks `g` that are eliminated together, axes `g B`."""
+    own, link = _pose_blocks(blocks, damping)
+    raw = _border_columns(border, blocks, gradient, link)
+    at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
+    put = jax.lax.dynamic_update_index_in_dim
+
+    def step(k, carry):
+        pivot, columns, halves, solved = carry
+        half = _half(pivot)
+        here = half @ columns
+        forward = _link_times(at(link, k + 1), half.swapaxes(-1, -2))
+        pivot = at(own, k + 1) - forward @ forward.swapaxes(-1, -2)
+        columns = at(raw, k + 1) - forward @ here
+        return pivot, columns, put(halves, half, k, 1), put(solved, here, k, 1)
+
+    pivot, columns = own[:, 0], raw[:, 0]
+    empty = lambda x: jnp.zeros((len(x), CHUNK - 1, *x.shape[1:]), x.dtype)
+    carry = pivot, columns, empty(pivot), empty(columns)
+    pivot, columns, halves, solved = jax.lax.fori_loop(0, CHUNK - 1, step, carry)
+    tall = solved.reshape(len(solved), -1, solved.shape[-1])
+    update = -tall.swapaxes(-1, -2) @ tall
+    return Postures(halves, solved, link[:, 1:], pivot, columns, update)
+
+
+def _half(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """`L^-1` of positive definite matrices `L L^T`; NaN where one is not."""
+    return invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
+
+
+def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Inverse of triangular matrices, halved until little is left: matrix products are
     ten times as fast as substitution.
 
@@ -161,8 +180,8 @@ def _invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     if n <= 24:
         return _substitute(lower)
     cut = n // 2
-    first = _invert_lower(lower[..., :cut, :cut])
-    last = _invert_lower(lower[..., cut:, cut:])
+    first = invert_lower(lower[..., :cut, :cut])
+    last = invert_lower(lower[..., cut:, cut:])
     mixed = -last @ (lower[..., cut:, :cut] @ first)
     top = jnp.concatenate([first, jnp.zeros_like(mixed.swapaxes(-1, -2))], axis=-1)
     return jnp.concatenate([top, jnp.concatenate([mixed, last], axis=-1)], axis=-2)
@@ -183,31 +202,30 @@ def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     return jax.lax.fori_loop(0, len(index), one, eye)
 
 
-def _border_columns(lin, border, link, cut):
-    """Columns of each posture of a chunk, `h n B 69 b`, against the chunk's border."""
-    h, n = link.shape[:2]
-    dtype = link.dtype
-    none = lambda width: jnp.zeros((h, n, CHUNK, POSE, width), dtype)
+def _border_columns(border, blocks, gradient, link):
+    """Columns of each posture of a chunk, `g B 69 b`, against the chunk's border."""
+    g = len(gradient)
+    dtype = gradient.dtype
+    none = lambda width: jnp.zeros((g, CHUNK, POSE, width), dtype)
     is_first = jnp.eye(1, CHUNK, dtype=dtype)[0][:, None, None]
-    dense = link if link.ndim == 5 else _to_dense(link)
+    dense = link if link.ndim == 4 else _to_dense(link)
     parts = [dense * is_first]
     if border.cross:
         for name in ("root", "camera"):
-            block = lin.blocks.get(("pose", name, 1))
-            parts.append(none(6) if block is None else cut(block) * is_first)
+            block = blocks.get(("pose", name, 1))
+            parts.append(none(6) if block is None else block * is_first)
     for name in ("root", "camera") if border.cross else ("root",):
         total = none(6 * CHUNK)
         for lag in (-1, 0, 1):
-            block = lin.blocks.get(("pose", name, lag))
+            block = blocks.get(("pose", name, lag))
             if block is not None:
                 # Frame k of the chunk against frame k - lag of the same chunk.
                 place = jnp.eye(CHUNK, k=-lag, dtype=dtype)[:, None, :, None]
-                wide = cut(block)[:, :, :, :, None, :] * place
-                total = total + wide.reshape(total.shape)
+                total = total + (block[:, :, :, None, :] * place).reshape(total.shape)
         parts.append(total)
-    common = lin.blocks.get(("pose", "globals", 0))
-    parts.append(none(border.own_globals) if common is None else cut(common))
-    parts.append(-cut(lin.gradient["pose"])[..., None])
+    common = blocks.get(("pose", "globals", 0))
+    parts.append(none(border.own_globals) if common is None else common)
+    parts.append(-gradient[..., None])
     return jnp.concatenate(parts, axis=-1)
 
 
@@ -217,16 +235,25 @@ def substitute_postures(
     separator_step: Float[Array, "h n 69"],
 ) -> Float[Array, "h t 69"]:
     """Steps of all postures from those of the border (without the rhs column)."""
+    h, n = separator_step.shape[:2]
 
-    def step(following, kept):
-        inverse, solved, link = kept
-        here = solved[..., -1]
-        here = here - jnp.einsum("hnab,hnb->hna", solved[..., :-1], border_step)
-        back = _link_times(link.swapaxes(-1, -2), following[..., None])
-        here = here - (inverse @ back)[..., 0]
-        return here, here
+    def group(known):
+        half, solved, link, border, last = known
+        right = solved[..., -1] - (solved[..., :-1] @ border[:, None, :, None])[..., 0]
+        at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
 
-    kept = postures.inverse, postures.solved, postures.link
-    _, steps = jax.lax.scan(step, separator_step, kept, reverse=True)
-    steps = jnp.concatenate([jnp.moveaxis(steps, 0, 2), separator_step[:, :, None]], 2)
-    return steps.reshape(steps.shape[0], -1, POSE)
+        def step(i, carry):
+            following, steps = carry
+            k = CHUNK - 2 - i
+            back = _link_times(at(link, k).swapaxes(-1, -2), following[..., None])
+            row = at(right, k)[..., None] - at(half, k) @ back
+            here = (at(half, k).swapaxes(-1, -2) @ row)[..., 0]
+            return here, jax.lax.dynamic_update_index_in_dim(steps, here, k, 1)
+
+        empty = jnp.zeros((len(last), CHUNK, POSE), last.dtype).at[:, -1].set(last)
+        return jax.lax.fori_loop(0, CHUNK - 1, step, (last, empty))[1]
+
+    together = group_size(h * n)
+    cut = lambda x: x.reshape(-1, together, *x.shape[2:])
+    given = postures.half, postures.solved, postures.link, border_step, separator_step
+    return jax.lax.map(group, jax.tree.map(cut, given)).reshape(h, -1, POSE)

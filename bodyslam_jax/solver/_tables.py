@@ -62,7 +62,8 @@ def linearise_landmarks(
     rows, by_l, cost = _rows(problem, factor, seen, state, sizes)
     sums.costs.append(cost)
     wide = rows.reshape(*rows.shape[:3], -1)
-    gram = jnp.einsum("ubrx,ubsx->ubrs", wide, wide)
+    # Fused sums: a matrix product for each frame of a piece would be far too small.
+    gram = jnp.sum(wide[:, :, :, None] * wide[:, :, None], axis=-1)
     if "cameras" in sizes.variables:
         of_camera = jnp.zeros((sizes.chunks, CHUNK, 6, gram.shape[-1]), dtype)
         of_camera = of_camera.at[seen.chunk].add(gram[:, :, :6])
