@@ -106,8 +106,18 @@ def make_tracks(frames, cameras, scale, rng, per_frame=9.6):
     return points, frame, landmark
 
 
-def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03, loss=None, draw=0):
-    """A problem, its true state, and a start; `draw` numbers the noise on one scene."""
+def make(
+    frames,
+    people=1,
+    seed=0,
+    dtype=np.float64,
+    outliers=0.03,
+    loss=None,
+    draw=0,
+    noise=1.0,
+):
+    """A problem, its true state, and a start; `draw` numbers the noise on one scene,
+    and `noise` multiplies it, with the sigmas."""
     rng = np.random.default_rng(seed)
     scale, cameras, roots, poses = make_scene(frames, people, rng)
     points, frame, landmark = make_tracks(frames, cameras, scale, rng)
@@ -129,7 +139,7 @@ def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03, loss=None, d
     seen = p_C[:, 2] > 0.3
     missing = rng.random((people, frames, 25)) < 0.1
     rng = np.random.default_rng((seed, draw))
-    pixel += rng.standard_normal(pixel.shape)
+    pixel += noise * rng.standard_normal(pixel.shape)
     wrong = rng.random(len(pixel)) < outliers
     pixel[wrong] += rng.uniform(-80, 80, (wrong.sum(), 2))
     frame, landmark, pixel = frame[seen], landmark[seen], pixel[seen]
@@ -138,24 +148,24 @@ def make(frames, people=1, seed=0, dtype=np.float64, outliers=0.03, loss=None, d
             frame=jnp.asarray(frame),
             landmark=jnp.asarray(landmark),
             pixel=array(pixel),
-            sigma=array(np.ones(len(frame))),
+            sigma=array(np.full(len(frame), noise)),
             loss=g.Cauchy(1.5) if loss is None else loss,
         )
     ]
     if people:
-        factors += person(truth, missing, rng, array, loss)
+        factors += person(truth, missing, rng, array, loss, noise)
     problem = g.make_problem(factors, truth)
     return problem, truth, start_of(problem, truth, rng, array)
 
 
-def person(truth, missing, rng, array, loss):
+def person(truth, missing, rng, array, loss, noise):
     h, t = truth.roots.shape[:2]
     body = load_body_model(dtype=truth.scale.dtype)
     p_H = local_keypoints(body, truth.poses, truth.shapes[:, None], "body25")
     p_C = jnp.einsum("htij,htkj->htki", truth.roots[..., :3, :3], p_H)
     pixel = project(truth.intrinsics, p_C + truth.roots[..., None, :3, 3])
-    pixel = np.asarray(pixel, float) + 4.0 * rng.standard_normal(pixel.shape)
-    sigma = np.where(missing, np.inf, 4.0)
+    pixel = np.asarray(pixel, float) + 4.0 * noise * rng.standard_normal(pixel.shape)
+    sigma = np.where(missing, np.inf, 4.0 * noise)
     blank = g.HumanMotion(
         translation=array(np.zeros((h, t, 3))),
         whitening=array(np.zeros((h, t, 3, 3))),
@@ -164,13 +174,15 @@ def person(truth, missing, rng, array, loss):
     moved = blank.map_frames(
         lambda d, w, s, _: g.displacement(w[1], w[0], s.scale), truth
     )
-    slow = lambda size, rho, shape: size * drift(rng, shape, rho)
+    slow = lambda size, rho, shape: noise * size * drift(rng, shape, rho)
     valid = jnp.ones((h, t), bool).at[:, 0].set(False)
-    covariance = array(np.tile(np.diag([0.01, 0.01, 0.01]) ** 2, (h, t, 1, 1)))
+    covariance = array(np.tile(np.diag(3 * [0.01 * noise]) ** 2, (h, t, 1, 1)))
     posture = g.retract_rotation(truth.poses, array(slow(0.17, 0.96, (h, t, 23, 3))))
     shape_sigma = np.full((h, t, 10), np.inf)
-    shape_sigma[:, 0] = 0.5
-    measured = truth.shapes[:, None] + array(0.5 * rng.standard_normal((h, 1, 10)))
+    shape_sigma[:, 0] = 0.5 * noise
+    measured = truth.shapes[:, None] + array(
+        shape_sigma[0, 0, 0] * rng.standard_normal((h, 1, 10))
+    )
     return [
         g.JointReprojection(
             body=body,
@@ -185,7 +197,7 @@ def person(truth, missing, rng, array, loss):
         ),
         g.Posture(
             rotation=posture,
-            sigma=array(np.full((h, t, 23), 0.17)),
+            sigma=array(np.full((h, t, 23), 0.17 * noise)),
             correlation=g.runs(jnp.ones((h, t), bool), 0.96).astype(truth.scale.dtype),
         ),
         g.Shape(shape=measured + array(np.zeros((h, t, 10))), sigma=array(shape_sigma)),
@@ -306,13 +318,13 @@ def peers(frames, python, repeats, rtol):
         )
 
 
-def calibration(frames, draws):
+def calibration(frames, draws, noise=1.0):
     """Errors over what the covariances say, on simulated noise that is as the weights
     have it: per group the mean normalised error squared (1 is right) and the share of
     coordinates within 1.96 standard deviations (0.95 is right)."""
     squares, inside = {}, {}
     for draw in range(draws):
-        scene = make(frames, outliers=0.0, loss=g.Squared(), draw=draw)
+        scene = make(frames, outliers=0.0, loss=g.Squared(), draw=draw, noise=noise)
         problem, truth, _ = scene
         found = solve(problem, truth, schedule=(Stage(rtol=1e-9),)).state
         spread = marginals(problem, found)

@@ -16,6 +16,7 @@ import tyro
 from bodyslam_jax.cli._body import ACTIONS
 from bodyslam_jax.cli._datasets import DATASETS
 from bodyslam_jax.cli._make import experiment, simulate, train_motion
+from bodyslam_jax.cli._memory import return_memory
 from bodyslam_jax.cli._run import demo, evaluate, run
 from bodyslam_jax.cli._settings import base_config, option, starting_from
 from bodyslam_jax.cli._settings import read_settings as read_settings
@@ -143,6 +144,7 @@ def _prepare_jax() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
+    return_memory()
     jax.config.update("jax_enable_x64", True)
     cache = os.environ.get("BODYSLAM_CACHE") or Path(
         os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "bodyslam_jax"
