@@ -52,18 +52,19 @@ class Border(eqx.Module):
 
 
 class Postures(eqx.Module):
-    """What elimination leaves, and what back-substitution needs; axes `h n`."""
+    """What elimination leaves, and what back-substitution needs; axes `h n`, or
+    one group of chunks."""
 
-    half: Float[Array, "h n e 69 69"]
+    half: Float[Array, "*h n e 69 69"]
     """`L^-1` of each pivot `L L^T`, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "h n e 69 b"]
+    solved: Float[Array, "*h n e 69 b"]
     """`L^-1` times border columns."""
-    link: Float[Array, "h n e *joint r r"]
+    link: Float[Array, "*b r r"]
     """Coupling of the next frame (rows) with each eliminated one; joint by joint (23
     of 3 x 3) where joints do not interact over time."""
-    separator: Float[Array, "h n 69 69"]
-    separator_border: Float[Array, "h n 69 b"]
-    border: Float[Array, "h n b b"]
+    separator: Float[Array, "*h n 69 69"]
+    separator_border: Float[Array, "*h n 69 b"]
+    border: Float[Array, "*h n b b"]
     """To be added to the border's own blocks (negative)."""
 
 
