@@ -2,7 +2,7 @@
 
     python peer_ceres.py problem.npz result.npz
 
-Run by `bench_solver.py peers --peer-python PYTHON`, where PYTHON has `pyceres`,
+Run by `bench_solver.py ceres --peer-python PYTHON`, where PYTHON has `pyceres`,
 `pycolmap` and NumPy. SPARSE_SCHUR, 2 threads, Cauchy, intrinsics held; the gauge as
 COLMAP holds it by default (one camera, and one coordinate of a second).
 """

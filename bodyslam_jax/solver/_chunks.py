@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.solver._assembly import Chunks
 from bodyslam_jax.solver._blocks import Sizes
 from bodyslam_jax.solver._landmarks import CAMERAS
+from bodyslam_jax.solver._triangular import half_of
 
 
 class Factor(eqx.Module):
@@ -33,7 +34,6 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     head = q - CAMERAS
     middle = r - head - CAMERAS - tail
     dtype = chunks.pivot.dtype
-    eye = jnp.eye(q, dtype=dtype)
 
     def step(front, chunk):
         pivot, coupling = chunk
@@ -44,8 +44,7 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
             [gap[0], known[:, :middle], gap[1], known[:, middle:]], axis=1
         )
         # The upper part of the front is all there is of it.
-        lower = jnp.linalg.cholesky(pivot.T, symmetrize_input=False)
-        half = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
+        half = half_of(pivot.T)
         side = half @ coupling
         rest = _spread(front[q:, q:], head, middle)
         return rest - _upper_square(side, tail), (half, side)

@@ -15,8 +15,10 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph import Problem, State, world_from_root
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
 from bodyslam_jax.solver._chunks import Factor
+from bodyslam_jax.solver._compile import is_alone
 from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
-from bodyslam_jax.solver._levenberg_marquardt import Final, little
+from bodyslam_jax.solver._levenberg_marquardt import little
+from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._normal import damped, diagonals
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._solve import method_of, run
@@ -48,7 +50,7 @@ def marginals(problem: Problem, state: State) -> Marginals:
     t, l = len(state.cameras), len(state.landmarks)
     problem, state = pad(problem, state)
     method = method_of((), 0.0, state.scale.dtype, keep=True)
-    _, final = run(problem, state, method)
+    _, final = run(problem, state, method, alone=is_alone())
     spread = _marginals(problem, state, final)
     cut = {"cameras": spread.cameras[:t], "people": spread.people[:, :t]}
     return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})

@@ -18,19 +18,19 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from bodyslam_jax.graph import (
-    VARIABLES,
-    Problem,
-    Reprojection,
-    State,
-    Step,
-    lift,
-    residual_of,
-)
-from bodyslam_jax.solver._blocks import Linearisation, Observations, sizes_of
-from bodyslam_jax.solver._chunks import Factor
+from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
+from bodyslam_jax.solver._blocks import sizes_of
 from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver._loop import Final, History, Loop
+from bodyslam_jax.solver._normal import (
+    damped,
+    diagonals,
+    eliminate,
+    quadratic,
+    slope_along,
+    solve_step,
+)
+from bodyslam_jax.solver._search import search
 from bodyslam_jax.solver._tables import gather
 
 GAIN = 1e-4
@@ -40,46 +40,6 @@ CAUTION = (1e-2, 1e4)
 """Least and greatest damping of a landmark that a step would have thrown off."""
 SHRINK = 0.1
 """Least factor of the damping after a good step."""
-
-
-class History(eqx.Module):
-    """One entry an iteration, of which the first `num_steps` are filled."""
-
-    cost: Float[Array, "*s _"]
-    """Before each iteration, and after the last."""
-    terms: Float[Array, "*s _ k"]
-    """By factor, in the order of the problem."""
-    damping: Float[Array, "*s n"]
-    step: Float[Array, "*s n"]
-    """Length of the step in standard deviations: `sqrt(δ^T diag(H) δ)`."""
-    accepted: Bool[Array, "*s n"]
-
-
-class Final(eqx.Module):
-    """The normal equations where the solver stopped, hardly damped, factorised."""
-
-    lin: Linearisation
-    factor: Factor
-
-
-class _Loop(eqx.Module):
-    stage: Int[Array, ""]
-    """That runs now; the number of stages while the last factorisation is made."""
-    prediction: Any
-    observations: Observations | None
-    final: Final
-    stale: Bool[Array, ""]
-    """Whether `final.lin` is of an earlier state or stage."""
-    damping: Float[Array, ""]
-    caution: Float[Array, " l"]
-    """Damping that landmarks have at least, each by itself."""
-    growth: Float[Array, ""]
-    cost: Float[Array, ""]
-    first_cost: Float[Array, ""]
-    steps: Int[Array, " s"]
-    finished: Bool[Array, ""]
-    result: optx.RESULTS
-    history: History
 
 
 class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -113,7 +73,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         struct = eqx.filter_eval_shape(_first, args, observations, y)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
         stage = self._after(jnp.array(-1))
-        return _Loop(
+        return Loop(
             stage=stage,
             prediction=empty[1],
             observations=observations,
@@ -172,13 +132,13 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         eliminated = eliminate(problem, lin, sizes, extra)
         move = solve_step(problem, y, lin, sizes, eliminated)
-        length = _quadratic(problem, diagonal, move)
-        slope = -_slope(problem, lin, move)
-        predicted = 0.5 * (_quadratic(problem, extra, move) + slope)
+        length = quadratic(problem, diagonal, move)
+        slope = -slope_along(problem, lin, move)
+        predicted = 0.5 * (quadratic(problem, extra, move) + slope)
         finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
         move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
         slope = jnp.where(finite, slope, 0.0)
-        trial, thrown, best, terms, gain = _search(
+        trial, thrown, best, terms, gain = search(
             problem, y, move, slope, predicted, lin.costs
         )
         more = jnp.clip(10 * state.caution, *CAUTION)
@@ -218,7 +178,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         new_y = jax.tree.map(lambda a, b: jnp.where(accept, a, b), trial, y)
         new_damping = jnp.where(accept, lower, higher)
-        loop = _Loop(
+        loop = Loop(
             stage=following,
             prediction=prediction,
             observations=state.observations,
@@ -276,116 +236,6 @@ def _first(problem, observations, state):
 def _linearise_anew(problem, observations, state):
     seen = problem.predict(state)
     return linearise(problem.with_prediction(seen), observations, state), seen
-
-
-def _search(problem, state, move, slope, predicted, terms):
-    """The full step, and the one that a parabola through its cost finds better.
-
-    Robust losses bend more than `J^T J` knows: full steps then overshoot to and fro.
-    The second evaluation is a few per cent of an iteration. Returns the better state,
-    landmarks left behind, the share of the step, the terms there, and actual over
-    predicted decrease of the full step.
-    """
-    known = jnp.sum(terms)
-
-    def one(carry, _):
-        share, place, thrown, best, best_terms, full = carry
-        moved = state.retract(jax.tree.map(lambda x: share * x, move))
-        moved, off, new = _settle(problem, state, moved)
-        cost = jnp.sum(new)
-        cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-        better = cost < jnp.sum(best_terms)
-        best = jnp.where(better, share, best)
-        best_terms = jnp.where(better, new, best_terms)
-        place = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, place)
-        thrown = jnp.where(better, off, thrown)
-        full = jnp.where(jnp.isnan(full), cost, full)
-        # cost(a) = known - slope a + bend a^2, through the full step
-        bend = full - known + slope
-        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
-        vertex = jnp.where(bend > 0, vertex, 2.0)
-        share = jnp.clip(vertex, 0.1, 2.0)
-        return (share, place, thrown, best, best_terms, full), None
-
-    one_ = jnp.ones_like(known)
-    none = jnp.zeros(len(state.landmarks), bool)
-    start = (one_, state, none, one_, terms, jnp.nan * one_)
-    found, _ = jax.lax.scan(one, start, length=2)
-    _, place, thrown, best, best_terms, full = found
-    gain = (known - full) / jnp.where(predicted > 0, predicted, 1.0)
-    return place, thrown, best, best_terms, jnp.clip(gain, -1.0, 2.0)
-
-
-def _settle(
-    problem: Problem, state: State, moved: State
-) -> tuple[State, Bool[Array, " l"], Float[Array, " k"]]:
-    """A trial in which landmarks that the step throws off stay behind; which they are;
-    and its costs.
-
-    A point that few frames see, or that an outlier pulls, may be sent behind the
-    cameras; given the cameras its cost is its own, so that it need not hold up the
-    step of all others.
-    """
-    costs = []
-    keep = jnp.zeros(len(state.landmarks), bool)
-    for factor in problem.factors:
-        if not isinstance(factor, Reprojection):
-            costs.append(factor.cost(moved))
-            continue
-        old = eqx.tree_at(lambda s: s.landmarks, moved, state.landmarks)
-        count = len(state.landmarks)
-        ahead, behind = (
-            jnp.zeros(count, moved.scale.dtype)
-            .at[factor.landmark]
-            .add(factor.loss.rho(jnp.sum(residual_of(factor, s) ** 2, axis=-1)))
-            for s in (moved, old)
-        )
-        keep = ~(ahead <= behind)
-        landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
-        moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
-        costs.append(0.5 * jnp.sum(jnp.where(keep, behind, ahead)))
-    return moved, keep, jnp.stack(costs)
-
-
-def _quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
-    """`δ^T diag(H) δ`"""
-    total = jnp.sum(diagonal["camera"] * step.cameras**2)
-    total = total + jnp.sum(diagonal["root"] * step.roots**2)
-    total = total + jnp.sum(diagonal["globals"] * _globals(diagonal, step) ** 2)
-    if "pose" in diagonal:
-        poses = step.poses.reshape(*step.poses.shape[:2], -1)
-        total = total + jnp.sum(diagonal["pose"] * poses**2)
-    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
-        moved = step.landmarks[bucket.landmark]
-        total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
-    return total
-
-
-def _slope(problem, lin, step):
-    """`g^T δ`"""
-    total = jnp.sum(lin.globals_gradient * _globals({"globals": lin.globals}, step))
-    gradient = lin.gradient
-    if "camera_alone" in gradient:
-        total = total + jnp.sum(gradient["camera_alone"] * step.cameras)
-    if "camera" in gradient:
-        total = total + jnp.sum(gradient["camera"] * step.cameras)
-    if "root" in gradient:
-        total = total + jnp.sum(gradient["root"] * step.roots)
-    if "pose" in gradient:
-        poses = step.poses.reshape(*step.poses.shape[:2], -1)
-        total = total + jnp.sum(gradient["pose"] * poses)
-    for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
-        moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
-        total = total + jnp.sum(table.gradient * moved)
-    return total
-
-
-def _globals(like, step):
-    """Globals in one vector; intrinsics only if they are among them."""
-    count = like["globals"].shape[0] - 1 - step.shapes.size
-    return jnp.concatenate(
-        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
-    )
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:

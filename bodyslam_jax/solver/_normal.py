@@ -146,3 +146,44 @@ def _postures(sizes, eliminated, people, cameras, roots, common):
     parts.append(jnp.broadcast_to(own[:, None], (h, n, own.shape[-1])))
     known = jnp.concatenate(parts, axis=-1)
     return substitute_postures(eliminated.postures, known, separator)
+
+
+def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
+    """`δ^T diag(H) δ`"""
+    total = jnp.sum(diagonal["camera"] * step.cameras**2)
+    total = total + jnp.sum(diagonal["root"] * step.roots**2)
+    total = total + jnp.sum(diagonal["globals"] * _globals(diagonal, step) ** 2)
+    if "pose" in diagonal:
+        poses = step.poses.reshape(*step.poses.shape[:2], -1)
+        total = total + jnp.sum(diagonal["pose"] * poses**2)
+    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
+        moved = step.landmarks[bucket.landmark]
+        total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
+    return total
+
+
+def slope_along(problem, lin, step):
+    """`g^T δ`"""
+    total = jnp.sum(lin.globals_gradient * _globals({"globals": lin.globals}, step))
+    gradient = lin.gradient
+    if "camera_alone" in gradient:
+        total = total + jnp.sum(gradient["camera_alone"] * step.cameras)
+    if "camera" in gradient:
+        total = total + jnp.sum(gradient["camera"] * step.cameras)
+    if "root" in gradient:
+        total = total + jnp.sum(gradient["root"] * step.roots)
+    if "pose" in gradient:
+        poses = step.poses.reshape(*step.poses.shape[:2], -1)
+        total = total + jnp.sum(gradient["pose"] * poses)
+    for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
+        moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
+        total = total + jnp.sum(table.gradient * moved)
+    return total
+
+
+def _globals(like, step):
+    """Globals in one vector; intrinsics only if they are among them."""
+    count = like["globals"].shape[0] - 1 - step.shapes.size
+    return jnp.concatenate(
+        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
+    )

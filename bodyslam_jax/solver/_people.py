@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation, Sizes
+from bodyslam_jax.solver._triangular import half_of
 
 POSE = 69
 GROUP = 16
@@ -149,7 +150,7 @@ def _eliminate_group(border: Border, blocks: dict, gradient: Array, damping: Arr
 
     def step(k, carry):
         pivot, columns, halves, solved = carry
-        half = _half(pivot)
+        half = half_of(pivot)
         here = half @ columns
         forward = _link_times(at(link, k + 1), half.swapaxes(-1, -2))
         pivot = at(own, k + 1) - forward @ forward.swapaxes(-1, -2)
@@ -163,44 +164,6 @@ def _eliminate_group(border: Border, blocks: dict, gradient: Array, damping: Arr
     tall = solved.reshape(len(solved), -1, solved.shape[-1])
     update = -tall.swapaxes(-1, -2) @ tall
     return Postures(halves, solved, link[:, 1:], pivot, columns, update)
-
-
-def _half(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """`L^-1` of positive definite matrices `L L^T`; NaN where one is not."""
-    return invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
-
-
-def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """Inverse of triangular matrices, halved until little is left: matrix products are
-    ten times as fast as substitution.
-
-    Without LAPACK's: two of jaxlib's batched solves at the same time (0.10.2, on two
-    cores) wait for each other's threads for ever.
-    """
-    n = lower.shape[-1]
-    if n <= 24:
-        return _substitute(lower)
-    cut = n // 2
-    first = invert_lower(lower[..., :cut, :cut])
-    last = invert_lower(lower[..., cut:, cut:])
-    mixed = -last @ (lower[..., cut:, :cut] @ first)
-    top = jnp.concatenate([first, jnp.zeros_like(mixed.swapaxes(-1, -2))], axis=-1)
-    return jnp.concatenate([top, jnp.concatenate([mixed, last], axis=-1)], axis=-2)
-
-
-def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """The same, one row after another taken from all below it."""
-    index = jnp.arange(lower.shape[-1])
-
-    def one(k, inverse):
-        column = jax.lax.dynamic_index_in_dim(lower, k, -1)
-        pivot = jax.lax.dynamic_index_in_dim(column, k, -2)
-        row = jax.lax.dynamic_index_in_dim(inverse, k, -2) / pivot
-        below = jnp.where((index > k)[:, None], column, 0.0)
-        return jnp.where((index == k)[:, None], row, inverse - below * row)
-
-    eye = jnp.broadcast_to(jnp.eye(len(index), dtype=lower.dtype), lower.shape)
-    return jax.lax.fori_loop(0, len(index), one, eye)
 
 
 def _border_columns(border, blocks, gradient, link):

@@ -1,6 +1,8 @@
 """`solve`: a problem and a first state in, the best state and how it was found out."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -11,13 +13,13 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.solver import _baselines
+from bodyslam_jax.solver._compile import is_alone, quick_options
 from bodyslam_jax.solver._implicit import cotangent_of_problem
 from bodyslam_jax.solver._levenberg_marquardt import (
-    Final,
-    History,
     StructuredLevenbergMarquardt,
     lifted,
 )
+from bodyslam_jax.solver._loop import Final, History
 from bodyslam_jax.solver._padding import pad, unpad
 
 Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
@@ -98,7 +100,7 @@ def solve(
     if solver != "structured":
         return _solve_baseline(problem, state, solver, schedule)
     padded, start = pad(problem, state)
-    solution = _differentiable(padded, start, schedule, damping)
+    solution = _differentiable(padded, start, schedule, damping, is_alone())
     return eqx.tree_at(
         lambda s: s.state,
         solution,
@@ -124,11 +126,26 @@ def method_of(
     )
 
 
-@eqx.filter_jit
 def run(
-    problem: Problem, state: State, method: StructuredLevenbergMarquardt
+    problem: Problem,
+    state: State,
+    method: StructuredLevenbergMarquardt,
+    *,
+    alone: bool = False,
 ) -> tuple[Solution, Final]:
-    """All stages on a padded problem, and the equations where they end."""
+    """All stages on a padded problem, and the equations where they end.
+
+    `alone` is what `is_alone()` said before anything was traced.
+    """
+    return _program(alone)(problem, state, method)
+
+
+@functools.cache
+def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
+    return eqx.filter_jit(_run, compiler_options=quick_options() if alone else None)
+
+
+def _run(problem, state, method):
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )
@@ -152,14 +169,14 @@ def run(
 
 
 @eqx.filter_custom_vjp
-def _differentiable(problem, state, schedule, damping):
-    return _solve(problem, state, schedule, damping)
+def _differentiable(problem, state, schedule, damping, alone):
+    return _solve(problem, state, schedule, damping, alone)
 
 
-def _solve(problem, state, schedule, damping):
+def _solve(problem, state, schedule, damping, alone):
     method = method_of(schedule, damping, state.scale.dtype)
     now = restrict(problem, tuple(name for stage in schedule for name in stage.free))
-    solution, _ = run(now, state, method)
+    solution, _ = run(now, state, method, alone=alone)
     used = len(schedule)
     return dataclasses.replace(
         solution,
@@ -169,13 +186,13 @@ def _solve(problem, state, schedule, damping):
 
 
 @_differentiable.def_fwd
-def _forward(perturbed, problem, state, schedule, damping):
-    solution = _solve(problem, state, schedule, damping)
+def _forward(perturbed, problem, state, schedule, damping, alone):
+    solution = _solve(problem, state, schedule, damping, alone)
     return solution, solution.state
 
 
 @_differentiable.def_bwd
-def _backward(found, cotangent, perturbed, problem, state, schedule, damping):
+def _backward(found, cotangent, perturbed, problem, state, schedule, damping, alone):
     arrive = cotangent.state
     full = jax.tree.map(
         lambda c, x: jnp.zeros_like(x) if c is None else c,

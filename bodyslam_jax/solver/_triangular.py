@@ -1,0 +1,61 @@
+"""Inverses of Cholesky factors, without LAPACK's triangular solves."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+LEAF = 24
+"""Width of the blocks, at most."""
+
+
+def half_of(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """`L^-1` of positive definite matrices `L L^T`; NaN where one is not."""
+    return invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
+
+
+def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """Inverse of triangular matrices: of small blocks down the diagonal first, then of
+    two neighbours at a time, as matrix products are ten times as fast as substitution.
+
+    Without LAPACK's: two of jaxlib's batched solves at the same time (0.10.2, on two
+    cores) wait for each other's threads for ever.
+    """
+    n = lower.shape[-1]
+    levels = max(0, math.ceil(math.log2(n / LEAF)))
+    size = -(-n // 2**levels)
+    more = size * 2**levels - n
+    lower = jnp.pad(lower, [(0, 0)] * (lower.ndim - 2) + [(0, more)] * 2)
+    lower = lower + jnp.diag(jnp.arange(n + more) >= n).astype(lower.dtype)
+
+    def blocks(shift, step):
+        """Those `shift` below the diagonal, every `step`-th, side by side."""
+        starts = range(0, n + more - shift * size, step * size)
+        pick = lambda k: lower[..., k + shift * size :, k:][..., :size, :size]
+        return jnp.stack([pick(k) for k in starts], axis=-3)
+
+    inverse = _substitute(blocks(0, 1))
+    while inverse.shape[-3] > 1:
+        first, last = inverse[..., 0::2, :, :], inverse[..., 1::2, :, :]
+        mixed = -last @ (blocks(1, 2) @ first)
+        top = jnp.concatenate([first, jnp.zeros_like(mixed)], axis=-1)
+        bottom = jnp.concatenate([mixed, last], axis=-1)
+        inverse = jnp.concatenate([top, bottom], axis=-2)
+        size *= 2
+    return inverse[..., 0, :n, :n]
+
+
+def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """The same, one row after another taken from all below it."""
+    index = jnp.arange(lower.shape[-1])
+
+    def one(k, inverse):
+        column = jax.lax.dynamic_index_in_dim(lower, k, -1)
+        pivot = jax.lax.dynamic_index_in_dim(column, k, -2)
+        row = jax.lax.dynamic_index_in_dim(inverse, k, -2) / pivot
+        below = jnp.where((index > k)[:, None], column, 0.0)
+        return jnp.where((index == k)[:, None], row, inverse - below * row)
+
+    eye = jnp.broadcast_to(jnp.eye(len(index), dtype=lower.dtype), lower.shape)
+    return jax.lax.fori_loop(0, len(index), one, eye)
