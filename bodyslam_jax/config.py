@@ -52,6 +52,9 @@ class GraphWeights:
     """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
     root_smoothness: float | None = 0.006
     """Change of the pelvis' step in a frame of 1/30 s, m; free without it."""
+    ground_sigma: float | None = 0.05
+    """How far the map's ground may be from what people stand on, m: one error for the
+    whole sequence. Without it, people need not stand on anything."""
 
     @classmethod
     def paper(cls) -> "GraphWeights":
@@ -75,6 +78,7 @@ class GraphWeights:
             root_sigma=None,
             root_turning=None,
             root_smoothness=None,
+            ground_sigma=None,
         )
 
 

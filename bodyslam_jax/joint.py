@@ -59,7 +59,8 @@ def prepare(
         jnp.asarray(roots.present),
     )
     moving = cameras.kind == "moving"
-    start = ScaleStart(1.0, float("inf"))
+    start = ScaleStart()
+    contact = None
     stages = []
     factors = []
     if moving:
@@ -78,13 +79,29 @@ def prepare(
         walked = lambda seen, state: initialisation.motion_factor(
             seen, state.shapes, body, config.weights
         )
+        if moving:
+            contact = initialisation.ground_contact(
+                state,
+                roots,
+                cameras.registered,
+                sequence.keypoints,
+                body,
+                config.weights,
+            )
+        if contact is not None:
+            factors.append(contact)
         problem = make([*factors, walked(_predict(predictor, state), state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
         seen = _predict(predictor, state)
         if moving:
-            start = initialisation.scale_start(state, seen)
-            log.info("scale: %.4g ± %.2g", start.value, start.standard_error)
+            start = initialisation.scale_start(state, seen, contact)
+            log.info(
+                "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
+                *(start.value, start.standard_error),
+                *(start.motion, start.motion_error),
+                *(start.ground, start.ground_error),
+            )
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
         factors.append(walked(seen, state))
     if not factors:
@@ -104,7 +121,11 @@ def _settle_people(
 ) -> tuple[graph.State, dict]:
     """People alone in the camera's frame: the same program with all else held."""
     alone = graph.mute(
-        problem, graph.Reprojection, graph.HumanMotion, graph.RootSmoothness
+        problem,
+        graph.Reprojection,
+        graph.HumanMotion,
+        graph.RootSmoothness,
+        graph.GroundContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")
     alone = dataclasses.replace(alone, free=graph.hold(alone.free, *rest))

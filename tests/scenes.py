@@ -154,6 +154,11 @@ def extra_factors(rng, state):
         g.RootSmoothness(sigma=late(h, t, skip=2)),
         g.StanceFoot(body=body_model(), sigma=late(h, t, 4, skip=1)),
         g.UpDirection(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
+        g.GroundContact(
+            body=body_model(),
+            plane=jnp.array([0.1, -0.99, 0.1, 1.2]),
+            sigma=late(h, t, skip=1),
+        ),
     ]
 
 

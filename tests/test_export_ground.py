@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax import export
-from bodyslam_jax.export._ground import find_ground
+from bodyslam_jax.ground import find_ground
 from bodyslam_jax.result import Result
 
 
@@ -56,7 +56,8 @@ def test_says_how_much_too_small_the_map_is(factor, tilt):
 
 def test_the_ground_is_found_among_much_else():
     normal, offset = np.split(
-        find_ground(scene().landmarks, scene().T_WC[:, :3, 3]), [3]
+        find_ground(scene().landmarks, scene().T_WC[:, :3, 3], np.array([0.0, 1, 0])),
+        [3],
     )
     np.testing.assert_allclose(normal, [0, 1, 0], atol=0.01)
     np.testing.assert_allclose(offset, 0, atol=0.02)

@@ -1,16 +1,12 @@
 """Do people stand on the ground of the map? A check the estimate knows nothing of."""
 
 import numpy as np
-from jaxtyping import Float
 
+from bodyslam_jax.ground import find_ground
 from bodyslam_jax.result import Result
 
 _FEET = [10, 11]
-_TILT = np.cos(np.radians(20.0))
-"""The ground may lean this far from level, as up is only known from people's trunks."""
-_THICKNESS = 0.05
-"""Half the ground's thickness, of the camera's height above it."""
-_TRIES = 1000
+_UP = np.array([0.0, 1.0, 0.0])
 
 
 def ground_scale(result: Result) -> float | None:
@@ -23,7 +19,7 @@ def ground_scale(result: Result) -> float | None:
     """
     if not result.present.any():
         return None
-    plane = find_ground(result.landmarks, result.T_WC[:, :3, 3])
+    plane = find_ground(result.landmarks, result.T_WC[:, :3, 3], _UP)
     if plane is None:
         return None
     normal, offset = plane[:3], plane[3]
@@ -39,36 +35,3 @@ def ground_scale(result: Result) -> float | None:
         factors.append(1 / reach[reach > 0])
     every = np.concatenate(factors)
     return float(np.median(every)) if len(every) else None
-
-
-def find_ground(
-    points: Float[np.ndarray, "l 3"], eyes: Float[np.ndarray, "t 3"]
-) -> Float[np.ndarray, " 4"] | None:
-    """The plane `n x + d = 0` (n up, unit) of the ground, or `None`; by RANSAC."""
-    below = points[points[:, 1] < np.median(eyes[:, 1])]
-    if len(below) < 30:
-        return None
-    rng = np.random.default_rng(0)
-    best, most = None, max(30, 0.15 * len(points))
-    for _ in range(_TRIES):
-        a, b, c = below[rng.choice(len(below), 3, replace=False)]
-        plane = _plane(np.cross(b - a, c - a), a)
-        height = np.median(eyes @ plane[:3] + plane[3])
-        if plane[1] < _TILT or height <= 0:
-            continue
-        near = np.abs(below @ plane[:3] + plane[3]) < _THICKNESS * height
-        if near.sum() > most:
-            best, most = near, near.sum()
-    if best is None:
-        return None
-    chosen = below[best]
-    centre = chosen.mean(axis=0)
-    return _plane(np.linalg.svd(chosen - centre)[2][2], centre)
-
-
-def _plane(
-    normal: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 4"]:
-    length = np.linalg.norm(normal)
-    normal = normal / max(length, 1e-12) * (1 if normal[1] >= 0 else -1)
-    return np.append(normal, -normal @ point)

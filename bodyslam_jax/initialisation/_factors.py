@@ -1,13 +1,5 @@
-"""From tracks and bodies to a first metric state and the factors that refine it.
+"""The graph's error terms from what was measured (section 3.6 of the paper)."""
 
-Section 3.6 of the paper: cameras and landmarks up to scale from structure from motion,
-people placed in them by `T_WH = T_WC T_CH`, and the graph's error terms. The first
-scale comes in closed form from the motion model, which is linear in s.
-"""
-
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -32,46 +24,6 @@ def map_factor(
         pixel=jnp.asarray(tracks.uv, float),
         sigma=jnp.asarray(np.where(keep, sigma, np.inf)),
         loss=graph.Cauchy(jnp.asarray(weights.landmark_loss)),
-    )
-
-
-def first_state(
-    cameras: Float[np.ndarray, "t 4 4"],
-    landmarks: Float[np.ndarray, "l 3"],
-    roots: Roots,
-    intrinsics: Float[np.ndarray, " i"],
-) -> graph.State:
-    """The state before any scale is known: s = 1."""
-    return graph.State(
-        scale=jnp.ones(()),
-        cameras=jnp.asarray(cameras),
-        roots=jnp.asarray(roots.T_CH),
-        poses=jnp.asarray(roots.body_pose),
-        shapes=jnp.asarray(roots.shape),
-        landmarks=jnp.asarray(landmarks),
-        intrinsics=jnp.asarray(intrinsics, float),
-    )
-
-
-def no_people(num_frames: int) -> Roots:
-    """An empty list of people, for cameras alone."""
-    return Roots(
-        np.zeros((0, num_frames), bool),
-        np.zeros((0, num_frames, 4, 4)),
-        np.zeros((0, num_frames, 23, 3)),
-        np.zeros((0, 10)),
-    )
-
-
-def free_people(state: graph.State) -> graph.Step:
-    """Only people move: for a camera that stands, or of which only turns are known."""
-    free = jax.tree.map(jnp.zeros_like, state.zero_step())
-    ones = lambda x: jnp.ones_like(x)
-    return dataclasses.replace(
-        free,
-        roots=ones(free.roots),
-        poses=ones(free.poses),
-        shapes=ones(free.shapes),
     )
 
 
@@ -193,37 +145,3 @@ def motion_factor(
         correlated=weights.motion_correlation > 0,
         body=body,
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class ScaleStart:
-    """The first guess of s, in closed form."""
-
-    value: float
-    standard_error: float
-    """Infinite if the people's motion says nothing."""
-
-
-def scale_start(state: graph.State, seen: motion.Prediction) -> ScaleStart:
-    """Robust regression of predicted on observed displacements, people averaged.
-
-    1 with an infinite error where the motion model says nothing, so that the map stays
-    in its own unit.
-    """
-    C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
-    turn = C_WC @ state.roots[..., :3, :3]
-    offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])
-    found = []
-    for h in range(len(state.roots)):
-        one = jax.tree.map(lambda x: x[h], seen)
-        found.append(motion.scale_from_motion(one, turn[h], r_WC, offset[h]))
-    usable = [f for f in found if np.isfinite(f.value) and f.value > 0]
-    if not usable:
-        return ScaleStart(1.0, float("inf"))
-    errors = np.array([f.standard_error for f in usable])
-    errors = np.where(
-        np.isfinite(errors), errors, 0.5 * np.array([f.value for f in usable])
-    )
-    weight = 1 / np.maximum(errors, 1e-6) ** 2
-    value = float(np.sum(weight * [f.value for f in usable]) / weight.sum())
-    return ScaleStart(value, float(weight.sum() ** -0.5))

@@ -1,0 +1,128 @@
+"""The first scale in closed form: from how people move, and from where they stand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax import graph, motion
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.ground import find_ground
+from bodyslam_jax.people import Roots
+from bodyslam_jax.sequence import Keypoints
+
+
+_FEET = (11, 14, 19, 20, 21, 22, 23, 24)
+"""Ankles, toes and heels of BODY_25."""
+_SEEN = 0.2
+"""Confidence from which a keypoint of the feet counts as seen."""
+_STEADY = 0.3
+"""How far the scale under single feet may vary, between quartiles: on stairs, or where
+the plane is not what people stand on, it varies more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaleStart:
+    """The first guess of s, in closed form: two cues, weighted by their errors."""
+
+    motion: float = 1.0
+    """From how people move; 1 if that says nothing."""
+    motion_error: float = float("inf")
+    """Its standard error; infinite if people's motion says nothing."""
+    ground: float = 1.0
+    """From where they stand on the map's ground."""
+    ground_error: float = float("inf")
+    """Its standard error; infinite if no ground is seen under the feet."""
+
+    @property
+    def _weights(self) -> Float[np.ndarray, " 2"]:
+        return np.array([self.motion_error, self.ground_error]) ** -2.0
+
+    @property
+    def value(self) -> float:
+        """s; 1 if neither cue says anything, so that the map stays in its own unit."""
+        weight = self._weights
+        if not weight.any():
+            return 1.0
+        return float(weight @ [self.motion, self.ground] / weight.sum())
+
+    @property
+    def standard_error(self) -> float:
+        """Infinite if neither cue says anything."""
+        total = self._weights.sum()
+        return float(total**-0.5) if total else float("inf")
+
+
+def scale_start(
+    state: graph.State,
+    seen: motion.Prediction,
+    contact: graph.GroundContact | None,
+) -> ScaleStart:
+    """Both cues of scale: motion, and the ground if there is one."""
+    start = _motion_scale(state, seen)
+    if contact is None:
+        return start
+    used = np.isfinite(np.asarray(contact.sigma))
+    ground = float(np.median(np.asarray(contact.scales(state))[used]))
+    # Metres by which the ground may be off, over units from it to the camera.
+    metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
+    units = state.cameras[:, :3, 3] @ contact.plane[:3] + contact.plane[3]
+    error = metres / float(np.median(np.asarray(units)))
+    return dataclasses.replace(start, ground=ground, ground_error=error)
+
+
+def ground_contact(
+    state: graph.State,
+    roots: Roots,
+    registered: Bool[np.ndarray, " t"],
+    keypoints: Keypoints | None,
+    body: BodyModel,
+    weights: GraphWeights,
+) -> graph.GroundContact | None:
+    """People stand on the map's ground, where their feet are seen; `None` without one.
+
+    Up is where people's trunks point on average.
+    """
+    there = roots.present & registered
+    if keypoints is not None:
+        there &= (keypoints.confidence[:, :, _FEET] > _SEEN).any(axis=-1)
+    if weights.ground_sigma is None or there.sum() < 2:
+        return None
+    up = np.asarray(state.cameras[:, :3, :3] @ state.roots[..., :3, 1:2])[there]
+    up = up[..., 0].mean(axis=0)
+    plane = find_ground(
+        np.asarray(state.landmarks),
+        np.asarray(state.cameras[:, :3, 3]),
+        up / np.linalg.norm(up),
+    )
+    if plane is None:
+        return None
+    sigma = np.where(there, weights.ground_sigma * np.sqrt(there.sum()), np.inf)
+    contact = graph.GroundContact(body, jnp.asarray(plane), jnp.asarray(sigma))
+    every = np.asarray(contact.scales(state))[there]
+    low, middle, high = np.quantile(every, [0.25, 0.5, 0.75])
+    return contact if low > 0 and high - low < _STEADY * middle else None
+
+
+def _motion_scale(state: graph.State, seen: motion.Prediction) -> ScaleStart:
+    """Robust regression of predicted on observed displacements, people averaged."""
+    C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
+    turn = C_WC @ state.roots[..., :3, :3]
+    offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])
+    found = []
+    for h in range(len(state.roots)):
+        one = jax.tree.map(lambda x: x[h], seen)
+        found.append(motion.scale_from_motion(one, turn[h], r_WC, offset[h]))
+    usable = [f for f in found if np.isfinite(f.value) and f.value > 0]
+    if not usable:
+        return ScaleStart()
+    errors = np.array([f.standard_error for f in usable])
+    errors = np.where(
+        np.isfinite(errors), errors, 0.5 * np.array([f.value for f in usable])
+    )
+    weight = 1 / np.maximum(errors, 1e-6) ** 2
+    value = float(np.sum(weight * [f.value for f in usable]) / weight.sum())
+    return ScaleStart(value, float(weight.sum() ** -0.5))

@@ -1,0 +1,51 @@
+"""The first state: people placed before cameras whose path has no unit yet."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import graph
+from bodyslam_jax.people import Roots
+
+
+def first_state(
+    cameras: Float[np.ndarray, "t 4 4"],
+    landmarks: Float[np.ndarray, "l 3"],
+    roots: Roots,
+    intrinsics: Float[np.ndarray, " i"],
+) -> graph.State:
+    """The state before any scale is known: s = 1."""
+    return graph.State(
+        scale=jnp.ones(()),
+        cameras=jnp.asarray(cameras),
+        roots=jnp.asarray(roots.T_CH),
+        poses=jnp.asarray(roots.body_pose),
+        shapes=jnp.asarray(roots.shape),
+        landmarks=jnp.asarray(landmarks),
+        intrinsics=jnp.asarray(intrinsics, float),
+    )
+
+
+def no_people(num_frames: int) -> Roots:
+    """An empty list of people, for cameras alone."""
+    return Roots(
+        np.zeros((0, num_frames), bool),
+        np.zeros((0, num_frames, 4, 4)),
+        np.zeros((0, num_frames, 23, 3)),
+        np.zeros((0, 10)),
+    )
+
+
+def free_people(state: graph.State) -> graph.Step:
+    """Only people move: for a camera that stands, or of which only turns are known."""
+    free = jax.tree.map(jnp.zeros_like, state.zero_step())
+    ones = lambda x: jnp.ones_like(x)
+    return dataclasses.replace(
+        free,
+        roots=ones(free.roots),
+        poses=ones(free.poses),
+        shapes=ones(free.shapes),
+    )
