@@ -14,7 +14,6 @@ from bodyslam_jax.ground import find_ground
 from bodyslam_jax.people import Roots
 from bodyslam_jax.sequence import Keypoints
 
-
 _FEET = (11, 14, 19, 20, 21, 22, 23, 24)
 """Ankles, toes and heels of BODY_25."""
 _SEEN = 0.2
