@@ -22,9 +22,11 @@ class GraphWeights:
     keypoint_sigma: float | None = None
     """Keypoints of confidence 1, px; divided by the confidence. Without it, the
     detector's usual error in metres of the body, as it appears at its distance."""
-    keypoint_inflation: float = 1.5
-    """Factor on the detector's usual error: errors last, frames are not independent."""
-    keypoint_loss: float = 5.0
+    keypoint_inflation: float = 4.0
+    """Factor on the detector's usual error at 30 fps; grows with the root of the frame
+    rate. Errors last for about a quarter of a second: taken for independent, keypoints
+    stretch the body by some per cent."""
+    keypoint_loss: float = 2.0
     """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
@@ -52,7 +54,7 @@ class GraphWeights:
     """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
     root_smoothness: float | None = 0.006
     """Change of the pelvis' step in a frame of 1/30 s, m; free without it."""
-    ground_sigma: float | None = 0.05
+    ground_sigma: float | None = 0.04
     """How far the map's ground may be from what people stand on, m: one error for the
     whole sequence. Without it, people need not stand on anything."""
 
@@ -261,8 +263,9 @@ class Structure:
 
     max_error: float = 2.0
     """Reprojection error beyond which an observation is an outlier, px."""
-    min_angle: float = 0.3
-    """Smallest angle between the rays of a point, degrees."""
+    min_angle: float = 0.5
+    """Smallest angle between the rays of a point, degrees; less is tried where cameras
+    cannot be located with it."""
     max_first_pairs: int = 4
     """Pairs of frames that are tried for the start."""
     keyframe_motion: float = 0.03

@@ -115,16 +115,19 @@ def resect(
             found = _refine_pose(R, centre, points, xy, threshold)
             if found is not None and found[2].sum() >= max(10, 0.6 * len(points)):
                 return found
-    ok, rotvec, t, inlier = cv2.solvePnPRansac(
-        points,
-        xy,
-        np.eye(3),
-        None,
-        iterationsCount=500,
-        reprojectionError=2 * threshold,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
+    try:
+        ok, rotvec, t, inlier = cv2.solvePnPRansac(
+            points,
+            xy,
+            np.eye(3),
+            None,
+            iterationsCount=500,
+            reprojectionError=2 * threshold,
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:  # SQPnP gives up at a sample whose points coincide.
+        return None
     if not ok or inlier is None or len(inlier) < 6:
         return None
     R = cv2.Rodrigues(rotvec)[0]

@@ -23,6 +23,9 @@ from bodyslam_jax.frontend._geometry import (
 
 _log = logging.getLogger(__name__)
 
+_ENOUGH = 20
+"""Views of known points that tell how far points usually are."""
+
 Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
 """Adjusts the free cameras and all points of `views` in place, as `_bundle.adjust`."""
 
@@ -224,12 +227,34 @@ class Builder:
         fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
         if not good.any():
             return
-        angle = widest_angle(trial, views[np.flatnonzero(good)], points, len(points))
+        known = self._views_of(grown)
+        known = known[grown.has_point[self.views.landmark[known]]]
+        angle = self._parallax(trial, views[np.flatnonzero(good)], self.views[known])
         new = (fits >= 2) & (fits >= 0.6 * count) & (angle > self.min_angle)
         grown.scene.points[new] = points[new]
         grown.has_point |= new
         kept = new[views.landmark]
         grown.inlier[use[kept]] = good[kept]
+
+    def _parallax(self, scene: Scene, views: Views, known: Views) -> np.ndarray:
+        """Largest angle (rad) between the rays to each landmark, were it no nearer than
+        usual among those of `known` that are seen from the same cameras.
+
+        The angle at the point itself would choose points that noise has drawn nearer:
+        the map would shrink, the more so the further it grows.
+        """
+        around = np.isin(known.frame, np.unique(views.frame))
+        points = scene.points
+        if np.count_nonzero(around) > _ENOUGH:
+            at = known[np.flatnonzero(around)]
+            away = points[at.landmark] - scene.centre[at.frame]
+            usual = np.median(np.linalg.norm(away, axis=-1))
+            centre = np.zeros_like(points)
+            centre[views.landmark] = scene.centre[views.frame]
+            distance = np.linalg.norm(points - centre, axis=-1, keepdims=True)
+            farther = np.maximum(1.0, usual / np.maximum(distance, 1e-12))
+            points = centre + farther * (points - centre)
+        return widest_angle(scene, views, points, self.num_landmarks)
 
     def _mark(self, grown: Growing) -> None:
         """Sorts observations into inliers and outliers, and drops poor points."""

@@ -40,11 +40,12 @@ def keypoint_sigma(
     assert keypoints is not None
     focal = float(np.mean(sequence.intrinsics.params[:2]))
     sigma = np.full(keypoints.confidence.shape, np.inf)
+    inflation = weights.keypoint_inflation * np.sqrt(sequence.fps / 30.0)
     for h in range(len(sigma)):
         if weights.keypoint_sigma is None:
             depth = np.maximum(roots.T_CH[h, :, 2, 3], 0.1)
             metres = people.keypoint_sigma(keypoints, sequence.intrinsics, h)
-            sigma[h] = weights.keypoint_inflation * metres * (focal / depth)[:, None]
+            sigma[h] = inflation * metres * (focal / depth)[:, None]
         else:
             confidence = np.clip(keypoints.confidence[h], 0, 1)
             with np.errstate(divide="ignore"):
