@@ -22,11 +22,11 @@ class GraphWeights:
     keypoint_sigma: float | None = None
     """Keypoints of confidence 1, px; divided by the confidence. Without it, the
     detector's usual error in metres of the body, as it appears at its distance."""
-    keypoint_inflation: float = 4.0
+    keypoint_inflation: float = 3.0
     """Factor on the detector's usual error at 30 fps; grows with the root of the frame
-    rate. Errors last for about a quarter of a second: taken for independent, keypoints
+    rate. Errors last for about 0.15 s: taken for independent, keypoints
     stretch the body by some per cent."""
-    keypoint_loss: float = 2.0
+    keypoint_loss: float = 3.0
     """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
