@@ -154,8 +154,7 @@ def estimate(
         unobserved = solver.observability(problem, best, spread)
     return Joint(
         scale=float(best.scale),
-        scale_start=prepared.scale.value,
-        scale_start_error=prepared.scale.standard_error,
+        start=prepared.scale,
         scale_sigma=(
             float(spread.scale) ** 0.5 if spread and prepared.moving else np.nan
         ),

@@ -12,12 +12,15 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import body as body_
 from bodyslam_jax import camera, export
 from bodyslam_jax.config import Config
+from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Sequence, Tracks
 from bodyslam_jax.smoothing import low_pass, low_pass_rotations
 
 FEET = (10, 11)
 """SMPL's foot joints."""
+_CUES_APART = 1.25
+"""Factor between the sizes that motion and ground tell, from which a line says so."""
 _GROUND_DOUBT, _GROUND_DISTRUST = 1.15, 1.4
 """Factors between the map's size and that of the people on its ground."""
 
@@ -56,8 +59,8 @@ class Joint:
     """The graph's optimum."""
 
     scale: float
-    scale_start: float
-    scale_start_error: float
+    start: ScaleStart
+    """What motion and ground said of the scale by themselves."""
     scale_sigma: float
     """Standard deviation of `scale`; NaN if it was not computed or not estimated."""
     shape_covariance: Float[np.ndarray, "h 10 10"]
@@ -177,6 +180,7 @@ def summarise(
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
         )
+    warnings += _disagreement(joint.start)
     ground = export.ground_scale(result) if cameras.kind == "moving" else None
     apart = max(ground, 1 / ground) if ground else 1.0
     if apart > _GROUND_DOUBT:
@@ -236,8 +240,9 @@ def summarise(
         "scale": {
             "value": result.scale,
             "sigma": joint.scale_sigma,
-            "start": joint.scale_start,
-            "start_standard_error": joint.scale_start_error,
+            "start": joint.start.value,
+            "start_standard_error": joint.start.standard_error,
+            **_cues(joint.start),
             "ground_factor": ground,
         },
         "people": persons,
@@ -254,6 +259,30 @@ def summarise(
         "settings": dataclasses.asdict(config),
         "versions": versions(),
     }
+
+
+def _cues(start: ScaleStart) -> dict[str, list[float] | None]:
+    """Scale and standard error as each cue alone has them; `None` where it has none."""
+    cues = {
+        "from_motion": [start.motion, start.motion_error],
+        "from_ground": [start.ground, start.ground_error],
+    }
+    return {k: v if np.isfinite(v[1]) else None for k, v in cues.items()}
+
+
+def _disagreement(start: ScaleStart) -> list[str]:
+    """A line where motion and ground tell sizes that both cannot be right."""
+    ratio = start.motion / start.ground
+    sigma = np.hypot(
+        start.motion_error / start.motion, start.ground_error / start.ground
+    )
+    apart = max(ratio, 1 / ratio)
+    if not np.isfinite(sigma) or apart < max(_CUES_APART, 1 + 2 * sigma):
+        return []
+    return [
+        f"people's motion makes the map {ratio:.2f} times as large as the ground under "
+        "their feet does: postures, focal length or ground are off; look at both."
+    ]
 
 
 def describe(sequence: Sequence) -> dict[str, Any]:

@@ -12,8 +12,10 @@ from bodyslam_jax.config import Structure, Tracking
 from bodyslam_jax.frontend import frames, read_sequence, reconstruct, track
 from bodyslam_jax.frontend._bundle import Scene, Views, adjust, errors
 from bodyslam_jax.frontend._features import match, spread
+from bodyslam_jax.frontend._geometry import resect
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.frontend._reconstruct import interpolate_poses
+from bodyslam_jax.frontend._structure import Builder, Growing
 from bodyslam_jax.frontend._video import look_at
 from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence, Tracks
 
@@ -429,3 +431,34 @@ def test_rendered_walk_from_its_video():
     spread_of_path = np.sqrt((np.var(rows[:, 1:4], axis=0)).sum())
     assert cameras.registered.all()
     assert camera_error(cameras.T_WC, truth) * spread_of_path < 0.02  # m
+
+
+def test_points_that_noise_draws_nearer_are_not_preferred():
+    rng = np.random.default_rng(5)
+    num, count = 12, 600
+    scene = Scene(
+        np.tile(np.eye(3), (num, 1, 1)),
+        np.linspace(0, 0.05, num)[:, None] * np.array([1.0, 0, 0]),
+        rng.uniform([-2, -2, 4], [2, 2, 7], (count, 3)),
+    )
+    frame, landmark = (x.ravel() for x in np.mgrid[:num, :count])
+    offset = scene.points[landmark] - scene.centre[frame]
+    noise = 0.5 / 500 * rng.standard_normal((num * count, 2))
+    views = Views(frame, landmark, offset[:, :2] / offset[:, 2:] + noise)
+    truth = scene.points.copy()
+    known = np.arange(count) < 100
+    builder = Builder(views, num, count, 500.0, Structure(min_angle=0.5))
+    every = np.ones(len(frame), bool)
+    grown = Growing(scene, np.ones(num, bool), known.copy(), every & known[landmark])
+    builder._triangulate(grown, np.flatnonzero(~known[landmark]))
+    new = grown.has_point & ~known
+    assert new.sum() > 50
+    ratio = scene.points[new, 2] / truth[new, 2]
+    # Nearest to the rays they are 18 % too near; chosen by their own angles, 4 %.
+    assert abs(np.median(ratio) - 1) < 0.03
+
+
+def test_points_that_coincide_locate_no_camera():
+    points = np.full((20, 3), 2.0) + 1e-9 * np.arange(20)[:, None]
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
+    assert resect(points, xy, 0.004) is None

@@ -9,7 +9,6 @@ import jax
 from bodyslam_jax import graph, joint, solver
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments._case import Case
-from bodyslam_jax.experiments._score import score
 from bodyslam_jax.experiments._variants import VARIANTS
 
 INDEPENDENT = {
@@ -116,13 +115,7 @@ def _time_of_gradient(problem: graph.Problem, state: graph.State) -> float:
 
 
 def _row(case, prepared, state, stage, solution=None, seconds=None):
-    found = score(
-        state,
-        case.truth,
-        case.body,
-        prepared.roots.present,
-        case.cameras.registered,
-    )
+    found = case.score(state, prepared.roots.present)
     row = {**found, "radius": case.radius, "scale_ratio": 1 / found["scale"]}
     if solution is not None:
         steps = sum(int(n) for n in solution.num_steps)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import evaluation, joint, pipeline, reconstruction, synthetic
+from bodyslam_jax import evaluation, graph, joint, pipeline, reconstruction, synthetic
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
-from bodyslam_jax.experiments._score import truth_of
+from bodyslam_jax.experiments._score import score, truth_of
 from bodyslam_jax.outcome import Cameras
 from bodyslam_jax.sequence import Bodies, Sequence
 
@@ -45,6 +45,10 @@ class Case:
         """RMS distance of the true camera from its mean place, m."""
         centre = np.asarray(self.truth.T_WC[:, :3, 3])
         return float(np.sqrt(((centre - centre.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+    def score(self, state: graph.State, present: np.ndarray) -> dict[str, float]:
+        """Errors of a state against the truth: `_score.NAMES`."""
+        return score(state, self.truth, self.body, present, self.cameras.registered)
 
     def prepare(self, config: Config | None = None) -> joint.Prepared:
         """The joint problem and its start, with other settings if they are given."""

@@ -8,7 +8,7 @@ import numpy as np
 from bodyslam_jax import evaluation, graph, people
 from bodyslam_jax.experiments._case import Case
 from bodyslam_jax.experiments._problems import with_scale, without_map
-from bodyslam_jax.experiments._score import score, trajectories
+from bodyslam_jax.experiments._score import trajectories
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.joint import solve_stage
 
@@ -67,13 +67,7 @@ def compare_methods(case: Case) -> dict[str, Any]:
         "status": stage["status"],
     }
     for name, state in states.items():
-        found = score(
-            state,
-            case.truth,
-            case.body,
-            prepared.roots.present,
-            case.cameras.registered,
-        )
+        found = case.score(state, prepared.roots.present)
         row |= {f"{name}/{key}": value for key, value in found.items()}
     row["scale_ratio"] = 1 / float(row["full/scale"])
     drawn = {name: states[name] for name in ("no_mm", "full")}

@@ -7,7 +7,6 @@ from jaxtyping import PRNGKeyArray
 from bodyslam_jax import graph
 from bodyslam_jax.experiments._case import Case
 from bodyslam_jax.experiments._problems import with_scale, without_map
-from bodyslam_jax.experiments._score import score
 from bodyslam_jax.joint import solve_stage
 
 SHIFT, TURN = 0.1, 0.01
@@ -60,13 +59,7 @@ def landmark_ablation(case: Case, *, seed: int = 0) -> dict[str, float | str]:
         "landmarks": with_map.state,
     }
     for name, one in states.items():
-        found = score(
-            one,
-            case.truth,
-            case.body,
-            prepared.roots.present,
-            case.cameras.registered,
-        )
+        found = case.score(one, prepared.roots.present)
         row[name] = found["c_ate_se3"]
         row[f"{name}/sim3"] = found["c_ate_sim3"]
         row[f"{name}/scale"] = found["scale"]

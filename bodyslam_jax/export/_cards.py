@@ -63,7 +63,7 @@ def cards(
                 "",
                 "one standard deviation of the scale, as the estimate itself sees it",
                 f"scale {result.scale:.4g} m per unit of the unscaled map",
-                *_on_the_ground(scale.get("ground_factor")),
+                *_cues(scale),
             )
         )
     else:
@@ -80,11 +80,18 @@ def cards(
     return f'<section class="cards">{"".join(found)}</section>'
 
 
-def _on_the_ground(factor: float | None) -> list[str]:
-    """What the ground of the map says of the scale, which was found without it."""
-    if factor is None:
-        return []
-    return [f"people on the map's ground would make it {100 * (factor - 1):+.0f} %"]
+def _cues(scale: Mapping[str, Any]) -> list[str]:
+    """What motion and ground say by themselves, and where the feet are at the end."""
+    found = []
+    for cue, name in (
+        ("from_motion", "people's motion"),
+        ("from_ground", "the ground they stand on"),
+    ):
+        if (told := scale.get(cue)) is not None:
+            found.append(f"from {name} alone: {told[0]:.4g} ± {told[1]:.2g}")
+    if (factor := scale.get("ground_factor")) is not None:
+        found.append(f"feet exactly on the ground: {100 * (factor - 1):+.0f} %")
+    return found
 
 
 def _focal_length(lens: Mapping[str, Any]) -> list[str]:

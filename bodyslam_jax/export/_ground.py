@@ -1,4 +1,4 @@
-"""Do people stand on the ground of the map? A check the estimate knows nothing of."""
+"""Do people stand on the ground of the map? A check of what came out."""
 
 import numpy as np
 

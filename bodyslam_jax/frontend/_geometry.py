@@ -79,7 +79,36 @@ def triangulate(
         error = np.linalg.norm(p_C[:, :2] / z[:, None] - views.xy, axis=-1) / scale
         distance = np.linalg.norm(p_C, axis=-1) + 1e-12
         weight = 1 / distance**2 / (1 + error**2)
+    points = _refine_points(scene, views, points, scale)
     return points, widest_angle(scene, views, points, num_landmarks), count
+
+
+def _refine_points(
+    scene: Scene, views: Views, points: Float[np.ndarray, "l 3"], scale: float
+) -> Float[np.ndarray, "l 3"]:
+    """Gauss-Newton on reprojection errors. The point nearest to the rays is too near:
+    noise of their directions makes up parallax, a fifth where they are 0.5 deg apart.
+    """
+    R = scene.R_CW[views.frame]
+    for _ in range(5):
+        offset = points[views.landmark] - scene.centre[views.frame]
+        p_C = np.einsum("mij,mj->mi", R, offset)
+        front = p_C[:, 2] > 1e-9
+        z = np.where(front, p_C[:, 2], 1.0)[:, None]
+        seen = p_C[:, :2] / z
+        error = views.xy - seen
+        jac = (R[:, :2] - seen[:, :, None] * R[:, 2:]) / z[:, :, None]
+        weight = front / (1 + np.sum((error / scale) ** 2, axis=-1))
+        pull = np.einsum("mki,mk->mi", jac, error) * weight[:, None]
+        across = np.einsum("mki,mkj->mij", jac, jac) * weight[:, None, None]
+        normal = sum_by(views.landmark, across, len(points))
+        size = np.trace(normal, axis1=1, axis2=2)
+        normal += (1e-9 * size + 1e-30)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(
+            normal, sum_by(views.landmark, pull, len(points))[..., None]
+        )[..., 0]
+        points = points + step
+    return points
 
 
 def widest_angle(

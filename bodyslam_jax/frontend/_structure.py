@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 _ENOUGH = 20
 """Views of known points that tell how far points usually are."""
+_FLAT = 0.5
+"""Share of the smallest angle that a point may itself have."""
 
 Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
 """Adjusts the free cameras and all points of `views` in place, as `_bundle.adjust`."""
@@ -227,34 +229,35 @@ class Builder:
         fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
         if not good.any():
             return
-        known = self._views_of(grown)
-        known = known[grown.has_point[self.views.landmark[known]]]
-        angle = self._parallax(trial, views[np.flatnonzero(good)], self.views[known])
-        new = (fits >= 2) & (fits >= 0.6 * count) & (angle > self.min_angle)
+        seen = views[np.flatnonzero(good)]
+        angle = widest_angle(trial, seen, points, self.num_landmarks)
+        new = (fits >= 2) & (fits >= 0.6 * count) & (angle > _FLAT * self.min_angle)
+        new &= self._parallax(trial, seen, grown) > self.min_angle
         grown.scene.points[new] = points[new]
         grown.has_point |= new
         kept = new[views.landmark]
         grown.inlier[use[kept]] = good[kept]
 
-    def _parallax(self, scene: Scene, views: Views, known: Views) -> np.ndarray:
-        """Largest angle (rad) between the rays to each landmark, were it no nearer than
-        usual among those of `known` that are seen from the same cameras.
+    def _parallax(self, trial: Scene, views: Views, grown: Growing) -> np.ndarray:
+        """Largest angle (rad) between the rays to each landmark, were it as far away as
+        points usually are that the same cameras see.
 
         The angle at the point itself would choose points that noise has drawn nearer:
         the map would shrink, the more so the further it grows.
         """
-        around = np.isin(known.frame, np.unique(views.frame))
-        points = scene.points
-        if np.count_nonzero(around) > _ENOUGH:
-            at = known[np.flatnonzero(around)]
-            away = points[at.landmark] - scene.centre[at.frame]
-            usual = np.median(np.linalg.norm(away, axis=-1))
-            centre = np.zeros_like(points)
-            centre[views.landmark] = scene.centre[views.frame]
-            distance = np.linalg.norm(points - centre, axis=-1, keepdims=True)
-            farther = np.maximum(1.0, usual / np.maximum(distance, 1e-12))
-            points = centre + farther * (points - centre)
-        return widest_angle(scene, views, points, self.num_landmarks)
+        near = np.isin(np.arange(self.num_frames), views.frame)
+        at = grown.has_point[self.views.landmark] & near[self.views.frame]
+        if np.count_nonzero(at) < _ENOUGH:
+            return widest_angle(trial, views, trial.points, self.num_landmarks)
+        known = self.views[np.flatnonzero(at)]
+        away = grown.scene.points[known.landmark] - grown.scene.centre[known.frame]
+        usual = np.median(np.linalg.norm(away, axis=-1))
+        centre = np.zeros_like(trial.points)
+        centre[views.landmark] = trial.centre[views.frame]
+        ray = trial.points - centre
+        distance = np.linalg.norm(ray, axis=-1, keepdims=True)
+        there = centre + usual * ray / np.maximum(distance, 1e-12)
+        return widest_angle(trial, views, there, self.num_landmarks)
 
     def _mark(self, grown: Growing) -> None:
         """Sorts observations into inliers and outliers, and drops poor points."""
@@ -272,7 +275,7 @@ class Builder:
             grown.scene.points,
             self.num_landmarks,
         )
-        bad = (fits < 2) | (fits < 0.5 * count) | (angle < 0.7 * self.min_angle)
+        bad = (fits < 2) | (fits < 0.5 * count) | (angle < _FLAT * self.min_angle)
         grown.has_point &= ~bad
         grown.inlier &= grown.has_point[self.views.landmark]
 

@@ -38,19 +38,28 @@ class CameraPrior(AbstractFrameFactor):
         return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
 
 
-class IntrinsicsPrior(AbstractFrameFactor):
-    """A calibration, as known as it is: `(intrinsics - known) / σ`."""
+class AbstractIntrinsicsFactor(AbstractFrameFactor):
+    """A factor of the intrinsics alone: one for the whole video."""
 
-    intrinsics: Float[Array, "1 i"]
-    sigma: Float[Array, "1 i"]
-    """px, distortion: 1; `inf` where not known."""
-    loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ()
 
     @property
     def touches(self) -> tuple[Touch, ...]:
         return (("intrinsics", 0),)
+
+    def map_frames(self, function, state, extra=None):
+        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
+        return super().map_frames(function, first, extra)
+
+
+class IntrinsicsPrior(AbstractIntrinsicsFactor):
+    """A calibration, as known as it is: `(intrinsics - known) / σ`."""
+
+    intrinsics: Float[Array, "1 i"]
+    sigma: Float[Array, "1 i"]
+    """px, distortion: 1; `inf` where not known."""
+    loss: AbstractLoss = Squared()
 
     def data(self):
         return self.intrinsics, self.sigma
@@ -59,33 +68,19 @@ class IntrinsicsPrior(AbstractFrameFactor):
         known, sigma = data
         return (shared.intrinsics - known) / sigma
 
-    def map_frames(self, function, state, extra=None):
-        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
-        return super().map_frames(function, first, extra)
 
-
-class SquarePixels(AbstractFrameFactor):
+class SquarePixels(AbstractIntrinsicsFactor):
     """One focal length for rows and columns, `(fx - fy) / σ`."""
 
     sigma: Float[Array, " 1"]
     """px"""
     loss: AbstractLoss = Squared()
-    of_people = False
-    frame_fields = ()
-
-    @property
-    def touches(self) -> tuple[Touch, ...]:
-        return (("intrinsics", 0),)
 
     def data(self):
         return self.sigma
 
     def local(self, data, window, shared):
         return (shared.intrinsics[:1] - shared.intrinsics[1:2]) / data
-
-    def map_frames(self, function, state, extra=None):
-        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
-        return super().map_frames(function, first, extra)
 
 
 class CameraSmoothness(AbstractFrameFactor):

@@ -116,7 +116,7 @@ def predict(
     is θ (rad) at the model's frame rate; `present` says which frames are to be used.
     Needs no displacement, no heading and no gravity. Section 3.4 of the paper; but the
     default network sees steady turning taken out (`_turning`), for which it looks at
-    orientations a second ahead.
+    orientations 1.5 seconds ahead.
 
     **Raises:** `ValueError` if the weights belong to another body model.
     """

@@ -1,0 +1,130 @@
+"""People on the ground of the map: where it is, what it says of scale, the check."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+
+from bodyslam_jax import export, graph, outcome
+from bodyslam_jax.ground import find_ground
+from bodyslam_jax.initialisation import ScaleStart
+from bodyslam_jax.result import Result
+
+
+def scene(factor: float = 1.0, tilt: float = 0.0, num: int = 40) -> Result:
+    """Somebody walks 5 m before a camera; map and path are `factor` times too small."""
+    rng = np.random.default_rng(0)
+    s = np.linspace(0, 1, num)
+    T_WC = np.tile(np.eye(4), (num, 1, 1))
+    T_WC[:, :3, 3] = np.stack([0.2 * s, 1.5 + 0.02 * np.sin(9 * s), 4 * s], axis=-1)
+    floor = np.stack(
+        [rng.uniform(-4, 4, 200), rng.normal(0, 0.02, 200), rng.uniform(1, 15, 200)], -1
+    )
+    floor[:, 1] += np.tan(tilt) * (floor[:, 2] - 7)
+    trees = rng.uniform([-6, 0, 2], [6, 5, 16], (300, 3))
+    joints = np.zeros((1, num, 24, 3))
+    joints[..., 1] = 1.0
+    joints[0, :, :, 2] = (5 + 4 * s)[:, None]
+    for foot, phase in ((10, 0.0), (11, np.pi)):
+        joints[0, :, foot, 1] = 0.1 * np.maximum(np.sin(20 * s + phase), 0)
+        joints[0, :, foot, 1] += np.tan(tilt) * (joints[0, :, foot, 2] - 7)
+    # The camera is where it is relative to the person; the map is about the camera.
+    eye = T_WC[:, :3, 3].copy()
+    joints -= eye[None, :, None]
+    points = np.concatenate([floor, trees]) / factor
+    T_WC[:, :3, 3] /= factor
+    joints += T_WC[None, :, None, :3, 3]
+    return Result(
+        timestamps=np.arange(num) / 30,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.array([500.0, 500.0, 320.0, 240.0]),
+        landmarks=points,
+        poses=np.zeros((1, num, 72)),
+        trans=np.zeros((1, num, 3)),
+        betas=np.zeros((1, 10)),
+        joints=joints,
+        present=np.ones((1, num), bool),
+    )
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+@pytest.mark.parametrize("factor", [1.0, 1.8, 0.6])
+def test_says_how_much_too_small_the_map_is(factor, tilt):
+    found = export.ground_scale(scene(factor, tilt))
+    np.testing.assert_allclose(found, factor, rtol=0.04)  # floor: 2 cm rough
+
+
+def test_the_ground_is_found_among_much_else():
+    normal, offset = np.split(
+        find_ground(scene().landmarks, scene().T_WC[:, :3, 3], np.array([0.0, 1, 0])),
+        [3],
+    )
+    np.testing.assert_allclose(normal, [0, 1, 0], atol=0.01)
+    np.testing.assert_allclose(offset, 0, atol=0.02)
+
+
+def test_nothing_is_said_without_ground_or_people():
+    whole = scene()
+    walls = whole.landmarks[whole.landmarks[:, 1] > 0.5]
+    assert export.ground_scale(dataclasses.replace(whole, landmarks=walls)) is None
+    bare = dataclasses.replace(whole, landmarks=whole.landmarks[:0])
+    assert export.ground_scale(bare) is None
+    nobody = np.zeros_like(whole.present)
+    assert export.ground_scale(dataclasses.replace(whole, present=nobody)) is None
+
+
+def test_a_table_is_not_the_ground():
+    rng = np.random.default_rng(1)
+    flat = lambda n, y: np.c_[
+        rng.uniform(-3, 3, n), np.full(n, y), rng.uniform(1, 9, n)
+    ]
+    floor, table = flat(150, 0.0), flat(250, 0.7)
+    clutter = rng.uniform([-4, 0, 1], [4, 3, 9], (200, 3))
+    eyes = np.tile([0.0, 1.5, 0.0], (9, 1))
+    up = np.array([0.0, 1, 0])
+    found = find_ground(np.concatenate([floor, table, clutter]), eyes, up)
+    np.testing.assert_allclose(found, [0, 1, 0, 0], atol=0.02)
+
+
+def contact(state: graph.State, units: float = 1.0) -> graph.GroundContact:
+    """A floor under the people of `scenes`, whose world has y down."""
+    plane = jnp.array([0.0, -1.0, 0.0, 1.3 / float(state.scale) / units])
+    sigma = jnp.full(state.roots.shape[:2], 0.05)
+    return graph.GroundContact(scenes.body_model(), plane, sigma)
+
+
+def test_the_scale_that_contact_asks_for_puts_the_feet_on_the_ground():
+    state = scenes.truth(np.random.default_rng(2), frames=3, landmarks=5)
+    ground = contact(state)
+    for frame, scale in enumerate(ground.scales(state)[0]):
+        moved = dataclasses.replace(state, scale=scale)
+        np.testing.assert_allclose(ground.residual(moved)[0, frame], 0, atol=1e-12)
+
+
+def test_the_unit_of_the_map_does_not_matter_to_contact():
+    state = scenes.truth(np.random.default_rng(3), frames=3, landmarks=5)
+    factor = 3.0
+    cameras = state.cameras.at[:, :3, 3].divide(factor)
+    other = dataclasses.replace(state, cameras=cameras, scale=state.scale * factor)
+    there, here = contact(state, factor), contact(state)
+    there = dataclasses.replace(there, plane=here.plane.at[3].divide(factor))
+    np.testing.assert_allclose(
+        there.scales(other), factor * here.scales(state), rtol=1e-12
+    )
+    np.testing.assert_allclose(there.residual(other), here.residual(state), atol=1e-12)
+
+
+def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
+    both = ScaleStart(motion=2.0, motion_error=0.2, ground=3.0, ground_error=0.1)
+    assert both.value == pytest.approx((2 / 0.04 + 3 / 0.01) / (1 / 0.04 + 1 / 0.01))
+    assert both.standard_error == pytest.approx((1 / 0.04 + 1 / 0.01) ** -0.5)
+    (line,) = outcome._disagreement(both)
+    assert "0.67 times" in line
+    assert not outcome._disagreement(dataclasses.replace(both, motion=2.8))
+    nothing = ScaleStart()
+    assert nothing.value == 1.0 and np.isinf(nothing.standard_error)
+    assert not outcome._disagreement(nothing)
+    assert not outcome._disagreement(ScaleStart(motion=2.0, motion_error=0.1))
