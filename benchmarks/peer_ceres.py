@@ -52,7 +52,8 @@ class Watch(pyceres.IterationCallback):
 
 
 def main(source, target):
-    data = np.load(source)
+    with np.load(source) as archive:
+        data = dict(archive)
     model, ids = reconstruction(data)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = False
@@ -79,14 +80,16 @@ def main(source, target):
     pyceres.solve(settings, adjuster.problem, summary)
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
     cameras = np.tile(np.eye(4), (len(data["cameras"]), 1, 1))
+    # Each access copies all of them.
+    images, points = model.images, model.points3D
     for k in range(len(cameras)):
-        pose = model.images[k + 1].cam_from_world()
+        pose = images[k + 1].cam_from_world()
         R = pose.rotation.matrix()
         cameras[k, :3, :3], cameras[k, :3, 3] = R.T, -R.T @ pose.translation
     np.savez(
         target,
         cameras=cameras,
-        points=np.array([model.points3D[i].xyz for i in ids]),
+        points=np.array([points[i].xyz for i in ids]),
         seconds=wall,
         processor=processor,
         rows=np.array(watch.rows),

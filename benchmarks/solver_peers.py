@@ -170,7 +170,9 @@ def joint(frames, rtol, names):
             label = "optimistix LM with CG, at most 10 steps"
         else:
             stages = (Stage(free=first_stage, max_steps=200), Stage(max_steps=100))
+            # The rate is compiled in.
             _baselines.ADAM_RATE = float(name)
+            jax.clear_caches()
             method = _baselines.adam
             label = f"Adam 200 + 100, rate {name}"
         other, _, (its_wall, its_cpu) = timed(
