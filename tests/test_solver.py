@@ -14,11 +14,13 @@ from jax.flatten_util import ravel_pytree
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, marginals, observability, solve
 from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._compile import is_alone
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver._triangular import invert_lower
 
 TIGHT = (Stage(rtol=1e-13, max_steps=60),)
 
@@ -178,6 +180,22 @@ def test_starts_are_mapped_over_in_one_go():
     together = jax.vmap(lambda s: solve(problem, s, schedule=TIGHT).cost)(batch)
     alone = [float(solve(problem, s, schedule=TIGHT).cost) for s in starts]
     assert np.allclose(together, alone, rtol=1e-8)
+
+
+def test_only_a_whole_program_is_compiled_with_options_of_its_own():
+    seen = []
+    assert is_alone()
+    jax.vmap(lambda x: seen.append(is_alone()) or x)(jnp.zeros(2))
+    jax.jit(lambda: seen.append(is_alone()) or jnp.zeros(()))()
+    assert seen == [True, False]
+
+
+def test_triangular_matrices_of_any_width_are_inverted():
+    rng = np.random.default_rng(0)
+    for n in (1, 24, 25, 69):
+        lower = np.tril(rng.standard_normal((2, n, n))) + 4 * np.sqrt(n) * np.eye(n)
+        inverse = invert_lower(jnp.asarray(lower))
+        assert np.allclose(inverse @ lower, np.eye(n), atol=1e-12)
 
 
 def test_single_precision_reaches_the_same_optimum():
