@@ -51,13 +51,7 @@ def prepare(
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
     )
-    model = motion.load_motion_model(config.motion_model)
-    predictor = graph.MotionPredictor(
-        motion.predict_between,
-        (model, motion.make_clock(sequence.timestamps, model.fps)),
-        body,
-        jnp.asarray(roots.present),
-    )
+    predictor = motion_predictor(sequence, roots, body, config)
     moving = cameras.kind == "moving"
     start = ScaleStart()
     contact = None
@@ -90,10 +84,10 @@ def prepare(
             )
         if contact is not None:
             factors.append(contact)
-        problem = make([*factors, walked(_predict(predictor, state), state)], state)
+        problem = make([*factors, walked(predict(predictor, state), state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
-        seen = _predict(predictor, state)
+        seen = predict(predictor, state)
         if moving:
             start = initialisation.scale_start(state, seen, contact)
             log.info(
@@ -111,6 +105,24 @@ def prepare(
         )
     problem = make(factors, state)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
+
+
+def motion_predictor(
+    sequence: Sequence, roots: Roots, body: body_.BodyModel, config: Config
+) -> graph.MotionPredictor:
+    """The motion model, at the times of these frames."""
+    model = motion.load_motion_model(config.motion_model)
+    clock = motion.make_clock(sequence.timestamps, model.fps)
+    present = jnp.asarray(roots.present)
+    return graph.MotionPredictor(motion.predict_between, (model, clock), body, present)
+
+
+def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Prediction:
+    """What the motion model says of a state's people."""
+    # The map has no part in it, and its size, which every video has of its own, would
+    # have the program compiled once more.
+    none = jnp.zeros((0, 3), state.landmarks.dtype)
+    return _predict(predictor, eqx.tree_at(lambda s: s.landmarks, state, none))
 
 
 _predict = eqx.filter_jit(lambda predictor, state: predictor(state))

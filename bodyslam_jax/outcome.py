@@ -317,10 +317,10 @@ def stature(
 ) -> tuple[float, float]:
     """Height of the mesh in its rest pose and its standard deviation, m."""
 
+    y, by_shape = np.asarray(body.template)[:, 1], np.asarray(body.shape_dirs)[:, 1]
+
     def height(shape: np.ndarray) -> float:
-        nowhere = jnp.zeros(3)
-        y = body_.vertices(body, jnp.zeros(72), jnp.asarray(shape), nowhere)[:, 1]
-        return float(y.max() - y.min())
+        return float(np.ptp(y + by_shape @ shape))
 
     tall = height(shape)
     slope = np.array([height(shape + e) - tall for e in np.eye(10)])

@@ -25,6 +25,7 @@ from bodyslam_jax import joint as joint_
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config
 from bodyslam_jax.outcome import Cameras, Joint, assemble, describe
+from bodyslam_jax.rehearsal import Rehearsal, rehearse
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Bodies, Sequence, Tracks
 
@@ -73,7 +74,12 @@ def run(
     return _run(sequence, config, cache)[0]
 
 
-def _run(sequence: Sequence, config: Config, cache: Cache) -> tuple[Result, Tracks]:
+def _run(
+    sequence: Sequence,
+    config: Config,
+    cache: Cache,
+    rehearsal: Rehearsal = Rehearsal(),
+) -> tuple[Result, Tracks]:
     """`run`, and the points of the map as they were seen."""
     _check_length(sequence)
     watch = Stopwatch()
@@ -82,16 +88,18 @@ def _run(sequence: Sequence, config: Config, cache: Cache) -> tuple[Result, Trac
     if config.people:  # now, before minutes are spent
         motion.check_compatible(model, body, model.fps)
     sequence = _detected(sequence, config, cache, watch)
-    cameras, bodies = before_joint(sequence, body, config, cache, watch)
+    cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
     seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     with watch("joint"):
+        rehearsal.wait("prediction")
         joint = cache.stage(
             "joint",
             key,
             Joint,
             lambda: joint_.estimate(seen, cameras, bodies, body, config),
         )
+    rehearsal.wait("outcome")
     result = assemble(sequence, config, body, cameras, joint, watch.seconds)
     points, keep = cameras.tracks, cameras.keep
     return result, Tracks(points.frame[keep], points.landmark[keep], points.uv[keep])
@@ -103,6 +111,7 @@ def before_joint(
     config: Config,
     cache: Cache = Cache(None),
     watch: Stopwatch | None = None,
+    rehearsal: Rehearsal = Rehearsal(),
 ) -> tuple[Cameras, Bodies]:
     """Cameras and map up to scale, bodies in the camera: what the graph starts from.
 
@@ -123,6 +132,7 @@ def before_joint(
     sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     key = fingerprint(sequence, config.people_fit, config.people, config.body_model)
     with watch("people"):
+        rehearsal.wait("people")
         bodies = cache.stage(
             "people", key, Bodies, lambda: _people(sequence, body, config)
         )
@@ -208,17 +218,38 @@ def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies
     )
 
 
-def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:
+def run_to_folder(
+    sequence: Sequence, out: Path, config: Config = Config(), *, first: bool = False
+) -> Result:
     """`run`, with finished stages kept in `out` and everything of the contract written.
 
     Where the sequence has a ground truth, the report says how far off the result is.
+
+    Args:
+        first: whether programs are yet to be compiled: that then begins at once, beside
+            everything else.
 
     **Raises:** `ValueError` if `out` cannot be written or holds something else.
     """
     cache = Cache(out / ".cache", describe(sequence))
     export.check_folder(out, cache.source, cache.owner())
+    rehearsal = Rehearsal()
+    if first:
+        body, truth = body_.load_body_model(config.body_model), None
+        if sequence.groundtruth is not None:
+            truth = evaluation.read_groundtruth(sequence.groundtruth, body)
+        rehearsal = rehearse(sequence, body, config, truth)
+    try:
+        return _to_folder(sequence, out, config, cache, rehearsal)
+    finally:
+        rehearsal.stop()
+
+
+def _to_folder(
+    sequence: Sequence, out: Path, config: Config, cache: Cache, rehearsal: Rehearsal
+) -> Result:
     body = body_.load_body_model(config.body_model)
-    result, tracks = _run(sequence, config, cache)
+    result, tracks = _run(sequence, config, cache, rehearsal)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         result.summary["errors"] = errors(result, truth)
@@ -245,15 +276,29 @@ def errors(result: Result, truth: Result) -> dict[str, dict[str, float]]:
     return {"joint estimate, in metres": {k: float(v) for k, v in found.items()}}
 
 
-def demo(out: Path, config: Config = Config()) -> Result:
+def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result:
     """Renders a walker whom a moving camera films, and runs everything on the images.
 
     The scene is written to `out/scene`, a sequence folder with its ground truth.
 
+    Args:
+        first: as for `run_to_folder`.
+
     **Raises:** `ValueError` if `out` cannot be written.
     """
-    export.check_folder(out, {"name": "scene"}, Cache(out / ".cache").owner())
-    watch = Stopwatch()
-    with watch("rendering"):
-        scene = synthetic.demo_scene(out / "scene")
-    return run_to_folder(frontend.read_sequence(scene), out, config)
+    folder, rehearsal, watch = out / "scene", Rehearsal(), Stopwatch()
+    cache = Cache(out / ".cache", {"name": folder.name})
+    export.check_folder(out, cache.source, cache.owner())
+    if first:
+        body = body_.load_body_model(config.body_model)
+        scene = synthetic.simulate(synthetic.demo_settings())
+        measured, truth = synthetic.as_sequence(scene), synthetic.as_truth(scene)
+        rehearsal = rehearse(measured, body, config, truth)
+    try:
+        with watch("rendering"):
+            sequence = frontend.read_sequence(synthetic.demo_scene(folder))
+        cache = Cache(out / ".cache", describe(sequence))
+        export.check_folder(out, cache.source, cache.owner())
+        return _to_folder(sequence, out, config, cache, rehearsal)
+    finally:
+        rehearsal.stop()

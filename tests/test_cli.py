@@ -138,12 +138,12 @@ def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
     caplog.set_level("INFO")
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
-        commands._say_that_it_compiles()
+        assert commands._is_first()
         assert "first run: programs are compiled" in caplog.text
         caplog.clear()
         (tmp_path / "compiled").mkdir()
         (tmp_path / "compiled" / "program").write_text("compiled")
-        commands._say_that_it_compiles()
+        assert not commands._is_first()
         assert caplog.text == ""
     finally:
         jax.config.update("jax_compilation_cache_dir", kept)

@@ -51,8 +51,8 @@ def run(
         masks=masks,
         config=config.association,
     )
-    _say_that_it_compiles()
-    return _finish(pipeline.run_to_folder(sequence, out, config), out)
+    result = pipeline.run_to_folder(sequence, out, config, first=_is_first())
+    return _finish(result, out)
 
 
 def demo(
@@ -72,8 +72,7 @@ def demo(
     """
     from bodyslam_jax import pipeline
 
-    _say_that_it_compiles()
-    return _finish(pipeline.demo(out, config), out)
+    return _finish(pipeline.demo(out, config, first=_is_first()), out)
 
 
 def _finish(result: Any, out: Path) -> int:
@@ -103,9 +102,12 @@ def evaluate(
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
 
 
-def _say_that_it_compiles() -> None:
+def _is_first() -> bool:
+    """Whether nothing is compiled yet; says so, as it takes a while."""
     import jax
 
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if folder and not (Path(folder).is_dir() and any(Path(folder).iterdir())):
-        log.info("first run: programs are compiled, which takes minutes, and kept")
+    if not folder or (Path(folder).is_dir() and any(Path(folder).iterdir())):
+        return False
+    log.info("first run: programs are compiled, which takes minutes, and kept")
+    return True

@@ -62,15 +62,20 @@ def write_sequence(
     return folder
 
 
+def demo_settings(seed: int = 0) -> Simulation:
+    """Of the demo: three and a half seconds in which the camera goes along."""
+    return Simulation(
+        sequence="M1", family="follow", length=_DEMO_FRAMES, seed=seed, render=True
+    )
+
+
 def demo_scene(folder: Path, seed: int = 0) -> Path:
-    """Renders three and a half seconds of a walker whom a camera goes along with.
+    """Renders the walker whom a camera goes along with.
 
     Writes a sequence folder without tracks, so that they come from the video. What is
     there of the same seed is kept.
     """
-    settings = Simulation(
-        sequence="M1", family="follow", length=_DEMO_FRAMES, seed=seed, render=True
-    )
+    settings = demo_settings(seed)
     mark = Path(folder) / _MARK
     if mark.exists() and json.loads(mark.read_text()) == dataclasses.asdict(settings):
         return Path(folder)
