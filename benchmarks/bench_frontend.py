@@ -3,11 +3,12 @@
     python benchmarks/bench_frontend.py [SEQUENCE] [--frames 1000] [--threads 2]
 
 From images to tracks, and from tracks to cameras and a map up to scale, without the
-final bundle adjustment. Without a SEQUENCE folder a simulated one of 300 frames at
-640x480 is rendered (`simulate M1 --family follow --render`). For more frames than it
-has, the video runs to its end, back to its start, and so on, so that motion stays
-continuous. Each part runs alone in a process of its own, which JAX never enters but
-for its import, so that its peak memory can be told. Prints a Markdown table.
+final bundle adjustment. "Processor ms" is of all cores together: on a machine that does
+nothing else a frame takes no longer. Without a SEQUENCE folder a simulated one of 300
+frames at 640x480 is rendered (`simulate M1 --family follow --render`). For more frames
+than it has, the video runs to its end, back to its start, and so on, so that motion
+stays continuous. Each part runs alone in a process of its own, which JAX never enters
+but for its import, so that its peak memory can be told. Prints a Markdown table.
 """
 
 import argparse
@@ -93,11 +94,11 @@ def run(part: str, folder: Path) -> None:
     sequence = load(folder / "sequence.npz", Sequence)
     file = folder / "tracks.npz"
     tracks = load(file, Tracks) if file.exists() else None
-    start = time.perf_counter()
+    start, begun = time.perf_counter(), time.process_time()
     found = PARTS[part](sequence, tracks)
-    seconds = time.perf_counter() - start
+    seconds, busy = time.perf_counter() - start, time.process_time() - begun
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    said = {"seconds": seconds, "peak_mib": peak}
+    said = {"seconds": seconds, "busy": busy, "peak_mib": peak}
     if isinstance(found, Tracks):
         save(file, found)
         said["note"] = f"{len(found.frame) / sequence.num_frames:.0f} points a frame"
@@ -133,9 +134,9 @@ def main() -> None:
         cores = len(os.sched_getaffinity(0))
         print(f"{num} frames of {size}; {cores} cores, {args.threads} threads of")
         print(f"OpenCV {cv2.__version__}, {platform.machine()}\n")
-        print("| part | ms a frame | frames/s | peak memory, MiB | |")
-        print("|---|---|---|---|---|")
-        total = 0.0
+        print("| part | ms a frame | frames/s | processor ms | peak memory, MiB | |")
+        print("|---|---|---|---|---|---|")
+        total = all_busy = 0.0
         for part in PARTS:
             argv = [sys.executable, __file__, "--part", part, "--folder", name]
             argv += ["--threads", str(args.threads)]
@@ -143,13 +144,18 @@ def main() -> None:
                 subprocess.run(argv, check=True, stdout=subprocess.PIPE).stdout
             )
             each = said["seconds"] / num
-            total += 0.0 if part.endswith("alone") else each
+            busy = said["busy"] / num
+            if not part.endswith("alone"):
+                total, all_busy = total + each, all_busy + busy
             print(
                 f"| {part} | {1e3 * each:.1f} | {1 / each:.1f} | "
-                f"{said['peak_mib']:.0f} | {said.get('note', '')} |",
+                f"{1e3 * busy:.1f} | {said['peak_mib']:.0f} | {said.get('note', '')} |",
                 flush=True,
             )
-        print(f"| whole front end | {1e3 * total:.1f} | {1 / total:.1f} | | |")
+        print(
+            f"| whole front end | {1e3 * total:.1f} | {1 / total:.1f} | "
+            f"{1e3 * all_busy:.1f} | | load {os.getloadavg()[0]:.1f} |"
+        )
 
 
 if __name__ == "__main__":
