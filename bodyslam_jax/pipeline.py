@@ -252,7 +252,9 @@ def _to_folder(
     result, tracks = _run(sequence, config, cache, rehearsal)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
+        rehearsal.wait("errors")
         result.summary["errors"] = errors(result, truth)
+    rehearsal.wait("files")
     watch = Stopwatch()
     with export.run_folder(out) as partial:
         if config.overlay and sequence.frames is not None:

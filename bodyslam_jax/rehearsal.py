@@ -22,6 +22,9 @@ from bodyslam_jax.sequence import Sequence, Tracks
 
 log = logging.getLogger(__name__)
 
+_LONGEST = 300
+"""Frames. Longer videos take minutes anyway, and what is compiled early stays in memory
+while the joint problem needs it."""
 _DISTANCE = 4.0
 """Of the made-up people, m."""
 
@@ -34,7 +37,7 @@ class Rehearsal:
     says what is wrong.
     """
 
-    def __init__(self, parts: dict[str, Callable[[], None]] | None = None) -> None:
+    def __init__(self, parts: dict[str, Callable[[], object]] | None = None) -> None:
         self._thread = concurrent.futures.ThreadPoolExecutor(1, "rehearsal")
         self._parts = {n: self._thread.submit(p) for n, p in (parts or {}).items()}
 
@@ -53,19 +56,22 @@ class Rehearsal:
 def rehearse(
     sequence: Sequence, body: body_.BodyModel, config: Config, truth: Result | None
 ) -> Rehearsal:
-    """Begins the stages `people`, `prediction` and `outcome` of a sequence with bodies.
+    """Begins what a short sequence with bodies goes through: `people`, `prediction`,
+    `outcome`, `errors` and `files`.
 
-    Where people are yet to be fitted, nothing but that is known of their programs.
+    Of none where people are yet to be fitted, or the video is long.
     """
-    if not config.people or sequence.bodies is None:
+    if not config.people or sequence.bodies is None or sequence.num_frames > _LONGEST:
         return Rehearsal()
-    return Rehearsal(
-        {
-            "people": lambda: _people(sequence, body, config),
-            "prediction": lambda: _prediction(sequence, body, config),
-            "outcome": lambda: _outcome(sequence, body, config, truth),
-        }
-    )
+    made: list[Result] = []
+    parts = {
+        "people": lambda: _people(sequence, body, config),
+        "prediction": lambda: _prediction(sequence, body, config),
+        "outcome": lambda: made.append(_outcome(sequence, body, config)),
+        "errors": lambda: evaluation.evaluate(made[0], truth) if truth else None,
+        "files": lambda: _files(made[0], sequence, body, config),
+    }
+    return Rehearsal(parts)
 
 
 def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> None:
@@ -91,17 +97,15 @@ def _prediction(sequence: Sequence, body: body_.BodyModel, config: Config) -> No
     joint.predict(joint.motion_predictor(sequence, roots, body, config), state)
 
 
-def _outcome(
-    sequence: Sequence,
-    body: body_.BodyModel,
-    config: Config,
-    truth: Result | None,
+def _outcome(sequence: Sequence, body: body_.BodyModel, config: Config) -> Result:
+    found = _cameras(sequence), _joint(sequence)
+    return assemble(sequence, config, body, *found, seconds={})
+
+
+def _files(
+    result: Result, sequence: Sequence, body: body_.BodyModel, config: Config
 ) -> None:
-    result = assemble(
-        sequence, config, body, _cameras(sequence), _joint(sequence), seconds={}
-    )
-    if truth is not None:
-        evaluation.evaluate(result, truth)
+    """The overlay's meshes, of one frame; the rest whole, but for the report."""
     size = sequence.intrinsics.height, sequence.intrinsics.width
     view.draw_frame(np.zeros((*size, 3), np.uint8), result, body, 0)
     with tempfile.TemporaryDirectory() as folder:

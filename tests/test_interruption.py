@@ -82,6 +82,17 @@ def test_stages_that_were_done_are_not_done_again(
     assert code == 130
 
 
+def test_an_interrupt_that_python_drops_comes_again():
+    """Where it hits a callback of the garbage collector, as JAX has one."""
+
+    class Dropped:
+        exc_type = KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cli._interrupt_again(Dropped())
+        time.sleep(20)
+
+
 def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path):
     cache = Cache(tmp_path, {"name": "a"})
     kind = pipeline.Detections

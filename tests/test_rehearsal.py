@@ -53,9 +53,8 @@ def test_what_was_rehearsed_is_not_compiled_again(quick_compilation):
     jax.monitoring.register_event_duration_secs_listener(note)
     try:
         begun = rehearsal.rehearse(sequence, body, config, truth)
-        for part in ("people", "prediction", "outcome"):
-            error = begun._parts[part].exception()
-            assert error is None, part
+        for part, rehearsed in begun._parts.items():
+            assert rehearsed.exception() is None, part
         assert _LONG <= compiled
         compiled.clear()
         bodies = people.prepare_bodies(

@@ -4,9 +4,11 @@ JAX is imported inside the commands, never for `--help`. Exit codes: 0 done; 1 b
 input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 """
 
+import _thread
 import logging
 import os
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -140,7 +142,8 @@ def _one_line(error: BaseException) -> str:
 
 
 def _prepare_jax() -> None:
-    """64-bit, and compiled programs kept between runs."""
+    """64-bit, compiled programs kept between runs, and every Ctrl-C heard."""
+    sys.unraisablehook = _interrupt_again
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
@@ -152,3 +155,12 @@ def _prepare_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _interrupt_again(unraisable: Any) -> None:
+    """Ctrl-C that came within JAX's callback of the garbage collector, where Python
+    drops exceptions, comes once more."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.1, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(unraisable)
