@@ -16,6 +16,7 @@ import numpy as np
 from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, export, initialisation, joint, people, view
 from bodyslam_jax.config import Config
+from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras, Joint, assemble
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Sequence, Tracks
@@ -139,8 +140,7 @@ def _joint(sequence: Sequence) -> Joint:
     roots[..., 2, 3] = _DISTANCE
     return Joint(
         scale=1.0,
-        scale_start=1.0,
-        scale_start_error=1.0,
+        start=ScaleStart(),
         scale_sigma=1.0,
         shape_covariance=np.zeros((h, 10, 10)),
         unobserved=(),
