@@ -25,7 +25,8 @@ def rebuild(
 def without_map(
     problem: graph.Problem, state: graph.State, *, hold_cameras: bool
 ) -> tuple[graph.Problem, graph.State]:
-    """Neither landmarks nor their term; with `hold_cameras` s alone moves the cameras.
+    """Neither landmarks, nor their term, nor the ground among them; with `hold_cameras`
+    s alone moves the cameras.
 
     Section 4.2 of the paper: what people say of the scale, or of the cameras, when
     nothing else does.
@@ -34,7 +35,8 @@ def without_map(
     free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
     if hold_cameras:
         free = graph.hold(free, "cameras")
-    kept = [f for f in problem.factors if not isinstance(f, graph.Reprojection)]
+    of_map = (graph.Reprojection, graph.GroundContact)
+    kept = [f for f in problem.factors if not isinstance(f, of_map)]
     return rebuild(problem, bare, kept, free), bare
 
 

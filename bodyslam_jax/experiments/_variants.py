@@ -11,6 +11,9 @@ from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.experiments._problems import rebuild
 
+_SEE_SCALE = (graph.HumanMotion, graph.RootSmoothness, graph.GroundContact)
+"""What ties the map's unit to metres."""
+
 Variant = Callable[[graph.Problem, graph.State], graph.Problem]
 
 STANCE_SIGMA = 0.01
@@ -26,7 +29,8 @@ def without(*kinds: type[graph.AbstractFactor]) -> Variant:
 
     def variant(problem: graph.Problem, state: graph.State) -> graph.Problem:
         muted = graph.mute(problem, *kinds)
-        if {graph.HumanMotion, graph.RootSmoothness} <= set(kinds):
+        seeing = [f for f in problem.factors if isinstance(f, _SEE_SCALE)]
+        if all(isinstance(f, kinds) for f in seeing):
             muted = dataclasses.replace(muted, free=graph.hold(muted.free, "scale"))
         return muted
 
@@ -93,7 +97,10 @@ def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
 VARIANTS: dict[str, Variant] = {
     "full": lambda problem, state: problem,
     "no motion model": without(graph.HumanMotion),
-    "no motion model, no smooth path": without(graph.HumanMotion, graph.RootSmoothness),
+    "no ground": without(graph.GroundContact),
+    "nothing that sees scale": without(
+        graph.HumanMotion, graph.RootSmoothness, graph.GroundContact
+    ),
     "no smooth path": without(graph.RootSmoothness),
     "no keypoints": without(graph.JointReprojection),
     "no regressed postures": without(graph.Posture),
