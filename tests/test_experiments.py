@@ -76,7 +76,7 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     for name in ("with stance foot", "with steady camera", "with up direction"):
         found = experiments.VARIANTS[name](problem, start).cost_by_term(start)
         assert len(found) == len(full) + 1
-    still = experiments.VARIANTS["no motion model, no smooth path"](problem, start)
+    still = experiments.VARIANTS["nothing that sees scale"](problem, start)
     assert not still.free.scale.any() and still.free.poses.all()
     held = experiments.VARIANTS["β held at the regressor's"](problem, start)
     assert not held.free.shapes.any() and held.free.poses.all()
