@@ -55,6 +55,7 @@ def prepare(
     moving = cameras.kind == "moving"
     start = ScaleStart()
     contact = None
+    shared = config.weights.fitted_step_error if sequence.bodies is None else 0.0
     stages = []
     factors = []
     if moving:
@@ -71,7 +72,7 @@ def prepare(
     if anybody:
         factors += initialisation.people_factors(sequence, roots, config.weights, body)
         walked = lambda seen, state: initialisation.motion_factor(
-            seen, state.shapes, body, config.weights
+            seen, state.shapes, body, config.weights, shared_error=shared
         )
         if moving:
             contact = initialisation.ground_contact(
@@ -89,7 +90,9 @@ def prepare(
         stages.append(stage)
         seen = predict(predictor, state)
         if moving:
-            start = initialisation.scale_start(state, seen, contact)
+            start = initialisation.scale_start(
+                state, seen, contact, shared_error=shared
+            )
             log.info(
                 "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
                 *(start.value, start.standard_error),

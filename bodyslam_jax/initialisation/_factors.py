@@ -127,8 +127,14 @@ def motion_factor(
     shapes: Float[Array, "h 10"],
     body: BodyModel,
     weights: GraphWeights,
+    *,
+    shared_error: float = 0.0,
 ) -> graph.HumanMotion:
-    """The motion model's displacements, weighted by its own covariance."""
+    """The motion model's displacements, weighted by its own covariance.
+
+    `shared_error` is a share by which all of a person's steps may be wrong together:
+    they say no more of the scale than that allows, however many there are.
+    """
     valid = seen.valid
     eye = jnp.eye(3)
     if weights.motion_sigma is None:
@@ -138,11 +144,17 @@ def motion_factor(
         whitening = whitening / weights.motion_inflation
     else:
         whitening = jnp.broadcast_to(eye / weights.motion_sigma, (*valid.shape, 3, 3))
+    whitening = jnp.where(valid[..., None, None], whitening, 0.0)
+    step = jnp.where(valid[..., None], seen.translation, 0.0)
+    rho = weights.motion_correlation
+    told = jnp.sum((whitening @ step[..., None]) ** 2, axis=(1, 2, 3), keepdims=True)
+    told = told * (1 - rho) / (1 + rho)  # information on a factor of all steps
+    whitening = whitening / jnp.sqrt(1 + shared_error**2 * told)
     leg = motion.leg_length(body, shapes)[:, None, None]
     return graph.HumanMotion(
-        translation=jnp.where(valid[..., None], seen.translation / leg, 0.0),
-        whitening=jnp.where(valid[..., None, None], whitening * leg[..., None], 0.0),
-        correlation=graph.runs(valid, weights.motion_correlation),
+        translation=step / leg,
+        whitening=whitening * leg[..., None],
+        correlation=graph.runs(valid, rho),
         correlated=weights.motion_correlation > 0,
         body=body,
     )

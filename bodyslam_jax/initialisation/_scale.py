@@ -59,9 +59,16 @@ def scale_start(
     state: graph.State,
     seen: motion.Prediction,
     contact: graph.GroundContact | None,
+    *,
+    shared_error: float = 0.0,
 ) -> ScaleStart:
-    """Both cues of scale: motion, and the ground if there is one."""
+    """Both cues of scale: motion, and the ground if there is one.
+
+    `shared_error` is the share by which all steps may be wrong together.
+    """
     start = _motion_scale(state, seen)
+    error = float(np.hypot(start.motion_error, shared_error * start.motion))
+    start = dataclasses.replace(start, motion_error=error)
     if contact is None:
         return start
     used = np.isfinite(np.asarray(contact.sigma))
