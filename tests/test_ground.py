@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
 
-from bodyslam_jax import export, graph, outcome
+from bodyslam_jax import export, graph, initialisation, motion, outcome
+from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.ground import find_ground
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
@@ -128,3 +130,33 @@ def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
     assert nothing.value == 1.0 and np.isinf(nothing.standard_error)
     assert not outcome._disagreement(nothing)
     assert not outcome._disagreement(ScaleStart(motion=2.0, motion_error=0.1))
+
+
+def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():
+    frames, share = 200, 0.25
+    step = jnp.array([0.04, 0.0, 0.001])
+    one = motion.Prediction(
+        translation=jnp.broadcast_to(step, (frames, 3)),
+        covariance=jnp.broadcast_to(1e-4 * jnp.eye(3), (frames, 3, 3)),
+        body_pose=jnp.zeros((frames, 23, 3)),
+        rotation=jnp.zeros((frames, 3)),
+        valid=jnp.ones(frames, bool).at[0].set(False),
+    )
+    seen = jax.tree.map(lambda x: x[None], one)
+    shapes = jnp.zeros((1, 10))
+    body = scenes.body_model()
+
+    def error(shared: float) -> float:
+        """Standard deviation of a factor of all steps, by the residuals."""
+        factor = initialisation.motion_factor(
+            seen, shapes, body, GraphWeights(), shared_error=shared
+        )
+        rho = np.asarray(factor.correlation)[0, 2:, None]
+        white = np.asarray(factor.whitening @ factor.translation[..., None])[
+            0, 2:, :, 0
+        ]
+        return float((((1 - rho) ** 2 / (1 - rho**2) * white**2).sum()) ** -0.5)
+
+    alone = error(0.0)
+    assert alone < 0.1
+    np.testing.assert_allclose(error(share), np.hypot(alone, share), rtol=0.01)
