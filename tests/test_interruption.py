@@ -82,6 +82,15 @@ def test_stages_that_were_done_are_not_done_again(
     assert code == 130
 
 
+@pytest.fixture
+def heard():
+    """Ctrl-C raises, also where a shell without a terminal started the tests."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 def test_an_interrupt_that_python_drops_comes_again():
     """Where it hits a callback of the garbage collector, as JAX has one."""
 
@@ -90,7 +99,8 @@ def test_an_interrupt_that_python_drops_comes_again():
 
     with pytest.raises(KeyboardInterrupt):
         cli._interrupt_again(Dropped())
-        time.sleep(20)
+        for _ in range(400):
+            time.sleep(0.05)
 
 
 def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path):
@@ -158,6 +168,7 @@ def _settings(folder: Path) -> Path:
 NETWORKS = (("detector", "box.onnx"), ("pose", "pose.onnx"))
 
 
+@pytest.mark.usefixtures("heard")
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's")
 def test_signals_at_any_moment(sequence, tmp_path):
