@@ -15,7 +15,7 @@ from bodyslam_jax.joint import solve_stage
 METHODS = {
     "no_mm": "no motion model: cameras in the map's own unit, people from keypoints",
     "depth": "cameras scaled by the median of the regressed depths, same people",
-    "start": "scale in closed form from the motion model, same people",
+    "start": "scale in closed form from motion and ground, same people",
     "scale_only": "cameras held, s and people optimised, no landmarks",
     "per_frame": "the regressor's bodies in the cameras of the full estimate",
     "full": "the full estimate",
