@@ -46,10 +46,7 @@ class GroundContact(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         (frame,) = window
-        p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
-        height, _ = self._heights(p_H[np.array(BODY25_FEET)], frame, shared)
-        low = -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)
-        return (low - SOLE)[None] / data
+        return (self._lowest(frame, shared) - SOLE)[None] / data
 
     def jacobian(self, data, window, shared):
         (frame,) = window
@@ -58,7 +55,6 @@ class GroundContact(AbstractFrameFactor):
         p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
         height, up_C = self._heights(p_H, frame, shared)
         share = jax.nn.softmax(-height / _SOFTNESS)
-        low = -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)
         up_H = frame.root[:3, :3].T @ up_C
         at_H = share @ p_H
         at_C = frame.root[:3, :3] @ at_H + frame.root[:3, 3]
@@ -75,7 +71,7 @@ class GroundContact(AbstractFrameFactor):
             ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
         }
         parts = {touch: part[None] / data for touch, part in parts.items()}
-        return (low - SOLE)[None] / data, parts
+        return (_soft_minimum(height) - SOLE)[None] / data, parts
 
     def scales(self, state: State) -> Float[Array, "h t"]:
         """The s that would put the feet on the ground, for each person and frame."""
@@ -84,10 +80,12 @@ class GroundContact(AbstractFrameFactor):
 
     def _scale(self, frame, shared):
         eye = self.plane[:3] @ frame.camera[:3, 3] + self.plane[3]
+        return (shared.scale * eye - self._lowest(frame, shared) + SOLE) / eye
+
+    def _lowest(self, frame, shared):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
         height, _ = self._heights(p_H[np.array(BODY25_FEET)], frame, shared)
-        low = -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)
-        return (shared.scale * eye - low + SOLE) / eye
+        return _soft_minimum(height)
 
     def _heights(self, p_H, frame, shared):
         """Heights of points above the ground, m, and the ground's normal in C."""
@@ -96,3 +94,7 @@ class GroundContact(AbstractFrameFactor):
         p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
         eye = shared.scale * (normal @ frame.camera[:3, 3] + offset)
         return p_C @ up_C + eye, up_C
+
+
+def _soft_minimum(height: Float[Array, " f"]) -> Float[Array, ""]:
+    return -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)
