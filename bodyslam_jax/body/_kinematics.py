@@ -51,8 +51,8 @@ def local_joints(
     parent's frame; `shape` is SMPL β. Leading axes broadcast.
     """
     batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
-    posed = pose_joints(model, flatten(body_pose, batch, 2), flatten(shape, batch, 1))
-    return _unflatten(posed.x, batch)
+    R = _under_root(flatten(body_pose, batch, 2))
+    return _unflatten(pose_joints(model, R, flatten(shape, batch, 1)).x, batch)
 
 
 @jax.jit
@@ -88,7 +88,7 @@ def local_keypoints(
     """
     batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
     beta = flatten(shape, batch, 1)
-    posed = pose_joints(model, flatten(body_pose, batch, 2), beta)
+    posed = pose_joints(model, _under_root(flatten(body_pose, batch, 2)), beta)
     return _unflatten(_detected(model, posed, beta, layout, bias), batch)
 
 
@@ -107,31 +107,46 @@ def keypoints(
 
 
 class Posed:
-    """The joints of `n` bodies in frame H, batch last; lives within one function."""
+    """The joints of `n` bodies about the pelvis, batch last; lives within one function.
+
+    The frame is the one into which the root's rotation turns.
+    """
 
     def __init__(self, R, rest, G, x):
         self.R = R
-        """Rotations of joints 1 to 23 in their parents' frames, (23, 3, 3, n)."""
+        """Rotations of all joints in their parents' frames, (24, 3, 3, n)."""
         self.rest = rest
         """Joints at rest, m, (24, 3, n)."""
         self.G = G
-        """Rotations in H, (24, 3, 3, n)."""
+        """Rotations, (24, 3, 3, n)."""
         self.x = x
-        """Places in H, m, (24, 3, n)."""
+        """Places, m, (24, 3, n)."""
+
+
+def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
+    """Matrices of axis-angle vectors."""
+    return jaxlie.SO3.exp(pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
+
+
+def _under_root(body_pose):
+    """Rotations of all joints, the root's none."""
+    R = rotations(body_pose)
+    return jnp.concatenate([_identity(R), R])
 
 
 def pose_joints(
-    model: BodyModel, body_pose: Float[Array, "n 23 3"], shape: Float[Array, "n 10"]
+    model: BodyModel, R: Float[Array, "24 3 3 n"], shape: Float[Array, "n 10"]
 ) -> Posed:
     """Forward kinematics of a flat batch."""
-    n = len(body_pose)
-    R = jaxlie.SO3.exp(body_pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
-    moved = model.joint_shape_dirs.reshape(72, 10) @ shape.T
-    rest = model.joint_template[:, :, None] + moved.reshape(24, 3, n)
-    G, x = _chain(R, rest[1:] - rest[_PARENT])
-    G_root = jnp.broadcast_to(jnp.eye(3, dtype=G.dtype)[None, :, :, None], (1, 3, 3, n))
-    x_root = jnp.zeros((1, 3, n), x.dtype)
-    return Posed(R, rest, jnp.concatenate([G_root, G]), jnp.concatenate([x_root, x]))
+
+    def of_shape(template, dirs):
+        moved = dirs.reshape(-1, 10) @ shape.T
+        return template[:, :, None] + moved.reshape(*template.shape, -1)
+
+    J_0, J_s = model.joint_template, model.joint_shape_dirs
+    # Bones of their own, not differences of joints: a product less to differentiate.
+    bones = of_shape(J_0[1:] - J_0[_PARENT], J_s[1:] - J_s[_PARENT])
+    return Posed(R, of_shape(J_0, J_s), *_chain(R, bones))
 
 
 def matmul(A, B):
@@ -158,11 +173,9 @@ def flatten(x, batch, num_axes):
     return jnp.broadcast_to(x, (*batch, *tail)).reshape(math.prod(batch), *tail)
 
 
-def root_and_pelvis(model, pose, shape, trans):
-    """Root rotation (3, 3, n) and place of the pelvis (3, n) of a flat batch."""
-    R = jaxlie.SO3.exp(pose[:, :3]).as_matrix().transpose(1, 2, 0)
-    pelvis = model.joint_template[0] + shape @ model.joint_shape_dirs[0].T
-    return R, (pelvis + trans).T
+def pelvis_place(model, shape, trans):
+    """Where the pelvis is, (3, n), of a flat batch."""
+    return (model.joint_template[0] + shape @ model.joint_shape_dirs[0].T + trans).T
 
 
 def _unflatten(points, batch):
@@ -172,13 +185,13 @@ def _unflatten(points, batch):
 def _placed(model, pose, shape, trans, points):
     batch = jnp.broadcast_shapes(pose.shape[:-1], shape.shape[:-1], trans.shape[:-1])
     pose, beta = flatten(pose, batch, 1), flatten(shape, batch, 1)
-    posed = pose_joints(model, pose[:, 3:].reshape(len(pose), 23, 3), beta)
-    R, pelvis = root_and_pelvis(model, pose, beta, flatten(trans, batch, 1))
-    return _unflatten(matvec(R[None], points(posed, beta)) + pelvis, batch)
+    posed = pose_joints(model, rotations(pose.reshape(len(pose), 24, 3)), beta)
+    pelvis = pelvis_place(model, beta, flatten(trans, batch, 1))
+    return _unflatten(points(posed, beta) + pelvis, batch)
 
 
 def _detected(model, posed, shape, layout, bias):
-    """Keypoints (k, 3, n) in frame H."""
+    """Keypoints (k, 3, n) about the pelvis."""
     names = KEYPOINT_NAMES[layout]
     surface = [n for n in names if n in SURFACE_POINTS]
     inner = [n for n in names if n not in SURFACE_POINTS]
@@ -192,7 +205,7 @@ def _detected(model, posed, shape, layout, bias):
 
 
 def _picked_vertices(model, names, posed, shape):
-    """Skinned vertices of the named surface points, (k, 3, n), in frame H."""
+    """Skinned vertices of the named surface points, (k, 3, n), about the pelvis."""
     v = model.picks[np.array([SURFACE_POINTS.index(n) for n in names])]
     dirs = model.shape_dirs[v].reshape(-1, 10)
     rest = model.template[v][:, :, None] + (dirs @ shape.T).reshape(len(names), 3, -1)
@@ -210,44 +223,42 @@ def _picked_vertices(model, names, posed, shape):
 
 
 def pose_feature(R):
-    """SMPL's `vec(R_k - I)`, k = 1, 2, ...: (207, n) from (23, 3, 3, n)."""
+    """SMPL's `vec(R_k - I)`, k = 1, 2, ...: (207, n) from (24, 3, 3, n)."""
     eye = jnp.eye(3, dtype=R.dtype)[None, :, :, None]
-    return (R - eye).reshape(207, R.shape[-1])
+    return (R[1:] - eye).reshape(207, R.shape[-1])
 
 
 # The chain itself, with its own derivative. Differentiating the products of matrices
 # level by level is slow to compile and to run. But a small turn φ_k of joint k about
-# its own place (axis-angle, in H) moves every joint below it rigidly, so
-#   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x (x_i - x_parent(i)) + G_parent(i) do_i),
-# sums over i from the root down to k: products with constant matrices of ones.
+# its own place (axis-angle, in the outer frame) moves every joint below it rigidly, so
+#   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x b_i + G_parent(i) do_i),
+# sums over i from the root down to k, products with constant matrices of ones; o_i is
+# the bone to joint i at rest and b_i = G_parent(i) o_i.
 
 
 def _ancestry():
     below = np.zeros((24, 24))
     for k in range(24):
         i = k
-        while i > 0:
+        while i >= 0:
             below[k, i] = 1.0
             i = PARENTS[i]
-    return below[1:, 1:], below[_PARENT, 1:]
+    return below, below[_PARENT]
 
 
 _UP_TO_SELF, _UP_TO_PARENT = _ancestry()
 
 
 @jax.custom_jvp
-def _chain(R, offset):
-    """`G` (23, 3, 3, n) and `x` (23, 3, n) from `R` and bone vectors, in frame H."""
-    G_all, x_all, G, x, above = [], [], None, None, ()
+def _chain(R, bones):
+    """`G` (24, 3, 3, n) and `x` (24, 3, n) from `R` and bones (23, 3, n) at rest."""
+    G, x, above = R[:1], jnp.zeros_like(bones[:1]), (0,)
+    G_all, x_all = [G], [x]
     for level in LEVELS:
-        here = slice(level[0] - 1, level[-1])
-        if G is None or x is None:
-            G, x = R[here], offset[here]
-        else:
-            parent = np.array([above.index(PARENTS[k]) for k in level])
-            G, x = G[parent], x[parent]
-            x = x + matvec(G, offset[here])
-            G = matmul(G, R[here])
+        parent = np.array([above.index(PARENTS[k]) for k in level])
+        G, x = G[parent], x[parent]
+        x = x + matvec(G, bones[level[0] - 1 : level[-1]])
+        G = matmul(G, R[level[0] : level[-1] + 1])
         G_all.append(G)
         x_all.append(x)
         above = level
@@ -256,23 +267,29 @@ def _chain(R, offset):
 
 @_chain.defjvp
 def _chain_jvp(primals, tangents):
-    R, offset = primals
-    dR, doffset = tangents
-    G, x = _chain(R, offset)
-    n = R.shape[-1]
-    G_root = jnp.broadcast_to(jnp.eye(3, dtype=G.dtype)[None, :, :, None], (1, 3, 3, n))
-    G_parent = jnp.concatenate([G_root, G])[_PARENT]
-    x_parent = jnp.concatenate([jnp.zeros((1, 3, n), x.dtype), x])[_PARENT]
+    R, bones = primals
+    dR, dbones = tangents
+    G, x = _chain(R, bones)
+    above = G[_PARENT]
+    G_parent = jnp.concatenate([_identity(G), above])
     spin = lambda i, j: (dR[:, i] * R[:, j]).sum(1)  # of dR Rᵀ, which is skew
     phi = matvec(G_parent, jnp.stack([spin(2, 1), spin(0, 2), spin(1, 0)], 1))
     omega, omega_parent = _tree_sum(_UP_TO_SELF, phi), _tree_sum(_UP_TO_PARENT, phi)
-    dx = _cross(omega_parent, x - x_parent) + matvec(G_parent, doffset)
+    dx = _cross(omega_parent, matvec(above, bones)) + matvec(above, dbones)
     dG = jnp.stack([_cross(omega, G[:, :, i]) for i in range(3)], 2)
-    return (G, x), (dG, _tree_sum(_UP_TO_SELF, dx))
+    return (G, x), (dG, _tree_sum(_UP_TO_SELF[:, 1:], dx))
+
+
+def _identity(R):
+    """The root's rotation where it has none, (1, 3, 3, n)."""
+    eye = jnp.eye(3, dtype=R.dtype)[..., None]
+    return jnp.broadcast_to(eye, (1, 3, 3, R.shape[-1]))
 
 
 def _tree_sum(ones, u):
-    return (jnp.asarray(ones, u.dtype) @ u.reshape(23, -1)).reshape(u.shape)
+    return (jnp.asarray(ones, u.dtype) @ u.reshape(len(u), -1)).reshape(
+        len(ones), *u.shape[1:]
+    )
 
 
 def _cross(a, b):

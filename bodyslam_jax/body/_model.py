@@ -65,10 +65,10 @@ def runs_of_vertices(
 
     A mesh lists its parts one after another, so that long runs follow few joints. The
     cuts have the least cost of (vertices x joints) by dynamic programming over cells of
-    vertices; a cut has its price too, so that there are about ten in a body.
+    vertices; a cut has its price (compiling): there are about four runs in a body.
     """
     v = len(weights)
-    cell, price = max(1, -(-v // 400)), 0.3 * v + 1000
+    cell, price = max(1, -(-v // 400)), float(v + 1000)
     starts = [*range(0, v, cell), v]
     follows = [(weights[a:b] != 0).any(0) for a, b in zip(starts, starts[1:])]
     best, back = [0.0], [0]

@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body._kinematics import (
     flatten,
-    matmul,
     matvec,
+    pelvis_place,
     pose_feature,
     pose_joints,
-    root_and_pelvis,
+    rotations,
 )
 from bodyslam_jax.body._model import BodyModel
 
@@ -42,12 +42,10 @@ def vertices(
     is_shared = math.prod(shape.shape[:-1]) == 1 and model.pose_dirs.shape[-1] == 0
     pose, trans = flatten(pose, batch, 1), flatten(trans, batch, 1)
     beta = flatten(shape, batch, 1)
-    posed = pose_joints(model, pose[:, 3:].reshape(len(pose), 23, 3), beta)
-    root, pelvis = root_and_pelvis(model, pose, beta, trans)
-    # T_j = [root G_j | root (x_j - G_j J_j) + pelvis], (24, 3, 4, n)
-    move = posed.x - matvec(posed.G, posed.rest)
-    T = matmul(root[None], jnp.concatenate([posed.G, move[:, :, None]], 2))
-    T = jnp.concatenate([T[:, :, :3], T[:, :, 3:] + pelvis[None, :, None]], 2)
+    posed = pose_joints(model, rotations(pose.reshape(len(pose), 24, 3)), beta)
+    # T_j = [G_j | x_j - G_j J_j + pelvis], (24, 3, 4, n)
+    move = posed.x - matvec(posed.G, posed.rest) + pelvis_place(model, beta, trans)
+    T = jnp.concatenate([posed.G, move[:, :, None]], 2)
     if is_shared:
         points = _skin_shared(model, T, shape.reshape(10))
     else:
@@ -63,10 +61,11 @@ def _skin_shared(model, T, shape):
     runs = []
     for start, stop, joints in model.blocks:
         M = _weights(model, start, stop, joints)[:, None] * rest[:, start:stop]
-        runs.append((np.array(joints), M.reshape(4 * len(joints), stop - start)))
+        runs.append(M.reshape(4 * len(joints), stop - start))
 
     def skin(T):
-        parts = [T[:, :, j].reshape(-1, len(M)) @ M for j, M in runs]
+        by_run = _by_run(model, T, 2)
+        parts = [A.reshape(-1, len(M)) @ M for A, M in zip(by_run, runs, strict=True)]
         points = jnp.concatenate(parts, -1)
         return points.reshape(len(T), 3, -1).transpose(0, 2, 1)
 
@@ -75,29 +74,36 @@ def _skin_shared(model, T, shape):
 
 def _skin_each(model, T, shape, feature):
     """A rest surface for each frame: blend the transforms, then apply them."""
-    num_features = feature.shape[-1]
-    template = model.template.T
-    S, P = model.shape_dirs.transpose(2, 1, 0), model.pose_dirs.transpose(2, 1, 0)
+    v, num_features = model.num_vertices, feature.shape[-1]
+    S, P = (
+        dirs.transpose(2, 1, 0).reshape(-1, 3 * v)
+        for dirs in (model.shape_dirs, model.pose_dirs)
+    )
     weights = [_weights(model, *run) for run in model.blocks]
 
     # Recomputed in the backward pass: the blended transforms of a long video are
     # several times as large as its vertices.
     @jax.checkpoint
     def skin(T, shape, feature):
-        parts = []
-        for (start, stop, joints), W in zip(model.blocks, weights, strict=True):
-            size = stop - start
-            here = lambda dirs: dirs[:, :, start:stop].reshape(len(dirs), 3 * size)
-            rest = (shape @ here(S)).reshape(-1, 3, size) + template[:, start:stop]
-            if num_features:
-                rest = rest + (feature @ here(P)).reshape(-1, 3, size)
-            A = T[..., np.array(joints)].reshape(-1, len(joints)) @ W
-            A = A.reshape(-1, 3, 4, size)
-            row = lambda c: A[:, :, c] * rest[:, c, None]
+        rest = model.template.T.reshape(-1) + shape @ S
+        if num_features:
+            rest = rest + feature @ P
+        rest = rest.reshape(-1, 3, v)
+        parts, by_run = [], _by_run(model, T, 3)
+        for (start, stop, _), W, A in zip(model.blocks, weights, by_run, strict=True):
+            A = (A.reshape(-1, len(W)) @ W).reshape(-1, 3, 4, stop - start)
+            row = lambda c: A[:, :, c] * rest[:, c, None, start:stop]
             parts.append(row(0) + row(1) + row(2) + A[:, :, 3])
         return jnp.concatenate(parts, -1).transpose(0, 2, 1)
 
     return _by_chunks(skin, _CHUNK_EACH, T.transpose(3, 1, 2, 0), shape, feature)
+
+
+def _by_run(model, T, axis):
+    """The transforms that each run of vertices follows: one gather, then slices."""
+    every = np.concatenate([joints for *_, joints in model.blocks])
+    ends = np.cumsum([len(joints) for *_, joints in model.blocks])
+    return jnp.split(jnp.take(T, every, axis=axis), ends[:-1], axis=axis)
 
 
 def _weights(model, start, stop, joints):
