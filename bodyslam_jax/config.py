@@ -24,8 +24,8 @@ class GraphWeights:
     detector's usual error in metres of the body, as it appears at its distance."""
     keypoint_inflation: float = 3.0
     """Factor on the detector's usual error at 30 fps; grows with the root of the frame
-    rate. Errors last for about 0.15 s: taken for independent, keypoints
-    stretch the body by some per cent."""
+    rate. Errors last for about 0.15 s: taken for independent, keypoints stretch the
+    body by some per cent."""
     keypoint_loss: float = 3.0
     """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0

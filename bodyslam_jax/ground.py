@@ -43,7 +43,7 @@ def find_ground(
         return None
     chosen = below[best]
     centre = chosen.mean(axis=0)
-    return _plane(np.linalg.svd(chosen - centre)[2][2], centre, up)
+    return _plane(np.linalg.svd(chosen - centre, full_matrices=False)[2][2], centre, up)
 
 
 def _plane(

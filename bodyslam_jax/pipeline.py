@@ -194,28 +194,9 @@ def _tracks(sequence: Sequence, config: Config) -> Tracks:
 
 
 def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies:
-    """Bodies in the camera frame: a regressor's, cleaned, or fitted to keypoints."""
-    t = sequence.num_frames
-    if not config.people or (sequence.bodies is None and sequence.keypoints is None):
-        return Bodies(
-            np.zeros((0, t), bool),
-            np.zeros((0, t, 72)),
-            np.zeros((0, t, 10)),
-            np.zeros((0, t, 3)),
-        )
-    if sequence.bodies is not None:
-        return people.prepare_bodies(
-            sequence.bodies,
-            sequence.keypoints,
-            sequence.intrinsics,
-            body,
-            sequence.fps,
-            config.people_fit,
-        )
-    assert sequence.keypoints is not None
-    return people.fit_bodies(
-        sequence.keypoints, sequence.intrinsics, body, sequence.fps, config.people_fit
-    )
+    if not config.people:
+        return people.nobody(sequence.num_frames)
+    return people.estimate_bodies(sequence, body, config.people_fit)
 
 
 def run_to_folder(

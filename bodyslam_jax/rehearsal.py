@@ -66,26 +66,14 @@ def rehearse(
         return Rehearsal()
     made: list[Result] = []
     parts = {
-        "people": lambda: _people(sequence, body, config),
+        # As it will be, but for a focal length that is yet to be refined.
+        "people": lambda: people.estimate_bodies(sequence, body, config.people_fit),
         "prediction": lambda: _prediction(sequence, body, config),
         "outcome": lambda: made.append(_outcome(sequence, body, config)),
         "errors": lambda: evaluation.evaluate(made[0], truth) if truth else None,
         "files": lambda: _files(made[0], sequence, body, config),
     }
     return Rehearsal(parts)
-
-
-def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> None:
-    """As it will be, but for a focal length that is yet to be refined."""
-    assert sequence.bodies is not None
-    people.prepare_bodies(
-        sequence.bodies,
-        sequence.keypoints,
-        sequence.intrinsics,
-        body,
-        sequence.fps,
-        config.people_fit,
-    )
 
 
 def _prediction(sequence: Sequence, body: body_.BodyModel, config: Config) -> None:

@@ -30,7 +30,7 @@ def scene(factor: float = 1.0, tilt: float = 0.0, num: int = 40) -> Result:
     joints[..., 1] = 1.0
     joints[0, :, :, 2] = (5 + 4 * s)[:, None]
     for foot, phase in ((10, 0.0), (11, np.pi)):
-        joints[0, :, foot, 1] = 0.1 * np.maximum(np.sin(20 * s + phase), 0)
+        joints[0, :, foot, 1] = 0.027 + 0.1 * np.maximum(np.sin(20 * s + phase), 0)
         joints[0, :, foot, 1] += np.tan(tilt) * (joints[0, :, foot, 2] - 7)
     # The camera is where it is relative to the person; the map is about the camera.
     eye = T_WC[:, :3, 3].copy()

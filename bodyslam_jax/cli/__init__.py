@@ -5,8 +5,10 @@ input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 """
 
 import _thread
+import atexit
 import logging
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -144,6 +146,8 @@ def _one_line(error: BaseException) -> str:
 def _prepare_jax() -> None:
     """64-bit, compiled programs kept between runs, and every Ctrl-C heard."""
     sys.unraisablehook = _interrupt_again
+    # What was asked for is done by then: Ctrl-C could only change what is said of it.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 

@@ -33,6 +33,7 @@ WEIGHTS: dict[str, tuple[type[graph.AbstractFactor], str]] = {
     "orientation": (graph.RootOrientation, "sigma"),
     "turning": (graph.RootTurning, "sigma"),
     "smooth path": (graph.RootSmoothness, "sigma"),
+    "ground": (graph.GroundContact, "sigma"),
     "landmark": (graph.Reprojection, "sigma"),
     "landmark loss": (graph.Reprojection, "loss"),
 }

@@ -85,7 +85,7 @@ def _cues(scale: Mapping[str, Any]) -> list[str]:
     found = []
     for cue, name in (
         ("from_motion", "people's motion"),
-        ("from_ground", "the ground they stand on"),
+        ("from_ground", "the ground under people's feet"),
     ):
         if (told := scale.get(cue)) is not None:
             found.append(f"from {name} alone: {told[0]:.4g} ± {told[1]:.2g}")

@@ -6,6 +6,8 @@ from bodyslam_jax.ground import find_ground
 from bodyslam_jax.result import Result
 
 _FEET = [10, 11]
+_SOLE = 0.027
+"""How far these joints lie above what the sole stands on, m, in the default body."""
 _UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -26,7 +28,8 @@ def ground_scale(result: Result) -> float | None:
     factors = []
     for joints, here in zip(result.joints, result.present, strict=True):
         feet = joints[here][:, _FEET]
-        low = feet[np.arange(len(feet)), feet[..., 1].argmin(axis=1)]
+        low = feet[np.arange(len(feet)), (feet @ normal).argmin(axis=1)]
+        low = low - _SOLE * normal
         eye = result.T_WC[here, :3, 3]
         towards = (low - eye) @ normal
         reach = np.full(len(low), np.nan)

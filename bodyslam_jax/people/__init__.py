@@ -1,5 +1,7 @@
 """People: bodies from keypoints or from a regressor, made ready for the graph."""
 
+from bodyslam_jax.people._bodies import estimate_bodies as estimate_bodies
+from bodyslam_jax.people._bodies import nobody as nobody
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._fit import keypoint_sigma as keypoint_sigma
