@@ -25,6 +25,7 @@ def depth_is_valid(p_C: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
     return p_C[..., 2] > MIN_DEPTH
 
 
+@jax.jit
 def project(
     intrinsics: Float[Array, "*#b i"], p_C: Float[Array, "*#b 3"]
 ) -> Float[Array, "*_ 2"]:
@@ -37,6 +38,7 @@ def project(
     return _to_pixel(intrinsics, distort(intrinsics, p_C[..., :2] / depth))
 
 
+@jax.jit
 def unproject(
     intrinsics: Float[Array, "*#b i"], uv: Float[Array, "*#b 2"]
 ) -> Float[Array, "*_ 3"]:

@@ -8,6 +8,7 @@ and turns that do not fit together give it away. Distortion is not sought.
 import dataclasses
 import logging
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -170,7 +171,7 @@ def _adjusted(
     if guess is not None:
         spread = solver.marginals(problem, state).intrinsics
         focal_sigma = float(np.sqrt(config.structure.focal_runs * spread[0, 0]))
-    error = sigma * np.linalg.norm(np.asarray(factor.residual(state)), axis=-1)
+    error = sigma * np.linalg.norm(np.asarray(_residual(factor, state)), axis=-1)
     keep = cameras.keep
     found = _clipped(np.median(error[keep]) / _PER_SIGMA) if keep.any() else 1.0
     return dataclasses.replace(
@@ -183,6 +184,9 @@ def _adjusted(
         pixel_sigma=found,
         costs=(before, float(solution.cost)),
     )
+
+
+_residual = eqx.filter_jit(lambda factor, state: factor.residual(state))
 
 
 def _problem(

@@ -6,6 +6,7 @@ keypoint terms see neither the cameras nor `s`, and `s` is free to move.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
@@ -148,6 +149,7 @@ def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
     return cameras @ state.roots
 
 
+@jax.jit
 def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
     """1 where a camera coordinate may move, 0 where it holds the map in place.
 

@@ -1,5 +1,6 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -135,8 +136,21 @@ def motion_factor(
     `shared_error` is a share by which all of a person's steps may be wrong together:
     they say no more of the scale than that allows, however many there are.
     """
+    step, whitening = _steps(seen, shapes, body, weights, shared_error)
+    return graph.HumanMotion(
+        translation=step,
+        whitening=whitening,
+        correlation=graph.runs(seen.valid, weights.motion_correlation),
+        correlated=weights.motion_correlation > 0,
+        body=body,
+    )
+
+
+@eqx.filter_jit
+def _steps(seen, shapes, body, weights, shared_error):
+    """Displacements in lengths of the leg, and what whitens their errors."""
     valid = seen.valid
-    eye = jnp.eye(3)
+    eye = jnp.eye(3, dtype=seen.translation.dtype)
     if weights.motion_sigma is None:
         covariance = jnp.where(valid[..., None, None], seen.covariance, eye)
         lower = jnp.linalg.cholesky(covariance)
@@ -151,10 +165,4 @@ def motion_factor(
     told = told * (1 - rho) / (1 + rho)  # information on a factor of all steps
     whitening = whitening / jnp.sqrt(1 + shared_error**2 * told)
     leg = motion.leg_length(body, shapes)[:, None, None]
-    return graph.HumanMotion(
-        translation=step / leg,
-        whitening=whitening * leg[..., None],
-        correlation=graph.runs(valid, rho),
-        correlated=weights.motion_correlation > 0,
-        body=body,
-    )
+    return step / leg, whitening * leg[..., None]

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +73,7 @@ def scale_start(
     if contact is None:
         return start
     used = np.isfinite(np.asarray(contact.sigma))
-    ground = float(np.median(np.asarray(contact.scales(state))[used]))
+    ground = float(np.median(np.asarray(_scales(contact, state))[used]))
     # Metres by which the ground may be off, over units from it to the camera.
     metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
     units = state.cameras[:, :3, 3] @ contact.plane[:3] + contact.plane[3]
@@ -108,9 +109,12 @@ def ground_contact(
         return None
     sigma = np.where(there, weights.ground_sigma * np.sqrt(there.sum()), np.inf)
     contact = graph.GroundContact(body, jnp.asarray(plane), jnp.asarray(sigma))
-    every = np.asarray(contact.scales(state))[there]
+    every = np.asarray(_scales(contact, state))[there]
     low, middle, high = np.quantile(every, [0.25, 0.5, 0.75])
     return contact if low > 0 and high - low < _STEADY * middle else None
+
+
+_scales = eqx.filter_jit(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(state: graph.State, seen: motion.Prediction) -> ScaleStart:

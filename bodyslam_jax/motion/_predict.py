@@ -46,6 +46,7 @@ class Prediction(eqx.Module):
     """Whether row k had all frames that it needs; if not, its values mean nothing."""
 
 
+@jax.jit
 def leg_length(body: BodyModel, shape: Float[Array, "*b 10"]) -> Float[Array, "*b"]:
     """Hip to knee to ankle, mean of both sides, of a shaped body (m)."""
     rest = rest_joints(body, shape)

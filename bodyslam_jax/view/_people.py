@@ -50,10 +50,11 @@ def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
     arrays = lambda m: (
         [m.template, m.shape_dirs, m.pose_dirs, m.skin_joint] + [m.skin_weight]
     )
-    coarse = eqx.tree_at(arrays, body, [x[kept] for x in arrays(body)])
+    chosen = lambda x: jnp.asarray(np.asarray(x)[kept])
+    coarse = eqx.tree_at(arrays, body, [chosen(x) for x in arrays(body)])
     place = lambda vertex: int(np.searchsorted(kept, vertex))
     runs = tuple((place(i), place(j), joints) for i, j, joints in body.blocks)
-    regressor = coarse.joint_regressor[:, kept]
+    regressor = jnp.asarray(np.asarray(coarse.joint_regressor)[:, kept])
     return dataclasses.replace(coarse, blocks=runs, joint_regressor=regressor), faces
 
 
