@@ -325,7 +325,9 @@ def _log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
 
 
 @jax.jit
-def runs(present: Bool[Array, "h t"], correlation: float) -> Float[Array, "h t"]:
+def runs(
+    present: Bool[Array, "h t"], correlation: float | Float[Array, ""]
+) -> Float[Array, "h t"]:
     """ρ where this frame and the one before are measured, 0 at the start of a run."""
     before = jnp.concatenate([jnp.zeros_like(present[:, :1]), present[:, :-1]], axis=1)
     return jnp.where(present & before, correlation, 0.0)
