@@ -1,6 +1,6 @@
 """`python -m bodyslam_jax` is the command `bodyslam`."""
 
-from bodyslam_jax.cli import main
+from bodyslam_jax.cli import program
 
 if __name__ == "__main__":
-    main()
+    program()

@@ -97,8 +97,7 @@ def command(monkeypatch, capsys, tmp_path):
         raise AssertionError("computed from an input that is wrong")
 
     monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
-    monkeypatch.setattr(people, "fit_bodies", reached)
-    monkeypatch.setattr(people, "prepare_bodies", reached)
+    monkeypatch.setattr(people, "estimate_bodies", reached)
     monkeypatch.setattr(reconstruction, "estimate", reached)
 
     def run(*argv) -> tuple[int, str]:

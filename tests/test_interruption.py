@@ -59,7 +59,7 @@ def test_stages_that_were_done_are_not_done_again(
     def interrupt(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(people, "fit_bodies", interrupt)
+    monkeypatch.setattr(people, "estimate_bodies", interrupt)
     out = tmp_path / "run"
     code, said = command("run", sequence, "--out", out)
     assert code == 130 and "the same command continues it" in said
@@ -88,6 +88,16 @@ def heard():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
+def test_an_interrupt_waits_until_jax_is_loaded():
+    reached = False
+    with pytest.raises(KeyboardInterrupt), cli._interrupts_held():
+        signal.raise_signal(signal.SIGINT)
+        reached = True
+    assert reached
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.usefixtures("heard")
@@ -176,16 +186,17 @@ def test_signals_at_any_moment(sequence, tmp_path):
     out = tmp_path / "run"
     argv = [sys.executable, "-m", "bodyslam_jax", "run", str(sequence)]
     argv += ["--out", str(out), "--no-uncertainty"]
+    env = os.environ | {"PYTHONFAULTHANDLER": "1"}
     codes = []
     for wait in (3, 8, 15, 25, 40, 80, 600):
-        process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True, env=env)
         try:
             process.wait(wait)
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=120)[1]
         codes.append(process.returncode)
-        assert "Traceback" not in said, said
+        assert "Traceback" not in said and "Fatal" not in said, said
         # It is moved there whole: Ctrl-C may come while that is told, or just after.
         if (out / "summary.json").exists():
             break

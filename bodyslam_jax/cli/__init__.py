@@ -6,15 +6,16 @@ input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 
 import _thread
 import atexit
+import contextlib
 import importlib.metadata
 import logging
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import tyro
 
@@ -108,7 +109,7 @@ def main() -> None:
         sys.exit(_CLOSED_PIPE)
     except KeyboardInterrupt:
         print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(_INTERRUPTED)
     except Exception as error:
         if os.environ.get("BODYSLAM_DEBUG"):
             raise
@@ -120,6 +121,22 @@ def main() -> None:
     sys.exit(code or 0)
 
 
+def program() -> NoReturn:
+    """`main` as a process of its own."""
+    try:
+        main()
+    except SystemExit as end:
+        if end.code == _INTERRUPTED:
+            # Not Python's way out: it waits for threads that compile, and what they
+            # still call is then gone.
+            sys.stderr.flush()
+            os._exit(_INTERRUPTED)
+        raise
+    raise AssertionError("main exits.")
+
+
+_INTERRUPTED = 130
+"""What a shell says of a program that Ctrl-C ended."""
 _WHERE = "BODYSLAM_DEBUG=1 says where"
 _CLOSED_PIPE = 128 + 13
 """What a shell says of a program that SIGPIPE ended."""
@@ -151,7 +168,9 @@ def _prepare_jax() -> None:
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _compile_quickly()
-    import jax
+    with _interrupts_held():
+        import jax
+        import jax.numpy
 
     return_memory()
     jax.config.update("jax_enable_x64", True)
@@ -161,6 +180,21 @@ def _prepare_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C is heard at the end: while jaxlib is loaded it would crash Python."""
+    before = signal.getsignal(signal.SIGINT)
+    heard = []
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: heard.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if heard:
+        raise KeyboardInterrupt
 
 
 def _compile_quickly() -> None:
