@@ -76,7 +76,10 @@ def prepare_bodies(
     roots = roots_from_bodies(bodies, body)
     skeleton = make_skeleton(body, settings.detector_bias)
     prepared = Roots(
-        roots.present.copy(), roots.T_CH.copy(), roots.body_pose.copy(), roots.shape
+        present=roots.present.copy(),
+        T_CH=roots.T_CH.copy(),
+        body_pose=roots.body_pose.copy(),
+        shape=settings.regressor_shape_gain * roots.shape,
     )
     for h in range(len(roots.present)):
         T_CH = prepared.T_CH[h]
@@ -94,7 +97,7 @@ def prepare_bodies(
             scale = pixels_per_metre(uv, sigma, fps)
             sigma = np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
         orientation, position = _place_person(
-            skeleton, intrinsics, roots, h, where, uv, sigma, fps, settings
+            skeleton, intrinsics, prepared, h, where, uv, sigma, fps, settings
         )
         T_CH[where, :3, :3] = orientation
         T_CH[where, :3, 3] = position
