@@ -94,17 +94,10 @@ def reconstruct(
     grown = None
     if away > 1:
         starts = _first_pairs(pairs, config.max_first_pairs)
-        frames = np.arange(first, last + 1)
-        for angle in (config.min_angle, 0.6 * config.min_angle):
-            settings = dataclasses.replace(config, min_angle=angle)
-            builder = Builder(shot, num_frames, num_landmarks, focal, settings, refine)
-            other = builder.build(keyframes, starts)
-            if other is not None:
-                builder.complete(other, frames)
-                if grown is None or other.registered.sum() > grown.registered.sum():
-                    grown = other
-            if grown is not None and grown.registered[frames].all():
-                break
+        builder = Builder(shot, num_frames, num_landmarks, focal, config, refine)
+        grown = builder.build(keyframes, starts)
+        if grown is not None:
+            builder.complete(grown, np.arange(first, last + 1))
     if grown is not None:
         inlier = np.zeros(len(tracks.frame), dtype=bool)
         inlier[within] = grown.inlier

@@ -27,6 +27,8 @@ _ENOUGH = 20
 """Views of known points that tell how far points usually are."""
 _FLAT = 0.5
 """Share of the smallest angle that a point may itself have."""
+_RELAXED = 3
+"""Times that a smaller angle is tried where cameras cannot be located."""
 
 Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
 """Adjusts the free cameras and all points of `views` in place, as `_bundle.adjust`."""
@@ -91,6 +93,14 @@ class Builder:
         if best is None:
             return None
         self._grow(best, keyframes)
+        for _ in range(_RELAXED):
+            if best.registered[keyframes].all():
+                break
+            # The camera turned on while it hardly moved: what it came to see has but
+            # little parallax.
+            self.min_angle *= 0.6
+            self._triangulate(best, self._views_of(best))
+            self._grow(best, keyframes)
         for _ in range(3):  # outliers sorted anew in between
             self._refine(best, self._free(best))
             self._triangulate(best, self._views_of(best))
