@@ -26,6 +26,8 @@ _HELD = 1e-6
 """Prior's standard deviation, of the focal length, that holds it."""
 _MOVED = 0.02
 """Change of the focal length after which structure from motion is done again."""
+_WORSE = 1.5
+"""Times the error of a moving camera at which a turning one is no explanation."""
 _SQUARE = 1e-4
 """How alike the pixels' sides are, of the focal length."""
 
@@ -75,6 +77,8 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
         again = _reconstruct(sequence, tracks, better, config)
         cameras, sigma = _unadjusted(again, better, config), adjusted.pixel_sigma
         if again.kind != "moving":
+            if again.error > _WORSE * _PER_SIGMA * sigma:
+                return adjusted  # little as it moves, turning alone does not explain it
             # With its focal length wrong, a camera that turns had seemed to move.
             return dataclasses.replace(cameras, focal_sigma=adjusted.focal_sigma)
     return adjusted
