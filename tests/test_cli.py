@@ -1,3 +1,4 @@
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -147,3 +148,16 @@ def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
         assert caplog.text == ""
     finally:
         jax.config.update("jax_compilation_cache_dir", kept)
+
+
+def test_how_to_compile_is_set_once_where_it_is_known(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--a=1")
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.10.9")
+    for _ in range(2):
+        cli._compile_quickly()
+        wanted = "--a=1 --xla_cpu_use_fusion_emitters=false"
+        assert os.environ["XLA_FLAGS"] == wanted
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.2.3")
+    cli._compile_quickly()
+    assert os.environ["XLA_FLAGS"] == ""
