@@ -30,9 +30,12 @@ class GraphWeights:
     """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
+    step_error: float = 0.05
+    """Error that all of a person's steps share, as a share of them: people differ, and
+    postures are wrong for seconds. Without it steps would outvote the body's size."""
     fitted_step_error: float = 0.25
-    """Error that all steps share where bodies are fitted to keypoints, as a share: one
-    view hardly shows legs that swing towards it, and steps come out short."""
+    """The same where bodies are fitted to keypoints: one view hardly shows legs that
+    swing towards it, and steps come out short."""
     motion_sigma: float | None = None
     """Instead of the motion model's own covariance, m a frame."""
     motion_correlation: float = 0.8
@@ -73,6 +76,7 @@ class GraphWeights:
             landmark_loss=1.0,
             keypoint_sigma=1.0,
             keypoint_loss=100.0,
+            step_error=0.0,
             fitted_step_error=0.0,
             motion_sigma=0.1,
             motion_correlation=0.0,

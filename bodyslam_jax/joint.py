@@ -55,13 +55,15 @@ def prepare(
     moving = cameras.kind == "moving"
     start = ScaleStart()
     contact = None
-    shared = config.weights.fitted_step_error if sequence.bodies is None else 0.0
+    fitted = sequence.bodies is None
+    weights = config.weights
+    shared = weights.fitted_step_error if fitted else weights.step_error
     stages = []
     factors = []
     if moving:
         factors.append(
             initialisation.map_factor(
-                cameras.tracks, cameras.keep, cameras.pixel_sigma, config.weights
+                cameras.tracks, cameras.keep, cameras.pixel_sigma, weights
             )
         )
     anybody = len(roots.present) > 0
@@ -70,9 +72,9 @@ def prepare(
         factors, state, motion=predictor if anybody else None, free=free
     )
     if anybody:
-        factors += initialisation.people_factors(sequence, roots, config.weights, body)
+        factors += initialisation.people_factors(sequence, roots, weights, body)
         walked = lambda seen, state: initialisation.motion_factor(
-            seen, state.shapes, body, config.weights, shared_error=shared
+            seen, state.shapes, body, weights, shared_error=shared
         )
         if moving:
             contact = initialisation.ground_contact(
@@ -81,7 +83,7 @@ def prepare(
                 cameras.registered,
                 sequence.keypoints,
                 body,
-                config.weights,
+                weights,
             )
         if contact is not None:
             factors.append(contact)
