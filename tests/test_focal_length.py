@@ -1,11 +1,14 @@
 """The focal length when it was guessed: found where the camera's path tells it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
 from bodyslam_jax import reconstruction
 from bodyslam_jax.config import Config
+from bodyslam_jax.frontend import reconstruct
 from bodyslam_jax.sequence import Intrinsics, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -28,6 +31,27 @@ def test_a_guess_off_by_a_fifth_is_corrected():
     np.testing.assert_allclose(found.intrinsics[1], found.focal, rtol=1e-3)
     np.testing.assert_allclose(found.intrinsics[2:], CAMERA.params[2:], atol=0.01)
     assert camera_error(found.T_WC, truth) < 0.03
+
+
+@pytest.mark.parametrize(("error", "kind"), [(1.0, "moving"), (0.4, "rotation")])
+def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, kind):
+    """A map that fits to 0.3 px, and with a better focal length none, but turning."""
+    tracks, _ = scene("orbit", num=NUM)
+    first = reconstruct(tracks, CAMERA, NUM)
+    turning = dataclasses.replace(first, kind="rotation", error=error)
+    made = iter([first, turning])
+    monkeypatch.setattr(reconstruction, "_reconstruct", lambda *_: next(made))
+
+    def adjusted(cameras, sigma, config, guess):
+        found = np.asarray(guess.params) * [0.9, 0.9, 1, 1]
+        return dataclasses.replace(
+            cameras, intrinsics=found, focal_sigma=1.0, pixel_sigma=0.3
+        )
+
+    monkeypatch.setattr(reconstruction, "_adjusted", adjusted)
+    found = reconstruction.estimate(sequence(tracks, 1.0, NUM), tracks, Config())
+    assert found.kind == kind
+    np.testing.assert_allclose(found.focal, 0.9 * CAMERA.params[0])
 
 
 @pytest.mark.slow

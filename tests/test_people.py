@@ -12,7 +12,7 @@ import pytest
 from bodyslam_jax import people
 from bodyslam_jax.body import joints, keypoints, load_body_model, local_keypoints
 from bodyslam_jax.body import local_joints as body_joints
-from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.config import Config, PeopleFit
 from bodyslam_jax.people import _chain, _fit, _prior, _skeleton, _starts, _terms
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
 
@@ -306,6 +306,15 @@ def test_prepared_bodies_are_whole_smooth_and_the_right_way_round(
     assert error.mean() < 0.06
     gap = poses[0, 40:43, 3:66] - found.poses[0, 40:43, 3:66]
     assert 0 < np.abs(gap).max() < 0.5  # interpolated
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.3])
+def test_a_regressors_shape_is_taken_to_be_drawn_to_the_mean(truth, body, gain):
+    settings = PeopleFit(regressor_shape_gain=gain)
+    found = people.prepare_bodies(truth, None, CAMERA, body, FPS, settings)
+    np.testing.assert_allclose(found.shapes, gain * truth.shapes, atol=1e-12)
+    assert PeopleFit().regressor_shape_gain > 1
+    assert Config.paper().people_fit.regressor_shape_gain == 1
 
 
 def test_noise_of_regressed_bodies():
