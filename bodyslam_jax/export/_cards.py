@@ -90,7 +90,7 @@ def _cues(scale: Mapping[str, Any]) -> list[str]:
         if (told := scale.get(cue)) is not None:
             found.append(f"from {name} alone: {told[0]:.4g} ± {told[1]:.2g}")
     if (factor := scale.get("ground_factor")) is not None:
-        found.append(f"feet exactly on the ground: {100 * (factor - 1):+.0f} %")
+        found.append(f"feet exactly on the ground: {round(100 * (factor - 1)):+d} %")
     return found
 
 
