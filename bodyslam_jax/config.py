@@ -288,6 +288,8 @@ class Structure:
     """Error of a pure rotation below which there is no parallax to use, px."""
     min_baseline: float = 0.08
     """Extent of the path below which a camera only turns, of the distance of points."""
+    join_tracks: bool = True
+    """Whether tracks that turn out to be of one point become one landmark."""
     min_shared: int = 12
     """Points that two successive frames must share, or there is a cut."""
     focal_sigma: float = 0.2

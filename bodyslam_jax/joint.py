@@ -66,6 +66,11 @@ def prepare(
                 cameras.tracks, cameras.keep, cameras.pixel_sigma, weights
             )
         )
+        factors.append(
+            initialisation.revisit_factor(
+                cameras.places, cameras.elsewhere, cameras.pixel_sigma
+            )
+        )
     anybody = len(roots.present) > 0
     free = None if moving else initialisation.free_people(state)
     make = lambda factors, state: graph.make_problem(

@@ -39,6 +39,10 @@ class Cameras:
     """Observations of `landmarks`."""
     keep: Bool[np.ndarray, " m"]
     """Observations that fit."""
+    elsewhere: Float[np.ndarray, "l 3 3"]
+    """Information on `places` from other sightings, px² per squared unit of the map."""
+    places: Float[np.ndarray, "l 3"]
+    """Where all sightings of the same point place each landmark."""
     pixel_sigma: float
     """Robust standard deviation of those, px."""
     intrinsics: Float[np.ndarray, " i"]

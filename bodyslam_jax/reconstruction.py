@@ -26,6 +26,8 @@ _HELD = 1e-6
 """Prior's standard deviation, of the focal length, that holds it."""
 _MOVED = 0.02
 """Change of the focal length after which structure from motion is done again."""
+_SAME = 0.005
+"""Change of the focal length up to which places seen again are where they were."""
 _WORSE = 1.5
 """Times the error of a moving camera at which a turning one is no explanation."""
 _SQUARE = 1e-4
@@ -124,6 +126,8 @@ def _unadjusted(
         landmarks=found.landmarks,
         tracks=found.tracks,
         keep=np.ones(len(found.tracks.frame), bool),
+        elsewhere=found.elsewhere,
+        places=found.landmarks,
         pixel_sigma=config.weights.pixel_sigma,
         intrinsics=np.asarray(intrinsics.params, float),
         focal_sigma=float("nan"),
@@ -166,12 +170,19 @@ def _adjusted(
     factor = initialisation.map_factor(
         cameras.tracks, cameras.keep, sigma, config.weights
     )
-    problem = _problem(factor, state, config.structure, guess)
+    again = initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
+    if guess is not None and config.structure.focal_sigma > _HELD:
+        # Places are those of the focal length that was thought so far.
+        again = dataclasses.replace(again, whitening=0 * again.whitening)
+    problem = _problem(factor, again, state, config.structure, guess)
     solution = solver.solve(problem, state)
     before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
     state = solution.state
     focal_sigma = float("nan")
+    elsewhere = cameras.elsewhere
+    if abs(float(state.intrinsics[0]) / cameras.focal - 1) > _SAME:
+        elsewhere = np.zeros_like(elsewhere)
     if guess is not None:
         spread = solver.marginals(problem, state).intrinsics
         focal_sigma = float(np.sqrt(config.structure.focal_runs * spread[0, 0]))
@@ -185,6 +196,7 @@ def _adjusted(
         intrinsics=np.asarray(state.intrinsics),
         focal_sigma=focal_sigma,
         keep=keep & (error < 10 * found),
+        elsewhere=elsewhere,
         pixel_sigma=found,
         costs=(before, float(solution.cost)),
     )
@@ -195,12 +207,13 @@ _residual = eqx.filter_jit(lambda factor, state: factor.residual(state))
 
 def _problem(
     factor: graph.Reprojection,
+    again: graph.LandmarkPrior,
     state: graph.State,
     structure: Structure,
     guess: Intrinsics | None,
 ) -> graph.Problem:
     if guess is None:
-        return graph.make_problem([factor], state)
+        return graph.make_problem([factor, again], state)
     known = np.asarray(guess.params, float)
     focal = known[0]
     # Errors of a track last, so `focal_runs` observations count for one: here the

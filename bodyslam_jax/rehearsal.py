@@ -112,6 +112,8 @@ def _cameras(sequence: Sequence) -> Cameras:
         landmarks=np.zeros((0, 3)),
         tracks=Tracks(nothing, nothing, np.zeros((0, 2))),
         keep=nothing.astype(bool),
+        elsewhere=np.zeros((0, 3, 3)),
+        places=np.zeros((0, 3)),
         pixel_sigma=1.0,
         intrinsics=np.asarray(sequence.intrinsics.params, float),
         focal_sigma=float("nan"),

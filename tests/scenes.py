@@ -136,11 +136,25 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
     ]
 
 
-def extra_factors(rng, state):
+def landmark_prior(rng, state, seen=None):
+    """Half of the landmarks seen known besides, each its own way; not quite true."""
+    l = len(state.landmarks)
+    whitening = 5 * rng.standard_normal((l, 3, 3))
+    whitening[::2] = 0.0
+    if seen is not None:
+        whitening[~np.isin(np.arange(l), np.asarray(seen.landmark))] = 0.0
+    away = 0.05 * rng.standard_normal((l, 3))
+    return g.LandmarkPrior(
+        place=state.landmarks + away, whitening=jnp.asarray(whitening)
+    )
+
+
+def extra_factors(rng, state, seen=None):
     """Everything that can be switched on, for its blocks: not all of it true."""
     h, t = state.roots.shape[:2]
     late = lambda *shape, skip: jnp.full(shape, 0.05).at[:, :skip].set(jnp.inf)
     return [
+        landmark_prior(rng, state, seen),
         g.OrientationChange(
             rotation=jnp.asarray(0.05 * rng.standard_normal((h, t, 3))),
             sigma=late(h, t, skip=1),

@@ -462,7 +462,13 @@ def test_points_that_noise_draws_nearer_are_not_preferred():
     known = np.arange(count) < 100
     builder = Builder(views, num, count, 500.0, Structure(min_angle=0.5))
     every = np.ones(len(frame), bool)
-    grown = Growing(scene, np.ones(num, bool), known.copy(), every & known[landmark])
+    grown = Growing(
+        scene,
+        np.ones(num, bool),
+        known.copy(),
+        every & known[landmark],
+        np.arange(len(known)),
+    )
     builder._triangulate(grown, np.flatnonzero(~known[landmark]))
     new = grown.has_point & ~known
     assert new.sum() > 50

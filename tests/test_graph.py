@@ -181,6 +181,16 @@ def test_the_door_refuses_two_observations_in_one_frame(rng):
         g.make_problem([twice], state)
 
 
+def test_the_door_refuses_what_is_known_of_landmarks_that_are_not_there(rng):
+    state = scenes.truth(rng, frames=4, people=0, landmarks=6)
+    prior, seen = scenes.landmark_prior(rng, state), scenes.reprojection(rng, state)
+    with pytest.raises(ValueError, match="3 landmarks have a prior and no"):
+        g.make_problem([prior], state)
+    short = jax.tree.map(lambda x: x[:5] if jnp.ndim(x) else x, prior)
+    with pytest.raises(ValueError, match="5 places, expected one for each of 6"):
+        g.make_problem([seen, short], state)
+
+
 def test_a_problem_that_cannot_fit_says_how_many_frames_do(rng, monkeypatch):
     state = scenes.truth(rng, frames=40, people=1, landmarks=6)
     monkeypatch.setattr("os.sysconf", lambda name: 1000)

@@ -30,15 +30,24 @@ SEED = 2
 
 
 def make(
-    seed=SEED, people=0, frames=7, landmarks=25, extras=False, noise=1.0, **options
+    seed=SEED,
+    people=0,
+    frames=7,
+    landmarks=25,
+    extras=False,
+    known=False,
+    noise=1.0,
+    **options,
 ):
     rng = np.random.default_rng(seed)
     state = scenes.truth(rng, frames, people, landmarks)
     factors = [scenes.reprojection(rng, state, noise=0.5 * noise)]
     if people:
         factors += scenes.person_factors(rng, state, noise=noise)
+    if known:
+        factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
     if extras:
-        factors += scenes.extra_factors(rng, state)
+        factors += scenes.extra_factors(rng, state, factors[0])
     problem = g.make_problem(factors, state, **options)
     return problem, state, scenes.perturb(rng, problem, state)
 
@@ -78,7 +87,7 @@ def unpadded(step, state):
 @pytest.mark.parametrize(
     "options",
     [
-        {"frames": 33, "landmarks": 60},
+        {"frames": 33, "landmarks": 60, "known": True},
         pytest.param({"frames": 12, "people": 1}, marks=pytest.mark.slow),
         pytest.param(
             {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
@@ -107,6 +116,15 @@ def test_all_second_order_solvers_reach_the_same_optimum():
     best = costs.pop("structured")
     for name, cost in costs.items():
         assert cost == pytest.approx(best, rel=1e-8), name
+
+
+def test_landmarks_known_besides_reach_the_same_optimum_as_in_stock_solvers():
+    problem, _, start = make(known=True)
+    found = solve(problem, start, schedule=TIGHT)
+    other = solve(problem, start, solver="optimistix", schedule=TIGHT)
+    assert float(found.cost) == pytest.approx(float(other.cost), rel=1e-8)
+    without = eqx.tree_at(lambda p: p.factors, problem, problem.factors[1:])
+    assert float(without.cost(found.state)) < 0.9 * float(found.cost)
 
 
 @pytest.mark.slow
@@ -210,7 +228,7 @@ def test_single_precision_reaches_the_same_optimum():
 
 
 def test_marginal_covariances_are_blocks_of_the_inverse():
-    problem, state, _ = make(9, frames=24, landmarks=150)
+    problem, state, _ = make(9, frames=24, landmarks=150, known=True)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac
     diagonal = np.diag(hessian)

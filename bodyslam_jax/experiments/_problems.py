@@ -35,7 +35,7 @@ def without_map(
     free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
     if hold_cameras:
         free = graph.hold(free, "cameras")
-    of_map = (graph.Reprojection, graph.GroundContact)
+    of_map = (graph.Reprojection, graph.LandmarkPrior, graph.GroundContact)
     kept = [f for f in problem.factors if not isinstance(f, of_map)]
     return rebuild(problem, bare, kept, free), bare
 

@@ -48,6 +48,15 @@ def errors(scene: Scene, views: Views) -> Float[np.ndarray, " m"]:
     return np.where(z > _NEAR, error, np.inf)
 
 
+def jacobian_of_points(scene: Scene, views: Views) -> Float[np.ndarray, "m 2 3"]:
+    """Derivative of each observation by its point; 0 for a point behind the camera."""
+    p_C = _in_camera(scene, views)
+    z = np.where(p_C[:, 2] > _NEAR, p_C[:, 2], np.inf)[:, None, None]
+    xy = np.where(np.isfinite(z[:, 0]), p_C[:, :2] / z[:, 0], 0.0)
+    R = scene.R_CW[views.frame]
+    return (R[:, :2] - xy[:, :, None] * R[:, 2:]) / z
+
+
 def adjust(
     scene: Scene,
     views: Views,

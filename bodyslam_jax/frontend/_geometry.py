@@ -141,7 +141,7 @@ def resect(
         R, centre = guess
         good = _fits(R, centre, points, xy, 10 * threshold)
         if good.sum() >= max(10, 0.6 * len(points)):
-            found = _refine_pose(R, centre, points, xy, threshold)
+            found = refine_pose(R, centre, points, xy, threshold)
             if found is not None and found[2].sum() >= max(10, 0.6 * len(points)):
                 return found
     try:
@@ -160,7 +160,7 @@ def resect(
     if not ok or inlier is None or len(inlier) < 6:
         return None
     R = cv2.Rodrigues(rotvec)[0]
-    return _refine_pose(R, -R.T @ t[:, 0], points, xy, threshold)
+    return refine_pose(R, -R.T @ t[:, 0], points, xy, threshold)
 
 
 def _fits(
@@ -176,7 +176,7 @@ def _fits(
     return front & (np.linalg.norm(p_C[:, :2] / z[:, None] - xy, axis=-1) < threshold)
 
 
-def _refine_pose(
+def refine_pose(
     R: np.ndarray,
     centre: np.ndarray,
     points: np.ndarray,

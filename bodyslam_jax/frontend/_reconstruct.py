@@ -18,6 +18,7 @@ from bodyslam_jax.frontend._camera_motion import (
     rotations_only,
     stillness,
 )
+from bodyslam_jax.frontend._revisits import told_by_others
 from bodyslam_jax.frontend._structure import Builder, Growing, Refine
 from bodyslam_jax.sequence import Intrinsics, Tracks
 
@@ -44,6 +45,9 @@ class Reconstruction:
     """Which of the `m` observations given they are."""
     landmark_ids: Int[np.ndarray, " l"]
     """Which of the landmarks given these are."""
+    elsewhere: Float[np.ndarray, "l 3 3"]
+    """Information that other tracks of the same point hold on each landmark's place,
+    px² per squared unit of the map: to be divided by the variance of a pixel."""
     error: float
     """Median reprojection error of the inliers, px."""
     warnings: tuple[str, ...] = ()
@@ -187,14 +191,25 @@ def _moving(
     k0 = int(np.argmax(registered))
     R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()
     ids = np.flatnonzero(np.bincount(problem.views.landmark[inlier], minlength=1))
-    points = (grown.scene.points[ids] - c0) @ R0.T
+    points = (grown.scene.points[grown.shown[ids]] - c0) @ R0.T
     unit = float(np.median(np.linalg.norm(points, axis=-1))) if len(ids) else 1.0
     T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
     T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
     T_WC = interpolate_poses(T_WC, registered)
+    views = problem.views[np.flatnonzero(inlier)]
+    elsewhere = told_by_others(grown.scene, views, grown.shown)[ids]
+    elsewhere = (problem.focal * unit) ** 2 * (R0 @ elsewhere @ R0.T)
     return _pack(
-        problem, "moving", T_WC, registered, points / unit, ids, inlier, warnings
+        problem,
+        "moving",
+        T_WC,
+        registered,
+        points / unit,
+        ids,
+        inlier,
+        warnings,
+        elsewhere=elsewhere,
     )
 
 
@@ -241,6 +256,8 @@ def _pack(
     ids: np.ndarray,
     inlier: np.ndarray,
     warnings: tuple[str, ...],
+    *,
+    elsewhere: np.ndarray | None = None,
 ) -> Reconstruction:
     new = np.full(max(problem.num_landmarks, 1), -1)
     new[ids] = np.arange(len(ids))
@@ -263,6 +280,7 @@ def _pack(
         tracks=tracks,
         inlier=inlier,
         landmark_ids=ids,
+        elsewhere=np.zeros((len(ids), 3, 3)) if elsewhere is None else elsewhere,
         error=error,
         warnings=warnings,
     )

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.frontend._bundle import Scene, Views, adjust, errors
@@ -20,6 +20,7 @@ from bodyslam_jax.frontend._geometry import (
     triangulate,
     widest_angle,
 )
+from bodyslam_jax.frontend._revisits import Revisits
 
 _log = logging.getLogger(__name__)
 
@@ -27,6 +28,13 @@ _ENOUGH = 20
 """Views of known points that tell how far points usually are."""
 _FLAT = 0.5
 """Share of the smallest angle that a point may itself have."""
+_DRIFTED = 1.0
+"""Error of a place seen again, in thresholds, from which the loop is closed at once."""
+_CLOSING = (8.0, 3.0)
+"""Scales of the loss with which it is, in pixels: what joins must not seem outliers."""
+_ROUNDS, _SETTLED = 6, 0.01
+"""Times that joins are looked at again, and the share of observations of which another
+landmark is then thought that ends it."""
 _RELAXED = 3
 """Times that a smaller angle is tried where cameras cannot be located."""
 
@@ -43,6 +51,8 @@ class Growing:
     has_point: Bool[np.ndarray, " l"]
     inlier: Bool[np.ndarray, " m"]
     """Observations that fit, of those in registered frames."""
+    shown: Int[np.ndarray, " l"]
+    """The landmark that each track shows: its own, unless tracks were joined."""
 
 
 class Builder:
@@ -57,7 +67,10 @@ class Builder:
         config: Structure,
         refine: Refine | None = None,
     ):
-        self.views, self.config = views, config
+        self.views = Views(views.frame, views.landmark.copy(), views.xy)
+        self.config = config
+        self.revisits = Revisits(self.views, num_landmarks)
+        self.joining = False
         self.num_frames, self.num_landmarks = num_frames, num_landmarks
         self.pixel = 1 / focal
         self.threshold = config.max_error / focal
@@ -92,6 +105,7 @@ class Builder:
             best, score = wider, wider_score
         if best is None:
             return None
+        self.joining = self.config.join_tracks
         self._grow(best, keyframes)
         for _ in range(_RELAXED):
             if best.registered[keyframes].all():
@@ -101,6 +115,7 @@ class Builder:
             self.min_angle *= 0.6
             self._triangulate(best, self._views_of(best))
             self._grow(best, keyframes)
+        self._settle(best, keyframes[best.registered[keyframes]])
         for _ in range(3):  # outliers sorted anew in between
             self._refine(best, self._free(best))
             self._triangulate(best, self._views_of(best))
@@ -135,6 +150,7 @@ class Builder:
                 self._register(grown, int(k))
         self._triangulate(grown, self._views_of(grown))
         self._mark(grown)
+        grown.shown[self.revisits.track] = self.views.landmark
 
     def _start(self, a: int, b: int) -> Growing | None:
         _, i, j = np.intersect1d(
@@ -160,6 +176,7 @@ class Builder:
             np.isin(np.arange(self.num_frames), [a, b]),
             np.zeros(self.num_landmarks, dtype=bool),
             np.zeros(len(self.views.frame), dtype=bool),
+            np.arange(self.num_landmarks),
         )
         self._triangulate(grown, np.concatenate([at_a[good], at_b[good]]))
         if grown.has_point.sum() < self.config.min_shared:
@@ -184,6 +201,7 @@ class Builder:
             waiting.discard(k)
             since += 1
             self._triangulate(grown, self._views_seen_in(grown, k))
+            self._join(grown, k)
             count = int(grown.registered.sum())
             if count < 8 or count >= 1.25 * at_last:
                 self._refine(grown, self._free(grown))
@@ -214,6 +232,49 @@ class Builder:
         grown.registered[k] = True
         grown.inlier[at] = found[2]
         return True
+
+    def _join(self, grown: Growing, k: int) -> None:
+        """Finds points of the map again among those that frame `k` sees."""
+        if not self.joining:
+            return
+        seen = self.views.landmark[self.of_frame[k]]
+        pairs, away = self.revisits.find(
+            grown.scene, k, seen, grown.has_point, grown.registered, self.threshold
+        )
+        for one, other in pairs:
+            rows = self.revisits.join(one, other)
+            grown.has_point[one] = False
+            grown.inlier[rows] = grown.registered[self.views.frame[rows]]
+        if pairs and away > _DRIFTED * self.threshold:
+            self._close(grown)
+
+    def _settle(self, grown: Growing, frames: np.ndarray) -> None:
+        """Joins and parts tracks until that changes little: what was joined wrongly
+        while the map was bent is seen to be once it is less so."""
+        for _ in range(_ROUNDS):
+            if not self.revisits.members:
+                return
+            before = self.views.landmark.copy()
+            self._close(grown)
+            for k in frames:
+                self._join(grown, int(k))
+            self._refine(grown, self._free(grown))
+            self._triangulate(grown, self._views_of(grown))
+            if np.mean(self.views.landmark != before) < _SETTLED:
+                return
+
+    def _close(self, grown: Growing) -> None:
+        """Spreads what the map has drifted over all that was seen since."""
+        use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
+        for loss in _CLOSING:
+            adjust(
+                grown.scene,
+                self.views[use],
+                self._free(grown),
+                loss=loss * self.pixel,
+                tolerance=1e-3,
+            )
+        self._mark(grown)
 
     def _views_of(self, grown: Growing) -> np.ndarray:
         return np.flatnonzero(grown.registered[self.views.frame])
@@ -273,10 +334,18 @@ class Builder:
         """Sorts observations into inliers and outliers, and drops poor points."""
         use = self._views_of(grown)
         use = use[grown.has_point[self.views.landmark[use]]]
-        views = self.views[use]
-        good = errors(grown.scene, views) < self.threshold
+        error = errors(grown.scene, self.views[use]) / self.threshold
+        good = error < 1
         grown.inlier[:] = False
         grown.inlier[use] = good
+        of_all = np.full(len(self.views.frame), np.nan)
+        of_all[use] = error
+        if self.revisits.part(of_all):
+            # Tracks that are their own again have no point yet.
+            still = grown.has_point[self.views.landmark[use]]
+            grown.inlier[use[~still]] = False
+            use, good = use[still], good[still]
+        views = self.views[use]
         count = np.bincount(views.landmark, minlength=self.num_landmarks)
         fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
         angle = widest_angle(

@@ -26,6 +26,7 @@ from bodyslam_jax.graph._factors import rotation_between as rotation_between
 from bodyslam_jax.graph._factors import runs as runs
 from bodyslam_jax.graph._factors import whitening_of as whitening_of
 from bodyslam_jax.graph._ground import GroundContact as GroundContact
+from bodyslam_jax.graph._landmark_prior import LandmarkPrior as LandmarkPrior
 from bodyslam_jax.graph._layout import CHUNK as CHUNK
 from bodyslam_jax.graph._layout import Layout as Layout
 from bodyslam_jax.graph._layout import make_layout as make_layout

@@ -20,6 +20,7 @@ from bodyslam_jax.graph._factors import (
     Posture,
     Reprojection,
 )
+from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._layout import CHUNK, Layout, make_layout
 from bodyslam_jax.graph._state import State, Step, gauge
 from bodyslam_jax.motion import leg_length
@@ -142,6 +143,9 @@ def make_problem(
         )
     frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
     landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            _check_prior(factor, landmark)
     layout = make_layout(num_frames, num_landmarks, frame, landmark)
     _check_memory(layout, state)
     if free is None:
@@ -189,12 +193,16 @@ def _check_factor(factor, state):
             raise ValueError(f"{where}: {bad} values are not finite.")
     if isinstance(factor, Reprojection):
         _check_tracks(factor, state)
+    elif isinstance(factor, LandmarkPrior):
+        if factor.place.shape != state.landmarks.shape:
+            raise ValueError(
+                f"LandmarkPrior: {len(factor.place)} places, expected one for each of "
+                f"{len(state.landmarks)} landmarks."
+            )
     elif isinstance(factor, AbstractFrameFactor):
         _check_frames(factor, state)
     else:
-        raise ValueError(
-            f"factors: {name} is neither a `Reprojection` nor over frames."
-        )
+        raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
 
 
 def _check_tracks(factor, state):
@@ -217,6 +225,16 @@ def _check_tracks(factor, state):
                 f"Reprojection: landmark {l} is observed twice in frame {f} "
                 f"({len(twice)} such observations), expected once at most."
             )
+
+
+def _check_prior(factor, landmark):
+    known = np.asarray(factor.whitening).any(axis=(1, 2))
+    known[landmark] = False
+    if known.any():
+        raise ValueError(
+            f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
+            "observation; expected both, or a `whitening` of 0."
+        )
 
 
 def _check_frames(factor, state):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from bodyslam_jax.graph._factors import AbstractFactor, HumanMotion
+from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._problem import Problem
 from bodyslam_jax.graph._state import Step
 
@@ -20,7 +21,8 @@ def mute(problem: Problem, *kinds: type[AbstractFactor]) -> Problem:
 
 
 def _missing(factor: AbstractFactor) -> AbstractFactor:
-    field = "whitening" if isinstance(factor, HumanMotion) else "sigma"
+    whitened = isinstance(factor, HumanMotion | LandmarkPrior)
+    field = "whitening" if whitened else "sigma"
     old = getattr(factor, field)
     value = 0.0 if field == "whitening" else jnp.inf
     return eqx.tree_at(lambda f: getattr(f, field), factor, jnp.full_like(old, value))

@@ -11,6 +11,7 @@ from bodyslam_jax.initialisation._factors import keypoint_sigma as keypoint_sigm
 from bodyslam_jax.initialisation._factors import map_factor as map_factor
 from bodyslam_jax.initialisation._factors import motion_factor as motion_factor
 from bodyslam_jax.initialisation._factors import people_factors as people_factors
+from bodyslam_jax.initialisation._factors import revisit_factor as revisit_factor
 from bodyslam_jax.initialisation._scale import ScaleStart as ScaleStart
 from bodyslam_jax.initialisation._scale import ground_contact as ground_contact
 from bodyslam_jax.initialisation._scale import scale_start as scale_start

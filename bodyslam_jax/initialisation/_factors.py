@@ -28,6 +28,19 @@ def map_factor(
     )
 
 
+def revisit_factor(
+    places: Float[np.ndarray, "l 3"],
+    elsewhere: Float[np.ndarray, "l 3 3"],
+    sigma: float,
+) -> graph.LandmarkPrior:
+    """Where other sightings of the same points place landmarks (`frontend`)."""
+    size, axes = np.linalg.eigh(elsewhere)
+    whitening = np.sqrt(np.maximum(size, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
+    return graph.LandmarkPrior(
+        place=jnp.asarray(places, float), whitening=jnp.asarray(whitening / sigma)
+    )
+
+
 def keypoint_sigma(
     sequence: Sequence, roots: Roots, weights: GraphWeights
 ) -> Float[np.ndarray, "h t 25"]:

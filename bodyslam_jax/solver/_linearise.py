@@ -7,10 +7,16 @@ landmarks dense tables, frames by landmarks of a group (`_tables.py`).
 import equinox as eqx
 import jax.numpy as jnp
 
-from bodyslam_jax.graph import AbstractFrameFactor, Problem, Reprojection, State
+from bodyslam_jax.graph import (
+    AbstractFrameFactor,
+    LandmarkPrior,
+    Problem,
+    Reprojection,
+    State,
+)
 from bodyslam_jax.solver._blocks import Linearisation, Observations, Sums, sizes_of
 from bodyslam_jax.solver._frames import linearise_frames
-from bodyslam_jax.solver._tables import linearise_landmarks
+from bodyslam_jax.solver._tables import add_prior, linearise_landmarks
 
 
 @eqx.filter_jit
@@ -19,12 +25,17 @@ def linearise(
 ) -> Linearisation:
     """All blocks at a state; held coordinates have zero rows and columns."""
     sums = Sums(sizes_of(problem, state), state)
-    landmarks = ()
+    landmarks, priors = (), []
     for factor in problem.factors:
         if isinstance(factor, Reprojection):
             landmarks = linearise_landmarks(problem, factor, observations, state, sums)
+        elif isinstance(factor, LandmarkPrior):
+            priors.append(factor)
+            sums.costs.append(factor.cost(state))
         elif isinstance(factor, AbstractFrameFactor):
             linearise_frames(problem, factor, state, sums)
+    for prior in priors:
+        landmarks = add_prior(problem, prior, state, landmarks)
     return Linearisation(
         sums.blocks,
         sums.gradient,

@@ -10,7 +10,15 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax.graph import CHUNK, Problem, Reprojection, State, Step, round_up
+from bodyslam_jax.graph import (
+    CHUNK,
+    LandmarkPrior,
+    Problem,
+    Reprojection,
+    State,
+    Step,
+    round_up,
+)
 
 _FILL = {"sigma": "inf", "whitening": 0.0, "correlation": 0.0, "present": False}
 
@@ -19,7 +27,9 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
     """The same problem with `num_chunks * CHUNK` frames and more landmark slots."""
     frames = problem.layout.num_chunks * CHUNK - len(state.cameras)
     landmarks = round_up(len(state.landmarks) + 1) - len(state.landmarks)
-    factors = tuple(_pad_factor(factor, frames) for factor in problem.factors)
+    factors = tuple(
+        _pad_factor(factor, frames, landmarks) for factor in problem.factors
+    )
     motion = problem.motion
     if motion is not None:
         present = _extend(motion.present, 1, frames, False)
@@ -67,7 +77,13 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
     )
 
 
-def _pad_factor(factor, frames):
+def _pad_factor(factor, frames, landmarks):
+    if isinstance(factor, LandmarkPrior):
+        return LandmarkPrior(
+            place=_extend(factor.place, 0, landmarks, 0.0),
+            whitening=_extend(factor.whitening, 0, landmarks, 0.0),
+            loss=factor.loss,
+        )
     if isinstance(factor, Reprojection):
         rows = round_up(len(factor.frame) + 1) - len(factor.frame)
         return Reprojection(

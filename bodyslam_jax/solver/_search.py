@@ -9,7 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.graph import Problem, Reprojection, State, residual_of
+from bodyslam_jax.graph import (
+    LandmarkPrior,
+    Problem,
+    Reprojection,
+    State,
+    residual_of,
+)
 
 
 def search(problem, state, move, slope, predicted, terms):
@@ -60,22 +66,28 @@ def _settle(
     cameras; given the cameras its cost is its own, so that it need not hold up the
     step of all others.
     """
-    costs = []
+    tracks = next((f for f in problem.factors if isinstance(f, Reprojection)), None)
     keep = jnp.zeros(len(state.landmarks), bool)
-    for factor in problem.factors:
-        if not isinstance(factor, Reprojection):
-            costs.append(factor.cost(moved))
-            continue
+    of_tracks = jnp.zeros_like(state.scale)
+    if tracks is not None:
         old = eqx.tree_at(lambda s: s.landmarks, moved, state.landmarks)
-        count = len(state.landmarks)
-        ahead, behind = (
-            jnp.zeros(count, moved.scale.dtype)
-            .at[factor.landmark]
-            .add(factor.loss.rho(jnp.sum(residual_of(factor, s) ** 2, axis=-1)))
-            for s in (moved, old)
-        )
-        keep = ~(ahead <= behind)
+        here, there = (_by_landmark(problem, tracks, s) for s in (old, moved))
+        keep = ~(there[0] + there[1] <= here[0] + here[1])
         landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
         moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
-        costs.append(0.5 * jnp.sum(jnp.where(keep, behind, ahead)))
+        of_tracks = 0.5 * jnp.sum(jnp.where(keep, here[0], there[0]))
+    costs = [of_tracks if f is tracks else f.cost(moved) for f in problem.factors]
     return moved, keep, jnp.stack(costs)
+
+
+def _by_landmark(
+    problem: Problem, tracks: Reprojection, state: State
+) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
+    """Twice the cost of each landmark's observations, and of what else is known."""
+    rho = lambda f: f.loss.rho(jnp.sum(residual_of(f, state) ** 2, axis=-1))
+    none = jnp.zeros(len(state.landmarks), state.scale.dtype)
+    known = none
+    for factor in problem.factors:
+        if isinstance(factor, LandmarkPrior):
+            known = known + rho(factor)
+    return none.at[tracks.landmark].add(rho(tracks)), known

@@ -7,13 +7,14 @@ Gram matrix holds the camera's block, the intrinsics' and both gradients.
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.camera import project
-from bodyslam_jax.graph import CHUNK, Problem, Reprojection, State
+from bodyslam_jax.graph import CHUNK, LandmarkPrior, Problem, Reprojection, State
 from bodyslam_jax.solver._blocks import LandmarkBlocks, Observations, Sizes, Sums
 
 
@@ -105,6 +106,32 @@ def linearise_landmarks(
             )
         )
     return tuple(tables)
+
+
+def add_prior(
+    problem: Problem,
+    prior: LandmarkPrior,
+    state: State,
+    tables: tuple[LandmarkBlocks, ...],
+) -> tuple[LandmarkBlocks, ...]:
+    """The tables with what is known of their landmarks besides."""
+    free = problem.free.landmarks
+    error = prior.residual(state)
+    weight = prior.loss.weight(jnp.sum(error**2, axis=-1))[:, None]
+    jacobian = prior.whitening * free[:, None, :]
+    own = jnp.einsum("lki,lkj->lij", weight[..., None] * jacobian, jacobian)
+    gradient = jnp.einsum("lki,lk->li", jacobian, weight * error)
+    of = lambda x, bucket: jnp.moveaxis(
+        x.at[bucket.landmark].get(mode="fill", fill_value=0.0), 1, -1
+    )
+    return tuple(
+        eqx.tree_at(
+            lambda t: (t.own, t.gradient),
+            table,
+            (table.own + of(own, bucket), table.gradient + of(gradient, bucket)),
+        )
+        for bucket, table in zip(problem.layout.buckets, tables, strict=True)
+    )
 
 
 def _rows(
