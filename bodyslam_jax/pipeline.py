@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from bodyslam_jax import body as body_
 from bodyslam_jax import (
+    accuracy,
     evaluation,
     export,
     frontend,
@@ -21,6 +21,7 @@ from bodyslam_jax import (
     synthetic,
     view,
 )
+from bodyslam_jax import body as body_
 from bodyslam_jax import joint as joint_
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config
@@ -79,8 +80,8 @@ def _run(
     config: Config,
     cache: Cache,
     rehearsal: Rehearsal = Rehearsal(),
-) -> tuple[Result, Tracks]:
-    """`run`, and the points of the map as they were seen."""
+) -> tuple[Result, Cameras]:
+    """`run`, and the cameras before the joint estimate."""
     _check_length(sequence)
     watch = Stopwatch()
     body = body_.load_body_model(config.body_model)
@@ -100,9 +101,7 @@ def _run(
             lambda: joint_.estimate(seen, cameras, bodies, body, config),
         )
     rehearsal.wait("outcome")
-    result = assemble(sequence, config, body, cameras, joint, watch.seconds)
-    points, keep = cameras.tracks, cameras.keep
-    return result, Tracks(points.frame[keep], points.landmark[keep], points.uv[keep])
+    return assemble(sequence, config, body, cameras, joint, watch.seconds), cameras
 
 
 def before_joint(
@@ -230,11 +229,12 @@ def _to_folder(
     sequence: Sequence, out: Path, config: Config, cache: Cache, rehearsal: Rehearsal
 ) -> Result:
     body = body_.load_body_model(config.body_model)
-    result, tracks = _run(sequence, config, cache, rehearsal)
+    result, cameras = _run(sequence, config, cache, rehearsal)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         rehearsal.wait("errors")
-        result.summary["errors"] = errors(result, truth)
+        result.summary["errors"] = found = accuracy.errors(result, cameras, truth)
+        result.summary["headline"] += accuracy.headline(found)
     rehearsal.wait("files")
     watch = Stopwatch()
     with export.run_folder(out) as partial:
@@ -245,7 +245,7 @@ def _to_folder(
                     frontend.frames(sequence),
                     result,
                     body,
-                    tracks,
+                    _seen(cameras),
                 )
         result.summary["durations_s"] |= watch.seconds
         export.write_files(partial, result, config)
@@ -253,10 +253,10 @@ def _to_folder(
     return result
 
 
-def errors(result: Result, truth: Result) -> dict[str, dict[str, float]]:
-    """What `bodyslam evaluate` says, for the report."""
-    found = evaluation.evaluate(result, truth)
-    return {"joint estimate, in metres": {k: float(v) for k, v in found.items()}}
+def _seen(cameras: Cameras) -> Tracks:
+    """The points of the map as they were seen."""
+    tracks, keep = cameras.tracks, cameras.keep
+    return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])
 
 
 def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result:

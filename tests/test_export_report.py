@@ -53,7 +53,10 @@ SUMMARY = {
     ],
     "durations_s": {"tracks": 1.5, "joint": 2.0},
     "per_frame": {"reprojection_px": [None] * 9 + [0.7] * 81, "tracks": [200] * 90},
-    "errors": {"cameras alone": {"c_ate_se3": 1.5}, "joint": {"c_ate_se3": 0.0251}},
+    "errors": {
+        "cameras alone": {"c_ate_sim3": 0.0085, "c_ate_se3": "no <scale>"},
+        "joint": {"c_ate_sim3": 0.0081, "c_ate_se3": 0.0251},
+    },
     "settings": {"solver": {"iterations": 30}},
 }
 
@@ -77,7 +80,8 @@ def test_says_what_was_found(tmp_path, body):
         f"{100 * facts.stature(body, np.zeros(10)):.0f} ± 2 cm",
         "± 2.5 %",
         "focal length guessed &amp; refined",
-        "C-ATE, SE(3), mm 1500 25.1",
+        "cameras alone joint C-ATE, SE(3), mm – no &lt;scale&gt; 25.1",
+        "C-ATE, Sim(3), mm 8.5 8.1",
         "total 3.5",
         "iterations: 30",
     ):

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from bodyslam_jax import evaluation, outcome, pipeline, synthetic
+from bodyslam_jax import accuracy, evaluation, export, outcome, pipeline, synthetic
 from bodyslam_jax.config import Config, Simulation
 
 CONTRACT = {
@@ -27,7 +27,9 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     simulated = synthetic.simulate(
         Simulation(sequence="M1", family="follow", length=60, noise="low")
     )
-    sequence = synthetic.as_sequence(simulated)
+    camera = tmp_path / "camera.txt"
+    export.write_tum(camera, simulated.timestamps, simulated.T_WC)
+    sequence = dataclasses.replace(synthetic.as_sequence(simulated), groundtruth=camera)
     out = tmp_path / "run"
     result = pipeline.run_to_folder(sequence, out, Config())
 
@@ -45,7 +47,12 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     for name in ("camera.tum", "body_0.npz", "landmarks.ply", "config.yaml"):
         assert (out / name).stat().st_size > 0
     assert "<html" in (out / "report.html").read_text().lower()
-    assert json.loads((out / "summary.json").read_text())["status"] == "ok"
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "ok"
+    alone, joint = (summary["errors"][n] for n in (accuracy.ALONE, accuracy.JOINT))
+    assert alone["c_ate_sim3"] < 0.02 and alone["scale"] == "no scale"
+    assert alone["c_ate_sim3"] != joint["c_ate_sim3"]
+    assert joint["c_ate_se3"] == pytest.approx(float(found["c_ate_se3"]), abs=1e-6)
 
     # The same command again takes every stage from the folder, to the same result.
     caplog.set_level("INFO")

@@ -30,8 +30,9 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     - `people`: a list, with `stature_sigma_m` if known;
     - `per_frame`: lists of one number (or `None`) per frame, `reprojection_px`,
         `keypoint_px`, `tracks`, `inliers`;
-    - `errors`: a mapping from a name for what was evaluated ("cameras alone, any
-        scale", "joint estimate, metres") to its errors by `evaluation`'s names.
+    - `errors`: a mapping from a name for what was evaluated ("cameras alone, arbitrary
+        scale", "joint estimate, in metres") to its errors by `evaluation`'s names; a
+        text in place of a number says why there is none.
     """
     summary = plain(result.summary)
     camera = facts.camera_facts(result)

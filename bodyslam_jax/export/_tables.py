@@ -35,14 +35,20 @@ def _error_table(
     rows = []
     for key, label, unit, factor in chosen:
         values = [found.get(key) for found in errors.values()]
-        if any(value is not None for value in values):
-            cells = "".join(f"<td>{number(v, factor)}</td>" for v in values)
+        if any(isinstance(value, (int, float)) for value in values):
+            cells = "".join(f"<td>{_error(v, factor)}</td>" for v in values)
             name = f"{html.escape(label)}{f', {unit}' if unit else ''}"
             rows.append(f"<tr><th>{name}</th>{cells}</tr>")
     return (
         f'<div class="wide"><table><thead><tr><th></th>{head}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
+
+
+def _error(value: Any, factor: float) -> str:
+    """A number, or a dash and why there is none."""
+    why = f" <small>{html.escape(value)}</small>" if isinstance(value, str) else ""
+    return number(value, factor) + why
 
 
 def number(value: Any, factor: float = 1.0) -> str:

@@ -1,0 +1,101 @@
+"""Errors of the cameras before the joint estimate, beside those of the result."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax import accuracy
+from bodyslam_jax.outcome import Cameras
+from bodyslam_jax.result import Result
+from bodyslam_jax.sequence import Tracks
+
+T = 30
+WOBBLE, SMALLER = 0.02, 0.005  # m, of the cameras before and after
+
+
+def _path(wobble: float) -> np.ndarray:
+    """A camera that flies an arc, up and down by `wobble` from frame to frame."""
+    angle = np.linspace(0, 2, T)
+    T_WC = np.tile(np.eye(4), (T, 1, 1))
+    T_WC[:, 0, 3], T_WC[:, 2, 3] = np.cos(angle), np.sin(angle)
+    T_WC[:, 1, 3] = wobble * (-1.0) ** np.arange(T)
+    return T_WC
+
+
+def _result(T_WC: np.ndarray) -> Result:
+    joints = np.random.default_rng(0).normal(0, 0.3, (24, 3))
+    walked = np.zeros((T, 1, 3))
+    walked[:, 0, 2] = np.linspace(4, 6, T)
+    return Result(
+        timestamps=np.arange(T) / 30,
+        T_WC=T_WC,
+        scale=0.3,
+        intrinsics=np.array([500.0, 500.0, 320.0, 240.0]),
+        landmarks=np.zeros((0, 3)),
+        poses=np.zeros((1, T, 72)),
+        trans=walked[None, :, 0],
+        betas=np.zeros((1, 10)),
+        joints=(joints + walked)[None],
+        present=np.ones((1, T), bool),
+    )
+
+
+def _cameras(kind: str = "moving") -> Cameras:
+    """The wobbling path in a world of its own: turned, moved, three times as small."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    T_WC = turn @ _path(WOBBLE)
+    T_WC[:, :3, 3] = T_WC[:, :3, 3] / 3 + [1.0, 2.0, 3.0]
+    none = np.zeros(0, np.int64)
+    return Cameras(
+        kind=kind,
+        T_WC=T_WC,
+        registered=np.ones(T, bool),
+        landmarks=np.zeros((0, 3)),
+        tracks=Tracks(none, none, np.zeros((0, 2))),
+        keep=none.astype(bool),
+        pixel_sigma=1.0,
+        intrinsics=np.ones(4),
+        focal_sigma=float("nan"),
+        costs=(0.0, 0.0),
+        warnings=(),
+    )
+
+
+def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
+    result, truth = _result(_path(SMALLER)), _result(_path(0.0))
+    found = accuracy.errors(result, _cameras(), truth)
+    assert list(found) == [accuracy.ALONE, accuracy.JOINT]
+    alone, joint = found.values()
+    # In metres though the cameras are not: the truth's size is lent to them.
+    assert alone["c_ate_sim3"] == pytest.approx(WOBBLE, rel=0.02)
+    assert joint["c_ate_sim3"] == pytest.approx(SMALLER, rel=0.02)
+    assert alone["rpe_rotation"] == pytest.approx(0, abs=1e-6)  # turned as a whole
+    assert alone.keys() == joint.keys()
+    told = {key for key, value in alone.items() if not isinstance(value, str)}
+    known = {"c_ate_sim3", "rpe_rotation"}
+    assert told == known | {f"{name}_rmse" for name in known}
+    for key in ("c_ate_se3", "scale", "scale_error", "rpe_translation", "ate_s"):
+        assert alone[key] == "no scale"
+    for key in ("h_ate_sim3", "w_mpjpe", "pa_mpjpe", "rte"):
+        assert alone[key] == "no people"
+    first, second = accuracy.headline(found)
+    assert "arbitrary scale: C-ATE, Sim(3) 19.9" in first and ";" not in first
+    assert "in metres: C-ATE, SE(3) 4.9" in second and "H-ATE" in second
+
+
+@pytest.mark.parametrize("kind", ["static", "rotation"])
+def test_a_camera_without_a_path_is_not_judged_alone(kind):
+    truth = _result(_path(0.0))
+    assert list(accuracy.errors(truth, _cameras(kind), truth)) == [accuracy.JOINT]
+
+
+def test_a_truth_without_cameras_judges_people_only():
+    result = _result(_path(0.0))
+    truth = dataclasses.replace(result, summary={"has_camera": False})
+    found = accuracy.errors(result, _cameras(), truth)
+    assert list(found) == [accuracy.JOINT]
+    (line,) = accuracy.headline(found)
+    assert "C-ATE" not in line and "H-ATE" in line
