@@ -127,10 +127,10 @@ class PeopleFit:
     """The same for the orientation, rad."""
     depth_error: float = 0.05
     """Error of a regressor's depth, as a share of it."""
-    regressor_shape_gain: float = 1.2
-    """Factor on a regressor's β: regressors draw shapes to the mean, by 0.5 to 0.8 with
-    an error of 0.3, of which this is about the best linear estimate. 1 for bodies that
-    were measured or optimised."""
+    regressor_shape_gain: float | None = None
+    """Factor on the β of given bodies, whatever their source. Without it 1.2 for a
+    regressor's, which are drawn to the mean, and 1 where β was measured or optimised
+    (AMASS, SLAHMR, or `bodies.npz` that says so by `shapes_regressed`)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,7 +36,7 @@ class Keypoints:
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
-    """Regressed bodies of `h` people in the camera frame, per frame."""
+    """Given bodies of `h` people in the camera frame, per frame."""
 
     present: Bool[np.ndarray, "h t"]
     poses: Float[np.ndarray, "h t 72"]
@@ -45,6 +45,8 @@ class Bodies:
     """SMPL β."""
     trans: Float[np.ndarray, "h t 3"]
     """m: the pelvis joint is at `J_0(β) + trans` in the camera frame."""
+    shapes_regressed: bool = True
+    """Whether β is a network's guess, drawn to the mean, not measured or optimised."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -334,6 +334,19 @@ def test_contract_and_people(tmp_path):
     assert found.present.sum(axis=1).tolist() == [3, NUM]
 
 
+@pytest.mark.parametrize("weak", [False, True])
+@pytest.mark.parametrize("said", [None, True, False, 0])
+def test_shapes_of_an_unknown_source_are_a_regressors(tmp_path, said, weak):
+    data = bodies()
+    if weak:
+        data["bbox"] = np.tile([30.0, 25.0, 20.0], (NUM, 1))
+        data["camera"] = crop_camera(data.pop("trans"), data["bbox"], CAMERA)
+    if said is not None:
+        data["shapes_regressed"] = np.array(said)
+    np.savez(tmp_path / "b.npz", **data)
+    assert read(tmp_path / "b.npz").shapes_regressed is (said is None or bool(said))
+
+
 def test_weak_perspective_there_and_back():
     trans = bodies()["trans"]
     box = np.random.default_rng(0).uniform([10, 10, 15], [50, 40, 30], (NUM, 3))
@@ -361,6 +374,7 @@ def test_spin_turns_bodies_by_the_ray_of_their_crop(tmp_path):
     )
     found = read(tmp_path / "s.npz")
     np.testing.assert_allclose(found.trans[0], data["trans"], atol=1e-6)
+    assert found.shapes_regressed
     expected = np.tile([0, np.pi / 4, 0], (NUM, 1))
     np.testing.assert_allclose(found.poses[0, :, :3], expected, atol=1e-12)
 
@@ -534,6 +548,7 @@ def test_bodies_of_other_tools(tmp_path, tool):
     turned = Rotation.from_rotvec(found.poses[0, :, :66].reshape(-1, 3))
     wanted = Rotation.from_rotvec(expected["poses"][:, :66].reshape(-1, 3))
     assert (turned * wanted.inv()).magnitude().max() < 1e-6
+    assert found.shapes_regressed == (tool not in ("SLAHMR", "AMASS"))
     if tool not in ("GVHMR", "PromptHMR", "SLAHMR", "AMASS"):
         np.testing.assert_array_equal(found.shapes[0], expected["betas"])
 
@@ -554,7 +569,7 @@ def test_a_folder_of_tram_uses_its_camera(tmp_path):
     camera = {"img_focal": 160.0, "img_center": np.array([31.5, 23.5])}
     np.save(tmp_path / "camera.npy", np.array(camera, dtype=object), allow_pickle=True)
     found = read(tmp_path)
-    assert found.present.shape == (2, NUM)
+    assert found.present.shape == (2, NUM) and found.shapes_regressed
     np.testing.assert_allclose(found.trans[1], b["trans"], atol=1e-9)
 
 
@@ -584,6 +599,8 @@ BAD_BODIES = {
         "needs `bbox`",
     ),
     "nobody": (_contract(**{k: v[:0] for k, v in bodies().items()}), "no body"),
+    "no flag": (_contract(shapes_regressed=np.array(1.2)), "not true or false"),
+    "flags": (_contract(shapes_regressed=np.ones(NUM, bool)), "not true or false"),
     "text inside": (_contract(poses=np.full((NUM, 72), "a")), "not numbers"),
 }
 
@@ -779,9 +796,11 @@ def test_pairs_keypoints_and_bodies_of_the_same_person(tmp_path):
     two["trans"] = np.concatenate(
         [np.tile(at(50.0), (NUM, 1)), np.tile(at(15.0), (NUM, 1))]
     )
-    np.savez(path / "bodies.npz", **two, person=np.repeat([0, 1], NUM))
+    two |= {"person": np.repeat([0, 1], NUM), "shapes_regressed": np.array(False)}
+    np.savez(path / "bodies.npz", **two)
     found = read_sequence(path)
     assert isinstance(found.keypoints, Keypoints) and found.bodies is not None
+    assert not found.bodies.shapes_regressed
     for uv, trans in zip(found.keypoints.uv, found.bodies.trans, strict=True):
         u = 30 + 80 * trans[0, 0] / trans[0, 2]
         assert abs(u - uv[0, 8, 0]) < 10

@@ -114,6 +114,7 @@ def test_what_belongs_to_frames_left_out_is_left_out(tmp_path, monkeypatch):
         poses=np.zeros((12, 72)),
         betas=np.tile(np.arange(12.0)[:, None] / 10, 10),
         trans=np.tile([0.0, 0.0, 3.0], (12, 1)),
+        shapes_regressed=np.array(False),
     )
     dense = np.concatenate([np.arange(6) / 25, 5 / 25 + np.arange(1, 4) / 200])
     times = np.concatenate([dense, 6 / 25 + np.arange(3) / 25])
@@ -129,6 +130,7 @@ def test_what_belongs_to_frames_left_out_is_left_out(tmp_path, monkeypatch):
     np.testing.assert_allclose(means, wanted, atol=0.4)
     np.testing.assert_allclose(sequence.keypoints.uv[0, :, 0, 0], np.add(wanted, 20))
     np.testing.assert_allclose(sequence.bodies.shapes[0, :, 0], np.divide(wanted, 10))
+    assert not sequence.bodies.shapes_regressed
     np.testing.assert_allclose(sequence.tracks.uv[::3, 0], np.add(wanted, 5))
     assert sequence.tracks.frame.max() == 8
     middle = [np.argwhere(m)[:, 1].mean() for m in person_masks(sequence, 0.01)]

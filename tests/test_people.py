@@ -308,12 +308,24 @@ def test_prepared_bodies_are_whole_smooth_and_the_right_way_round(
     assert 0 < np.abs(gap).max() < 0.5  # interpolated
 
 
-@pytest.mark.parametrize("gain", [1.0, 1.3])
-def test_a_regressors_shape_is_taken_to_be_drawn_to_the_mean(truth, body, gain):
-    settings = PeopleFit(regressor_shape_gain=gain)
-    found = people.prepare_bodies(truth, None, CAMERA, body, FPS, settings)
+@pytest.mark.parametrize(
+    ("regressed", "said", "gain"),
+    [
+        (True, None, 1.2),
+        (False, None, 1.0),
+        (True, 1.0, 1.0),
+        (True, 1.3, 1.3),
+        (False, 1.3, 1.3),
+    ],
+)
+def test_a_regressors_shape_is_taken_to_be_drawn_to_the_mean(
+    truth, body, regressed, said, gain
+):
+    settings = PeopleFit() if said is None else PeopleFit(regressor_shape_gain=said)
+    given = dataclasses.replace(truth, shapes_regressed=regressed)
+    found = people.prepare_bodies(given, None, CAMERA, body, FPS, settings)
     np.testing.assert_allclose(found.shapes, gain * truth.shapes, atol=1e-12)
-    assert PeopleFit().regressor_shape_gain > 1
+    assert not found.shapes_regressed  # or it would be multiplied again
     assert Config.paper().people_fit.regressor_shape_gain == 1
 
 

@@ -65,6 +65,19 @@ def test_weak_perspective_says_the_same(simulated, folder):
     np.testing.assert_allclose(full.poses, weak.poses, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("noise", "regressed"), [("none", False), ("low", True), ("real", True)]
+)
+def test_true_bodies_are_not_said_to_be_regressed(
+    simulated, tmp_path, noise, regressed
+):
+    settings = dataclasses.replace(SETTINGS, noise="real", body_noise=noise)
+    true = dataclasses.replace(simulated, settings=settings)
+    assert synthetic.as_sequence(true).bodies.shapes_regressed is regressed
+    folder = synthetic.write_sequence(tmp_path / "true", true)
+    assert read_sequence(folder).bodies.shapes_regressed is regressed
+
+
 def test_folder_is_written_whole_and_over_nothing_else(simulated, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")

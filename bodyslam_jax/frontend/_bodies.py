@@ -3,6 +3,7 @@
 The contract's `bodies.npz` is read here; `_body_tools.py` reads the files of others.
 """
 
+import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,10 @@ _MAX_DISTANCE = 200.0
 
 def read_bodies(path: Path, *, num_frames: int, intrinsics: Intrinsics) -> Bodies:
     """Reads regressed bodies, recognised by content; a folder of TRAM's tracks too.
+
+    `bodies.npz` does not name its source: its shapes count as regressed, unless an
+    array `shapes_regressed` () in it is false, as it is to be where they were measured
+    or optimised.
 
     Nothing in the file is run: see `_pickle.py`.
 
@@ -58,10 +63,12 @@ def _read(path: Path, data: Any, num_frames: int, intrinsics: Intrinsics) -> Row
 
 
 def _from_contract(data: dict, intrinsics: Intrinsics, num_frames: int) -> Rows:
+    regressed = _flag(data, "shapes_regressed", default=True)
     if "trans" not in data:
         if "camera" not in data:
             raise Unfit("neither `trans` nor `camera` and `bbox`")
-        return from_spin({**data, "pose": data["poses"]}, intrinsics, num_frames)
+        rows = from_spin({**data, "pose": data["poses"]}, intrinsics, num_frames)
+        return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
     n = len(np.atleast_1d(np.asarray(data["frame"])))
     person = data.get("person", np.zeros(n))
@@ -82,7 +89,14 @@ def _from_contract(data: dict, intrinsics: Intrinsics, num_frames: int) -> Rows:
         arrays[name] = array.astype(
             np.int64 if name in ("frame", "person") else np.float64
         )
-    return Rows(**arrays)
+    return Rows(**arrays, shapes_regressed=regressed)
+
+
+def _flag(data: dict, key: str, default: bool) -> bool:
+    value = np.asarray(data.get(key, default))
+    if value.size != 1 or value.item() not in (0, 1):
+        raise Unfit(f"`{key}` is {str(value)[:40]}, not true or false")
+    return bool(value.item())
 
 
 def _read_tram_folder(folder: Path, num_frames: int, intrinsics: Intrinsics) -> Rows:
@@ -133,4 +147,4 @@ def _gather(path: Path, rows: Rows, num_frames: int) -> Bodies:
     at = (index, rows.frame)
     present[at] = True
     poses[at], shapes[at], trans[at] = rows.poses, rows.betas, rows.trans
-    return Bodies(present, poses, shapes, trans)
+    return Bodies(present, poses, shapes, trans, rows.shapes_regressed)

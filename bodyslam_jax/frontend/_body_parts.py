@@ -157,4 +157,7 @@ def join(rows: list[Rows]) -> Rows:
     if not rows:
         raise Unfit("no person in it")
     names = ("frame", "person", "poses", "betas", "trans")
-    return Rows(*(np.concatenate([getattr(r, name) for r in rows]) for name in names))
+    return Rows(
+        *(np.concatenate([getattr(r, name) for r in rows]) for name in names),
+        shapes_regressed=any(r.shapes_regressed for r in rows),
+    )

@@ -4,6 +4,9 @@ One function per tool, chosen by the keys that a file holds; the layouts are tho
 the tools' own code. All positions follow one convention, `pelvis = J_0(β) + trans`;
 where a tool means something else, the pelvis of the average body (SMPL's or SMPL-X's)
 stands for J_0. SMPL-X's shapes mean other things than SMPL's and are left out.
+
+SLAHMR fits shapes to a video and AMASS to markers; the others have what a network
+guessed, GLAMR too, which optimises paths only.
 """
 
 from collections.abc import Callable
@@ -250,7 +253,8 @@ def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     )
     person, frame = np.nonzero(seen)
     moved = moved.reshape(p, t, 3)
-    return Rows(frame, person, poses[seen], betas[seen], moved[seen])
+    parts = (poses[seen], betas[seen], moved[seen])
+    return Rows(frame, person, *parts, shapes_regressed=False)
 
 
 def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
@@ -310,6 +314,7 @@ def from_amass(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         poses[at],
         np.tile(betas, (num_frames, 1)),
         trans[at],
+        shapes_regressed=False,
     )
 
 

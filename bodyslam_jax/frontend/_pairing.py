@@ -1,5 +1,7 @@
 """Keypoints and bodies of the same person -> the same index."""
 
+import dataclasses
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -52,10 +54,11 @@ def pair(
         Keypoints(
             *(spread(a, np.arange(num_k)) for a in (keypoints.uv, keypoints.confidence))
         ),
-        Bodies(
-            *(
-                spread(a, target)
-                for a in (bodies.present, bodies.poses, bodies.shapes, bodies.trans)
-            )
+        dataclasses.replace(
+            bodies,
+            present=spread(bodies.present, target),
+            poses=spread(bodies.poses, target),
+            shapes=spread(bodies.shapes, target),
+            trans=spread(bodies.trans, target),
         ),
     )

@@ -18,3 +18,5 @@ class Rows:
     betas: Float[np.ndarray, "m 10"]
     trans: Float[np.ndarray, "m 3"]
     """m: the pelvis is at `J_0(β) + trans`."""
+    shapes_regressed: bool = True
+    """As in `Bodies`."""

@@ -186,13 +186,15 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
 
 def _thinned(sequence: Sequence, picks: np.ndarray) -> Sequence:
     """Only these frames of what was read for all of them; times are theirs already."""
-    cut = lambda bundle: (
-        None
-        if bundle is None
-        else type(bundle)(
-            *(getattr(bundle, f.name)[:, picks] for f in dataclasses.fields(bundle))
+
+    def cut(bundle):
+        if bundle is None:
+            return None
+        arrays = {k: v for k, v in vars(bundle).items() if isinstance(v, np.ndarray)}
+        return dataclasses.replace(
+            bundle, **{k: v[:, picks] for k, v in arrays.items()}
         )
-    )
+
     tracks = sequence.tracks
     if tracks is not None:
         kept = np.isin(tracks.frame, picks)

@@ -45,7 +45,10 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
 
 
 def bodies_from_roots(roots: Roots, body: BodyModel) -> Bodies:
-    """Inverse of `roots_from_bodies`, for bodies whose β does not change."""
+    """Inverse of `roots_from_bodies`, for bodies whose β does not change.
+
+    That β is an estimate, no longer what a regressor said.
+    """
     frames = roots.present.shape[1]
     orientation = vectors(roots.T_CH[..., :3, :3])
     pose = roots.body_pose.reshape(*roots.present.shape, 69)
@@ -56,6 +59,7 @@ def bodies_from_roots(roots: Roots, body: BodyModel) -> Bodies:
         np.concatenate([orientation, pose], axis=-1),
         shapes,
         np.where(roots.present[..., None], trans, 0.0),
+        shapes_regressed=False,
     )
 
 

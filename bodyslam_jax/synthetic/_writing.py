@@ -114,7 +114,7 @@ def as_sequence(simulated: SimulatedSequence) -> Sequence:
         timestamps=simulated.timestamps,
         intrinsics=Intrinsics(simulated.intrinsics, *simulated.size),
         keypoints=Keypoints(uv[None], confidence[None]),
-        bodies=Bodies(present, poses, shapes, trans),
+        bodies=Bodies(present, poses, shapes, trans, _shapes_regressed(simulated)),
         tracks=simulated.tracks,
     )
 
@@ -135,6 +135,12 @@ def as_truth(simulated: SimulatedSequence) -> Result:
     )
 
 
+def _shapes_regressed(simulated: SimulatedSequence) -> bool:
+    """Not where bodies are written as they truly are."""
+    settings = simulated.settings
+    return (settings.body_noise or settings.noise) != "none"
+
+
 def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
     width, height = simulated.size
     camera = {
@@ -153,6 +159,7 @@ def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
         poses=bodies.poses,
         betas=bodies.shapes,
         trans=bodies.trans,
+        shapes_regressed=np.array(_shapes_regressed(simulated)),
     )
     np.savez_compressed(
         folder / "bodies_weak_perspective.npz",
@@ -161,6 +168,7 @@ def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
         betas=bodies.shapes,
         camera=bodies.camera,
         bbox=bodies.box,
+        shapes_regressed=np.array(_shapes_regressed(simulated)),
     )
     if tracks:
         np.savez_compressed(
