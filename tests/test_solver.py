@@ -12,7 +12,7 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver import Stage, marginals, observability, solve
+from bodyslam_jax.solver import Stage, clock, marginals, observability, solve
 from bodyslam_jax.solver._blocks import sizes_of
 from bodyslam_jax.solver._compile import is_alone
 from bodyslam_jax.solver._levenberg_marquardt import lifted
@@ -146,6 +146,23 @@ def test_noise_free_scene_is_recovered_and_history_says_how():
     cost = found.histories[0].cost[: steps + 1]
     assert (jnp.diff(cost) <= 0).all()
     assert jnp.isclose(cost[0], problem.cost(start))
+
+
+def test_a_solve_on_the_clock_is_the_same_solve():
+    problem, _, start = make()
+    first = Stage(("cameras", "landmarks"), max_steps=3)
+    schedule = (first, Stage(rtol=1e-13, max_steps=60))
+    plain = solve(problem, start, schedule=schedule)
+    found, seconds = clock(problem, start, schedule=schedule)
+    assert found.status == plain.status
+    for taken, count, history, same in zip(
+        seconds, plain.num_steps, found.histories, plain.histories, strict=True
+    ):
+        assert taken.shape == (int(count),)
+        assert (taken > 0).all()
+        end = int(count) + 1
+        assert jnp.allclose(history.cost[:end], same.cost[:end], rtol=1e-9)
+    assert jnp.allclose(found.state.cameras, plain.state.cameras, atol=1e-9)
 
 
 @pytest.mark.slow

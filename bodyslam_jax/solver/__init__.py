@@ -8,4 +8,5 @@ from bodyslam_jax.solver._solve import Solution as Solution
 from bodyslam_jax.solver._solve import Stage as Stage
 from bodyslam_jax.solver._solve import restrict as restrict
 from bodyslam_jax.solver._solve import solve as solve
+from bodyslam_jax.solver._trace import clock as clock
 from bodyslam_jax.solver._trace import trace as trace

@@ -11,7 +11,10 @@ from bodyslam_jax.solver._chunks import Factor
 
 
 class History(eqx.Module):
-    """One entry an iteration, of which the first `num_steps` are filled."""
+    """One entry an iteration, of which the first `num_steps` are filled.
+
+    Time is not among them: the loop is one compiled program (see `clock`).
+    """
 
     cost: Float[Array, "*s _"]
     """Before each iteration, and after the last."""

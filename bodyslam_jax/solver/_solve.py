@@ -149,17 +149,19 @@ def _run(problem, state, method):
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )
-    stats = found.stats
+    return outcome(state, found.value, found.result, found.stats)
+
+
+def outcome(start, best, result, stats) -> tuple[Solution, Final]:
+    """What the loop leaves behind, as a solution; the start, if no cost was finite."""
     better = jnp.isfinite(stats["cost"])
-    best = jax.tree.map(
-        lambda new, old: jnp.where(better, new, old), found.value, state
-    )
-    stages = range(len(method.limit))
+    best = jax.tree.map(lambda new, old: jnp.where(better, new, old), best, start)
+    stages = range(len(stats["steps"]))
     histories = tuple(jax.tree.map(lambda x: x[i], stats["history"]) for i in stages)
     counts = tuple(stats["steps"][i] for i in stages)
     solution = Solution(
         state=best,
-        result=found.result,
+        result=result,
         cost=stats["cost"],
         histories=histories,
         num_steps=counts,
@@ -175,13 +177,16 @@ def _differentiable(problem, state, schedule, damping, alone):
 
 def _solve(problem, state, schedule, damping, alone):
     method = method_of(schedule, damping, state.scale.dtype)
-    now = restrict(problem, tuple(name for stage in schedule for name in stage.free))
-    solution, _ = run(now, state, method, alone=alone)
-    used = len(schedule)
+    solution, _ = run(restrict_to_all(problem, schedule), state, method, alone=alone)
+    return only(solution, len(schedule))
+
+
+def only(solution: Solution, count: int) -> Solution:
+    """Without the idle stages that make all schedules one program."""
     return dataclasses.replace(
         solution,
-        histories=solution.histories[:used],
-        num_steps=solution.num_steps[:used],
+        histories=solution.histories[:count],
+        num_steps=solution.num_steps[:count],
     )
 
 
@@ -215,6 +220,11 @@ def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
     """The same problem with only these groups free."""
     variables = tuple(name for name in problem.variables if name in free)
     return dataclasses.replace(problem, variables=variables)
+
+
+def restrict_to_all(problem: Problem, schedule: tuple[Stage, ...]) -> Problem:
+    """The same problem with only the groups free that some stage moves."""
+    return restrict(problem, tuple(name for stage in schedule for name in stage.free))
 
 
 def _solve_baseline(problem, state, solver, schedule):

@@ -1,17 +1,28 @@
-"""A solve that is watched: what it is asked for, after every iteration."""
+"""A solve that is watched: what it is asked for, or the clock, after each iteration."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 
 from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.solver._compile import quick_options
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._padding import pad, unpad
-from bodyslam_jax.solver._solve import Stage, method_of, restrict
+from bodyslam_jax.solver._solve import (
+    Solution,
+    Stage,
+    method_of,
+    only,
+    outcome,
+    restrict,
+    restrict_to_all,
+)
 
 
 def trace(
@@ -60,3 +71,52 @@ def _stage(problem, state, see, stage, damping):
     carry = state, arrays, jnp.array(False)
     (state, _, _), seen = jax.lax.scan(one, carry, length=stage.max_steps)
     return state, seen
+
+
+def clock(
+    problem: Problem,
+    state: State,
+    *,
+    schedule: tuple[Stage, ...] = (Stage(),),
+    damping: float = 1e-4,
+) -> tuple[Solution, tuple[np.ndarray, ...]]:
+    """`solve` with the wall time of each iteration, s, for each stage.
+
+    `solve` itself is one compiled loop in which no clock can be read: a call back to
+    Python would wait for each step, and its program would neither map nor be kept from
+    run to run. Here the same step is a program of its own, called from Python, compiled
+    before the clock runs; only passing the loop's state in and out comes on top.
+    """
+    t, l = len(state.cameras), len(state.landmarks)
+    problem, start = pad(problem, state)
+    problem = restrict_to_all(problem, schedule)
+    method = method_of(schedule, damping, state.scale.dtype)
+    loop = _begin(method, problem, start)
+    arrays, static = eqx.partition(loop, eqx.is_array)
+    program = eqx.filter_jit(_advance, compiler_options=quick_options())
+    program = program.lower(method, problem, start, arrays, static).compile()
+    seconds: list[list[float]] = [[] for _ in schedule]
+    y = start
+    while not bool(arrays.finished):
+        stage, before = int(arrays.stage), time.perf_counter()
+        y, arrays = program(method, problem, y, arrays, static)
+        jax.block_until_ready(arrays)
+        seconds[stage].append(time.perf_counter() - before)
+    loop = eqx.combine(arrays, static)
+    _, _, stats = method.postprocess(
+        lifted, y, None, problem, {}, loop, frozenset(), loop.result
+    )
+    solution, _ = outcome(start, y, loop.result, stats)
+    solution = eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, t, l))
+    return only(solution, len(schedule)), tuple(np.asarray(x) for x in seconds)
+
+
+@eqx.filter_jit
+def _begin(method, problem, state):
+    return method.init(lifted, state, problem, {}, None, None, frozenset())
+
+
+def _advance(method, problem, state, arrays, static):
+    loop = eqx.combine(arrays, static)
+    y, loop, _ = method.step(lifted, state, problem, {}, loop, frozenset())
+    return y, eqx.filter(loop, eqx.is_array)
