@@ -18,6 +18,14 @@ from bodyslam_jax.sequence import Bodies, Sequence
 
 log = logging.getLogger(__name__)
 
+COUPLED = {
+    "frozen": (),
+    "refreshed": (),
+    "displacement": ("translation",),
+    "full": ("translation", "rotation", "body_pose"),
+}
+"""Predictions of the motion model whose derivatives count, by `motion_coupling`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
@@ -114,6 +122,8 @@ def prepare(
             "before a textured background, or people's keypoints."
         )
     problem = make(factors, state)
+    if config.motion_coupling == "frozen":
+        problem = dataclasses.replace(problem, motion=None)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
 
 
@@ -124,7 +134,13 @@ def motion_predictor(
     model = motion.load_motion_model(config.motion_model)
     clock = motion.make_clock(sequence.timestamps, model.fps)
     present = jnp.asarray(roots.present)
-    return graph.MotionPredictor(motion.predict_between, (model, clock), body, present)
+    return graph.MotionPredictor(
+        motion.predict_between,
+        (model, clock),
+        body,
+        present,
+        COUPLED[config.motion_coupling],
+    )
 
 
 def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Prediction:

@@ -1,7 +1,8 @@
 """Stock solvers, as cross-checks and to be measured against; for small problems.
 
 They see a flat step from the first state (poses do not add, steps do) and the lifted
-residuals; the motion model's prediction stays as it is at the start.
+residuals; the motion model's prediction stays as it is at the start, but for what is
+coupled, which they differentiate in full.
 """
 
 import warnings
@@ -15,6 +16,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
 from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.solver._blocks import mask_of
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 
 ADAM_RATE = 1e-2
@@ -32,20 +34,13 @@ class _Flat(eqx.Module):
         return self.state.retract(held)
 
     def residual(self, step):
-        rows = lifted(self.retract(step), self.problem)
+        place = self.retract(step)
+        rows = lifted(place, self.problem.follow(place))
         return jnp.concatenate([r.reshape(-1) for r in rows])
 
     def cost(self, step):
-        return self.problem.cost(self.retract(step))
-
-
-def mask_of(problem: Problem) -> Step:
-    """The problem's mask, 0 for groups that are not among its variables."""
-    parts = {
-        name: value if name in problem.variables else jnp.zeros_like(value)
-        for name, value in vars(problem.free).items()
-    }
-    return Step(**parts)
+        place = self.retract(step)
+        return self.problem.follow(place).cost(place)
 
 
 def _flat(problem, state):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.graph import Problem, State, Step
 
 
 class Sizes(eqx.Module):
@@ -105,6 +105,15 @@ def sizes_of(problem: Problem, state: State) -> Sizes:
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
     )
+
+
+def mask_of(problem: Problem) -> Step:
+    """The problem's mask, 0 for groups that are not among its variables."""
+    parts = {
+        name: value if name in problem.variables else jnp.zeros_like(value)
+        for name, value in vars(problem.free).items()
+    }
+    return Step(**parts)
 
 
 def own_to_global(sizes: Sizes, person: int | None) -> Array:

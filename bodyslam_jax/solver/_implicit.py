@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from bodyslam_jax.graph import Problem, Reprojection, State, Step
-from bodyslam_jax.solver._baselines import mask_of
-from bodyslam_jax.solver._blocks import Linearisation, sizes_of
+from bodyslam_jax.solver._blocks import mask_of, sizes_of
+from bodyslam_jax.solver._coupling import with_gradient
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver._tables import gather
@@ -38,7 +38,12 @@ def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Pr
         moved = state.retract(step)
         seen = whole.predict(moved, frozen=False)
         fixed = whole.with_prediction(seen)
-        return jax.grad(lambda d: fixed.cost(state.retract(d)))(step)
+
+        def cost(d):
+            place = state.retract(d)
+            return fixed.follow(place).cost(place)
+
+        return jax.grad(cost)(step)
 
     _, transpose = jax.vjp(lambda d: gradient(d, arrays), zero)
     held = jax.tree.map(lambda m: 1 - m, mask)
@@ -111,33 +116,3 @@ def _preconditioner(problem: Problem, state: State):
         return solve_step(problem, state, there, sizes, eliminated)
 
     return apply
-
-
-def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisation:
-    """The same blocks with another gradient."""
-    count = lin.globals.shape[0] - 1 - step.shapes.size
-    gradient = {}
-    for name, known in lin.gradient.items():
-        if name == "pose":
-            gradient[name] = step.poses.reshape(known.shape)
-        elif name == "root":
-            gradient[name] = step.roots
-        else:
-            gradient[name] = jnp.zeros_like(known)
-    if "camera_alone" in gradient:
-        gradient["camera_alone"] = step.cameras
-    elif "camera" in gradient:
-        gradient["camera"] = gradient["camera"].at[0].set(step.cameras)
-    common = jnp.concatenate(
-        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
-    )
-    # Padding points at a row of zeros, so that groups are filled by plain gathering.
-    tables = tuple(
-        eqx.tree_at(
-            lambda t: t.gradient,
-            table,
-            jnp.moveaxis(step.landmarks[bucket.landmark], 1, 2),
-        )
-        for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True)
-    )
-    return Linearisation(lin.blocks, gradient, lin.globals, common, tables, lin.costs)

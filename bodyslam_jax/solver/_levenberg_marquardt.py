@@ -3,7 +3,7 @@
 Marquardt's damping (in proportion to each variable's own curvature, as units here mix
 m, rad and shape) with Nielsen's update; steps are accepted on the true robust cost. The
 linearisation is kept after a rejected step. The motion model's prediction is frozen
-within a step and made anew after each accepted one.
+within a step and made anew after each accepted one, unless it is coupled (`_coupling`).
 
 The stages of a schedule are phases of one loop, and differ by a mask: what they do is
 compiled once, and so is what covariances need of the last linearisation.
@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
 from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._coupling import with_coupling
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final, History, Loop
 from bodyslam_jax.solver._normal import (
@@ -235,7 +236,9 @@ def _first(problem, observations, state):
 
 def _linearise_anew(problem, observations, state):
     seen = problem.predict(state)
-    return linearise(problem.with_prediction(seen), observations, state), seen
+    problem = problem.with_prediction(seen)
+    lin = linearise(problem, observations, state)
+    return with_coupling(problem, lin, state), seen
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:

@@ -76,7 +76,10 @@ def _settle(
         landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
         moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
         of_tracks = 0.5 * jnp.sum(jnp.where(keep, here[0], there[0]))
-    costs = [of_tracks if f is tracks else f.cost(moved) for f in problem.factors]
+    costs = [
+        of_tracks if isinstance(f, Reprojection) else f.cost(moved)
+        for f in problem.follow(moved).factors
+    ]
     return moved, keep, jnp.stack(costs)
 
 

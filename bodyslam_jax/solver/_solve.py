@@ -228,10 +228,11 @@ def restrict_to_all(problem: Problem, schedule: tuple[Stage, ...]) -> Problem:
 
 
 def _solve_baseline(problem, state, solver, schedule):
-    run, first = getattr(_baselines, solver), problem.cost(state)
+    run, first = getattr(_baselines, solver), problem.follow(state).cost(state)
     counts = []
     result = optx.RESULTS.successful
     for stage in schedule:
         state, count, result = run(restrict(problem, stage.free), state, stage)
         counts.append(count)
-    return Solution(state, result, problem.cost(state), (), tuple(counts), first)
+    cost = problem.follow(state).cost(state)
+    return Solution(state, result, cost, (), tuple(counts), first)

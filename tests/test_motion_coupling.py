@@ -1,0 +1,229 @@
+"""The motion model's prediction in the graph: held, made anew, or differentiated."""
+
+import dataclasses
+import importlib
+import typing
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+import scenes
+from jax.flatten_util import ravel_pytree
+
+import bodyslam_jax.graph as g
+from bodyslam_jax import motion, synthetic
+from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.joint import COUPLED
+from bodyslam_jax.solver import Stage, solve
+from bodyslam_jax.solver._blocks import mask_of, sizes_of
+from bodyslam_jax.solver._coupling import with_coupling
+from bodyslam_jax.solver._linearise import linearise
+from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._tables import gather
+
+FRAMES = 7
+TIGHT = (Stage(rtol=1e-12, max_steps=120),)
+
+
+class Seen(eqx.Module):
+    translation: jax.Array
+    rotation: jax.Array
+    body_pose: jax.Array
+
+
+def stride(model, body, orientation, body_pose, shape, present):
+    """A motion model in one line, of three frames: who swings legs makes steps."""
+    swing = body_pose[:, 0, 0] - body_pose[:, 1, 0]
+    swing = swing + 0.5 * jnp.roll(swing, 2)
+    step = model * jnp.stack([0 * swing, 0.01 * swing, 0.05 + 0.02 * swing], -1)
+    step = step * (1 + 0.05 * shape[0])
+    return Seen(step, jnp.zeros_like(step), 0.9 * body_pose)
+
+
+def make(coupled, factors=lambda found: found):
+    rng = np.random.default_rng(2)
+    state = scenes.truth(rng, FRAMES, 1, 25)
+    found = [scenes.reprojection(rng, state), *scenes.person_factors(rng, state)]
+    predictor = g.MotionPredictor(
+        stride,
+        jnp.asarray(1.0),
+        scenes.body_model(),
+        jnp.ones((1, FRAMES), bool),
+        coupled,
+    )
+    problem = g.make_problem(factors(found), state, motion=predictor)
+    return problem, scenes.perturb(rng, problem, state)
+
+
+def held_to_prediction(factors):
+    """Postures against the motion model's, as in the paper."""
+    change = lambda f: (
+        dataclasses.replace(f, predicted=True) if isinstance(f, g.Posture) else f
+    )
+    return [change(f) for f in factors]
+
+
+def test_gradient_holds_the_derivative_of_what_is_coupled():
+    problem, state = pad(*make(("translation", "body_pose"), held_to_prediction))
+    problem = problem.refresh(state)
+
+    @eqx.filter_jit
+    def both(problem, state):
+        lin = linearise(problem, gather(problem), state)
+        lin = with_coupling(problem, lin, state)
+
+        def cost(step):
+            place = state.retract(step)
+            return problem.follow(place).cost(place)
+
+        exact = jax.grad(cost)(state.zero_step())
+        return lin, jax.tree.map(lambda m, x: m * x, mask_of(problem), exact)
+
+    lin, exact = both(problem, state)
+    assert sizes_of(problem, state).intrinsics == 0
+    poses = exact.poses.reshape(lin.gradient["pose"].shape)
+    close = lambda a, b: abs(a - b).max() < 1e-9 * abs(b).max()
+    assert close(lin.gradient["pose"], poses)
+    assert close(lin.gradient["root"], exact.roots)
+    assert close(lin.globals_gradient[1:], exact.shapes.reshape(-1))
+    held = linearise(problem, gather(problem), state)
+    assert not close(held.gradient["pose"], poses)
+
+
+@pytest.mark.slow
+def test_the_coupled_optimum_is_that_of_a_dense_solver():
+    """Which has the whole Jacobian, the network's included."""
+    problem, start = make(("translation",))
+    found = solve(problem, start, schedule=TIGHT)
+    assert found.status == "converged"
+    dense = solve(problem, found.state, solver="optimistix", schedule=TIGHT)
+    assert float(found.cost) == pytest.approx(float(dense.cost), rel=1e-6)
+    apart = solve(make(())[0], start, schedule=TIGHT).state
+    cost = lambda state: float(problem.follow(state).cost(state))
+    assert cost(apart) > float(found.cost) * (1 + 1e-4)
+
+
+def test_every_way_to_follow_the_estimate_is_known():
+    hints = typing.get_type_hints(Config)
+    assert set(COUPLED) == set(typing.get_args(hints["motion_coupling"]))
+    names = {field.name for field in dataclasses.fields(Seen)}
+    assert names == set(COUPLED["full"])
+
+
+def test_what_is_not_coupled_has_no_derivative():
+    problem, state = make(())
+    assert problem.follow(state) is problem
+
+    def predicted(step):
+        factor = problem.refresh(state.retract(step)).factors[2]
+        assert isinstance(factor, g.HumanMotion)
+        return jnp.sum(factor.translation)
+
+    push = jax.grad(predicted)(state.zero_step())
+    assert not ravel_pytree(push)[0].any()
+
+
+@pytest.mark.slow
+def test_gradient_of_a_coupled_solution_is_that_of_solving_again():
+    problem, start = make(("translation",))
+    exact = (Stage(rtol=1e-15, max_steps=200),)
+    start = solve(problem, start, schedule=exact).state
+
+    def value(gain):
+        there = eqx.tree_at(lambda p: p.motion.model, problem, gain)
+        found = solve(there, start, schedule=exact).state
+        return found.scale + jnp.sum(found.roots[0, :, 2, 3]) + found.shapes[0, 0]
+
+    slope = jax.grad(value)(jnp.asarray(1.0))
+    numeric = (value(jnp.asarray(1.001)) - value(jnp.asarray(0.999))) / 2e-3
+    assert float(slope) == pytest.approx(float(numeric), rel=5e-3)
+
+
+def walk(scale):
+    """A simulated walk of two seconds, measured exactly, of which only the person's
+    places and postures may move; predicted by the network that ships."""
+    body = scenes.body_model()
+    settings = Simulation(sequence="E2", family="follow", length=60, noise="none")
+    truth = synthetic.as_truth(synthetic.simulate(settings, body))
+    poses = jnp.asarray(truth.poses).reshape(1, 60, 24, 3)
+    C_WC = jnp.asarray(truth.T_WC[:, :3, :3])
+    T_WH = jnp.broadcast_to(jnp.eye(4), (1, 60, 4, 4))
+    T_WH = T_WH.at[..., :3, :3].set(jaxlie.SO3.exp(poses[:, :, 0]).as_matrix())
+    T_WH = T_WH.at[..., :3, 3].set(jnp.asarray(truth.joints[:, :, 0]))
+    away = T_WH[..., :3, 3] - jnp.asarray(truth.T_WC[:, :3, 3])
+    roots = T_WH.at[..., :3, :3].set(C_WC.swapaxes(-1, -2) @ T_WH[..., :3, :3])
+    roots = roots.at[..., :3, 3].set(jnp.einsum("tji,htj->hti", C_WC, away))
+    state = g.State(
+        scale=jnp.asarray(1.0),
+        cameras=jnp.asarray(truth.T_WC),
+        roots=roots,
+        poses=poses[:, :, 1:],
+        shapes=jnp.asarray(truth.betas),
+        landmarks=jnp.zeros((0, 3)),
+        intrinsics=jnp.asarray(truth.intrinsics),
+    )
+    factors = scenes.person_factors(np.random.default_rng(0), state, noise=0.0)
+    model = motion.load_motion_model(None)
+    clock = motion.make_clock(np.asarray(truth.timestamps), model.fps)
+    predictor = g.MotionPredictor(
+        motion.predict_between, (model, clock), body, jnp.ones((1, 60), bool)
+    )
+    problem = g.make_problem(factors, state, motion=predictor)
+    held = g.hold(problem.free, "scale", "cameras", "shapes")
+    wrong = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(scale))
+    return dataclasses.replace(problem, free=held), wrong
+
+
+def bent(problem, right, wrong, monkeypatch):
+    """How much longer predicted steps are by posture alone, and what the error of a
+    regressor is worth, as shares."""
+    folder = Path(__file__).resolve().parents[1] / "benchmarks"
+    monkeypatch.syspath_prepend(str(folder))
+    bench = importlib.import_module("bench_motion_coupling")
+    reference = bench.predicted(problem.motion, right)
+    weight = jnp.ones((1, 60, 1)).at[:, : problem.motion.model[0].past + 1].set(0.0)
+    there = eqx.tree_at(lambda s: s.poses, right, wrong.poses)
+    found = bench.stretch_and_error(problem.motion, there, reference, weight)
+    return [float(x) for x in found]
+
+
+def follows(coupled, change, monkeypatch):
+    """`bent` by a scale that is 20 % too large."""
+    schedule = (Stage(rtol=1e-8, max_steps=300),)
+    ends = []
+    for scale in (1.0, 1.2):
+        problem, start = walk(scale)
+        motion = dataclasses.replace(problem.motion, coupled=coupled)
+        problem = change(dataclasses.replace(problem, motion=motion))
+        ends.append(solve(problem, start, schedule=schedule).state)
+    return bent(problem, *ends, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    "coupled", [(), pytest.param(("translation",), marks=pytest.mark.slow)]
+)
+def test_postures_do_not_follow_a_wrong_scale(coupled, monkeypatch):
+    """The cameras want longer steps of the network; postures must not give them: by far
+    less than that, and less than their own error."""
+    longer, error = follows(coupled, lambda problem: problem, monkeypatch)
+    assert abs(longer) < min(error, 0.01)
+
+
+@pytest.mark.slow
+def test_postures_that_nothing_holds_do_follow_a_wrong_scale(monkeypatch):
+    """So that the test above could see it."""
+
+    def loosen(problem):
+        problem = g.mute(problem, g.JointReprojection)
+        held = g.hold(problem.free, "roots")
+        problem = dataclasses.replace(problem, free=held)
+        where = lambda p: p.factors[2].sigma
+        assert isinstance(problem.factors[2], g.Posture)
+        return eqx.tree_at(where, problem, 10 * where(problem))
+
+    longer, _ = follows(("translation",), loosen, monkeypatch)
+    assert longer > 0.03
