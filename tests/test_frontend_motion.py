@@ -13,9 +13,10 @@ from bodyslam_jax.frontend import _structure, frames, read_sequence, reconstruct
 from bodyslam_jax.frontend._bundle import Scene, Views, adjust, errors
 from bodyslam_jax.frontend._features import match, spread
 from bodyslam_jax.frontend._geometry import resect
+from bodyslam_jax.frontend._mapper import Growing
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.frontend._reconstruct import interpolate_poses
-from bodyslam_jax.frontend._structure import Builder, Growing
+from bodyslam_jax.frontend._structure import Builder
 from bodyslam_jax.frontend._video import look_at
 from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence, Tracks
 

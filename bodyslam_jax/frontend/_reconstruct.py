@@ -18,8 +18,9 @@ from bodyslam_jax.frontend._camera_motion import (
     rotations_only,
     stillness,
 )
+from bodyslam_jax.frontend._mapper import Growing, Refine
 from bodyslam_jax.frontend._revisits import told_by_others
-from bodyslam_jax.frontend._structure import Builder, Growing, Refine
+from bodyslam_jax.frontend._structure import Builder
 from bodyslam_jax.sequence import Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]

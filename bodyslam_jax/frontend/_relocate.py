@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from bodyslam_jax.frontend._bundle import Scene
 from bodyslam_jax.frontend._geometry import refine_pose
@@ -30,7 +30,7 @@ def near(
     front = np.flatnonzero(p_C[:, 2] > 1e-6)
     if not len(front):
         return np.zeros(0, int), np.zeros(0, int)
-    tree = cKDTree(p_C[front, :2] / p_C[front, 2:])
+    tree = KDTree(p_C[front, :2] / p_C[front, 2:])
     found = tree.query_ball_point(xy, radius)
     i = np.repeat(np.arange(len(xy)), [len(n) for n in found])
     return i, front[np.concatenate([np.asarray(n, int) for n in found])]
