@@ -10,6 +10,7 @@ import numpy as np
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras, Joint
@@ -151,7 +152,7 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Pred
     return _predict(predictor, eqx.tree_at(lambda s: s.landmarks, state, none))
 
 
-_predict = eqx.filter_jit(lambda predictor, state: predictor(state))
+_predict = jit_once(lambda predictor, state: predictor(state))
 
 
 def _settle_people(

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import camera, export
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
@@ -102,9 +103,7 @@ def assemble(
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(joint.shapes)))
     trans = pelvis - rest[:, None, 0]
     shapes = jnp.asarray(joint.shapes)[:, None]
-    joints = np.array(
-        body_.joints(body, jnp.asarray(poses), shapes, jnp.asarray(trans))
-    )
+    joints = np.array(_joints(body, jnp.asarray(poses), shapes, jnp.asarray(trans)))
     if joint.present.any():
         # The floor is where feet are lowest, but for a few frames.
         floor = np.quantile(joints[joint.present][:, FEET, 1].min(axis=1), 0.05)
@@ -124,6 +123,10 @@ def assemble(
     )
     summary = summarise(sequence, config, body, cameras, joint, result, seconds)
     return dataclasses.replace(result, summary=summary)
+
+
+_joints = jit_once(body_.joints)
+_keypoints = jit_once(body_.local_keypoints)
 
 
 def _smoothed(sequence, config, present, poses, pelvis):
@@ -357,7 +360,7 @@ def per_frame(
         found["reprojection_px"] = _means(tracks.frame[keep], length[keep], t)
     if sequence.keypoints is not None and joint.present.any():
         shapes = jnp.asarray(joint.shapes)[:, None]
-        p_H = body_.local_keypoints(body, jnp.asarray(joint.poses), shapes)
+        p_H = _keypoints(body, jnp.asarray(joint.poses), shapes)
         turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
         p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
         error = np.asarray(camera.project(intrinsics, p_C)) - sequence.keypoints.uv

@@ -14,7 +14,6 @@ from jax.flatten_util import ravel_pytree
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, clock, marginals, observability, solve
 from bodyslam_jax.solver._blocks import sizes_of
-from bodyslam_jax.solver._compile import is_alone
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
@@ -215,14 +214,6 @@ def test_starts_are_mapped_over_in_one_go():
     together = jax.vmap(lambda s: solve(problem, s, schedule=TIGHT).cost)(batch)
     alone = [float(solve(problem, s, schedule=TIGHT).cost) for s in starts]
     assert np.allclose(together, alone, rtol=1e-8)
-
-
-def test_only_a_whole_program_is_compiled_with_options_of_its_own():
-    seen = []
-    assert is_alone()
-    jax.vmap(lambda x: seen.append(is_alone()) or x)(jnp.zeros(2))
-    jax.jit(lambda: seen.append(is_alone()) or jnp.zeros(()))()
-    assert seen == [True, False]
 
 
 def test_triangular_matrices_of_any_width_are_inverted():

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.body import BodyModel, joints, keypoints
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation._alignment import align
 from bodyslam_jax.evaluation._evaluation import (
     FEET,
@@ -48,7 +49,7 @@ def evaluate(
     return _evaluate(*associate(result, truth, body, offset))
 
 
-_evaluate = eqx.filter_jit(evaluate_trajectories)
+_evaluate = jit_once(evaluate_trajectories)
 
 
 def associate(

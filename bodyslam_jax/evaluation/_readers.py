@@ -5,13 +5,13 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, joints
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation._association import brackets, interpolate_poses
 from bodyslam_jax.result import Result
 
@@ -258,7 +258,7 @@ def posed_joints(
 
 
 _CHUNK = 256
-_joints = eqx.filter_jit(joints)
+_joints = jit_once(joints)
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 

@@ -1,12 +1,12 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.people import Roots
 from bodyslam_jax.sequence import Sequence, Tracks
@@ -159,7 +159,7 @@ def motion_factor(
     )
 
 
-@eqx.filter_jit
+@jit_once
 def _steps(seen, shapes, body, weights, shared_error):
     """Displacements in lengths of the leg, and what whitens their errors."""
     valid = seen.valid

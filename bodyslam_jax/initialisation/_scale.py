@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.ground import find_ground
 from bodyslam_jax.people import Roots
@@ -114,7 +114,7 @@ def ground_contact(
     return contact if low > 0 and high - low < _STEADY * middle else None
 
 
-_scales = eqx.filter_jit(lambda contact, state: contact.scales(state))
+_scales = jit_once(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(state: graph.State, seen: motion.Prediction) -> ScaleStart:

@@ -7,7 +7,6 @@ smoothing a walk shrinks its steps, and the step is the scale.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.linalg import solveh_banded
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.camera import project
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._fit import keypoint_sigma, pixels_per_metre
 from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
@@ -182,7 +182,7 @@ def _place_person(
     return turned[each, path], _smooth(position[each, path], where, fps, settings)
 
 
-@eqx.filter_jit
+@jit_once
 def _place_bodies(
     skeleton: Skeleton,
     intrinsics: Float[Array, " i"],

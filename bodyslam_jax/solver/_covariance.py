@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.compilation import is_alone, jit_once
 from bodyslam_jax.graph import Problem, State, world_from_root
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
 from bodyslam_jax.solver._chunks import Factor
-from bodyslam_jax.solver._compile import is_alone
 from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
 from bodyslam_jax.solver._levenberg_marquardt import little
 from bodyslam_jax.solver._loop import Final
@@ -56,7 +56,7 @@ def marginals(problem: Problem, state: State) -> Marginals:
     return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})
 
 
-@eqx.filter_jit
+@jit_once
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)
     lin, factor = final.lin, final.factor

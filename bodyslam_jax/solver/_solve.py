@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from bodyslam_jax.compilation import is_alone, quick_options
 from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.solver import _baselines
-from bodyslam_jax.solver._compile import is_alone, quick_options
 from bodyslam_jax.solver._implicit import cotangent_of_problem
 from bodyslam_jax.solver._levenberg_marquardt import (
     StructuredLevenbergMarquardt,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.body import BodyModel, vertices
 from bodyslam_jax.camera import project
+from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.result import Result
 from bodyslam_jax.view._ink import PEOPLE, Image
 
@@ -68,7 +69,7 @@ class _Mesh(eqx.Module):
     """px"""
 
 
-@eqx.filter_jit
+@jit_once
 def _pose(
     body: BodyModel,
     poses: Float[Array, "t 72"],
