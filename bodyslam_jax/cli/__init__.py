@@ -7,6 +7,7 @@ input, one line; 2 wrong usage; 3 the estimate failed or is not to be trusted.
 import _thread
 import atexit
 import contextlib
+import gc
 import importlib.metadata
 import logging
 import os
@@ -135,6 +136,9 @@ def program() -> NoReturn:
     raise AssertionError("main exits.")
 
 
+_COLLECT_AFTER = 50_000
+"""New objects after which Python looks for what only refers to itself. Tracing makes
+millions that are all in use: looking every 700, as Python does, takes a tenth of it."""
 _INTERRUPTED = 130
 """What a shell says of a program that Ctrl-C ended."""
 _WHERE = "BODYSLAM_DEBUG=1 says where"
@@ -172,6 +176,7 @@ def _prepare_jax() -> None:
         import jax
         import jax.numpy
 
+    gc.set_threshold(_COLLECT_AFTER)
     return_memory()
     jax.config.update("jax_enable_x64", True)
     cache = os.environ.get("BODYSLAM_CACHE") or Path(
