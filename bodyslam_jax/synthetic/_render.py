@@ -20,11 +20,15 @@ from bodyslam_jax.synthetic._texture import make_texture
 
 _NEAR = 0.05
 _LEVELS = 7
+_SHRINK = np.float32(0.5) ** np.arange(_LEVELS, dtype=np.float32)
+"""Of texture coordinates, level by level."""
 _BORDER = 2
 _TEXELS = 130.0
 """Texels a metre: a camera of 525 px sees them one to one from 4 m."""
 _LIGHT = np.array([0.35, 0.85, 0.4])
 _LIGHT /= np.linalg.norm(_LIGHT)
+_SPOT = 9
+"""Width of the discs that a shadow is made of, px."""
 _NOISE = 1.5
 """Standard deviation of the image noise, grey levels."""
 
@@ -113,18 +117,21 @@ class Renderer:
             hit = (inverse > view) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
             if not hit.any():
                 continue
-            rows, columns = np.nonzero(hit)
-            z, u, v = z[hit], u[hit], v[hit]
+            within = np.flatnonzero(hit)
+            z, u, v = (part.take(within) for part in (z, u, v))
+            # A pixel has `texels z^3` of them; a level further down has a quarter.
             texels = abs(np.linalg.det(np.stack([a, b, c])))
-            level = 0.5 * np.log2(texels * z**3) + 0.5
-            level = np.clip(np.round(level), 0, _LEVELS - 1).astype(np.int64)
-            place = self.places[i][level]
-            shrink = np.float32(0.5) ** level.astype(np.float32)
-            rows, columns = rows + top, columns + left
-            best[rows, columns] = inverse[hit]
-            map_x[rows, columns] = u * shrink - 0.5 + place[:, 0]
-            map_y[rows, columns] = v * shrink - 0.5 + place[:, 1]
-            floor[rows, columns] = surface.kind == "floor"
+            level = np.zeros(len(z), np.intp)
+            for k in range(1, _LEVELS):
+                level += z > (4.0 ** (k - 1) / texels) ** (1 / 3)
+            shrink = _SHRINK.take(level)
+            place_x, place_y = self.places[i].T
+            row, column = np.divmod(within, right - left)
+            pixel = (row + top) * width + (column + left)
+            best.reshape(-1)[pixel] = inverse.take(within)
+            map_x.reshape(-1)[pixel] = u * shrink - 0.5 + place_x.take(level)
+            map_y.reshape(-1)[pixel] = v * shrink - 0.5 + place_y.take(level)
+            floor.reshape(-1)[pixel] = surface.kind == "floor"
         image = cv2.remap(self.atlas, map_x, map_y, cv2.INTER_LINEAR)
         return best, image.astype(np.float32), floor
 
@@ -156,11 +163,21 @@ class Renderer:
         if p[:, 2].min() < 0.2:
             return
         uv = p[:, :2] / p[:, 2:] * self.intrinsics[:2] + self.intrinsics[2:]
-        dark = np.zeros(floor.shape, np.uint8)
-        for x, y in uv.round().astype(int):
-            cv2.circle(dark, (int(x), int(y)), 4, 255, -1)
-        soft = cv2.GaussianBlur(dark, (0, 0), 3.0).astype(np.float32)
-        image *= (1 - (0.45 / 255) * soft * floor)[:, :, None]
+        pixel = uv.round().astype(int) + _SPOT
+        width, height = self.size
+        dark = np.zeros((height + 2 * _SPOT, width + 2 * _SPOT), np.uint8)
+        inside = (pixel >= 0) & (pixel < dark.shape[::-1])
+        column, row = pixel[inside.all(axis=1)].T
+        dark[row, column] = 255
+        centre = (_SPOT // 2, _SPOT // 2)
+        disc = np.zeros((_SPOT, _SPOT), np.uint8)
+        cv2.circle(disc, centre, _SPOT // 2, 1, -1)
+        dark = cv2.dilate(dark, disc)[_SPOT:-_SPOT, _SPOT:-_SPOT]
+        soft = cv2.GaussianBlur(dark, (0, 0), 3.0)
+        x, y, w, h = cv2.boundingRect(soft)
+        part = np.s_[y : y + h, x : x + w]
+        share = soft[part].astype(np.float32) * floor[part]
+        image[part] *= (1 - (0.45 / 255) * share)[:, :, None]
 
     def _body(self, image, inverse_depth, T_WC, vertices) -> Bool[np.ndarray, "r c"]:
         """Draws the mesh with smooth shading; the pixels that are the person's."""
@@ -174,7 +191,8 @@ class Renderer:
         light = 0.45 + 0.65 * np.clip(normal @ _LIGHT, 0, 1) + 0.08 * normal[:, 1]
         colour = self.colours * light[:, None]
         pixel, face = rasterise(uv, 1 / p[:, 2], faces, inverse_depth)
-        image.reshape(-1, 3)[pixel] = colour[faces[face]].mean(axis=1)
+        a, b, c = (colour[faces[face, k]] for k in range(3))
+        image.reshape(-1, 3)[pixel] = (a + b + c) / 3
         mask.reshape(-1)[pixel] = True
         # A camera has no hard edges: soften the outline by one pixel.
         grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -200,15 +218,16 @@ def rasterise(
     box size go together.
     """
     rows, columns = inverse_depth.shape
-    corner = uv[faces]
-    edge1, edge2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    edge1, edge2 = b - a, c - a
     area = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
-    low = np.ceil(corner.min(axis=1)).astype(np.int64)
-    high = np.floor(corner.max(axis=1)).astype(np.int64)
+    low = np.ceil(np.minimum(np.minimum(a, b), c)).astype(np.int64)
+    high = np.floor(np.maximum(np.maximum(a, b), c)).astype(np.int64)
     low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
     # Counter-clockwise seen from outside, which an image with y down turns round.
-    seen = (area < -1e-12) & (high >= low).all(axis=1)
-    extent = (high - low).max(axis=1) + 1
+    size = high - low + 1
+    seen = (area < -1e-12) & (size[:, 0] > 0) & (size[:, 1] > 0)
+    extent = np.maximum(size[:, 0], size[:, 1])
     pixels, owners, depths = [], [], []
     side = 1
     while seen.any():
@@ -219,19 +238,19 @@ def rasterise(
             x = (low[now, 0, None, None] + step).astype(float)
             y = (low[now, 1, None, None] + step[:, None]).astype(float)
             x, y = np.broadcast_arrays(x, y)
-            dx = x - corner[now, 0, 0, None, None]
-            dy = y - corner[now, 0, 1, None, None]
+            dx = x - a[now, 0, None, None]
+            dy = y - a[now, 1, None, None]
             e1, e2 = edge1[now, :, None, None], edge2[now, :, None, None]
             scale = 1 / area[now, None, None]
             s = (dx * e2[:, 1] - dy * e2[:, 0]) * scale
             t = (dy * e1[:, 0] - dx * e1[:, 1]) * scale
             hit = (s >= 0) & (t >= 0) & (s + t <= 1) & (x < columns) & (y < rows)
             which, i, j = np.nonzero(hit)
-            a, b, c = inverse[faces[now[which]]].T
+            first, second, third = inverse[faces[now[which]]].T
             s, t = s[which, i, j], t[which, i, j]
             pixels.append((low[now[which], 1] + i) * columns + low[now[which], 0] + j)
             owners.append(now[which])
-            depths.append(a + s * (b - a) + t * (c - a))
+            depths.append(first + s * (second - first) + t * (third - first))
         side *= 2
     if not pixels:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -74,14 +74,14 @@ def _shape(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
     top = int(rng.integers(0, max(1, image.shape[0] - h)))
     left = int(rng.integers(0, max(1, image.shape[1] - w)))
     patch = image[top : top + h, left : left + w]
-    y, x = np.mgrid[: patch.shape[0], : patch.shape[1]]
-    y, x = (y + 0.5) / h * 2 - 1, (x + 0.5) / w * 2 - 1
+    y = (np.arange(patch.shape[0])[:, None] + 0.5) / h * 2 - 1
+    x = (np.arange(patch.shape[1]) + 0.5) / w * 2 - 1
     radius = np.hypot(x, y) if rng.random() < 0.4 else np.maximum(abs(x), abs(y))
     mask = radius <= 1
     if rng.random() < 0.35:
         mask &= radius > 0.6
     tint = rng.uniform(0.75, 1.25, 3) * rng.choice([0.35, 0.5, 1.5, 1.9])
-    patch[mask] *= tint.astype(np.float32)
+    np.multiply(patch, tint.astype(np.float32), out=patch, where=mask[:, :, None])
 
 
 def _letters(rng: np.random.Generator, image: np.ndarray, dot: int) -> None:
