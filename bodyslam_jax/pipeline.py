@@ -270,6 +270,7 @@ def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result
     **Raises:** `ValueError` if `out` cannot be written.
     """
     folder, rehearsal, watch = out / "scene", Rehearsal(), Stopwatch()
+    scene = None
     cache = Cache(out / ".cache", {"name": folder.name})
     export.check_folder(out, cache.source, cache.owner())
     if first:
@@ -279,7 +280,8 @@ def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result
         rehearsal = rehearse(measured, body, config, truth)
     try:
         with watch("rendering"):
-            sequence = frontend.read_sequence(synthetic.demo_scene(folder))
+            synthetic.demo_scene(folder, simulated=scene)
+            sequence = frontend.read_sequence(folder)
         cache = Cache(out / ".cache", describe(sequence))
         export.check_folder(out, cache.source, cache.owner())
         return _to_folder(sequence, out, config, cache, rehearsal)

@@ -69,17 +69,22 @@ def demo_settings(seed: int = 0) -> Simulation:
     )
 
 
-def demo_scene(folder: Path, seed: int = 0) -> Path:
+def demo_scene(
+    folder: Path, seed: int = 0, simulated: SimulatedSequence | None = None
+) -> Path:
     """Renders the walker whom a camera goes along with.
 
     Writes a sequence folder without tracks, so that they come from the video. What is
-    there of the same seed is kept.
+    there of the same seed is kept. `simulated` is the demo's scene of that seed, if
+    there is one already.
     """
     settings = demo_settings(seed)
     mark = Path(folder) / _MARK
     if mark.exists() and json.loads(mark.read_text()) == dataclasses.asdict(settings):
         return Path(folder)
-    return write_sequence(folder, simulate(settings), tracks=False)
+    if simulated is None:
+        simulated = simulate(settings)
+    return write_sequence(folder, simulated, tracks=False)
 
 
 def render(simulated: SimulatedSequence) -> Iterator[UInt8[np.ndarray, "rows cols 3"]]:
