@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.solver._compile import quick_options
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._padding import pad, unpad
 from bodyslam_jax.solver._solve import (
