@@ -248,7 +248,7 @@ def _check_tracks(factor, state):
 
 def _check_prior(factor, landmark):
     known = np.asarray(factor.whitening).any(axis=(1, 2))
-    known[landmark] = False
+    known = known & ~np.isin(np.arange(len(known)), landmark)
     if known.any():
         raise ValueError(
             f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
