@@ -56,6 +56,11 @@ class GraphWeights:
     """Regressed orientation, stationary, rad per axis; not used without it."""
     root_correlation: float = 0.96
     """Of its errors in successive frames at 30 fps."""
+    root_direction: float = 0.015
+    """Regressed place of the person across the line of sight, of the distance; used
+    where there are no keypoints. Errors last as those of orientation do."""
+    root_depth: float = 0.07
+    """The same along the line of sight."""
     root_turning: float | None = 0.015
     """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
     root_smoothness: float | None = 0.006

@@ -166,6 +166,11 @@ def extra_factors(rng, state, seen=None):
         g.SquarePixels(sigma=jnp.array([3.0])),
         g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
+        g.RootPlace(
+            place=state.roots[..., :3, 3] + 0.1,
+            sigma=jnp.full((h, t, 2), 0.05),
+            correlation=jnp.full((h, t), 0.9).at[:, 0].set(0.0),
+        ),
         g.StanceFoot(body=body_model(), sigma=late(h, t, 4, skip=1)),
         g.UpDirection(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(

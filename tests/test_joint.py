@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bodyslam_jax import graph, initialisation, joint
+from bodyslam_jax import graph, initialisation, joint, people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras
-from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence, Tracks
+from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence, Tracks
 
 T = 4
 
@@ -37,6 +37,8 @@ def _cameras() -> Cameras:
         landmarks=np.zeros((0, 3)),
         tracks=Tracks(none, none, np.zeros((0, 2))),
         keep=none.astype(bool),
+        elsewhere=np.zeros((0, 3, 3)),
+        places=np.zeros((0, 3)),
         pixel_sigma=1.0,
         intrinsics=np.array([500.0, 500.0, 320.0, 240.0]),
         focal_sigma=float("nan"),
@@ -76,3 +78,29 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     )
     assert told == [share] * 3  # of people alone, of the first scale, of everything
     assert float(prepared.state.scale) == pytest.approx(2)
+
+
+def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
+    body = load_body_model(dtype=jnp.float64)
+    given = _bodies()
+    given.present[0, 1] = False
+    roots = people.roots_from_bodies(given, body)
+    weights = GraphWeights(root_direction=0.02, root_depth=0.1, root_correlation=0.0)
+    factors = initialisation.people_factors(_sequence(given), roots, weights, body)
+    (place,) = (f for f in factors if isinstance(f, graph.RootPlace))
+    state = initialisation.first_state(
+        _cameras().T_WC, np.zeros((0, 3)), roots, _cameras().intrinsics
+    )
+    np.testing.assert_allclose(place.residual(state), 0, atol=1e-12)
+    # 2 % of the distance to the right, 10 % farther away: one deviation each.
+    x, y, z = (np.asarray(roots.T_CH[0, :, i, 3]) for i in range(3))
+    moved = state.roots.at[0, :, 0, 3].add(0.02 * z + 0.1 * x)
+    moved = moved.at[0, :, 1, 3].add(0.1 * y).at[0, :, 2, 3].multiply(1.1)
+    state = dataclasses.replace(state, roots=moved)
+    found = np.asarray(place.residual(state))[0]
+    np.testing.assert_allclose(found[[0, 2, 3]], [[1.0, 0.0, 1.0]] * 3, atol=1e-9)
+    np.testing.assert_allclose(found[1], 0)
+    seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
+    both = dataclasses.replace(_sequence(given), keypoints=seen)
+    factors = initialisation.people_factors(both, roots, weights, body)
+    assert not any(isinstance(f, graph.RootPlace) for f in factors)

@@ -10,6 +10,7 @@ from bodyslam_jax.graph._extras import CameraPrior as CameraPrior
 from bodyslam_jax.graph._extras import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph._extras import IntrinsicsPrior as IntrinsicsPrior
 from bodyslam_jax.graph._extras import RootOrientation as RootOrientation
+from bodyslam_jax.graph._extras import RootPlace as RootPlace
 from bodyslam_jax.graph._extras import RootSmoothness as RootSmoothness
 from bodyslam_jax.graph._extras import RootTurning as RootTurning
 from bodyslam_jax.graph._extras import SquarePixels as SquarePixels

@@ -195,6 +195,48 @@ class RootOrientation(AbstractFrameFactor):
         return error / jnp.sqrt(1 - correlation**2) / sigma
 
 
+class RootPlace(AbstractFrameFactor):
+    """Regressed place of the person in the camera, where no keypoints tell it better.
+
+    `(x - x̃ z/z̃) / z̃` and the same of y, its direction, and `z/z̃ - 1`, its depth; with
+    errors that last as those of `Posture` do. Linear, so that nothing happens at z = 0.
+    """
+
+    place: Float[Array, "h t 3"]
+    """r̃_CH, m; z̃ above 0."""
+    sigma: Float[Array, "h t 2"]
+    """Stationary standard deviations of direction and depth, of the distance; `inf`
+    where not measured."""
+    correlation: Float[Array, "h t"]
+    """ρ between the errors of k-1 and k; 0 at the start of a run."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("place", "sigma", "correlation")
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("root", 0), ("root", 1)
+
+    def data(self):
+        previous = jnp.roll(self.place, 1, axis=1)
+        return self.place, previous, self.sigma, self.correlation
+
+    def local(self, data, window, shared):
+        measured, previous, sigma, correlation = data
+        error = _away(measured, window[0].root[:3, 3])
+        error = error - correlation * _away(previous, window[1].root[:3, 3])
+        across, depth = sigma
+        spread = jnp.stack([across, across, depth])
+        return error / jnp.sqrt(1 - correlation**2) / spread
+
+
+def _away(measured: Float[Array, " 3"], place: Float[Array, " 3"]) -> Array:
+    """Error of direction and of depth, of the measured distance."""
+    share = place / measured[2]
+    direction = share[:2] - measured[:2] / measured[2] * share[2]
+    return jnp.append(direction, share[2] - 1)
+
+
 class StanceFoot(AbstractFrameFactor):
     """The foot that carries the weight does not move in the world, between k-1 and k.
 

@@ -94,6 +94,9 @@ def people_factors(
             predicted=weights.posture_predicted,
         )
     )
+    if sequence.keypoints is None:
+        rho = between(weights.root_correlation)
+        factors.append(_place_factor(roots, rho, weights))
     factors.append(_shape_factor(roots, weights))
     if weights.root_sigma is not None:
         factors.append(
@@ -112,6 +115,18 @@ def people_factors(
         sigma = where(three, weights.root_smoothness * per_frame**2 / leg)
         factors.append(graph.RootSmoothness(sigma, body=body))
     return factors
+
+
+def _place_factor(
+    roots: Roots, correlation: Float[Array, "h t"], weights: GraphWeights
+) -> graph.RootPlace:
+    there = roots.present[..., None]
+    sigma = np.array([weights.root_direction, weights.root_depth])
+    return graph.RootPlace(
+        place=jnp.asarray(np.where(there, roots.T_CH[..., :3, 3], [0.0, 0.0, 1.0])),
+        sigma=jnp.asarray(np.where(there, sigma, np.inf)),
+        correlation=correlation,
+    )
 
 
 def _shape_factor(roots: Roots, weights: GraphWeights) -> graph.Shape:
