@@ -203,9 +203,8 @@ def follows(coupled, change, monkeypatch):
     return bent(problem, *ends, monkeypatch)
 
 
-@pytest.mark.parametrize(
-    "coupled", [(), pytest.param(("translation",), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("coupled", [(), ("translation",)])
 def test_postures_do_not_follow_a_wrong_scale(coupled, monkeypatch):
     """The cameras want longer steps of the network; postures must not give them: by far
     less than that, and less than their own error."""
