@@ -295,6 +295,9 @@ class Structure:
     """Extent of the path below which a camera only turns, of the distance of points."""
     join_tracks: bool = True
     """Whether tracks that turn out to be of one point become one landmark."""
+    landmark_span: int = 90
+    """Frames that a landmark of the graph may span: longer tracks are several. A step
+    of the solver costs as much as the square of that."""
     min_shared: int = 12
     """Points that two successive frames must share, or there is a cut."""
     focal_sigma: float = 0.2

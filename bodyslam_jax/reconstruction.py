@@ -62,13 +62,27 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     guess = sequence.intrinsics
+    span = config.structure.landmark_span
+    if guess.is_guess:
+        # While the focal length moves, so does what other sightings say: whole tracks.
+        whole = dataclasses.replace(config.structure, landmark_span=sequence.num_frames)
+        config = dataclasses.replace(config, structure=whole)
     found = _reconstruct(sequence, tracks, guess, config)
     cameras = _unadjusted(found, guess, config)
     if found.kind != "moving":
         return cameras
     if not guess.is_guess:
         return _adjusted(cameras, 1.0, config, None)
-    sigma = _clipped(found.error / _PER_SIGMA)
+    found = _with_focal(sequence, tracks, cameras, found.error, config)
+    return _cut(found, span) if found.kind == "moving" else found
+
+
+def _with_focal(
+    sequence: Sequence, tracks: Tracks, cameras: Cameras, error: float, config: Config
+) -> Cameras:
+    """The focal length as the camera's path tells it, where it does."""
+    guess = sequence.intrinsics
+    sigma = _clipped(error / _PER_SIGMA)
     for _ in range(3):
         adjusted = _adjusted(cameras, sigma, config, guess)
         if adjusted.focal_sigma > config.structure.focal_accuracy * adjusted.focal:
@@ -84,6 +98,26 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
             # With its focal length wrong, a camera that turns had seemed to move.
             return dataclasses.replace(cameras, focal_sigma=adjusted.focal_sigma)
     return adjusted
+
+
+def _cut(cameras: Cameras, span: int) -> Cameras:
+    """Long tracks in pieces, which know of each other by what is known of the map."""
+    tracks = cameras.tracks
+    of, piece = frontend.cut_tracks(tracks.frame, tracks.landmark, span)
+    kept = cameras.keep
+    told = frontend.told_by_other_pieces(
+        cameras.T_WC, cameras.landmarks, tracks.frame[kept], piece[kept], of
+    )
+    count = np.bincount(of)[of]
+    known = cameras.elsewhere[of] / count[:, None, None]
+    places = cameras.landmarks[of]
+    return dataclasses.replace(
+        cameras,
+        landmarks=places,
+        tracks=Tracks(tracks.frame, piece, tracks.uv),
+        places=places,
+        elsewhere=known + cameras.focal**2 * told,
+    )
 
 
 def with_intrinsics(

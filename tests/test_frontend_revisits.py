@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import synthetic
 from bodyslam_jax.config import Simulation, Structure
-from bodyslam_jax.frontend import reconstruct
+from bodyslam_jax.frontend import cut_tracks, reconstruct, told_by_other_pieces
 from bodyslam_jax.frontend._bundle import Scene, Views, errors, jacobian_of_points
 from bodyslam_jax.frontend._relocate import near, relocate, with_moved
 from bodyslam_jax.frontend._revisits import Revisits, told_by_others
@@ -35,6 +35,10 @@ def seen(scene, frames, points, tracks):
     p_C = scene.points[points][which] - scene.centre[frame]
     p_C = np.einsum("mij,mj->mi", scene.R_CW[frame], p_C)
     return Views(frame, np.asarray(tracks)[which], p_C[:, :2] / p_C[:, 2:])
+
+
+def seen_by_all(scene):
+    return seen(scene, np.arange(6), np.arange(40), np.arange(40))
 
 
 def together(*views):
@@ -185,6 +189,30 @@ def test_what_other_tracks_tell_sums_to_what_all_views_say(scene):
     )
     np.testing.assert_allclose(told[3], square[views.landmark == 43].sum(axis=0))
     assert (told[39] == 0).all() and (told[79] == 0).all()
+
+
+def test_long_tracks_are_cut_into_pieces_that_know_of_each_other(scene):
+    frame = np.concatenate([np.arange(10), np.arange(3, 6), [0, 9]])
+    track = np.repeat([4, 2, 7], [10, 3, 2])
+    of, piece = cut_tracks(frame, track, 4)
+    assert of.tolist() == [2, 4, 4, 4, 7, 7]
+    for p in range(len(of)):
+        seen = frame[piece == p]
+        assert np.ptp(seen) < 4 and (track[piece == p] == of[p]).all()
+    assert cut_tracks(frame, track, 10)[0].tolist() == [2, 4, 7]
+    assert cut_tracks(frame[:0], track[:0], 4)[0].size == 0
+    # What a piece is told are the views of the other one.
+    views = seen_by_all(scene)
+    of, piece = cut_tracks(views.frame, views.landmark, 3)
+    T_WC = np.tile(np.eye(4), (6, 1, 1))
+    T_WC[:, :3, :3] = np.swapaxes(scene.R_CW, 1, 2)
+    T_WC[:, :3, 3] = scene.centre
+    told = told_by_other_pieces(T_WC, scene.points, views.frame, piece, of)
+    J = jacobian_of_points(scene, views)
+    square = np.einsum("mki,mkj->mij", J, J)
+    assert len(of) == 80
+    np.testing.assert_allclose(told[6], square[piece == 7].sum(axis=0))
+    np.testing.assert_allclose(told[7], square[piece == 6].sum(axis=0))
 
 
 def test_a_camera_that_turns_back_keeps_the_size_of_its_map():

@@ -19,7 +19,7 @@ from bodyslam_jax.frontend._camera_motion import (
     stillness,
 )
 from bodyslam_jax.frontend._mapper import Growing, Refine
-from bodyslam_jax.frontend._revisits import told_by_others
+from bodyslam_jax.frontend._revisits import cut_tracks, told_by_others
 from bodyslam_jax.frontend._structure import Builder
 from bodyslam_jax.sequence import Intrinsics, Tracks
 
@@ -45,7 +45,7 @@ class Reconstruction:
     inlier: Bool[np.ndarray, " m"]
     """Which of the `m` observations given they are."""
     landmark_ids: Int[np.ndarray, " l"]
-    """Which of the landmarks given these are."""
+    """Which of the landmarks given these are; a long track is several landmarks."""
     elsewhere: Float[np.ndarray, "l 3 3"]
     """Information that other tracks of the same point hold on each landmark's place,
     px² per squared unit of the map: to be divided by the variance of a pixel."""
@@ -77,7 +77,15 @@ def reconstruct(
         xy = cv2.undistortPoints(tracks.uv[:, None], K, distortion)[:, 0]
     views = Views(tracks.frame, tracks.landmark, xy)
     num_landmarks = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
-    problem = _Problem(tracks, views, intrinsics, num_frames, num_landmarks, focal)
+    problem = _Problem(
+        tracks,
+        views,
+        intrinsics,
+        num_frames,
+        num_landmarks,
+        focal,
+        config.landmark_span,
+    )
 
     first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
     within = (views.frame >= first) & (views.frame <= last)
@@ -129,6 +137,8 @@ class _Problem:
     num_frames: int
     num_landmarks: int
     focal: float
+    longest: int
+    """Frames that a landmark may span."""
 
 
 def _longest_shot(
@@ -191,15 +201,16 @@ def _moving(
     registered = grown.registered
     k0 = int(np.argmax(registered))
     R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()
-    ids = np.flatnonzero(np.bincount(problem.views.landmark[inlier], minlength=1))
+    views = problem.views[np.flatnonzero(inlier)]
+    ids, piece = cut_tracks(views.frame, views.landmark, problem.longest)
     points = (grown.scene.points[grown.shown[ids]] - c0) @ R0.T
     unit = float(np.median(np.linalg.norm(points, axis=-1))) if len(ids) else 1.0
     T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
     T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
     T_WC = interpolate_poses(T_WC, registered)
-    views = problem.views[np.flatnonzero(inlier)]
-    elsewhere = told_by_others(grown.scene, views, grown.shown)[ids]
+    pieces = Views(views.frame, piece, views.xy)
+    elsewhere = told_by_others(grown.scene, pieces, grown.shown[ids])
     elsewhere = (problem.focal * unit) ** 2 * (R0 @ elsewhere @ R0.T)
     return _pack(
         problem,
@@ -207,7 +218,7 @@ def _moving(
         T_WC,
         registered,
         points / unit,
-        ids,
+        (ids, piece),
         inlier,
         warnings,
         elsewhere=elsewhere,
@@ -234,8 +245,10 @@ def _fixed(
     scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], direction)
     inlier = within & solved[problem.views.frame]
     inlier &= errors(scene, problem.views) * problem.focal < 4.0
-    ids = np.flatnonzero(np.bincount(problem.views.landmark[inlier], minlength=1))
-    return _pack(problem, kind, T_WC, solved, direction[ids], ids, inlier, warnings)
+    ids, of = np.unique(problem.views.landmark[inlier], return_inverse=True)
+    return _pack(
+        problem, kind, T_WC, solved, direction[ids], (ids, of), inlier, warnings
+    )
 
 
 def _nothing(
@@ -245,7 +258,8 @@ def _nothing(
     none = np.zeros(0, dtype=np.int64)
     nowhere = np.zeros(problem.num_frames, dtype=bool)
     inlier = np.zeros(len(problem.views.frame), dtype=bool)
-    return _pack(problem, kind, T_WC, nowhere, np.zeros((0, 3)), none, inlier, warnings)
+    points = np.zeros((0, 3))
+    return _pack(problem, kind, T_WC, nowhere, points, (none, none), inlier, warnings)
 
 
 def _pack(
@@ -254,19 +268,15 @@ def _pack(
     T_WC: np.ndarray,
     registered: np.ndarray,
     landmarks: np.ndarray,
-    ids: np.ndarray,
+    which: tuple[np.ndarray, np.ndarray],
     inlier: np.ndarray,
     warnings: tuple[str, ...],
     *,
     elsewhere: np.ndarray | None = None,
 ) -> Reconstruction:
-    new = np.full(max(problem.num_landmarks, 1), -1)
-    new[ids] = np.arange(len(ids))
-    tracks = Tracks(
-        problem.tracks.frame[inlier],
-        new[problem.tracks.landmark[inlier]],
-        problem.tracks.uv[inlier],
-    )
+    """`which`: the track that each landmark is of; the landmark of each inlier."""
+    ids, landmark = which
+    tracks = Tracks(problem.tracks.frame[inlier], landmark, problem.tracks.uv[inlier])
     error = 0.0
     if inlier.any():
         scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], landmarks)

@@ -187,10 +187,32 @@ class Revisits:
         return loose
 
 
+def cut_tracks(
+    frame: Int[np.ndarray, " m"], track: Int[np.ndarray, " m"], longest: int
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " m"]]:
+    """Cuts tracks that span more than `longest` frames into equal pieces.
+
+    Returns: the track that each piece is of, and the piece of each observation.
+    """
+    if not len(frame):
+        return np.zeros(0, int), np.zeros(0, int)
+    first = np.full(int(track.max()) + 1, frame.max() + 1)
+    last = np.full(len(first), -1)
+    np.minimum.at(first, track, frame)
+    np.maximum.at(last, track, frame)
+    span = last - first + 1
+    count = -(-span // longest)
+    part = (frame - first[track]) * count[track] // span[track]
+    most = max(int(count.max()), 1)
+    key, piece = np.unique(track * most + part, return_inverse=True)
+    return key // most, piece.ravel()
+
+
 def told_by_others(
     scene: Scene, views: Views, shown: Int[np.ndarray, " l"]
 ) -> Float[np.ndarray, "l 3 3"]:
-    """Information on each track's point that other tracks of the same point hold.
+    """Information on each track's point that other tracks of the same point hold (or
+    pieces of tracks).
 
     Each track is told a share of the others', such that the shares of a point sum to
     what all its observations say. Cameras are taken as known; errors are in units of
@@ -203,7 +225,25 @@ def told_by_others(
     seen = Views(views.frame, shown[views.landmark], views.xy)
     J = jacobian_of_points(scene, seen)
     own = sum_by(views.landmark, np.einsum("mki,mkj->mij", J, J), len(shown))
+    _, point = np.unique(shown, return_inverse=True)
     tracks = np.unique(views.landmark)
-    count = np.bincount(shown[tracks], minlength=len(shown))[shown]
-    total = sum_by(shown, own, len(shown))[shown]
+    count = np.bincount(point[tracks], minlength=len(shown))[point]
+    total = sum_by(point, own, len(shown))[point]
     return (total - own) / np.maximum(count - 1, 1)[:, None, None]
+
+
+def told_by_other_pieces(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    landmarks: Float[np.ndarray, "l 3"],
+    frame: Int[np.ndarray, " m"],
+    piece: Int[np.ndarray, " m"],
+    of: Int[np.ndarray, " p"],
+) -> Float[np.ndarray, "p 3 3"]:
+    """`told_by_others` for the pieces of tracks of `landmarks`.
+
+    Args:
+        of: the landmark that each piece is of.
+    """
+    C_WC = T_WC[:, :3, :3]
+    scene = Scene(np.swapaxes(C_WC, 1, 2), T_WC[:, :3, 3], landmarks)
+    return told_by_others(scene, Views(frame, piece, np.zeros((len(frame), 2))), of)
