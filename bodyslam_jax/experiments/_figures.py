@@ -45,7 +45,7 @@ def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> 
                 markersize=4,
                 label="the paper's, its own data" if method == "full" else None,
             )
-        axis.set(ylabel=label, yscale="log", ylim=(5, None))
+        axis.set(ylabel=label, yscale="log", ylim=(1, None))
         axis.grid(axis="y", alpha=0.3)
     axes[0].set_title("simulated sequences, after SE(3)", fontsize=10)
     axes[0].legend(ncols=3, fontsize=7, loc="upper left")
