@@ -53,16 +53,22 @@ def relocate(
         which: which image point a row is of; several rows may share one.
         share: part of wrong pairs that agree by chance.
     """
+    least = max(_LEAST, _BY_CHANCE * share * len(xy))
+    agree = lambda seen: len(
+        np.unique(which[np.linalg.norm(seen - xy, axis=-1) < threshold])
+    )
+    here = _project(points, pose)
     R, centre = pose
-    for scale in _ANNEALED:
+    # Where the map has hardly drifted, no wide loss need be tried.
+    for scale in _ANNEALED[2 if agree(here) > least else 0 :]:
         found = refine_pose(R, centre, points, xy, scale * threshold)
         if found is None:
             return None, 0.0
         R, centre, _ = found
-    there, here = (_project(points, p) for p in ((R, centre), pose))
-    fits = np.linalg.norm(there - xy, axis=-1) < threshold
-    if len(np.unique(which[fits])) <= max(_LEAST, _BY_CHANCE * share * len(xy)):
+    there = _project(points, (R, centre))
+    if agree(there) <= least:
         return None, 0.0
+    fits = np.linalg.norm(there - xy, axis=-1) < threshold
     away = np.linalg.norm(there - here, axis=-1)[fits]
     return (R, centre), float(np.median(away))
 
