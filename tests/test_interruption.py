@@ -101,6 +101,27 @@ def test_an_interrupt_waits_until_jax_is_loaded():
 
 
 @pytest.mark.usefixtures("heard")
+def test_an_interrupt_that_became_another_error_is_an_interrupt(
+    sequence, command, monkeypatch, tmp_path
+):
+    """As where it hits the import of a compiled module, which then fails in its way."""
+    monkeypatch.setattr(cli, "_INTERRUPTS", [])
+
+    def broken(*args, **kwargs):
+        try:
+            cli._interrupt()
+        except KeyboardInterrupt as error:
+            raise SystemError("initialization failed") from error
+
+    monkeypatch.setattr(frontend, "track", broken)
+    code, said = command("run", sequence, "--out", tmp_path / "run")
+    assert code == 130 and "the same command continues it" in said
+    cli._INTERRUPTS.clear()
+    monkeypatch.setattr(frontend, "track", lambda *a, **k: 1 / 0)
+    assert command("run", sequence, "--out", tmp_path / "run")[0] == 3
+
+
+@pytest.mark.usefixtures("heard")
 def test_an_interrupt_that_python_drops_comes_again():
     """Where it hits a callback of the garbage collector, as JAX has one."""
 
@@ -187,7 +208,7 @@ def test_signals_at_any_moment(sequence, tmp_path):
     argv = [sys.executable, "-m", "bodyslam_jax", "run", str(sequence)]
     argv += ["--out", str(out), "--no-uncertainty"]
     env = os.environ | {"PYTHONFAULTHANDLER": "1"}
-    codes = []
+    codes, told = [], []
     for wait in (3, 8, 15, 25, 40, 80, 600):
         process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True, env=env)
         try:
@@ -196,13 +217,14 @@ def test_signals_at_any_moment(sequence, tmp_path):
             process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=120)[1]
         codes.append(process.returncode)
+        told.append(said)
         assert "Traceback" not in said and "Fatal" not in said, said
         # It is moved there whole: Ctrl-C may come while that is told, or just after.
         if (out / "summary.json").exists():
             break
         time.sleep(0.1)
-    assert set(codes) <= {0, 3, 130, -signal.SIGINT}, codes
-    assert not {0, 3} & set(codes[:-1]), codes
+    assert set(codes) <= {0, 3, 130, -signal.SIGINT}, (codes, told)
+    assert not {0, 3} & set(codes[:-1]), (codes, told)
     assert (out / "report.html").exists()
     written = json.loads((out / "summary.json").read_text())
     assert written["camera_motion"] == "static" and (out / "result.npz").exists()

@@ -109,9 +109,12 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_CLOSED_PIPE)
     except KeyboardInterrupt:
-        print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
-        sys.exit(_INTERRUPTED)
+        _leave_interrupted()
     except Exception as error:
+        if _INTERRUPTS:
+            # Ctrl-C within code that makes an error of its own of it, as an import of
+            # half a compiled module is.
+            _leave_interrupted()
         if os.environ.get("BODYSLAM_DEBUG"):
             raise
         if isinstance(error, (OSError, ValueError)):
@@ -124,6 +127,8 @@ def main() -> None:
 
 def program() -> NoReturn:
     """`main` as a process of its own."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         main()
     except SystemExit as end:
@@ -139,11 +144,24 @@ def program() -> NoReturn:
 _COLLECT_AFTER = 50_000
 """New objects after which Python looks for what only refers to itself. Tracing makes
 millions that are all in use: looking every 700, as Python does, takes a tenth of it."""
+_INTERRUPTS: list[bool] = []
+"""That this process was interrupted, whatever has become of `KeyboardInterrupt`."""
 _INTERRUPTED = 130
 """What a shell says of a program that Ctrl-C ended."""
 _WHERE = "BODYSLAM_DEBUG=1 says where"
 _CLOSED_PIPE = 128 + 13
 """What a shell says of a program that SIGPIPE ended."""
+
+
+def _interrupt(*_: object) -> NoReturn:
+    """Python's own answer to Ctrl-C, and that it came."""
+    _INTERRUPTS.append(True)
+    raise KeyboardInterrupt
+
+
+def _leave_interrupted() -> NoReturn:
+    print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
+    sys.exit(_INTERRUPTED)
 
 
 def _call(commands: dict[str, Callable[..., Any]], prog: str, argv: list[str]) -> Any:
@@ -192,14 +210,14 @@ def _interrupts_held() -> Iterator[None]:
     """Ctrl-C is heard at the end: while jaxlib is loaded it would crash Python."""
     before = signal.getsignal(signal.SIGINT)
     heard = []
-    if before is signal.default_int_handler:
+    if callable(before):
         signal.signal(signal.SIGINT, lambda *_: heard.append(True))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if heard:
-        raise KeyboardInterrupt
+    if heard and callable(before):
+        before(signal.SIGINT, None)
 
 
 def _compile_quickly() -> None:
