@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.config import Structure, Tracking
+from bodyslam_jax.config import Simulation, Structure, Tracking
 from bodyslam_jax.frontend import _structure, frames, read_sequence, reconstruct, track
 from bodyslam_jax.frontend._bundle import Scene, Views, adjust, errors
 from bodyslam_jax.frontend._features import match, spread
@@ -19,6 +19,7 @@ from bodyslam_jax.frontend._reconstruct import interpolate_poses
 from bodyslam_jax.frontend._structure import Builder
 from bodyslam_jax.frontend._video import look_at
 from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence, Tracks
+from bodyslam_jax.synthetic import as_sequence, simulate
 
 SHARED = Path(__file__).parents[2] / "shared"
 SIZE = (320, 240)
@@ -445,6 +446,27 @@ def test_rendered_walk_from_its_video():
     spread_of_path = np.sqrt((np.var(rows[:, 1:4], axis=0)).sum())
     assert cameras.registered.all()
     assert camera_error(cameras.T_WC, truth) * spread_of_path < 0.02  # m
+
+
+def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
+    """The camera comes near a wall, sees 60 points of it, and turns away. Maps that
+    start beyond take its way along the wall for a turn of 17°."""
+    simulated = simulate(Simulation(sequence="D2", seed=3))
+    sequence = as_sequence(simulated)
+    first, num = 480, 160
+    tracks = sequence.tracks
+    now = (tracks.frame >= first) & (tracks.frame < first + num)
+    landmark = np.unique(tracks.landmark[now], return_inverse=True)[1]
+    tracks = Tracks(tracks.frame[now] - first, landmark, tracks.uv[now])
+    truth = simulated.T_WC[first : first + num]
+    away = []
+    for thin in (_structure._THIN, 0):
+        monkeypatch.setattr(_structure, "_THIN", thin)
+        config = Structure(join_tracks=False)
+        found = reconstruct(tracks, sequence.intrinsics, num, config)
+        assert found.registered.all()
+        away.append(camera_error(found.T_WC, truth))
+    assert away[0] < 0.06 and away[1] > 0.3  # of the path's radius
 
 
 def test_points_that_noise_draws_nearer_are_not_preferred():

@@ -37,6 +37,9 @@ class Views:
 
 
 _NEAR = 1e-6
+_DAMPING, _LEAST = 1e-8, 1e-13
+"""Of the diagonal, at first and at least: the softest bend of a long path is some 1e-10
+as stiff as one camera."""
 
 
 def errors(scene: Scene, views: Views) -> Float[np.ndarray, " m"]:
@@ -79,14 +82,14 @@ def adjust(
     camera_of = np.full(len(free), -1)
     camera_of[cameras] = np.arange(len(cameras))
     camera_of = camera_of[views.frame]
-    damping, cost = 1e-5, _cost(scene, views, loss)
+    damping, cost = _DAMPING, _cost(scene, views, loss)
     for _ in range(iterations):
         system = _linearise(scene, views, camera_of, point_of, loss, len(cameras))
         improved = False
         for _ in range(4):
             step = _solve(system, damping, len(points))
             if step is None:
-                damping *= 10
+                damping *= 100
                 continue
             trial = _moved(scene, cameras, points, *step)
             new = _cost(trial, views, loss)
@@ -95,11 +98,11 @@ def adjust(
                 break
             if new < (1 + tolerance) * cost:
                 break  # as good as it gets, up to rounding
-            damping *= 10
+            damping *= 100
         if not improved:
             break
         scene.R_CW, scene.centre, scene.points = trial.R_CW, trial.centre, trial.points
-        damping = max(damping / 10, 1e-9)
+        damping = max(damping / 10, _LEAST)
         done = cost - new < tolerance * cost
         cost = new
         if done:

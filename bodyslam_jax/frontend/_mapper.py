@@ -57,8 +57,8 @@ class Mapper:
         self.revisits = Revisits(self.views, num_landmarks)
         self.joining = False
         self.num_frames, self.num_landmarks = num_frames, num_landmarks
-        self.pixel = 1 / focal
-        self.threshold = config.max_error / focal
+        self.pixel: float = 1 / focal
+        self.threshold: float = config.max_error / focal
         self.min_angle = np.radians(config.min_angle)
         self.refine = refine or self._adjust
         order = np.argsort(views.frame, kind="stable")

@@ -20,7 +20,7 @@ from bodyslam_jax.frontend._camera_motion import (
 )
 from bodyslam_jax.frontend._mapper import Growing, Refine
 from bodyslam_jax.frontend._revisits import cut_tracks, told_by_others
-from bodyslam_jax.frontend._structure import Builder
+from bodyslam_jax.frontend._structure import Builder, build_map
 from bodyslam_jax.sequence import Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
@@ -104,14 +104,14 @@ def reconstruct(
     keyframes = choose_keyframes(shot, first, last, motion, config.min_shared)
     pairs = rotation_error(shot, keyframes, 1 / focal)
     away = _turning_error(pairs) * focal / config.rotation_error
-    grown = None
+    built = None
     if away > 1:
-        starts = _first_pairs(pairs, config.max_first_pairs)
-        builder = Builder(shot, num_frames, num_landmarks, focal, config, refine)
-        grown = builder.build(keyframes, starts)
-        if grown is not None:
-            builder.complete(grown, np.arange(first, last + 1))
-    if grown is not None:
+        size = (num_frames, num_landmarks)
+        make = lambda: Builder(shot, *size, focal, config, refine)
+        built = build_map(make, keyframes, pairs)
+    if built is not None:
+        builder, grown = built
+        builder.complete(grown, np.arange(first, last + 1))
         inlier = np.zeros(len(tracks.frame), dtype=bool)
         inlier[within] = grown.inlier
         found = _moving(problem, grown, inlier, (first, last), warnings)
@@ -166,23 +166,6 @@ def _turning_error(pairs: np.ndarray) -> float:
         return np.inf
     telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
     return float(np.median(pairs[np.argsort(-telling)[:5], 2]))
-
-
-def _first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Pairs of keyframes to start from: much parallax, many points, spread in time."""
-    if not len(pairs):
-        return np.zeros((0, 2), dtype=np.int64)
-    enough = np.minimum(pairs[:, 2], np.radians(5.0))
-    score = enough * np.minimum(pairs[:, 3], 100) ** 1.5
-    chosen: list[np.ndarray] = []
-    for i in np.argsort(-score):
-        apart = [np.abs(pairs[i, :2] - c).max() for c in chosen]
-        span = pairs[i, 1] - pairs[i, 0]
-        if not apart or min(apart) > 0.3 * span:
-            chosen.append(pairs[i, :2])
-        if len(chosen) == count:
-            break
-    return np.asarray(chosen).astype(np.int64)
 
 
 def _moving(

@@ -6,6 +6,7 @@ adjustment runs in between. Keyframes first, then the frames between them.
 """
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,10 +18,75 @@ _log = logging.getLogger(__name__)
 
 _RELAXED = 3
 """Times that a smaller angle is tried where cameras cannot be located."""
+_THIN, _AROUND = 25, 10
+"""Known points below which a camera is located poorly, and keyframes before and after
+it that show which of two maps is right there."""
+
+
+def build_map(
+    make: Callable[[], "Builder"], keyframes: np.ndarray, pairs: np.ndarray
+) -> tuple["Builder", Growing] | None:
+    """The map that grows best over the keyframes of one shot.
+
+    A camera that moves along a plane that few points show may be taken for one that
+    turns: a map that crosses such a thin place bends there, and no adjustment bends it
+    back. From the other side the place may well be crossed rightly. So both are tried,
+    and the map that explains more of the place is kept.
+
+    Args:
+        make: a builder that has not begun yet.
+        pairs: frames, error of a turning camera and common points of each pair of
+            keyframes, as from `rotation_error`.
+    """
+    builder = make()
+    count = builder.config.max_first_pairs
+    grown = builder.build(keyframes, first_pairs(pairs, count))
+    if grown is None:
+        return None
+    best = builder, grown
+    if builder.thin:
+        thinnest = min(builder.thin, key=lambda k: (builder.thin[k], k))
+        before, after = pairs[:, :2] < thinnest, pairs[:, :2] > thinnest
+        beyond = before if builder.origin > thinnest else after
+        other = make()
+        starts = first_pairs(pairs[beyond.all(axis=1)], count)
+        again = other.build(keyframes, starts)
+        if again is not None and other.threshold <= builder.threshold:
+            at = np.searchsorted(keyframes, sorted(builder.thin | other.thin))
+            away = np.abs(np.arange(len(keyframes))[:, None] - at).min(axis=1)
+            near = keyframes[away <= _AROUND]
+            scores = builder.score(grown, near), other.score(again, near)
+            _log.debug("around frame %d: %.3f, and %.3f from beyond", thinnest, *scores)
+            if scores[1] > scores[0]:
+                best = other, again
+    best[0].finish(best[1], keyframes)
+    return best
+
+
+def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Pairs of keyframes to start from: much parallax, many points, spread in time."""
+    if not len(pairs):
+        return np.zeros((0, 2), dtype=np.int64)
+    enough = np.minimum(pairs[:, 2], np.radians(5.0))
+    score = enough * np.minimum(pairs[:, 3], 100) ** 1.5
+    chosen: list[np.ndarray] = []
+    for i in np.argsort(-score):
+        apart = [np.abs(pairs[i, :2] - c).max() for c in chosen]
+        span = pairs[i, 1] - pairs[i, 0]
+        if not apart or min(apart) > 0.3 * span:
+            chosen.append(pairs[i, :2])
+        if len(chosen) == count:
+            break
+    return np.asarray(chosen).astype(np.int64)
 
 
 class Builder(Mapper):
     """Grows a reconstruction over the keyframes of one shot."""
+
+    origin = 0
+    """Frame that the map grew from."""
+    thin: dict[int, int]
+    """Keyframes that were located by few points, and by how many."""
 
     def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> Growing | None:
         """The best of the reconstructions that grow from `pairs` of keyframes.
@@ -28,6 +94,7 @@ class Builder(Mapper):
         Where even the best leaves much unexplained, the points are noisier than
         thought: it is tried again with twice the tolerance.
         """
+        self.thin = {}
         best, score = self._best_start(keyframes, pairs)
         for _ in range(2):
             if score > 0.75:
@@ -42,6 +109,7 @@ class Builder(Mapper):
             best, score = wider, wider_score
         if best is None:
             return None
+        self.origin, self.thin = int(np.argmax(best.registered)), {}
         self.joining = self.config.join_tracks
         self._grow(best, keyframes)
         for _ in range(_RELAXED):
@@ -52,11 +120,14 @@ class Builder(Mapper):
             self.min_angle *= 0.6
             self._triangulate(best, self._views_of(best))
             self._grow(best, keyframes)
-        self._settle(best, keyframes[best.registered[keyframes]])
-        for _ in range(3):  # outliers sorted anew in between
-            self._refine(best, self._free(best))
-            self._triangulate(best, self._views_of(best))
         return best
+
+    def finish(self, grown: Growing, keyframes: np.ndarray) -> None:
+        """Looks at all joins and outliers again, now that the keyframes are there."""
+        self._settle(grown, keyframes[grown.registered[keyframes]])
+        for _ in range(3):  # outliers sorted anew in between
+            self._refine(grown, self._free(grown))
+            self._triangulate(grown, self._views_of(grown))
 
     def _best_start(
         self, keyframes: np.ndarray, pairs: np.ndarray
@@ -69,7 +140,7 @@ class Builder(Mapper):
             # A few more cameras tell a right start from a wrong one.
             near = keyframes[np.argsort(np.abs(keyframes - (a + b) / 2))][:8]
             self._grow(started, near)
-            score = self._score(started, near)
+            score = self.score(started, near)
             _log.debug("start from frames %d and %d: %.2f", a, b, score)
             if score > max(scores):
                 best = started
@@ -166,11 +237,13 @@ class Builder(Mapper):
         if found is None or found[2].sum() < max(8, 0.3 * len(at)):
             return False
         grown.scene.R_CW[k], grown.scene.centre[k] = found[:2]
+        if len(at) < _THIN:
+            self.thin[k] = len(at)
         grown.registered[k] = True
         grown.inlier[at] = found[2]
         return True
 
-    def _score(self, grown: Growing, frames: np.ndarray) -> float:
+    def score(self, grown: Growing, frames: np.ndarray) -> float:
         """Part of the observations in `frames` that the reconstruction explains."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.

@@ -140,8 +140,11 @@ def _roots(people, lin, sizes, base, damping):
     new["own"] = new["own"].at[:, :, rows, rows].add(own)
     new["next"] = new["next"].at[:, :, rows, rows].add(following)
     same, before, after = _place(_of(lin, "root", "camera"), cut)
-    new["cameras"] = new["cameras"].at[:, :, rows].add(same)
-    new["next_cameras"] = new["next_cameras"].at[:, :, rows].add(after)
+    # XLA would take seconds to add up zeros that it knows.
+    if not isinstance(same, float):
+        new["cameras"] = new["cameras"].at[:, :, rows].add(same)
+    if not isinstance(after, float):
+        new["next_cameras"] = new["next_cameras"].at[:, :, rows].add(after)
     if not isinstance(before, float):
         before = _to_previous(_transposed(before))
         new["before_cameras"] = new["before_cameras"].at[..., rows].add(before)
