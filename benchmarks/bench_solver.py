@@ -3,7 +3,7 @@
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
     python benchmarks/bench_solver.py breakdown --frames 1000
-    python benchmarks/bench_solver.py ceres --peer-python PYTHON
+    python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2 cg
     python benchmarks/bench_solver.py scales --frames 300
     python benchmarks/bench_solver.py growth
@@ -141,7 +141,7 @@ def one(frames, steps):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    subjects = "landmarks joint breakdown ceres baselines scales growth one calibration"
+    subjects = "landmarks joint breakdown peers baselines scales growth one calibration"
     parser.add_argument("what", choices=subjects.split())
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
@@ -150,7 +150,11 @@ def main():
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="of `calibration`")
     parser.add_argument("--baselines", nargs="+", default=["1e-3", "1e-2", "cg"])
-    parser.add_argument("--peer-python", help="has pyceres and pycolmap")
+    parser.add_argument(
+        "--peers", nargs="+", choices=solver_peers.PEERS, default=solver_peers.PEERS
+    )
+    parser.add_argument("--peer-python", help="has what `peer_*.py` ask for")
+    parser.add_argument("--peer-steps", type=int, default=100, help="at most")
     args = parser.parse_args()
     dtype = np.float32 if args.float32 else np.float64
     jax.config.update("jax_enable_x64", not args.float32)
@@ -159,8 +163,8 @@ def main():
         return
     others = {
         "calibration": lambda n: calibration(n, args.repeats, args.noise),
-        "ceres": lambda n: solver_peers.ceres(
-            n, args.peer_python, args.repeats, args.rtol
+        "peers": lambda n: solver_peers.peers(
+            n, args.peers, args.peer_python, args.repeats, args.rtol, args.peer_steps
         ),
         "baselines": lambda n: solver_peers.joint(n, args.rtol, args.baselines),
         "scales": lambda n: scales(n, args.rtol),

@@ -2,7 +2,7 @@
 
     python peer_ceres.py problem.npz result.npz
 
-Run by `bench_solver.py ceres --peer-python PYTHON`, where PYTHON has `pyceres`,
+Run by `bench_solver.py peers --peer-python PYTHON`, where PYTHON has `pyceres`,
 `pycolmap` and NumPy. SPARSE_SCHUR, 2 threads, Cauchy, intrinsics held; the gauge as
 COLMAP holds it by default (one camera, and one coordinate of a second).
 """
@@ -70,7 +70,7 @@ def main(source, target):
     settings = pyceres.SolverOptions()
     settings.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
     settings.num_threads = 2
-    settings.max_num_iterations = 100
+    settings.max_num_iterations = int(data["steps"])
     settings.function_tolerance = float(data["rtol"])
     settings.gradient_tolerance = settings.parameter_tolerance = 0.0
     watch = Watch()

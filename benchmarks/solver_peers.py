@@ -1,7 +1,7 @@
 """The solver beside others, on one problem each; costs by one function.
 
-Ceres on cameras and landmarks; first-order steps and stock optimistix with conjugate
-gradients on the joint problem.
+Ceres, GTSAM and jaxls on cameras and landmarks; first-order steps and stock optimistix
+with conjugate gradients on the joint problem.
 """
 
 import subprocess
@@ -16,11 +16,19 @@ from solver_clock import reached, timed
 from solver_scene import make
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.camera import MIN_DEPTH
 from bodyslam_jax.solver import Stage, _baselines, solve
 from bodyslam_jax.solver._solve import restrict
 
 NEAR = 1.001
 """Solvers are compared by the time to this multiple of the least cost of all."""
+
+LIMIT = 600
+"""Seconds that a peer's process may take."""
+
+PEERS = ("ceres", "gtsam", "jaxls")
+BLIND = ("ceres", "gtsam")
+"""Those with a cost function of their own behind a camera."""
 
 
 @eqx.filter_jit
@@ -28,53 +36,66 @@ def cost_of(problem, state):
     return problem.cost(state)
 
 
-def ceres(frames, python, repeats, rtol):
-    """Ceres and this solver, in turn, on one problem.
-
-    COLMAP's cost function calls a point behind the camera no error at all, and Ceres
-    sends a few landmarks there. Those are left out of the problem, until it sends none:
-    then both minimise the same function.
-    """
+def peers(frames, names, python, repeats, rtol, steps):
+    """Peers and this solver, in turn, on one problem."""
     problem, _, start = make(frames, 0)
     (factor,) = problem.factors
     count = len(np.unique(factor.landmark))
-    left_out = 0
-    while True:
-        result, times = run_ceres(factor, start, python, 1, rtol)
-        there = state_of(result, start)
-        lost = np.unique(np.asarray(factor.landmark)[behind(factor, there)])
-        if not len(lost):
-            break
-        left_out += len(lost)
-        factor = without(factor, lost)
+    run = lambda name, factor: run_peer(name, factor, start, python, rtol, steps)
+    factor = without_lost(factor, start, [n for n in names if n in BLIND], run)
+    left_out = count - len(np.unique(factor.landmark))
     problem = g.make_problem([factor], start)
     print(
-        f"{frames} frames, {count} landmarks, {len(factor.frame)} observations; "
-        f"{left_out} landmarks left out that Ceres sends behind a camera",
+        f"{frames} frames, {count} landmarks less {left_out} that a peer sends behind "
+        f"a camera, {len(factor.frame)} observations",
         flush=True,
     )
-    result, times = run_ceres(factor, start, python, repeats, rtol)
-    found = {"Ceres": float(cost_of(problem, state_of(result, start)))}
-    curves = {"Ceres": result["rows"][:, 1]}
-    wall, cpu = np.median(times, axis=0)
-    share = result["rows"][:, 0] / result["rows"][-1, 0]
-    clocks = {"Ceres": (wall * share, cpu * share)}
-    notes = {"Ceres": f"{result['versions']}, {int(result['solves'])} linear solves"}
+    found, curves, clocks, notes = {}, {}, {}, {}
+    for name in names:
+        try:
+            runs = [run(name, factor)]
+            # A run that was stopped at its cap is long, and once is enough.
+            while len(runs) < repeats and not runs[0].get("capped", False):
+                runs.append(run(name, factor))
+        except subprocess.TimeoutExpired:
+            print(f"  {name:20s} not done after {LIMIT} s", flush=True)
+            continue
+        result = runs[-1]
+        wall, cpu = np.median([(r["seconds"], r["processor"]) for r in runs], axis=0)
+        found[name] = float(cost_of(problem, state_of(result, start)))
+        curves[name] = result["rows"][:, 1]
+        share = result["rows"][:, 0] / result["rows"][-1, 0]
+        clocks[name] = (wall * share, cpu * share)
+        notes[name] = note_of(result, found[name])
     for dtype in (np.float64, np.float32):
         name = f"structured {np.dtype(dtype).name}"
         p, s = cast((problem, start), dtype)
-        run = lambda p=p, s=s: solve(p, s, schedule=(Stage(rtol=rtol),))
-        solution, first, (wall, cpu) = timed(run, repeats)
-        steps = int(solution.num_steps[0])
+        ours = lambda p=p, s=s: solve(p, s, schedule=(Stage(rtol=rtol),))
+        solution, first, (wall, cpu) = timed(ours, repeats)
+        taken = int(solution.num_steps[0])
         found[name] = float(cost_of(problem, cast(solution.state, np.float64)))
-        curves[name] = np.asarray(solution.histories[0].cost[: steps + 1], float)
-        share = np.arange(steps + 1) / steps
+        curves[name] = np.asarray(solution.histories[0].cost[: taken + 1], float)
+        share = np.arange(taken + 1) / taken
         clocks[name] = wall * share, cpu * share
         notes[name] = (
-            f"{steps} steps, {solution.status}; first call "
+            f"{taken} steps, {solution.status}; first call "
             f"{first[0] - wall:.1f} s longer (processor {first[1] - cpu:.1f})"
         )
     table(found, curves, clocks, notes)
+
+
+def note_of(result, cost):
+    """Versions, solves, and whatever else is to be known of a peer's run."""
+    note = f"{result['versions']}, {int(result['solves'])} linear solves"
+    if result.get("capped", False):
+        note += ", stopped at its cap"
+    if "compilation" in result:
+        wall, cpu = result["compilation"]
+        note += f"; first call, of one step, {wall:.1f} s (processor {cpu:.1f})"
+    own = result["rows"][-1, 1]
+    if abs(own - cost) > 1e-6 * cost:
+        note += f"; by its own reckoning {own:.8g}"
+    return note
 
 
 def table(found, curves, clocks, notes):
@@ -98,10 +119,26 @@ def table(found, curves, clocks, notes):
             )
 
 
-def run_ceres(factor, start, python, repeats, rtol):
-    """Its result and, for each repeat, wall and processor seconds of the solve."""
-    script = Path(__file__).with_name("peer_ceres.py")
-    times = []
+def without_lost(factor, start, names, run):
+    """The factor without the landmarks that these peers send behind a camera.
+
+    COLMAP's cost function calls such a point no error at all, and GTSAM's a constant
+    one. Left out until there are none: then all minimise the same function.
+    """
+    while True:
+        lost = []
+        for name in names:
+            there = state_of(run(name, factor), start)
+            lost.append(np.asarray(factor.landmark)[behind(factor, there)])
+        lost = np.unique(np.concatenate([*lost, np.zeros(0, int)]))
+        if not len(lost):
+            return factor
+        factor = without(factor, lost)
+
+
+def run_peer(name, factor, start, python, rtol, steps):
+    """What `peer_<name>.py` finds, and how long it takes."""
+    script = Path(__file__).with_name(f"peer_{name}.py")
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "problem.npz", Path(folder) / "result.npz"
         np.savez(
@@ -114,13 +151,13 @@ def run_ceres(factor, start, python, repeats, rtol):
             pixel=factor.pixel,
             loss=factor.loss.scale,
             rtol=rtol,
+            steps=steps,
+            min_depth=MIN_DEPTH,
         )
-        for _ in range(repeats):
-            subprocess.run([python, str(script), str(given), str(found)], check=True)
-            with np.load(found) as archive:
-                result = dict(archive)
-            times.append((float(result["seconds"]), float(result["processor"])))
-    return result, times
+        command = [python, str(script), str(given), str(found)]
+        subprocess.run(command, check=True, timeout=LIMIT)
+        with np.load(found) as archive:
+            return dict(archive)
 
 
 def state_of(result, start):
