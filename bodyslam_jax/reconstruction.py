@@ -63,18 +63,18 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     guess = sequence.intrinsics
     span = config.structure.landmark_span
-    if guess.is_guess:
-        # While the focal length moves, so does what other sightings say: whole tracks.
-        whole = dataclasses.replace(config.structure, landmark_span=sequence.num_frames)
-        config = dataclasses.replace(config, structure=whole)
+    # Whole tracks, until all that they tell of the path and the focal length is in.
+    whole = dataclasses.replace(config.structure, landmark_span=sequence.num_frames)
+    config = dataclasses.replace(config, structure=whole)
     found = _reconstruct(sequence, tracks, guess, config)
     cameras = _unadjusted(found, guess, config)
     if found.kind != "moving":
         return cameras
-    if not guess.is_guess:
-        return _adjusted(cameras, 1.0, config, None)
-    found = _with_focal(sequence, tracks, cameras, found.error, config)
-    return _cut(found, span) if found.kind == "moving" else found
+    if guess.is_guess:
+        cameras = _with_focal(sequence, tracks, cameras, found.error, config)
+    else:
+        cameras = _adjusted(cameras, 1.0, config, None)
+    return _cut(cameras, span) if cameras.kind == "moving" else cameras
 
 
 def _with_focal(
