@@ -63,8 +63,10 @@ class GraphWeights:
     """The same along the line of sight."""
     root_turning: float | None = 0.015
     """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
-    root_smoothness: float | None = 0.006
-    """Change of the pelvis' step in a frame of 1/30 s, m; free without it."""
+    root_smoothness: float | None = 0.02
+    """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
+    are of 0.006 m; held to that, a camera that goes with the person would be thought to
+    move less, and the world to be smaller."""
     ground_sigma: float | None = 0.04
     """How far the map's ground may be from what people stand on, m: one error for the
     whole sequence. Without it, people need not stand on anything."""
