@@ -141,7 +141,8 @@ def draw_structure(
         )
     axis.set(ylabel="C-ATE, SE(3), mm", yscale="log")
     axis.set_xticks(np.arange(len(rows)), [str(row["sequence"]) for row in rows])
-    axis.legend(fontsize=8, ncols=2, title="simulated")
+    where = "outside upper center"
+    figure.legend(fontsize=8, ncols=4, title="simulated", loc=where)
     figure.savefig(path, dpi=110)
 
 
