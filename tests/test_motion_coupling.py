@@ -67,6 +67,7 @@ def held_to_prediction(factors):
     return [change(f) for f in factors]
 
 
+@pytest.mark.slow
 def test_gradient_holds_the_derivative_of_what_is_coupled():
     problem, state = pad(*make(("translation", "body_pose"), held_to_prediction))
     problem = problem.refresh(state)
