@@ -31,7 +31,7 @@ def build_map(
     A camera that moves along a plane that few points show may be taken for one that
     turns: a map that crosses such a thin place bends there, and no adjustment bends it
     back. From the other side the place may well be crossed rightly. So both are tried,
-    and the map that explains more of the place is kept.
+    and the map that explains more of the place is kept, unless it loses cameras.
 
     Args:
         make: a builder that has not begun yet.
@@ -51,7 +51,12 @@ def build_map(
         other = make()
         starts = first_pairs(pairs[beyond.all(axis=1)], count)
         again = other.build(keyframes, starts)
-        if again is not None and other.threshold <= builder.threshold:
+        located = lambda growing: np.count_nonzero(growing.registered[keyframes])
+        if (
+            again is not None
+            and other.threshold <= builder.threshold
+            and located(again) >= located(grown)
+        ):
             at = np.searchsorted(keyframes, sorted(builder.thin | other.thin))
             away = np.abs(np.arange(len(keyframes))[:, None] - at).min(axis=1)
             near = keyframes[away <= _AROUND]
