@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from bodyslam_jax.frontend._geometry import resect
 from bodyslam_jax.frontend._mapper import Growing
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.frontend._reconstruct import interpolate_poses
-from bodyslam_jax.frontend._structure import Builder
+from bodyslam_jax.frontend._structure import Builder, build_map
 from bodyslam_jax.frontend._video import look_at
 from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence, Tracks
 from bodyslam_jax.synthetic import as_sequence, simulate
@@ -467,6 +468,43 @@ def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
         assert found.registered.all()
         away.append(camera_error(found.T_WC, truth))
     assert away[0] < 0.06 and away[1] > 0.3  # of the path's radius
+
+
+@pytest.mark.parametrize(
+    ("score", "threshold", "located", "kept"),
+    [(0.9, 1.0, 20, 1), (0.7, 1.0, 20, 0), (0.9, 2.0, 20, 0), (0.9, 1.0, 19, 0)],
+)
+def test_a_map_from_beyond_is_kept_only_if_it_is_better(
+    score, threshold, located, kept
+):
+    """It explains more, with the same tolerance, and loses no camera."""
+
+    class Made:
+        config, origin, finished = Structure(), 15, False
+
+        def __init__(self, score, threshold, located, thin):
+            self.threshold, self.thin = threshold, thin
+            self.explained, self.grown = score, SimpleNamespace()
+            self.grown.registered = np.arange(20) < located
+
+        def build(self, keyframes, starts):
+            self.starts = starts
+            return self.grown
+
+        def score(self, grown, frames):
+            np.testing.assert_array_equal(frames, np.arange(20))
+            return self.explained
+
+        def finish(self, grown, keyframes):
+            self.finished = True
+
+    made = [Made(0.8, 1.0, 20, {9: 8, 11: 20}), Made(score, threshold, located, {})]
+    pairs = np.array([[a, a + 4, 0.1, 50] for a in range(16)])
+    waiting = iter(made)
+    best, grown = build_map(lambda: next(waiting), np.arange(20), pairs)
+    assert best is made[kept] and grown is best.grown
+    assert [m.finished for m in made] == [m is best for m in made]
+    assert len(made[1].starts) and made[1].starts.max() < 9
 
 
 def test_points_that_noise_draws_nearer_are_not_preferred():
