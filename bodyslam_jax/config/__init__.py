@@ -1,0 +1,15 @@
+"""Every setting, one frozen class per stage; no JAX here, so that `--help` is quick.
+
+The command line and `config.yaml` are generated from these classes.
+"""
+
+from bodyslam_jax.config._front_end import Association as Association
+from bodyslam_jax.config._front_end import Detect as Detect
+from bodyslam_jax.config._front_end import Structure as Structure
+from bodyslam_jax.config._front_end import Tracking as Tracking
+from bodyslam_jax.config._motion import MotionTraining as MotionTraining
+from bodyslam_jax.config._people import PeopleFit as PeopleFit
+from bodyslam_jax.config._run import Config as Config
+from bodyslam_jax.config._simulation import Experiment as Experiment
+from bodyslam_jax.config._simulation import Simulation as Simulation
+from bodyslam_jax.config._weights import GraphWeights as GraphWeights

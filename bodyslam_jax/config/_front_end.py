@@ -1,0 +1,87 @@
+"""From images to cameras up to scale: people found, points followed, structure."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Detect:
+    """Finding people and keypoints in the images, for who has no keypoints."""
+
+    detector: str | None = None
+    """YOLOX of one's own, an ONNX file; by default YOLOX-S, fetched once."""
+    pose: str | None = None
+    """RTMPose of one's own, an ONNX file; by default DWPose-L 384x288, fetched once."""
+    min_score: float = 0.5
+    """Score of people that are looked at."""
+    max_overlap: float = 0.45
+    """Overlap of two boxes above which they are the same person."""
+    max_people: int = 4
+    """The largest ones in an image that are looked at."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Association:
+    """Which detections in successive frames are the same person."""
+
+    max_people: int = 8
+    """People kept, those that fill most of the video first."""
+    min_duration: float = 0.4
+    """Time that a person must be seen for, s."""
+    max_gap: float = 0.7
+    """Time that a person may be unseen and still be recognised, s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracking:
+    """Points followed through the video (BRISK, KLT, RANSAC)."""
+
+    num_points: int = 200
+    """Points followed at any time."""
+    threshold: int = 20
+    """BRISK's smallest contrast of a corner, grey levels."""
+    octaves: int = 3
+    """BRISK's pyramid, octaves."""
+    cells: int = 8
+    """Cells along the longer side of the image, over which points are spread."""
+    window: int = 21
+    """Side of the window that is followed, px."""
+    max_epipolar: float = 1.5
+    """Distance from the epipolar line beyond which a point is dropped, px."""
+    keyframe_gap: int = 10
+    """Frames over which a point must fit one rigid motion."""
+    person_margin: float = 0.06
+    """Width added around people's keypoints, of the person's height."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """Cameras and map up to scale, from tracks (structure from motion)."""
+
+    max_error: float = 2.0
+    """Reprojection error beyond which an observation is an outlier, px."""
+    min_angle: float = 0.5
+    """Smallest angle between the rays of a point, degrees; less is tried where cameras
+    cannot be located with it."""
+    max_first_pairs: int = 4
+    """Pairs of frames that are tried for the start."""
+    keyframe_motion: float = 0.03
+    """Motion of points between keyframes, of the image's longer side."""
+    static_motion: float = 0.6
+    """Motion of points below which the camera stands still, px."""
+    rotation_error: float = 1.0
+    """Error of a pure rotation below which there is no parallax to use, px."""
+    min_baseline: float = 0.08
+    """Extent of the path below which a camera only turns, of the distance of points."""
+    join_tracks: bool = True
+    """Whether tracks that turn out to be of one point become one landmark."""
+    landmark_span: int = 90
+    """Frames that a landmark of the graph may span: longer tracks are several. A step
+    of the solver costs as much as the square of that."""
+    min_shared: int = 12
+    """Points that two successive frames must share, or there is a cut."""
+    focal_sigma: float = 0.2
+    """How wrong a guessed focal length may be: standard deviation, of the guess."""
+    focal_accuracy: float = 0.08
+    """Standard deviation, of the focal length, above which the guess is kept."""
+    focal_runs: float = 30.0
+    """Observations of a track that count for one, as its errors last."""

@@ -1,0 +1,56 @@
+"""What is simulated, and what experiments run on."""
+
+import dataclasses
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """A simulated sequence: who walks where, who films it, what is measured."""
+
+    sequence: Literal["E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3"] = "M2"
+    """Easy, medium or difficult: how fast the camera moves, turns and shakes."""
+    family: Literal["room", "follow"] = "room"
+    """The camera stays within about a metre and turns, or it goes with the person."""
+    length: int | None = None
+    """Frames at 30 fps; without it the sequence's own, 600 to 1000."""
+    seed: int | None = None
+    """Everything random follows from it; without it the sequence's own."""
+    motion: str | None = None
+    """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
+    noise: Literal["none", "low", "real"] = "real"
+    """Errors of all measurements, unless set apart below."""
+    keypoint_noise: Literal["none", "low", "real"] | None = None
+    """Errors of the keypoints."""
+    body_noise: Literal["none", "low", "real"] | None = None
+    """Errors of the regressed bodies."""
+    track_noise: Literal["none", "low", "real"] | None = None
+    """Errors of the tracked points."""
+    feet_and_face: bool = True
+    """Whether keypoints have BODY_25's feet and face, or the 15 others only."""
+    detector_bias: float = 0.0
+    """0: keypoints are SMPL's joints; 1: hips, neck and shoulders as COCO has them."""
+    render: bool = False
+    """Whether a video is rendered."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What an experiment runs on; its own choice where nothing is said."""
+
+    sequences: tuple[
+        Literal["E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3"], ...
+    ] = ()
+    """Simulated sequences; without them the experiment's own."""
+    family: Literal["room", "follow", "both"] | None = None
+    """Of the simulated sequences; without it the experiment's own."""
+    frames: int | None = None
+    """Frames of each at 30 fps; without it the sequence's own, 600 to 1000."""
+    noise: Literal["none", "low", "real"] = "real"
+    """Errors of all measurements."""
+    motion: str | None = None
+    """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
+    seed: int | None = None
+    """Everything random follows from it; without it the sequence's own."""
+    motion_models: tuple[str, ...] = ()
+    """Other motion models' weights to compare with, for `ablation`."""

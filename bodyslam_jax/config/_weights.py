@@ -1,0 +1,95 @@
+"""What the terms of the graph are trusted to."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class GraphWeights:
+    """What each measurement is trusted to: standard deviations, and losses in them.
+
+    The defaults are inverse covariances of what is measured, with errors that last
+    taken for what they are. `GraphWeights.paper()` has the paper's λ's.
+    """
+
+    pixel_sigma: float = 1.0
+    """Static points, px."""
+    landmark_loss: float = 1.5
+    """Cauchy scale, in `pixel_sigma`."""
+    keypoint_sigma: float | None = None
+    """Keypoints of confidence 1, px; divided by the confidence. Without it, the
+    detector's usual error in metres of the body, as it appears at its distance."""
+    keypoint_inflation: float = 3.0
+    """Factor on the detector's usual error at 30 fps; grows with the root of the frame
+    rate. Errors last for about 0.15 s: taken for independent, keypoints stretch the
+    body by some per cent."""
+    keypoint_loss: float = 3.0
+    """Geman-McClure scale, in `keypoint_sigma` (Bogo et al.: 100 px)."""
+    motion_inflation: float = 1.0
+    """Factor on the motion model's own standard deviation, 1."""
+    step_error: float = 0.05
+    """Error that all of a person's steps share, as a share of them: people differ, and
+    postures are wrong for seconds. Without it steps would outvote the body's size."""
+    fitted_step_error: float = 0.25
+    """The same where bodies are fitted to keypoints: one view hardly shows legs that
+    swing towards it, and steps come out short."""
+    motion_sigma: float | None = None
+    """Instead of the motion model's own covariance, m a frame."""
+    motion_correlation: float = 0.8
+    """Of the motion model's errors in successive frames."""
+    posture_sigma: float = 0.18
+    """Regressed joint rotations, stationary, rad per axis."""
+    posture_correlation: float = 0.96
+    """Of their errors in successive frames at 30 fps."""
+    posture_predicted: bool = False
+    """Whether postures are held to the motion model's prediction instead."""
+    shape_sigma: float = 0.4
+    """Regressed β; one measurement a person, as the regressor errs alike in all."""
+    shape_each_frame: bool = False
+    """Whether each frame counts as a measurement of β of its own."""
+    orientation_sigma: float | None = None
+    """Predicted turns of the person, rad a frame; none without it."""
+    root_sigma: float | None = 0.12
+    """Regressed orientation, stationary, rad per axis; not used without it."""
+    root_correlation: float = 0.96
+    """Of its errors in successive frames at 30 fps."""
+    root_direction: float = 0.015
+    """Regressed place of the person across the line of sight, of the distance; used
+    where there are no keypoints. Errors last as those of orientation do."""
+    root_depth: float = 0.07
+    """The same along the line of sight."""
+    root_turning: float | None = 0.015
+    """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
+    root_smoothness: float | None = 0.02
+    """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
+    are of 0.006 m; held to that, a camera that goes with the person would be thought to
+    move less, and the world to be smaller."""
+    ground_sigma: float | None = 0.04
+    """How far the map's ground may be from what people stand on, m: one error for the
+    whole sequence. Without it, people need not stand on anything."""
+
+    @classmethod
+    def paper(cls) -> "GraphWeights":
+        """λ_lm = 64/b² with b = 2.25 px, λ_mm = 100, λ_posture = λ_shape = 1.
+
+        Its joint weight is read as confidence squared (SMPLify), in px^-2; the scale
+        of its Cauchy loss is not stated.
+        """
+        return cls(
+            pixel_sigma=2.25 / 8,
+            landmark_loss=1.0,
+            keypoint_sigma=1.0,
+            keypoint_loss=100.0,
+            step_error=0.0,
+            fitted_step_error=0.0,
+            motion_sigma=0.1,
+            motion_correlation=0.0,
+            posture_sigma=1.0,
+            posture_correlation=0.0,
+            posture_predicted=True,
+            shape_sigma=1.0,
+            shape_each_frame=True,
+            root_sigma=None,
+            root_turning=None,
+            root_smoothness=None,
+            ground_sigma=None,
+        )
