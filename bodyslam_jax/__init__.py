@@ -5,9 +5,14 @@ only read the version do not wait for JAX.
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+# What is factorised here are small blocks. OpenBLAS, which is loaded with the first, has
+# threads that wait by spinning: ten times slower where other programs run.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
     from bodyslam_jax.body import BodyModel as BodyModel

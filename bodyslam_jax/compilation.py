@@ -5,7 +5,7 @@ traced becomes a part of that.
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -13,7 +13,8 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
-Options = Mapping[str, bool | int]
+from bodyslam_jax.kept import Options, kept
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _OPTIONS = {"xla_cpu_use_fusion_emitters": False}
@@ -30,7 +31,7 @@ def jit_once(function: F) -> F:
 
     @functools.cache
     def effortless():
-        return eqx.filter_jit(function, compiler_options=effortless_options())
+        return kept(function, effortless_options)
 
     @functools.wraps(function)
     def call(*args, **kwargs):

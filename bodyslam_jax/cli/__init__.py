@@ -188,7 +188,6 @@ def _prepare_jax() -> None:
     sys.unraisablehook = _interrupt_again
     # What was asked for is done by then: Ctrl-C could only change what is said of it.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _compile_quickly()
     with _interrupts_held():
         import jax

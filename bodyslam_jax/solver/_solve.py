@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.compilation import is_alone, quick_options
 from bodyslam_jax.graph import VARIABLES, Problem, State
+from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
 from bodyslam_jax.solver._levenberg_marquardt import (
@@ -142,7 +143,7 @@ def run(
 
 @functools.cache
 def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
-    return eqx.filter_jit(_run, compiler_options=quick_options() if alone else None)
+    return kept(_run, quick_options) if alone else eqx.filter_jit(_run)
 
 
 def _run(problem, state, method):
