@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-# What is factorised here are small blocks. OpenBLAS, which is loaded with the first, has
-# threads that wait by spinning: ten times slower where other programs run.
+# Small blocks are factorised here. OpenBLAS, loaded with the first of them, has threads
+# that wait by spinning: ten times slower where other programs run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
