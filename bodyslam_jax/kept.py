@@ -165,8 +165,12 @@ def _compile(function, options, leaves, tree, static, file: Path) -> _Program:
         forms.append(jax.tree.map(place, out))
         return jax.tree.leaves(eqx.filter(out, eqx.is_array))
 
+    _listen()
+    _compiled.before = False
     compiled = jax.jit(run, compiler_options=options).lower(leaves).compile()
     program = _program(compiled, forms[0])
+    if _compiled.before:
+        return program
     try:
         parts = serialize_executable.serialize(compiled)
         # The form itself: equinox' part of a tree's structure is not what it was when
@@ -181,6 +185,29 @@ def _compile(function, options, leaves, tree, static, file: Path) -> _Program:
     return program
 
 
+_compiled = threading.local()
+"""`before`: whether JAX had machine code of its own. Once loaded it cannot be written
+again: what is written then lacks functions."""
+
+
+def _note(event: str, **_: Any) -> None:
+    if event.endswith("/cache_hits"):
+        _compiled.before = True
+
+
+@functools.cache
+def _listen() -> None:
+    jax.monitoring.register_event_listener(_note)
+
+
+@functools.cache
+def _prepare_lapack() -> None:
+    """Has JAX find LAPACK, as it does when it lowers what calls it: a program that
+    comes from disk would call nothing, and end this one."""
+    matrix = jax.ShapeDtypeStruct((2, 2), np.float32)
+    jax.jit(jax.lax.linalg.cholesky).lower(matrix)
+
+
 def _load(file: Path) -> _Program | None:
     """A program from its file; `None` if there is none, or it is damaged."""
     try:
@@ -189,6 +216,7 @@ def _load(file: Path) -> _Program | None:
         if hashlib.sha256(content).digest() != mark:
             return None
         parts, form = pickle.loads(content)
+        _prepare_lapack()
         return _program(serialize_executable.deserialize_and_load(*parts), form)
     except OSError:
         return None

@@ -1,10 +1,14 @@
 """Programs kept on disk say what they said, and are not traced again."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
+from jax.experimental.compilation_cache import compilation_cache
 
 import bodyslam_jax.graph as g
 from bodyslam_jax import kept as kept_
@@ -84,6 +88,34 @@ def test_a_damaged_file_is_made_anew(folder, content):
     assert fresh()(x)["sum"] == 14.0 and len(traced) == 3
 
 
+@pytest.fixture
+def jax_keeps_all(folder):
+    """JAX's own cache takes short compilations too."""
+    names = (
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
+    before = [getattr(jax.config, name) for name in names]
+    for name in names:
+        jax.config.update(name, 0)
+    compilation_cache.reset_cache()
+    yield
+    for name, value in zip(names, before, strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_what_jax_had_compiled_is_not_written_again(folder, jax_keeps_all):
+    """Written again it lacks functions, which shows when it runs."""
+    x = jnp.arange(4.0)
+    fresh()(x)
+    (file,) = folder.iterdir()
+    file.unlink()
+    for count in (2, 3):
+        assert fresh()(x)["sum"] == 14.0
+        assert len(traced) == count and not list(folder.iterdir())
+
+
 def test_what_cannot_be_kept_runs_all_the_same(folder):
     shift = 1.0
     assert kept(lambda x: x + shift, lambda: None)(jnp.ones(())) == 2.0
@@ -116,3 +148,23 @@ def test_the_solver_from_disk_finds_the_same_and_says_so(folder, monkeypatch):
     assert first.status == second.status == "converged"
     np.testing.assert_array_equal(first.state.cameras, second.state.cameras)
     assert first.num_steps == second.num_steps
+
+
+def test_a_program_that_calls_lapack_runs_in_a_new_process(tmp_path):
+    script = tmp_path / "factors.py"
+    script.write_text(
+        "import jax, jax.numpy as jnp\n"
+        f"jax.config.update('jax_compilation_cache_dir', {str(tmp_path)!r})\n"
+        "from bodyslam_jax.kept import kept\n"
+        "def factor(x):\n"
+        "    print('traced')\n"
+        "    return jnp.linalg.cholesky(x)\n"
+        "print(kept(factor, lambda: None)(4 * jnp.eye(2))[1, 1])\n"
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, script], capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert said == [["traced", "2.0"], ["2.0"]]
