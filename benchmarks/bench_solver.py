@@ -2,6 +2,7 @@
 
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
+    python benchmarks/bench_solver.py joint --frames 300 --cache FOLDER  # twice
     python benchmarks/bench_solver.py breakdown --frames 1000
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2 cg
@@ -10,8 +11,9 @@
     python benchmarks/bench_solver.py calibration --frames 20 --repeats 60
 
 Compilation is outside the clock and given by itself; all solvers' results are judged by
-one cost function. Set `OPENBLAS_NUM_THREADS=1`: its threads and XLA's get in each
-other's way. Processor time is beside wall time, which on a shared machine says little.
+one cost function. With `--cache` a second run tells what loading the program takes in
+place of compiling it. Processor time is beside wall time, which on a shared machine
+says little.
 """
 
 import argparse
@@ -155,9 +157,11 @@ def main():
     )
     parser.add_argument("--peer-python", help="has what `peer_*.py` ask for")
     parser.add_argument("--peer-steps", type=int, default=100, help="at most")
+    parser.add_argument("--cache", help="keep programs in this folder, as commands do")
     args = parser.parse_args()
     dtype = np.float32 if args.float32 else np.float64
     jax.config.update("jax_enable_x64", not args.float32)
+    jax.config.update("jax_compilation_cache_dir", args.cache)
     if args.what == "growth":
         growth(args.frames, args.steps)
         return
