@@ -410,3 +410,13 @@ def test_gradient_with_people_and_a_motion_model_is_that_of_solving_again():
         behind[which] -= size
         numeric = (at(ahead) - at(behind)) / (2 * size)
         assert float(slopes[which]) == pytest.approx(float(numeric), rel=5e-3)
+
+
+def test_a_stage_ends_where_a_step_would_gain_less_than_its_tolerance():
+    """Within that of the optimum, as steps shrink fast there; and says so."""
+    problem, _, start = make()
+    best = solve(problem, start, schedule=TIGHT)
+    found = solve(problem, start, schedule=(Stage(rtol=0.0, atol=0.05),))
+    assert found.status == "converged"
+    assert 0 <= found.cost - best.cost < 0.05
+    assert found.num_steps[0] < best.num_steps[0]

@@ -56,6 +56,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Steps at most; a stage with none is left out."""
     rtol: Float[Array, " s"]
     """A stage ends when an undisturbed step lowers the cost by less than this share."""
+    atol: Float[Array, " s"]
+    """Or by less than this."""
     damping: Float[Array, ""]
     """At the first step of a stage; 0 is Gauss-Newton, with step control left to
     `GAIN`."""
@@ -63,7 +65,6 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Whether to factorise once more at the end, hardly damped, for covariances."""
     length: int = eqx.field(static=True)
     """Of the history."""
-    atol: float = 0.0
     norm: Callable[..., Any] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -154,7 +155,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         eps = float(jnp.finfo(dtype).eps)
         floor = 8 * eps * known + eps**1.25
         tiny = predicted <= floor
-        small = predicted <= jnp.maximum(self.rtol[at] * known, floor)
+        enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
+        small = predicted <= jnp.maximum(enough, floor)
         done = finite & (tiny | (small & accept & (damping <= 1e-2)))
         stuck = ~accept & ~done & (higher > MAX_DAMPING)
         broken = ~jnp.isfinite(known)

@@ -35,6 +35,8 @@ class Stage:
     max_steps: int = 50
     rtol: float = 1e-8
     """Relative decrease of the cost at which to stop."""
+    atol: float = 0.0
+    """The same in units of the cost: a half is what a standard deviation is worth."""
 
 
 PAPER_SCHEDULE = (
@@ -121,6 +123,7 @@ def method_of(
         free=jnp.asarray([[v in s.free for v in VARIABLES] for s in stages], dtype),
         limit=jnp.asarray([s.max_steps for s in stages]),
         rtol=jnp.asarray([s.rtol for s in stages], dtype),
+        atol=jnp.asarray([s.atol for s in stages], dtype),
         damping=jnp.asarray(damping, dtype),
         keep=jnp.asarray(keep),
         length=HISTORY * max(1, -(-longest // HISTORY)),
