@@ -70,16 +70,20 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     problem = g.make_problem(problem.factors, start, motion=predictor)
     full = problem.cost_by_term(start)
     for name in ("no keypoints", "no motion model", "no regressed postures"):
-        found = experiments.VARIANTS[name](problem, start).cost_by_term(start)
+        found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
         off = {k for k, v in found.items() if v != full[k]}
         assert len(off) == 1 and float(found[off.pop()]) == 0, name
     for name in ("with stance foot", "with steady camera", "with up direction"):
-        found = experiments.VARIANTS[name](problem, start).cost_by_term(start)
+        found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
         assert len(found) == len(full) + 1
-    still = experiments.VARIANTS["nothing that sees scale"](problem, start)
+    still, _ = experiments.VARIANTS["nothing that sees scale"](problem, start)
     assert not still.free.scale.any() and still.free.poses.all()
-    held = experiments.VARIANTS["β held at the regressor's"](problem, start)
+    held, state = experiments.VARIANTS["β held at the regressor's"](problem, start)
     assert not held.free.shapes.any() and held.free.poses.all()
+    (said,) = (factor for factor in problem.factors if isinstance(factor, g.Shape))
+    regressed = said.shape[0][np.isfinite(np.asarray(said.sigma)[0]).all(axis=-1)]
+    assert not np.allclose(start.shapes[0], regressed.mean(axis=0))
+    np.testing.assert_allclose(state.shapes[0], regressed.mean(axis=0))
     low = carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
     assert low.shape == (1, 12, 4) and not low[:, 0].any()
     assert (low.sum(axis=-1) <= 1).all()

@@ -32,8 +32,8 @@ def ablate(
     case: Case, prepared: joint.Prepared, variant: str
 ) -> dict[str, float | str]:
     """Errors of one of `VARIANTS`, solved from the start of the full problem, m."""
-    problem = VARIANTS[variant](prepared.problem, prepared.state)
-    solution, stage = joint.solve_stage(problem, prepared.state, case.config, "joint")
+    problem, start = VARIANTS[variant](prepared.problem, prepared.state)
+    solution, stage = joint.solve_stage(problem, start, case.config, "joint")
     return _row(case, prepared, solution.state, stage)
 
 
