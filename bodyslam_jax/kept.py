@@ -166,8 +166,10 @@ def _compile(function, options, leaves, tree, static, file: Path) -> _Program:
         return jax.tree.leaves(eqx.filter(out, eqx.is_array))
 
     _listen()
+    lowered = jax.jit(run, compiler_options=options).lower(leaves)
+    # Tracing may run small programs of its own, which JAX has: only this one counts.
     _compiled.before = False
-    compiled = jax.jit(run, compiler_options=options).lower(leaves).compile()
+    compiled = lowered.compile()
     program = _program(compiled, forms[0])
     if _compiled.before:
         return program
