@@ -41,6 +41,7 @@ from bodyslam_jax.graph._robust import Cauchy as Cauchy
 from bodyslam_jax.graph._robust import GemanMcClure as GemanMcClure
 from bodyslam_jax.graph._robust import Squared as Squared
 from bodyslam_jax.graph._robust import lift as lift
+from bodyslam_jax.graph._robust import squared_norm as squared_norm
 from bodyslam_jax.graph._state import State as State
 from bodyslam_jax.graph._state import Step as Step
 from bodyslam_jax.graph._state import gauge as gauge

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph._robust import AbstractLoss
+from bodyslam_jax.graph._robust import AbstractLoss, squared_norm
 from bodyslam_jax.graph._state import State
 
 Touch = tuple[str, int]
@@ -49,7 +49,7 @@ class AbstractFactor(eqx.Module):
 
     def cost(self, state: State) -> Float[Array, ""]:
         """Negative log-likelihood: `0.5 sum rho(|r|^2)`."""
-        s = jnp.sum(residual_of(self, state) ** 2, axis=-1)
+        s = squared_norm(residual_of(self, state))
         return 0.5 * jnp.sum(self.loss.rho(s))
 
 

@@ -41,7 +41,8 @@ class Reprojection(AbstractFactor):
     def residual(self, state: State) -> Float[Array, "m 2"]:
         camera = state.cameras[self.frame]
         offset = state.landmarks[self.landmark] - camera[:, :3, 3]
-        p_C = jnp.einsum("mji,mj->mi", camera[:, :3, :3], offset)
+        # Fused sums: a product for each observation would be far too small.
+        p_C = sum(camera[:, j, :3] * offset[:, j, None] for j in range(3))
         return (project(state.intrinsics, p_C) - self.pixel) / self.sigma[:, None]
 
 

@@ -64,11 +64,10 @@ def assemble(
         people = _roots(people, lin, sizes, base, damping["root"])
     if postures is not None:
         people = _separators(people, lin, sizes, postures, border)
-        part = border.globals
-        keep = jnp.arange(part.start, part.stop + 1)
+        part = border.globals.start
         for person in range(h):
             index = jnp.append(own_to_global(sizes, person), g)
-            total = jnp.sum(postures.border[person], axis=0)[keep[:, None], keep]
+            total = jnp.sum(postures.border[person, :, part:, part:], axis=0)
             corner = corner.at[index[:, None], index].add(total)
     i = sizes.intrinsics
     if i:

@@ -15,6 +15,7 @@ from bodyslam_jax.graph import (
     Problem,
     State,
     inverse_right_jacobian,
+    squared_norm,
 )
 from bodyslam_jax.solver._blocks import Sums
 
@@ -41,7 +42,7 @@ def linearise_frames(
         return
     joint = factor.per_joint
     residual, parts = _derivatives(factor, touches, state, sums)
-    s = jnp.sum(residual**2, axis=-1)
+    s = squared_norm(residual)
     sums.costs.append(0.5 * jnp.sum(factor.loss.rho(s)))
     root_weight = jnp.sqrt(factor.loss.weight(s))[..., None]
     if not factor.of_people:

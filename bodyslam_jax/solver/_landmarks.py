@@ -106,7 +106,10 @@ def substitute_landmarks(
         problem.layout.buckets, tables, damping, strict=True
     ):
         step = cameras[frames_of(bucket.first_chunk, bucket.width)]
-        right = -table.gradient - jnp.einsum("nfabg,nfa->nbg", table.cross, step)
+        n, g = len(step), table.own.shape[-1]
+        # In the order that the tables have: `einsum` would have them in another first.
+        taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
+        right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
         moved = solve_landmarks(half_inverse(table, damp), right)
         out = out.at[bucket.landmark].set(jnp.moveaxis(moved, 1, 2), mode="drop")

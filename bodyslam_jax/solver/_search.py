@@ -15,6 +15,7 @@ from bodyslam_jax.graph import (
     Reprojection,
     State,
     residual_of,
+    squared_norm,
 )
 
 
@@ -87,7 +88,7 @@ def _by_landmark(
     problem: Problem, tracks: Reprojection, state: State
 ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
     """Twice the cost of each landmark's observations, and of what else is known."""
-    rho = lambda f: f.loss.rho(jnp.sum(residual_of(f, state) ** 2, axis=-1))
+    rho = lambda f: f.loss.rho(squared_norm(residual_of(f, state)))
     none = jnp.zeros(len(state.landmarks), state.scale.dtype)
     known = none
     for factor in problem.factors:

@@ -66,9 +66,11 @@ def linearise_landmarks(
     # Fused sums: a matrix product for each frame of a piece would be far too small.
     gram = jnp.sum(wide[:, :, :, None] * wide[:, :, None], axis=-1)
     if "cameras" in sizes.variables:
-        of_camera = jnp.zeros((sizes.chunks, CHUNK, 6, gram.shape[-1]), dtype)
-        of_camera = of_camera.at[seen.chunk].add(gram[:, :, :6])
-        of_camera = of_camera.reshape(-1, *of_camera.shape[2:])
+        # As a product: a scatter would take its pieces one by one.
+        chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
+        belongs = (chunk == seen.chunk).astype(dtype)
+        of_camera = belongs @ gram[:, :, :6].reshape(len(gram), -1)
+        of_camera = of_camera.reshape(-1, 6, gram.shape[-1])
         sums.add(("alone", "alone", 0), of_camera[..., :6])
         sums.add_gradient("camera_alone", of_camera[..., -1])
         if sizes.intrinsics:
