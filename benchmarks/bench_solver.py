@@ -40,8 +40,9 @@ from bodyslam_jax.solver._landmarks import eliminate_landmarks
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, solve_step
 from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._people import border_of, eliminate_postures
+from bodyslam_jax.solver._people import eliminate_people
 from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver._window import window_of
 
 
 def report(name, problem, truth, start, schedule, repeats):
@@ -89,12 +90,13 @@ def breakdown(problem, state, repeats):
         damping["landmarks"],
         sizes,
     )
-    postures, border = None, border_of(lin, sizes)
-    if "pose" in damping:
-        postures = part("postures", eliminate_postures, lin, sizes, damping["pose"])
-    chunks = part("assembly", assemble, lin, sizes, reduced, postures, border, damping)
+    people, window = None, window_of(lin, sizes)
+    if sizes.people:
+        people = part("people", eliminate_people, lin, sizes, window, damping)
+    kept = None if people is None else people.kept
+    chunks = part("assembly", assemble, lin, sizes, reduced, kept, window, damping)
     factor = part("factorisation", factorise, chunks, sizes)
-    whole = Eliminated(damping, postures, border, factor)
+    whole = Eliminated(damping, window, people, factor)
     part("back-substitution", solve_step, problem, state, lin, sizes, whole)
 
 

@@ -1,5 +1,6 @@
 """The structured solver against dense algebra, stock solvers and the truth."""
 
+import dataclasses
 import importlib
 from pathlib import Path
 
@@ -12,8 +13,15 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver import Stage, clock, marginals, observability, solve
-from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver import (
+    Stage,
+    clock,
+    marginals,
+    observability,
+    restrict,
+    solve,
+)
+from bodyslam_jax.solver._blocks import mask_of, sizes_of
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
@@ -54,7 +62,7 @@ def make(
 def dense(problem, state):
     """Jacobian and residual of a problem in its free coordinates, without structure."""
     zero, unravel = ravel_pytree(state.zero_step())
-    mask, _ = ravel_pytree(problem.free)
+    mask, _ = ravel_pytree(mask_of(problem))
 
     @jax.jit
     def residual(x):
@@ -92,10 +100,26 @@ def unpadded(step, state):
             {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
             marks=pytest.mark.slow,
         ),
+        # Without postures, and without anything that ties a person's frames.
+        pytest.param(
+            {"frames": 23, "people": 2, "held": "poses"}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"frames": 12, "people": 1, "held": "poses", "without": g.HumanMotion},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"frames": 12, "people": 1, "without": g.HumanMotion},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_step_is_that_of_the_dense_normal_equations(options):
+    held, without = options.pop("held", None), options.pop("without", ())
     problem, _, state = make(1, **options)
+    kept = tuple(f for f in problem.factors if not isinstance(f, without))
+    problem = dataclasses.replace(problem, factors=kept)
+    problem = restrict(problem, tuple(set(g.VARIABLES) - {held}))
     jac, residual = dense(problem, state)
     hessian, damping = jac.T @ jac, 1e-3
     diagonal = np.diag(hessian)
@@ -235,8 +259,17 @@ def test_single_precision_reaches_the_same_optimum():
     assert float(single.cost) == pytest.approx(float(double.cost), rel=1e-4)
 
 
-def test_marginal_covariances_are_blocks_of_the_inverse():
-    problem, state, _ = make(9, frames=24, landmarks=150, known=True)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"frames": 24, "landmarks": 150, "known": True},
+        pytest.param(
+            {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_marginal_covariances_are_blocks_of_the_inverse(options):
+    problem, state, _ = make(9, **options)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac
     diagonal = np.diag(hessian)
@@ -247,11 +280,15 @@ def test_marginal_covariances_are_blocks_of_the_inverse():
 
     def metric(x):
         moved = state.retract(unravel(x))
-        return moved.scale * moved.cameras[:, :3, 3], moved.scale * moved.landmarks
+        centres = moved.scale * moved.cameras[:, :3, 3]
+        pelvis = g.world_from_root(moved)[..., :3, 3].reshape(-1, 3)
+        return centres, moved.scale * moved.landmarks, pelvis
 
     spread = marginals(problem, state)
-    found = spread.cameras, spread.landmarks
+    found = spread.cameras, spread.landmarks, spread.people.reshape(-1, 3, 3)
     for by_step, block in zip(jax.jacfwd(metric)(zero), found, strict=True):
+        if not len(block):
+            continue
         expected = np.einsum("lin,nm,ljm->lij", by_step, inverse, by_step)
         size = np.trace(expected, axis1=1, axis2=2)
         error = abs(np.asarray(block) - expected).max(axis=(1, 2))

@@ -274,9 +274,12 @@ def _check_memory(layout, state):
     """Refuses what cannot fit: bytes grow linearly with frames, and say so."""
     item = state.scale.dtype.itemsize
     people = len(state.roots)
-    front = CHUNK * 6 * layout.bandwidth + people * (69 + 6 * CHUNK + 10) + 16
-    pivot = 6 * CHUNK + people * (69 + 6 * CHUNK)
-    chunk = 3 * pivot * front + people * CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)
+    person = 69 + 12  # what stays of a chunk: a posture and two roots
+    front = CHUNK * 6 * layout.bandwidth + people * (person + 10) + 16
+    pivot = 6 * CHUNK + people * person
+    window = 2 * person + 6 * CHUNK + 24
+    postures = CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)
+    chunk = 3 * pivot * front + people * (window**2 + postures)
     tables = sum(40 * bucket.row.size for bucket in layout.buckets)
     need = item * (chunk * layout.num_chunks + tables)
     have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

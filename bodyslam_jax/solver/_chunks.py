@@ -22,46 +22,45 @@ class Factor(eqx.Module):
 
     half: Float[Array, "n q q"]
     """`L^-1` of each pivot."""
-    side: Float[Array, "n q r"]
-    """`L^-1` times the coupling; last column is the right-hand side's."""
+    side: Float[Array, "n r q"]
+    """`L^-1` times the coupling, transposed; the last row is the right-hand side's."""
     corner: Float[Array, "g1 g1"]
 
 
 def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     """Slides the front along the chunks."""
-    n, q, r = chunks.coupling.shape
+    n, r, q = chunks.coupling.shape
     tail = sizes.globals + 1
     head = q - CAMERAS
     middle = r - head - CAMERAS - tail
     dtype = chunks.pivot.dtype
+    gap = lambda height: jnp.zeros((height, q), dtype)
 
     def step(front, chunk):
         pivot, coupling = chunk
-        pivot = pivot + front[:q, :q]
-        known = front[:q, q:]
-        gap = jnp.zeros((q, head), dtype), jnp.zeros((q, CAMERAS), dtype)
+        known = front[q:, :q]
         coupling = coupling + jnp.concatenate(
-            [gap[0], known[:, :middle], gap[1], known[:, middle:]], axis=1
+            [gap(head), known[:middle], gap(CAMERAS), known[middle:]]
         )
-        # The upper part of the front is all there is of it.
-        half = half_of(pivot.T)
-        side = half @ coupling
+        # The lower part of the front is all there is of it.
+        half = half_of(pivot + front[:q, :q])
+        side = coupling @ half.T
         rest = _spread(front[q:, q:], head, middle)
-        return rest - _upper_square(side, tail), (half, side)
+        return rest - _lower_square(side, tail), (half, side)
 
     front = jnp.zeros((r, r), dtype)
     front, (half, side) = jax.lax.scan(step, front, (chunks.pivot, chunks.coupling))
     return Factor(half, side, chunks.corner + front[-tail:, -tail:])
 
 
-def _upper_square(side: Array, tail: int) -> Array:
-    """`side^T side` above the diagonal, in three strips; the last `tail` in full."""
-    width = side.shape[1]
+def _lower_square(side: Array, tail: int) -> Array:
+    """`side side^T` below the diagonal, in three strips; the last `tail` in full."""
+    width = side.shape[0]
     cuts = [0, width // 3, min(2 * width // 3, width - tail), width]
     strips = []
     for start, stop in itertools.pairwise(cuts):
-        strip = side[:, start:stop].T @ side[:, start:]
-        strips.append(jnp.pad(strip, ((0, 0), (start, 0))))
+        strip = side[start:stop] @ side[:stop].T
+        strips.append(jnp.pad(strip, ((0, 0), (0, width - stop))))
     return jnp.concatenate(strips)
 
 
@@ -87,7 +86,7 @@ def back_substitute(
     factor: Factor, sizes: Sizes
 ) -> tuple[Float[Array, "n q"], Float[Array, " g"]]:
     """Steps of all chunks, and of the globals."""
-    n, q, r = factor.side.shape
+    n, r, q = factor.side.shape
     g = sizes.globals
     head = q - CAMERAS
     corner = factor.corner
@@ -96,8 +95,9 @@ def back_substitute(
 
     def step(following, chunk):
         half, side = chunk
-        known = jnp.concatenate([following, common])
-        here = half.T @ (side[:, -1] - side[:, :-1] @ known)
+        # -1 for the right-hand side: the whole table, without a copy of a part.
+        known = jnp.concatenate([following, common, -jnp.ones_like(common[:1])])
+        here = -half.T @ (known @ side)
         kept = following[head : r - g - 1 - CAMERAS]
         return jnp.concatenate([here[:head], here[head:], kept]), here
 

@@ -21,7 +21,9 @@ from bodyslam_jax.solver._levenberg_marquardt import little
 from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._normal import damped, diagonals
 from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._people import Roots
 from bodyslam_jax.solver._solve import method_of, run
+from bodyslam_jax.solver._window import Window, window_of
 
 
 class Marginals(eqx.Module):
@@ -63,7 +65,8 @@ def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     damping = damped(
         diagonals(lin, sizes), jnp.asarray(little(state.scale.dtype), state.scale.dtype)
     )
-    fronts, windows, common = _selected_inverse(factor, sizes)
+    pairs, windows, common = _selected_inverse(factor, sizes)
+    fronts = _with_inner(pairs, final.roots, window_of(lin, sizes), sizes)
     common = common * _outer(_free_globals(problem, sizes))
     cameras, people = _centres(problem, state, sizes, fronts)
     landmarks = _landmarks(problem, state, sizes, lin, damping, windows)
@@ -97,10 +100,10 @@ def _free_globals(problem: Problem, sizes: Sizes) -> Array:
 
 def _selected_inverse(
     factor: Factor, sizes: Sizes
-) -> tuple[Float[Array, "n f f"], Float[Array, "n w w"], Float[Array, "g g"]]:
-    """Covariance of each chunk with the globals; of the cameras of its band with them;
-    of the globals."""
-    _, q, r = factor.side.shape
+) -> tuple[Float[Array, "n p p"], Float[Array, "n w w"], Float[Array, "g g"]]:
+    """Covariance of each chunk with the one before and the globals; of the cameras of
+    its band with them; of the globals."""
+    _, r, q = factor.side.shape
     g = sizes.globals
     head = q - CAMERAS
     middle = r - 1 - g - head - CAMERAS
@@ -111,23 +114,77 @@ def _selected_inverse(
     start = jnp.zeros((r - 1, r - 1), dtype).at[-g:, -g:].set(common)
     last = jnp.arange(g) + q + r - 1 - g
     kept = jnp.concatenate([jnp.arange(q), q + head + jnp.arange(middle), last])
-    front = jnp.concatenate([jnp.arange(q), last])
+    pair = jnp.concatenate([jnp.arange(2 * q), last])
     window = jnp.concatenate(
         [head + jnp.arange(CAMERAS), q + head + jnp.arange(CAMERAS + middle), last]
     )
 
     def step(known, chunk):
         half, side = chunk
-        gain = half.T @ side[:, :-1]
+        gain = half.T @ side[:-1].T
         mixed = -gain @ known
         own = half.T @ half - mixed @ gain.T
         whole = jnp.block([[own, mixed], [mixed.T, known]])
         part = lambda index: whole[index[:, None], index[None, :]]
-        return part(kept), (part(front), part(window))
+        return part(kept), (part(pair), part(window))
 
     chunks = (factor.half, factor.side)
-    _, (fronts, windows) = jax.lax.scan(step, start, chunks, reverse=True)
-    return fronts, windows, common
+    _, (pairs, windows) = jax.lax.scan(step, start, chunks, reverse=True)
+    # Of a chunk and the next; before the first there is none.
+    own = jnp.concatenate([jnp.arange(q), 2 * q + jnp.arange(g)])
+    first = jnp.zeros_like(pairs[0])
+    at = jnp.concatenate([q + jnp.arange(q), 2 * q + jnp.arange(g)])
+    first = first.at[at[:, None], at].set(pairs[0][own[:, None], own])
+    return jnp.concatenate([first[None], pairs[:-1]]), windows, common
+
+
+def _with_inner(
+    pairs: Float[Array, "n f f"], roots: Roots | None, window: Window, sizes: Sizes
+) -> Float[Array, "n _ _"]:
+    """Covariance of all roots of each chunk, person by person, its cameras, and the
+    globals: eliminated roots follow from what was kept, with a spread of their own."""
+    g, last, width = sizes.globals, 6 * window.reach, window.person
+    q = (pairs.shape[-1] - g) // 2
+    eye = jnp.eye(pairs.shape[-1], dtype=pairs.dtype)
+    own_roots = q + width - last + jnp.arange(last)
+    kept = jnp.arange(q - CAMERAS, q + g) + q
+    at = [
+        jnp.concatenate(
+            [
+                p * width + jnp.arange(width),
+                q - last + jnp.arange(last),
+                q + p * width + jnp.arange(width),
+                2 * q - CAMERAS + jnp.arange(CAMERAS),
+                2 * q + own_to_global(sizes, p),
+            ]
+        )
+        for p in range(sizes.people)
+    ]
+
+    def one(chunk):
+        known, roots = chunk
+        rows, spread = [], jnp.zeros((0, 0), known.dtype)
+        for p, index in enumerate(at):
+            half = roots.half[p]
+            gain = -half.T @ roots.side[p, :-1].T
+            rows.append(
+                jnp.zeros((len(half), len(eye)), eye.dtype).at[:, index].set(gain)
+            )
+            rows.append(eye[p * width + own_roots])
+            spread = _diagonal(spread, half.T @ half, last)
+        rows.append(eye[kept])
+        turn = jnp.concatenate(rows)
+        return turn @ known @ turn.T + _diagonal(spread, eye[:0, :0], len(kept))
+
+    by_chunk = jax.tree.map(lambda x: x.swapaxes(0, 1), roots)
+    return jax.lax.map(one, (pairs, by_chunk))
+
+
+def _diagonal(first: Array, second: Array, more: int) -> Array:
+    """Two blocks down a diagonal, and `more` of zeros."""
+    a, b = len(first), len(second)
+    first = jnp.pad(first, ((0, b + more),) * 2)
+    return first + jnp.pad(second, ((a, more),) * 2)
 
 
 def _centres(problem, state, sizes, fronts):

@@ -185,7 +185,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             stage=following,
             prediction=prediction,
             observations=state.observations,
-            final=Final(lin, eliminated.factor),
+            final=final_of(lin, eliminated),
             stale=accept | over,
             damping=jnp.where(over, self.damping, new_damping).astype(dtype),
             caution=jnp.where(accept, caution, state.caution),
@@ -233,7 +233,12 @@ def _first(problem, observations, state):
     lin, prediction = _linearise_anew(problem, observations, state)
     sizes = sizes_of(problem, state)
     extra = damped(diagonals(lin, sizes), jnp.ones_like(state.scale))
-    return Final(lin, eliminate(problem, lin, sizes, extra).factor), prediction
+    return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
+
+
+def final_of(lin, eliminated) -> Final:
+    people = eliminated.people
+    return Final(lin, eliminated.factor, None if people is None else people.roots)
 
 
 def _linearise_anew(problem, observations, state):

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.solver._blocks import Linearisation, Observations
 from bodyslam_jax.solver._chunks import Factor
+from bodyslam_jax.solver._people import Roots
 
 
 class History(eqx.Module):
@@ -31,6 +32,8 @@ class Final(eqx.Module):
 
     lin: Linearisation
     factor: Factor
+    roots: Roots | None
+    """Of the people's roots that were eliminated within chunks."""
 
 
 class Loop(eqx.Module):

@@ -19,23 +19,17 @@ from bodyslam_jax.solver._landmarks import (
     eliminate_landmarks,
     substitute_landmarks,
 )
-from bodyslam_jax.solver._people import (
-    POSE,
-    Border,
-    Postures,
-    border_of,
-    eliminate_postures,
-    pose_diagonal,
-    substitute_postures,
-)
+from bodyslam_jax.solver._people import People, eliminate_people, substitute_people
+from bodyslam_jax.solver._postures import pose_diagonal
+from bodyslam_jax.solver._window import Window, window_of
 
 
 class Eliminated(eqx.Module):
     """All that back-substitution needs."""
 
     damping: dict
-    postures: Postures | None
-    border: Border
+    window: Window
+    people: People | None
     factor: Factor
 
 
@@ -78,12 +72,13 @@ def eliminate(
 ) -> Eliminated:
     """Factorises the damped normal equations."""
     reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
-    border = border_of(lin, sizes)
-    postures = None
-    if "pose" in damping:
-        postures = eliminate_postures(lin, sizes, damping["pose"])
-    chunks = assemble(lin, sizes, reduced, postures, border, damping)
-    return Eliminated(damping, postures, border, factorise(chunks, sizes))
+    window = window_of(lin, sizes)
+    people = None
+    if sizes.people:
+        people = eliminate_people(lin, sizes, window, damping)
+    kept = None if people is None else people.kept
+    chunks = assemble(lin, sizes, reduced, kept, window, damping)
+    return Eliminated(damping, window, people, factorise(chunks, sizes))
 
 
 @eqx.filter_jit
@@ -98,17 +93,17 @@ def solve_step(
     h, n = sizes.people, sizes.chunks
     steps, common = back_substitute(eliminated.factor, sizes)
     head = steps.shape[1] - CAMERAS
-    hb = head // h if h else 0
-    people = steps[:, :head].reshape(n, h, hb).swapaxes(0, 1)
     cameras = steps[:, head:].reshape(n * CAMERAS // 6, 6)
-    base = hb - CAMERAS if h else 0
-    roots = people[..., base:].reshape(h, n * CAMERAS // 6, 6)
     zero = state.zero_step()
-    poses = zero.poses
+    roots, poses = zero.roots, zero.poses
+    if eliminated.people is not None:
+        steps = steps[:, :head].reshape(n, h, -1).swapaxes(0, 1)
+        own = jnp.stack([common[own_to_global(sizes, p)] for p in range(h)])
+        roots, moved = substitute_people(
+            eliminated.people, sizes, eliminated.window, steps, cameras, own
+        )
+        poses = poses if moved is None else moved.reshape(poses.shape)
     i = sizes.intrinsics
-    if eliminated.postures is not None:
-        poses = _postures(sizes, eliminated, people, cameras, roots, common)
-        poses = poses.reshape(zero.poses.shape)
     intrinsics = common[1 : 1 + i] if i else zero.intrinsics
     landmarks = substitute_landmarks(
         problem,
@@ -127,25 +122,6 @@ def solve_step(
         landmarks=landmarks,
         intrinsics=intrinsics,
     )
-
-
-def _postures(sizes, eliminated, people, cameras, roots, common):
-    h, n = sizes.people, sizes.chunks
-    border = eliminated.border
-    later = lambda x: jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
-    separator = people[..., :POSE]
-    chunk_roots = roots.reshape(h, n, CAMERAS)
-    chunk_cameras = jnp.broadcast_to(cameras.reshape(1, n, CAMERAS), (h, n, CAMERAS))
-    parts = [later(separator)]
-    if border.cross:
-        parts += [later(chunk_roots[..., -6:]), later(chunk_cameras[..., -6:])]
-    parts.append(chunk_roots)
-    if border.cross:
-        parts.append(chunk_cameras)
-    own = jnp.stack([common[own_to_global(sizes, p)] for p in range(h)])
-    parts.append(jnp.broadcast_to(own[:, None], (h, n, own.shape[-1])))
-    known = jnp.concatenate(parts, axis=-1)
-    return substitute_postures(eliminated.postures, known, separator)
 
 
 def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:

@@ -1,9 +1,10 @@
-"""Eliminates postures: a chain in time, cut into chunks that are eliminated together.
+"""Eliminates what a person has within a chunk: postures but the last, roots but the
+last ones.
 
-Inside a chunk of B frames the 69 joint coordinates of all frames but the last go, frame
-after frame, the same step in all chunks and people at once. What they leave couples the
-`border` of the chunk: the last posture before it, its own last posture (separators),
-its roots, and the person's globals. Exact; about 7 MFLOP a frame.
+Chunks are worked on a group at a time, so that what they need stays in the processor's
+cache: first the postures (`_postures.py`), then the roots all at once. What is left
+couples the last posture and roots of a chunk with those of the chunk before, with the
+cameras of both, and with the globals.
 """
 
 import equinox as eqx
@@ -13,125 +14,70 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation, Sizes
+from bodyslam_jax.solver._postures import (
+    Postures,
+    border_of,
+    eliminate_postures,
+    posture_blocks,
+    substitute_postures,
+)
 from bodyslam_jax.solver._triangular import half_of
+from bodyslam_jax.solver._window import (
+    KEPT,
+    POSE,
+    Pairs,
+    Window,
+    add_pairs,
+    matrix_of,
+    spread,
+)
 
-POSE = 69
 GROUP = 16
 """Chunks eliminated together, at most."""
 
 
-class Border(eqx.Module):
-    """Columns of a chunk's border; the last column of all is the right-hand side."""
+class Roots(eqx.Module):
+    """The factor of inner roots: `L^-1` of their pivot, and of their coupling with the
+    kept groups, transposed; its last row is the right-hand side's."""
 
-    cross: bool = eqx.field(static=True)
-    """Whether postures couple with cameras, or with roots of other frames."""
-    own_globals: int = eqx.field(static=True)
-
-    @property
-    def before(self) -> slice:
-        """Last posture of the chunk before; with `cross`, its last root and camera."""
-        return slice(0, POSE + (12 if self.cross else 0))
-
-    @property
-    def roots(self) -> slice:
-        start = self.before.stop
-        return slice(start, start + 6 * CHUNK)
-
-    @property
-    def cameras(self) -> slice:
-        start = self.roots.stop
-        return slice(start, start + (6 * CHUNK if self.cross else 0))
-
-    @property
-    def globals(self) -> slice:
-        start = self.cameras.stop
-        return slice(start, start + self.own_globals)
-
-    @property
-    def rhs(self) -> int:
-        return self.globals.stop
+    half: Float[Array, "*n m m"]
+    side: Float[Array, "*n k m"]
 
 
-class Postures(eqx.Module):
-    """What elimination leaves, and what back-substitution needs; axes `h n`, or
-    one group of chunks."""
+class People(eqx.Module):
+    """What elimination leaves, and what back-substitution needs."""
 
-    half: Float[Array, "*h n e 69 69"]
-    """`L^-1` of each pivot `L L^T`, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "*h n e 69 b"]
-    """`L^-1` times border columns."""
-    link: Float[Array, "*b r r"]
-    """Coupling of the next frame (rows) with each eliminated one; joint by joint (23
-    of 3 x 3) where joints do not interact over time."""
-    separator: Float[Array, "*h n 69 69"]
-    separator_border: Float[Array, "*h n 69 b"]
-    border: Float[Array, "*h n b b"]
-    """To be added to the border's own blocks (negative)."""
+    postures: Postures | None
+    """Leading axes `h n`."""
+    roots: Roots
+    kept: Float[Array, "*n k k"]
+    """Between the groups `KEPT` of each chunk's window."""
 
 
-def border_of(lin: Linearisation, sizes: Sizes) -> Border:
-    cross = any(
-        key[0] == "pose" and (key[1] == "camera" or (key[1] == "root" and key[2]))
-        for key in lin.blocks
-    )
-    return Border(cross, sizes.own_globals)
-
-
-def _pose_blocks(blocks: dict, damping: Float[Array, "*b 69"]) -> tuple[Array, Array]:
-    """Postures with themselves, `*b 69 69`, and with those of the frame before, like
-    `Postures.link`."""
-    dtype = damping.dtype
-    own = damping[..., None] * jnp.eye(POSE, dtype=dtype)
-    if ("pose", "pose", 0) in blocks:
-        own = own + blocks["pose", "pose", 0]
-    if ("joint", "joint", 0) in blocks:
-        own = own + _to_dense(blocks["joint", "joint", 0])
-    none = jnp.zeros((*damping.shape[:-1], 23, 3, 3), dtype)
-    link = blocks.get(("joint", "joint", 1), none)
-    if ("pose", "pose", 1) in blocks:
-        link = blocks["pose", "pose", 1] + _to_dense(link)
-    return own, link
-
-
-def _to_dense(small: Float[Array, "*b 23 3 3"]) -> Float[Array, "*b 69 69"]:
-    """Blocks down the diagonal, by a product: scatters of so many are slow."""
-    eye = jnp.eye(23, dtype=small.dtype)
-    full = small[..., :, :, None, :] * eye[:, None, :, None]
-    return full.reshape(*small.shape[:-3], POSE, POSE)
-
-
-def _link_times(link: Array, x: Float[Array, "*b 69 c"]) -> Float[Array, "*b 69 c"]:
-    if link.ndim == x.ndim:
-        return link @ x
-    rows = x.reshape(*x.shape[:-2], 23, 3, x.shape[-1])
-    # Three fused products: a matrix product for each joint would be far too small.
-    term = lambda b: link[..., b, None] * rows[..., b, None, :]
-    return (term(0) + term(1) + term(2)).reshape(x.shape)
-
-
-def pose_diagonal(lin: Linearisation) -> Float[Array, "h t 69"]:
-    total = jnp.zeros_like(lin.gradient["pose"])
-    for kind in ("pose", "joint"):
-        block = lin.blocks.get((kind, kind, 0))
-        if block is not None:
-            diagonal = jnp.diagonal(block, axis1=-2, axis2=-1)
-            total = total + diagonal.reshape(total.shape)
-    return total
-
-
-def eliminate_postures(
-    lin: Linearisation, sizes: Sizes, damping: Float[Array, "h t 69"]
-) -> Postures:
-    """Eliminates all postures but the last of each chunk; `damping` joins diagonals."""
-    border = border_of(lin, sizes)
+def eliminate_people(
+    lin: Linearisation, sizes: Sizes, window: Window, damping: dict[str, Array]
+) -> People:
+    """Eliminates inner postures and roots of all people; `damping` joins diagonals."""
     h, n = sizes.people, sizes.chunks
-    blocks = {k: v for k, v in lin.blocks.items() if k[0] in ("pose", "joint")}
-    given = blocks, lin.gradient["pose"], damping
+    terms = _terms(lin, sizes, window, damping["root"])
+    chain = posture_blocks(lin, damping["pose"]) if window.postures else None
     together = group_size(h * n)
-    cut = lambda x: x.reshape(-1, together, CHUNK, *x.shape[2:])
-    found = jax.lax.map(
-        lambda x: _eliminate_group(border, *x), jax.tree.map(cut, given)
-    )
+    cut = lambda x: x.reshape(h * n // together, together, *x.shape[2:])
+    of_chunks = lambda x: cut(x.reshape(h, n, CHUNK, *x.shape[2:]))
+    given = jax.tree.map(cut, terms), jax.tree.map(of_chunks, chain)
+
+    def group(given):
+        pairs, chain = given
+        postures = None
+        if chain is not None:
+            postures, left = eliminate_postures(window, *chain)
+            pairs = add_pairs(left, pairs)
+        half = half_of(matrix_of(window, pairs, ("inner",), ("inner",)))
+        side = matrix_of(window, pairs, KEPT, ("inner",)) @ half.swapaxes(-1, -2)
+        kept = matrix_of(window, pairs, KEPT, KEPT) - side @ side.swapaxes(-1, -2)
+        return People(postures, Roots(half, side), kept)
+
+    found = jax.lax.map(group, given)
     return jax.tree.map(lambda x: x.reshape(h, n, *x.shape[2:]), found)
 
 
@@ -141,83 +87,106 @@ def group_size(count: int) -> int:
     return max(size for size in range(1, GROUP + 1) if count % size == 0)
 
 
-def _eliminate_group(border: Border, blocks: dict, gradient: Array, damping: Array):
-    """The same for chunks `g` that are eliminated together, axes `g B`."""
-    own, link = _pose_blocks(blocks, damping)
-    raw = _border_columns(border, blocks, gradient, link)
-    at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
-    put = jax.lax.dynamic_update_index_in_dim
+def _terms(
+    lin: Linearisation, sizes: Sizes, window: Window, damping: Float[Array, "h t 6"]
+) -> Pairs:
+    """Blocks of roots with roots, cameras and globals, of each chunk's window. A term
+    belongs to the chunk of its latest frame."""
+    h, n, reach = sizes.people, sizes.chunks, window.reach
+    cut = lambda x: x.reshape(h, n, CHUNK, *x.shape[2:])
+    turned = lambda x: x.swapaxes(-1, -2)
+    length = 6 * (CHUNK + reach)
+    roots = spread(
+        cut(damping[..., None] * jnp.eye(6, dtype=damping.dtype)), 0, 0, reach
+    )
+    cameras = jnp.zeros((h, n, length, length), damping.dtype)
+    for (first, other, lag), block in lin.blocks.items():
+        if (first, other) == ("root", "root"):
+            wide = spread(cut(block), 0, lag, reach)
+            roots = roots + (wide + turned(wide) if lag else wide)
+        elif (first, other) == ("root", "camera"):
+            later = cut(_forward(block, max(-lag, 0)))
+            cameras = cameras + spread(later, max(-lag, 0), max(lag, 0), reach)
+    old, start = 6 * reach, 6 * CHUNK
+    parts = {
+        "old_roots": slice(0, old),
+        "inner": slice(old, start),
+        "roots": slice(start, length),
+    }
+    pairs = {
+        ("inner", "old_roots"): roots[..., parts["inner"], parts["old_roots"]],
+        ("roots", "old_roots"): roots[..., parts["roots"], parts["old_roots"]],
+        ("inner", "inner"): roots[..., parts["inner"], parts["inner"]],
+        ("roots", "inner"): roots[..., parts["roots"], parts["inner"]],
+        ("roots", "roots"): roots[..., parts["roots"], parts["roots"]],
+    }
+    for name, part in parts.items():
+        pairs[name, "cameras"] = cameras[..., part, old:]
+        if name != "old_roots":
+            pairs[name, "old_cameras"] = cameras[..., part, :old]
+    common = jnp.zeros((h, n, start, window.own_globals), damping.dtype)
+    if ("root", "globals", 0) in lin.blocks:
+        common = lin.blocks["root", "globals", 0].reshape(common.shape)
+    right = jnp.zeros((h, n, start, 1), damping.dtype)
+    if "root" in lin.gradient:
+        right = -lin.gradient["root"].reshape(right.shape)
+    common = jnp.concatenate([common, right], axis=-1)
+    pairs["inner", "common"] = common[..., : start - old, :]
+    pairs["roots", "common"] = common[..., start - old :, :]
+    # The last posture of the chunk before, with the first root and camera of this one.
+    for other, name in (("root", "inner"), ("camera", "cameras")):
+        block = lin.blocks.get(("pose", other, -1))
+        if block is not None:
+            block = _forward(cut(block)[:, :, -1], 1)
+            more = window.widths[name] - 6
+            pairs["before", name] = jnp.pad(block, ((0, 0),) * 3 + ((0, more),))
+    return pairs
 
-    def step(k, carry):
-        pivot, columns, halves, solved = carry
-        half = half_of(pivot)
-        here = half @ columns
-        forward = _link_times(at(link, k + 1), half.swapaxes(-1, -2))
-        pivot = at(own, k + 1) - forward @ forward.swapaxes(-1, -2)
-        columns = at(raw, k + 1) - forward @ here
-        return pivot, columns, put(halves, half, k, 1), put(solved, here, k, 1)
 
-    pivot, columns = own[:, 0], raw[:, 0]
-    empty = lambda x: jnp.zeros((len(x), CHUNK - 1, *x.shape[1:]), x.dtype)
-    carry = pivot, columns, empty(pivot), empty(columns)
-    pivot, columns, halves, solved = jax.lax.fori_loop(0, CHUNK - 1, step, carry)
-    tall = solved.reshape(len(solved), -1, solved.shape[-1])
-    update = -tall.swapaxes(-1, -2) @ tall
-    return Postures(halves, solved, link[:, 1:], pivot, columns, update)
+def _forward(x: Float[Array, "h t *b"], count: int) -> Float[Array, "h t *b"]:
+    """Row k of axis 1 to row k + count."""
+    if not count:
+        return x
+    return jnp.concatenate([jnp.zeros_like(x[:, :count]), x[:, :-count]], axis=1)
 
 
-def _border_columns(border, blocks, gradient, link):
-    """Columns of each posture of a chunk, `g B 69 b`, against the chunk's border."""
-    g = len(gradient)
-    dtype = gradient.dtype
-    none = lambda width: jnp.zeros((g, CHUNK, POSE, width), dtype)
-    is_first = jnp.eye(1, CHUNK, dtype=dtype)[0][:, None, None]
-    dense = link if link.ndim == 4 else _to_dense(link)
-    parts = [dense * is_first]
-    if border.cross:
-        for name in ("root", "camera"):
-            block = blocks.get(("pose", name, 1))
-            parts.append(none(6) if block is None else block * is_first)
-    for name in ("root", "camera") if border.cross else ("root",):
-        total = none(6 * CHUNK)
-        for lag in (-1, 0, 1):
-            block = blocks.get(("pose", name, lag))
-            if block is not None:
-                # Frame k of the chunk against frame k - lag of the same chunk.
-                place = jnp.eye(CHUNK, k=-lag, dtype=dtype)[:, None, :, None]
-                total = total + (block[:, :, :, None, :] * place).reshape(total.shape)
-        parts.append(total)
-    common = blocks.get(("pose", "globals", 0))
-    parts.append(none(border.own_globals) if common is None else common)
-    parts.append(-gradient[..., None])
-    return jnp.concatenate(parts, axis=-1)
-
-
-def substitute_postures(
-    postures: Postures,
-    border_step: Float[Array, "h n b"],
-    separator_step: Float[Array, "h n 69"],
-) -> Float[Array, "h t 69"]:
-    """Steps of all postures from those of the border (without the rhs column)."""
-    h, n = separator_step.shape[:2]
-
-    def group(known):
-        half, solved, link, border, last = known
-        right = solved[..., -1] - (solved[..., :-1] @ border[:, None, :, None])[..., 0]
-        at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
-
-        def step(i, carry):
-            following, steps = carry
-            k = CHUNK - 2 - i
-            back = _link_times(at(link, k).swapaxes(-1, -2), following[..., None])
-            row = at(right, k)[..., None] - at(half, k) @ back
-            here = (at(half, k).swapaxes(-1, -2) @ row)[..., 0]
-            return here, jax.lax.dynamic_update_index_in_dim(steps, here, k, 1)
-
-        empty = jnp.zeros((len(last), CHUNK, POSE), last.dtype).at[:, -1].set(last)
-        return jax.lax.fori_loop(0, CHUNK - 1, step, (last, empty))[1]
-
+def substitute_people(
+    people: People,
+    sizes: Sizes,
+    window: Window,
+    steps: Float[Array, "h n p"],
+    cameras: Float[Array, "t 6"],
+    own_globals: Float[Array, "h g"],
+) -> tuple[Float[Array, "h t 6"], Float[Array, "h t 69"] | None]:
+    """Steps of all roots and postures, from what each person keeps of the chunks, from
+    those of cameras and of the person's globals."""
+    h, n = sizes.people, sizes.chunks
+    last = 6 * window.reach
+    of_chunks = jnp.broadcast_to(cameras.reshape(1, n, -1), (h, n, 6 * CHUNK))
+    old_cameras = _forward(of_chunks, 1)[..., 6 * CHUNK - last :]
+    common = jnp.broadcast_to(own_globals[:, None], (h, n, own_globals.shape[-1]))
+    known = [_forward(steps, 1), old_cameras, steps, of_chunks, common]
+    right = people.roots.side[..., -1, :] - jnp.einsum(
+        "hnkm,hnk->hnm", people.roots.side[..., :-1, :], jnp.concatenate(known, axis=-1)
+    )
+    inner = jnp.einsum("hnmi,hnm->hni", people.roots.half, right)
+    pose = window.widths["sep"]
+    roots = jnp.concatenate([inner, steps[..., pose:]], axis=-1)
+    if people.postures is None:
+        return roots.reshape(h, -1, 6), None
+    values = {
+        "before": _forward(steps, 1)[..., :pose],
+        "old_roots": _forward(steps, 1)[..., pose:],
+        "inner": inner,
+        "roots": steps[..., pose:],
+        "old_cameras": old_cameras,
+        "cameras": of_chunks,
+        "common": common,
+    }
+    border = jnp.concatenate([values[name] for name in border_of(window)], axis=-1)
     together = group_size(h * n)
-    cut = lambda x: x.reshape(-1, together, *x.shape[2:])
-    given = postures.half, postures.solved, postures.link, border_step, separator_step
-    return jax.lax.map(group, jax.tree.map(cut, given)).reshape(h, -1, POSE)
+    cut = lambda x: x.reshape(h * n // together, together, *x.shape[2:])
+    given = people.postures, border, steps[..., :pose]
+    group = lambda given: substitute_postures(*given)
+    poses = jax.lax.map(group, jax.tree.map(cut, given))
+    return roots.reshape(h, -1, 6), poses.reshape(h, -1, POSE)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-LEAF = 24
+LEAF = 12
 """Width of the blocks, at most."""
 
 
