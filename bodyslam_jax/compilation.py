@@ -36,10 +36,8 @@ def jit_once(function: F) -> F:
     @functools.wraps(function)
     def call(*args, **kwargs):
         # A derivative of a program becomes a part of one, too.
-        traced = any(
-            isinstance(x, jax.core.Tracer) for x in jax.tree.leaves([args, kwargs])
-        )
-        program = plain if traced or not is_alone() else effortless()
+        inside = is_traced([args, kwargs]) or not is_alone()
+        program = plain if inside else effortless()
         return program(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]
@@ -48,6 +46,11 @@ def jit_once(function: F) -> F:
 def is_alone() -> bool:
     """Whether what is called now is not part of a larger `jit`."""
     return not isinstance(jnp.zeros(()) + 1, jax.core.Tracer)
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any array in it stands for others: mapped, differentiated or compiled."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
 @functools.cache

@@ -240,6 +240,21 @@ def test_starts_are_mapped_over_in_one_go():
     assert np.allclose(together, alone, rtol=1e-8)
 
 
+@pytest.mark.slow
+def test_gradients_of_solutions_are_mapped_over():
+    problem, _, start = make()
+
+    def place(shift):
+        pixels = lambda p: p.factors[0].pixel
+        data = eqx.tree_at(pixels, problem, pixels(problem) + shift)
+        return solve(data, start, schedule=TIGHT).state.cameras[-1, 0, 3]
+
+    shifts = jnp.array([0.0, 0.3])
+    together = jax.vmap(jax.grad(place))(shifts)
+    alone = [float(jax.grad(place)(shift)) for shift in shifts]
+    assert np.allclose(together, alone, rtol=1e-6)
+
+
 def test_triangular_matrices_of_any_width_are_inverted():
     rng = np.random.default_rng(0)
     for n in (1, 24, 25, 69):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from bodyslam_jax.compilation import is_alone, quick_options
+from bodyslam_jax.compilation import is_alone, is_traced, quick_options
 from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
@@ -21,6 +21,7 @@ from bodyslam_jax.solver._levenberg_marquardt import (
     lifted,
 )
 from bodyslam_jax.solver._loop import Final, History
+from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
 
 Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
@@ -141,7 +142,10 @@ def run(
 
     `alone` is what `is_alone()` said before anything was traced.
     """
-    return _program(alone)(problem, state, method)
+    given = problem, state, method
+    if is_traced(given):
+        return in_turn(_program(False))(*given)
+    return _program(alone)(*given)
 
 
 @functools.cache
