@@ -116,6 +116,21 @@ def test_what_jax_had_compiled_is_not_written_again(folder, jax_keeps_all):
         assert len(traced) == count and not list(folder.iterdir())
 
 
+def probing(x):
+    """Runs a small program while it is traced."""
+    with jax.ensure_compile_time_eval():
+        known = jax.jit(lambda y: 3 * y + 1)(jnp.arange(5.0))
+    return x + known[1]
+
+
+def test_what_tracing_runs_by_itself_does_not_count(folder, jax_keeps_all):
+    kept(probing, lambda: None)(jnp.ones(4))
+    jax.clear_caches()
+    # The small program now comes from JAX's cache, the large one is new.
+    assert kept(probing, lambda: None)(jnp.ones(3))[0] == 5.0
+    assert len(list(folder.iterdir())) == 2
+
+
 def test_what_cannot_be_kept_runs_all_the_same(folder):
     shift = 1.0
     assert kept(lambda x: x + shift, lambda: None)(jnp.ones(())) == 2.0
