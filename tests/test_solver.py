@@ -24,6 +24,7 @@ from bodyslam_jax.solver import (
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
+from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._tables import gather
@@ -240,6 +241,21 @@ def test_starts_are_mapped_over_in_one_go():
     assert np.allclose(together, alone, rtol=1e-8)
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="maps all at once")
+def test_a_cpu_maps_in_turn():
+    """Each problem takes its own branch, which is then no choice between both."""
+
+    def turn(x, name):
+        return {name: jax.lax.cond(x > 0, lambda: 2 * x, lambda: -x), "name": name}
+
+    mapped = jax.vmap(lambda x: in_turn(turn)(x, "y")["y"])
+    x = jnp.array([1.0, -3.0])
+    assert mapped(x).tolist() == [2.0, 3.0]
+    assert "cond[" in str(jax.make_jaxpr(mapped)(x))
+    at_once = jax.vmap(lambda x: turn(x, "y")["y"])
+    assert "cond[" not in str(jax.make_jaxpr(at_once)(x))
+
+
 @pytest.mark.slow
 def test_gradients_of_solutions_are_mapped_over():
     problem, _, start = make()
@@ -250,9 +266,10 @@ def test_gradients_of_solutions_are_mapped_over():
         return solve(data, start, schedule=TIGHT).state.cameras[-1, 0, 3]
 
     shifts = jnp.array([0.0, 0.3])
-    together = jax.vmap(jax.grad(place))(shifts)
-    alone = [float(jax.grad(place)(shift)) for shift in shifts]
-    assert np.allclose(together, alone, rtol=1e-6)
+    found = jax.vmap(jax.grad(place))(shifts)
+    places = jax.vmap(place)(jnp.concatenate([shifts + 1e-3, shifts - 1e-3]))
+    expected = (places[:2] - places[2:]) / 2e-3
+    assert np.allclose(found, expected, rtol=1e-4)
 
 
 def test_triangular_matrices_of_any_width_are_inverted():
