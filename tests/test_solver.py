@@ -96,7 +96,7 @@ def unpadded(step, state):
     "options",
     [
         {"frames": 33, "landmarks": 60, "known": True},
-        pytest.param({"frames": 12, "people": 1}, marks=pytest.mark.slow),
+        {"frames": 12, "people": 1},
         pytest.param(
             {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
             marks=pytest.mark.slow,

@@ -19,11 +19,12 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
-from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._blocks import Linearisation, sizes_of
 from bodyslam_jax.solver._coupling import with_coupling
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final, History, Loop
 from bodyslam_jax.solver._normal import (
+    Eliminated,
     damped,
     diagonals,
     eliminate,
@@ -236,7 +237,8 @@ def _first(problem, observations, state):
     return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
 
 
-def final_of(lin, eliminated) -> Final:
+def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
+    """What a solve leaves of a factorisation."""
     people = eliminated.people
     return Final(lin, eliminated.factor, None if people is None else people.roots)
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation
 from bodyslam_jax.solver._triangular import half_of
-from bodyslam_jax.solver._window import POSE, Window
+from bodyslam_jax.solver._window import POSE, Pairs, Window
 
 
 class Postures(eqx.Module):
@@ -88,7 +88,7 @@ def posture_blocks(lin: Linearisation, damping: Float[Array, "h t 69"]) -> tuple
 
 def eliminate_postures(
     window: Window, blocks: dict, gradient: Array, damping: Float[Array, "g B 69"]
-) -> tuple[Postures, dict[tuple[str, str], Array]]:
+) -> tuple[Postures, Pairs]:
     """Eliminates all postures but the last of each of `g` chunks, at the same time.
 
     Returns what they leave on pairs of the window's groups, too.

@@ -67,6 +67,7 @@ class Window(eqx.Module):
 
 
 def window_of(lin: Linearisation, sizes: Sizes) -> Window:
+    """The window that holds every block of a linearisation."""
     cross, reach = False, 0
     for first, other, lag in lin.blocks:
         if first == "pose" and other in ("root", "camera"):
@@ -103,6 +104,7 @@ def matrix_of(
 
 
 def add_pairs(first: Pairs, second: Pairs) -> Pairs:
+    """The sum of two, whichever way round their blocks are held."""
     total = dict(first)
     for (row, column), block in second.items():
         if (row, column) in total:
