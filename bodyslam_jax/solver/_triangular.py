@@ -1,5 +1,10 @@
-"""Inverses of Cholesky factors, without LAPACK's triangular solves."""
+"""Cholesky factors and their inverses, without LAPACK's batches.
 
+On a CPU two of jaxlib's batched factorisations or solves at the same time (0.10.2, on
+two cores), of two threads or two devices, wait for each other's threads for ever.
+"""
+
+import functools
 import math
 
 import jax
@@ -12,15 +17,22 @@ LEAF = 12
 
 def half_of(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """`L^-1` of positive definite matrices `L L^T`; NaN where one is not."""
-    return invert_lower(jnp.linalg.cholesky(matrix, symmetrize_input=False))
+    return invert_lower(cholesky(matrix))
+
+
+def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+    """`L` of positive definite matrices `L L^T`, from their lower triangles; NaN where
+    one is not. On a CPU one after another, as fast as a batch."""
+    one = functools.partial(jnp.linalg.cholesky, symmetrize_input=False)
+    if matrix.ndim == 2 or jax.default_backend() != "cpu":
+        return one(matrix)
+    each = matrix.reshape(-1, *matrix.shape[-2:])
+    return jax.lax.map(one, each).reshape(matrix.shape)
 
 
 def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Inverse of triangular matrices: of small blocks down the diagonal first, then of
     two neighbours at a time, as matrix products are ten times as fast as substitution.
-
-    Without LAPACK's: two of jaxlib's batched solves at the same time (0.10.2, on two
-    cores) wait for each other's threads for ever.
     """
     n = lower.shape[-1]
     levels = max(0, math.ceil(math.log2(n / LEAF)))
