@@ -32,7 +32,7 @@ from solver_clock import timed
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver import Stage, solve
+from bodyslam_jax.solver import Stage, over_devices, solve
 from bodyslam_jax.solver._assembly import assemble
 from bodyslam_jax.solver._blocks import sizes_of
 from bodyslam_jax.solver._chunks import factorise
@@ -101,21 +101,21 @@ def breakdown(problem, state, repeats):
 
 
 def scales(frames, rtol, factors=(0.4, 0.63, 0.79, 1.26, 1.59, 2.5)):
-    """Starts with other scales, mapped over in one program and one after another."""
+    """Starts with other scales, in one program and one after another."""
     problem, _, start = make(frames, 1)
     starts = [eqx.tree_at(lambda s: s.scale, start, start.scale * f) for f in factors]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
-    one = lambda s: solve(problem, s, schedule=(Stage(rtol=rtol),))
-    outcome = lambda solution: (solution.cost, solution.num_steps[0])
-    mapped = eqx.filter_jit(jax.vmap(lambda s: outcome(one(s))))
-    (costs, steps), _, (wall, cpu) = timed(lambda: mapped(batch), 1)
-    turn, _, (turn_wall, turn_cpu) = timed(lambda: [one(s) for s in starts], 1)
+    one = lambda problem, s: solve(problem, s, schedule=(Stage(rtol=rtol),))
+    mapped = over_devices(one, (None, 0))
+    found, _, (wall, cpu) = timed(lambda: mapped(problem, batch), 1)
+    turn, _, (turn_wall, turn_cpu) = timed(lambda: [one(problem, s) for s in starts], 1)
     alone = [float(s.cost) for s in turn]
     print(
-        f"{frames} frames, {len(factors)} scales: mapped {wall:.2f} s (processor "
-        f"{cpu:.2f}), {steps} steps, costs {costs}; in turn {turn_wall:.2f} s "
-        f"(processor {turn_cpu:.2f}), {[int(s.num_steps[0]) for s in turn]} steps, "
-        f"costs {alone}; ratio {wall / turn_wall:.2f} (processor {cpu / turn_cpu:.2f})",
+        f"{frames} frames, {len(factors)} scales: on {len(jax.devices())} devices "
+        f"{wall:.2f} s (processor {cpu:.2f}), {found.num_steps[0]} steps, costs "
+        f"{found.cost}; in turn {turn_wall:.2f} s (processor {turn_cpu:.2f}), "
+        f"{[int(s.num_steps[0]) for s in turn]} steps, costs {alone}; ratio "
+        f"{wall / turn_wall:.2f} (processor {cpu / turn_cpu:.2f})",
         flush=True,
     )
 
@@ -159,11 +159,16 @@ def main():
     )
     parser.add_argument("--peer-python", help="has what `peer_*.py` ask for")
     parser.add_argument("--peer-steps", type=int, default=100, help="at most")
+    parser.add_argument(
+        "--devices", type=int, default=2, help="that the CPU is to JAX, for `scales`"
+    )
     parser.add_argument("--cache", help="keep programs in this folder, as commands do")
     args = parser.parse_args()
     dtype = np.float32 if args.float32 else np.float64
     jax.config.update("jax_enable_x64", not args.float32)
     jax.config.update("jax_compilation_cache_dir", args.cache)
+    if args.what == "scales":
+        jax.config.update("jax_num_cpu_devices", args.devices)
     if args.what == "growth":
         growth(args.frames, args.steps)
         return

@@ -30,6 +30,7 @@ _HOME = {
     "evaluate": "evaluation",
     "load_body_model": "body",
     "load_motion_model": "motion",
+    "over_devices": "solver",
     "read_sequence": "frontend",
     "run": "pipeline",
     "solve": "solver",

@@ -64,10 +64,10 @@ def kept(
 ) -> Callable[..., Any]:
     """`eqx.filter_jit(function)`, its programs kept on disk where that can be done.
 
-    It cannot where there is no folder for them, more than one device, a function with
-    variables of its surroundings, or an argument that does not pickle: they are then
-    compiled as ever. `function` is known by where it is written: its decorators may
-    check what it is given, and do no more.
+    It cannot where there is no folder for them, for arguments on other devices than the
+    first, a function with variables of its surroundings, or an argument that does not
+    pickle: they are then compiled as ever. `function` is known by where it is written:
+    its decorators may check what it is given, and do no more.
     """
     plain = functools.cache(
         lambda: eqx.filter_jit(function, compiler_options=options())
@@ -99,7 +99,9 @@ def _key(function, options, leaves, tree, static) -> str | None:
     """A hash of all that the program follows from; `None` if it cannot be kept."""
     if not jax.config.jax_compilation_cache_dir:  # pyright: ignore
         return None
-    if jax.config.jax_disable_jit or len(jax.devices()) > 1:  # pyright: ignore
+    if jax.config.jax_disable_jit:  # pyright: ignore
+        return None
+    if any(x.devices() != {jax.devices()[0]} for x in leaves):
         return None
     written = inspect.unwrap(function)
     code = getattr(written, "__code__", None)
@@ -219,7 +221,9 @@ def _load(file: Path) -> _Program | None:
             return None
         parts, form = pickle.loads(content)
         _prepare_lapack()
-        return _program(serialize_executable.deserialize_and_load(*parts), form)
+        first = jax.devices()[:1]
+        run = serialize_executable.deserialize_and_load(*parts, execution_devices=first)
+        return _program(run, form)
     except OSError:
         return None
     except Exception as error:  # of another version of something

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
@@ -108,7 +109,19 @@ def experiment(
         on: What it runs on.
         config: Settings of every stage.
     """
+    if name == "scale":
+        _make_each_core_a_device()
     from bodyslam_jax import experiments
 
     for path in experiments.run_experiment(name, out, on, config):
         print(path)
+
+
+def _make_each_core_a_device() -> None:
+    """So that mapped solves run side by side; too late where JAX runs already."""
+    import jax
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    with contextlib.suppress(RuntimeError):
+        if jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
+            jax.config.update("jax_num_cpu_devices", cores)

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -57,8 +55,9 @@ def scale_recovery(
     """Cameras of the true size, made `1/p` as large and held; s starts at 1.
 
     Only s and people are free, no landmark is seen. All perturbations are one solve,
-    mapped over its first states. The cameras are those of the pipeline (the paper takes
-    the motion capture's), put to their true size by Sim(3).
+    mapped over its first states and shared out among JAX's devices. The cameras are
+    those of the pipeline (the paper takes the motion capture's), put to their true size
+    by Sim(3).
     """
     if prepared is None:
         found = case.prepare()
@@ -66,9 +65,9 @@ def scale_recovery(
     problem, state = prepared
     true_size = rescaled(with_scale(state, 1.0), case.map_scale)
     state, seen = _recover(
+        jnp.asarray(perturbations),
         problem,
         true_size,
-        jnp.asarray(perturbations),
         case.truth,
         case.body,
         jnp.asarray(case.bodies.present),
@@ -83,17 +82,18 @@ def scale_recovery(
     )
 
 
-@eqx.filter_jit
-def _recover(problem, state, perturbations, truth, body, present, registered, schedule):
-    def one(perturbation):
-        start = rescaled(state, 1 / perturbation)
-        observe = lambda y: {
-            "scale": y.scale,
-            "h_ate": _h_ate(y, truth, body, present, registered),
-        }
-        return solver.trace(problem, start, observe, schedule=schedule)
+def _recover_one(
+    perturbation, problem, state, truth, body, present, registered, schedule
+):
+    start = rescaled(state, 1 / perturbation)
+    observe = lambda y: {
+        "scale": y.scale,
+        "h_ate": _h_ate(y, truth, body, present, registered),
+    }
+    return solver.trace(problem, start, observe, schedule=schedule)
 
-    return jax.vmap(one)(perturbations)
+
+_recover = solver.over_devices(_recover_one, (0, *(None,) * 7))
 
 
 def _h_ate(state, truth: Trajectories, body, present, registered):

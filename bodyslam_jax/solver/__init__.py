@@ -2,6 +2,7 @@
 
 from bodyslam_jax.solver._covariance import Marginals as Marginals
 from bodyslam_jax.solver._covariance import marginals as marginals
+from bodyslam_jax.solver._mapping import over_devices as over_devices
 from bodyslam_jax.solver._observability import observability as observability
 from bodyslam_jax.solver._solve import PAPER_SCHEDULE as PAPER_SCHEDULE
 from bodyslam_jax.solver._solve import Solution as Solution

@@ -90,7 +90,8 @@ def solve(
     `structured` is the solver for real videos; the others are baselines for small
     problems. Pure: jits, differentiates with respect to everything in `problem`, and
     maps over problems or states of one shape: one after another on a CPU, which is no
-    slower there, at once elsewhere.
+    slower there, at once elsewhere; `over_devices` gives each device a share. Threads
+    may solve at the same time.
 
     **Raises:** `ValueError` if `state` does not have the sizes the problem was made
     for. Failure to converge is a `status`.

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.compilation import quick_options
+from bodyslam_jax.compilation import is_traced, quick_options
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._levenberg_marquardt import lifted
+from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
 from bodyslam_jax.solver._solve import (
     Solution,
@@ -37,8 +38,13 @@ def trace(
 
     The steps are those of `solve`; after convergence the state stays. Returns the last
     state and the notes, of `1 + Σ max_steps` rows: the first state's, then one an
-    iteration. Pure; mapped over states, it costs the same whatever they are.
+    iteration. Pure; costs the same whatever the states are; maps as `solve` does.
     """
+    watched = lambda problem, state: _trace(problem, state, observe, schedule, damping)
+    return (in_turn(watched) if is_traced(state) else watched)(problem, state)
+
+
+def _trace(problem, state, observe, schedule, damping):
     t, l = len(state.cameras), len(state.landmarks)
     problem, state = pad(problem, state)
     see = lambda y: observe(unpad(y, t, l))
