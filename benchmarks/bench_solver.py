@@ -153,7 +153,7 @@ def main():
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="of `calibration`")
-    parser.add_argument("--baselines", nargs="+", default=["1e-3", "1e-2", "cg"])
+    parser.add_argument("--baselines", nargs="+", default=["1e-2", "1e-2x10", "cg"])
     parser.add_argument(
         "--peers", nargs="+", choices=solver_peers.PEERS, default=solver_peers.PEERS
     )

@@ -23,6 +23,9 @@ from bodyslam_jax.solver._solve import restrict
 NEAR = 1.001
 """Solvers are compared by the time to this multiple of the least cost of all."""
 
+CG_STEPS = 50
+"""Of optimistix with conjugate gradients, at most."""
+
 LIMIT = 600
 """Seconds that a peer's process may take."""
 
@@ -186,48 +189,67 @@ def cast(tree, dtype):
 
 
 def joint(frames, rtol, names):
-    """First-order steps (300, the paper's 200 + 100) at several rates, and stock
-    optimistix with conjugate gradients, beside this solver on the joint problem."""
+    """First-order steps and stock optimistix with conjugate gradients beside this
+    solver on the joint problem.
+
+    Of the names, `1e-2` is Adam at that rate for the paper's 200 + 100 steps, `1e-2x10`
+    for ten times as many with a rate that falls to 0, `cg` optimistix.
+    """
     problem, _, start = make(frames, 1)
     run = lambda: solve(problem, start, schedule=(Stage(rtol=rtol),))
     solution, _, (wall, cpu) = timed(run, 1)
     steps = int(solution.num_steps[0])
     curve = np.asarray(solution.histories[0].cost[: steps + 1])
-    first = float(solution.first_cost)
+    best = float(solution.cost)
+    near = reached(curve, NEAR * best) / steps
     print(
-        f"{frames} frames, joint: structured {first:.6g} -> {float(solution.cost):.8g} "
-        f"in {steps} steps, {wall:.2f} s (processor {cpu:.2f})",
+        f"{frames} frames, joint: structured {float(solution.first_cost):.6g} -> "
+        f"{best:.8g} in {steps} steps, {wall:.2f} s (processor {cpu:.2f}), within "
+        f"0.1 % after {near * steps:.0f}: {near * wall:.2f} s ({near * cpu:.2f})",
         flush=True,
     )
-    first_stage = ("scale", "cameras", "roots", "landmarks")
     for name in names:
-        if name == "cg":
-            stages = (Stage(max_steps=10, rtol=rtol),)
-            method = _baselines.optimistix_cg
-            label = "optimistix LM with CG, at most 10 steps"
-        else:
-            stages = (Stage(free=first_stage, max_steps=200), Stage(max_steps=100))
-            # The rate is compiled in.
-            _baselines.ADAM_RATE = float(name)
-            jax.clear_caches()
-            method = _baselines.adam
-            label = f"Adam 200 + 100, rate {name}"
-        other, _, (its_wall, its_cpu) = timed(
-            lambda m=method, s=stages: staged(m, problem, start, s), 1
-        )
-        cost = float(cost_of(problem, other))
-        at = reached(curve, cost)
+        run, label = joint_peer(problem, start, rtol, name)
+        (cost, costs), _, (its_wall, its_cpu) = timed(run, 1)
+        at, its = reached(curve, cost), reached(costs, NEAR * best)
         share = at / steps if at is not None else np.nan
+        gets = (
+            "never within 0.1 %" if its is None else f"within 0.1 % after {its} steps"
+        )
         print(
-            f"  {label}: cost {cost:.8g}, {its_wall:.2f} s (processor {its_cpu:.2f}); "
-            f"structured is there after {at} steps, {share * wall:.2f} s "
-            f"(processor {share * cpu:.2f})",
+            f"  {label}: cost {cost:.8g} ({cost / best - 1:+.2%}), {its_wall:.2f} s "
+            f"(processor {its_cpu:.2f}), {gets}; structured is there after {at} steps, "
+            f"{share * wall:.2f} s (processor {share * cpu:.2f})",
             flush=True,
         )
 
 
-def staged(method, problem, state, stages):
-    """A baseline's schedule, with the groups of each stage free."""
-    for stage in stages:
-        state, *_ = method(restrict(problem, stage.free), state, stage)
-    return state
+def joint_peer(problem, start, rtol, name):
+    """A peer on the joint problem: what gives its last cost and all, and its name."""
+    if name == "cg":
+
+        def conjugate_gradients():
+            stage = Stage(max_steps=CG_STEPS, rtol=rtol)
+            state, *_ = _baselines.optimistix_cg(problem, start, stage)
+            cost = float(cost_of(problem.follow(state), state))
+            return cost, [cost]
+
+        return conjugate_gradients, f"optimistix LM with CG, {CG_STEPS} steps at most"
+    rate, _, times = name.partition("x")
+    times, decays = int(times or 1), bool(times)
+    first_stage = ("scale", "cameras", "roots", "landmarks")
+    stages = Stage(first_stage, 200 * times), Stage(max_steps=100 * times)
+
+    def first_order():
+        state, curves = start, []
+        for stage in stages:
+            held = restrict(problem, stage.free)
+            state, costs = _baselines.adam_curve(
+                held, state, stage, float(rate), decays=decays
+            )
+            curves.append(np.asarray(costs))
+        cost = float(cost_of(problem.follow(state), state))
+        return cost, np.append(np.concatenate(curves), cost)
+
+    label = f"Adam {stages[0].max_steps} + {stages[1].max_steps}, rate {rate}"
+    return first_order, label + " that falls" * decays

@@ -71,17 +71,42 @@ def optimistix(problem, state, stage):
     return flat.retract(found.value), found.stats["num_steps"], found.result
 
 
-def optimistix_cg(problem, state, stage):
-    """The same with conjugate gradients on the normal equations."""
+def optimistix_cg(problem, state, stage, inner_steps=500):
+    """The same with conjugate gradients on the normal equations, of unknowns in units
+    in which each matters as much: they do not converge in others."""
     flat, zero = _flat(problem, state)
-    inner = lx.Normal(lx.CG(rtol=1e-6, atol=1e-6, max_steps=500))
+    unit = _units(flat, zero)
+    inner = lx.Normal(lx.CG(rtol=1e-6, atol=1e-6, max_steps=inner_steps))
     method = optx.LevenbergMarquardt(
         rtol=stage.rtol, atol=stage.rtol, linear_solver=inner
     )
     found = optx.least_squares(
-        _held_rows, method, zero, flat, max_steps=stage.max_steps, throw=False
+        _scaled_rows, method, zero, (flat, unit), max_steps=stage.max_steps, throw=False
     )
-    return flat.retract(found.value), found.stats["num_steps"], found.result
+    step = jax.tree.map(jnp.multiply, unit, found.value)
+    return flat.retract(step), found.stats["num_steps"], found.result
+
+
+def _scaled_rows(step, given):
+    flat, unit = given
+    return _held_rows(jax.tree.map(jnp.multiply, unit, step), flat)
+
+
+PROBES = 64
+
+
+@eqx.filter_jit
+def _units(flat, zero):
+    """One over the lengths of the columns of the Jacobian, by random signs: to about a
+    tenth."""
+    residual, pull = jax.vjp(flat.residual, zero)
+    keys = jax.random.split(jax.random.key(0), PROBES)
+    signs = lambda key: jax.random.rademacher(key, residual.shape, residual.dtype)
+    squares = jax.lax.map(
+        lambda key: jax.tree.map(jnp.square, pull(signs(key))[0]), keys
+    )
+    unit = lambda s: jnp.where(s.mean(0) > 0, jax.lax.rsqrt(s.mean(0)), 1.0)
+    return jax.tree.map(unit, squares)
 
 
 def jaxopt_lm(problem, state, stage):
@@ -119,22 +144,35 @@ def _jaxopt(name, problem, state, stage):
 
 def adam(problem, state, stage):
     """First-order steps, as the paper took: `stage.max_steps` of them."""
+    state, _ = adam_curve(problem, state, stage, ADAM_RATE)
+    return state, jnp.array(stage.max_steps), optx.RESULTS.successful
+
+
+def adam_curve(problem, state, stage, rate, *, decays=False):
+    """The state after these steps, and the cost before each; `decays`: the rate falls
+    to 0 as a cosine does."""
     flat, zero = _flat(problem, state)
-    found = _adam(flat, zero, stage.max_steps)
-    return flat.retract(found), jnp.array(stage.max_steps), optx.RESULTS.successful
+    rate = jnp.asarray(rate, state.scale.dtype)
+    found, costs = _adam(flat, zero, rate, stage.max_steps, decays)
+    return flat.retract(found), costs
 
 
 @eqx.filter_jit
-def _adam(flat, start, count):
-    method = optax.adam(ADAM_RATE)
+def _adam(flat, start, rate, count, decays):
+    method = optax.scale_by_adam()
+    falls = optax.cosine_decay_schedule(1.0, max(count, 1))
 
-    def one(carry, _):
+    def one(carry, k):
         step, memory = carry
-        gradient = jax.grad(flat.cost)(step)
+        cost, gradient = jax.value_and_grad(flat.cost)(step)
         # optax takes powers of Python's numbers.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(gradient, memory)
-        return (optax.apply_updates(step, change), memory), None
+            length = rate * falls(k) if decays else rate
+        length = length.astype(rate.dtype)
+        step = jax.tree.map(lambda s, c: s - length * c, step, change)
+        return (step, memory), cost
 
-    (step, _), _ = jax.lax.scan(one, (start, method.init(start)), length=count)
-    return step
+    carry = start, method.init(start)
+    (step, _), costs = jax.lax.scan(one, carry, jnp.arange(count))
+    return step, costs
