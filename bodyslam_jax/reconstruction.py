@@ -62,10 +62,6 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     guess = sequence.intrinsics
-    span = config.structure.landmark_span
-    # Whole tracks, until all that they tell of the path and the focal length is in.
-    whole = dataclasses.replace(config.structure, landmark_span=sequence.num_frames)
-    config = dataclasses.replace(config, structure=whole)
     found = _reconstruct(sequence, tracks, guess, config)
     cameras = _unadjusted(found, guess, config)
     if found.kind != "moving":
@@ -74,7 +70,10 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
         cameras = _with_focal(sequence, tracks, cameras, found.error, config)
     else:
         cameras = _adjusted(cameras, 1.0, config, None)
-    return _cut(cameras, span) if cameras.kind == "moving" else cameras
+    if cameras.kind != "moving":
+        return cameras
+    # Only now: whole tracks tell more of the path and the focal length.
+    return _cut(cameras, config.structure.landmark_span)
 
 
 def _with_focal(

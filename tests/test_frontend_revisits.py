@@ -225,7 +225,7 @@ def test_a_camera_that_turns_back_keeps_the_size_of_its_map():
             sequence.tracks,
             sequence.intrinsics,
             240,
-            Structure(join_tracks=joined, landmark_span=240),
+            Structure(join_tracks=joined),
         )
         assert found.registered.all()
         x, y = found.T_WC[:, :3, 3], made.T_WC[:, :3, 3]

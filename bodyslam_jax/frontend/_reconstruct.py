@@ -19,7 +19,7 @@ from bodyslam_jax.frontend._camera_motion import (
     stillness,
 )
 from bodyslam_jax.frontend._mapper import Growing, Refine
-from bodyslam_jax.frontend._revisits import cut_tracks, told_by_others
+from bodyslam_jax.frontend._revisits import told_by_others
 from bodyslam_jax.frontend._structure import Builder, build_map
 from bodyslam_jax.sequence import Intrinsics, Tracks
 
@@ -84,7 +84,6 @@ def reconstruct(
         num_frames,
         num_landmarks,
         focal,
-        config.landmark_span,
     )
 
     first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
@@ -137,8 +136,6 @@ class _Problem:
     num_frames: int
     num_landmarks: int
     focal: float
-    longest: int
-    """Frames that a landmark may span."""
 
 
 def _longest_shot(
@@ -185,15 +182,15 @@ def _moving(
     k0 = int(np.argmax(registered))
     R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()
     views = problem.views[np.flatnonzero(inlier)]
-    ids, piece = cut_tracks(views.frame, views.landmark, problem.longest)
+    ids, of = np.unique(views.landmark, return_inverse=True)
     points = (grown.scene.points[grown.shown[ids]] - c0) @ R0.T
     unit = float(np.median(np.linalg.norm(points, axis=-1))) if len(ids) else 1.0
     T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
     T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
     T_WC = interpolate_poses(T_WC, registered)
-    pieces = Views(views.frame, piece, views.xy)
-    elsewhere = told_by_others(grown.scene, pieces, grown.shown[ids])
+    views = Views(views.frame, of, views.xy)
+    elsewhere = told_by_others(grown.scene, views, grown.shown[ids])
     elsewhere = (problem.focal * unit) ** 2 * (R0 @ elsewhere @ R0.T)
     return _pack(
         problem,
@@ -201,7 +198,7 @@ def _moving(
         T_WC,
         registered,
         points / unit,
-        (ids, piece),
+        (ids, of),
         inlier,
         warnings,
         elsewhere=elsewhere,
