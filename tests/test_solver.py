@@ -13,6 +13,7 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver import (
     Stage,
     clock,
@@ -327,6 +328,38 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options):
         known = size < 10 * np.median(size)  # the rest is as good as not seen
         assert known.sum() > 0.8 * len(known)
         assert (error[known] < 1e-3 * size[known] + 1e-12).all()
+
+
+def test_marginal_covariances_are_mapped_over():
+    problem, _, start = make(known=True)
+    states = [start, solve(problem, start, schedule=TIGHT).state]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    found = jax.jit(jax.vmap(lambda s: marginals(problem, s)))(batch)
+    for k, state in enumerate(states):
+        alone = marginals(problem, state)
+        for one, other in (
+            (found.cameras, alone.cameras),
+            (found.landmarks, alone.landmarks),
+        ):
+            size = np.abs(other).max(axis=(-2, -1), keepdims=True)
+            assert (size > 0).sum() > 5
+            assert (np.abs(one[k] - other) <= 1e-5 * size).all()
+
+
+def test_factors_that_reach_too_far_are_refused():
+    class Far(g.CameraSmoothness):
+        @property
+        def touches(self):
+            return ("camera", 0), ("camera", CHUNK)
+
+        def local(self, data, window, shared):
+            return (window[0].camera - window[CHUNK].camera)[:3, 3] / data[0]
+
+    problem, state, start = make()
+    far = Far(jnp.full((len(state.cameras), 2), 0.1))
+    problem = g.make_problem([*problem.factors, far], state)
+    with pytest.raises(ValueError, match=f"{CHUNK} frames apart.*{CHUNK - 1} at most"):
+        solve(problem, start)
 
 
 def test_turning_on_the_spot_is_reported():

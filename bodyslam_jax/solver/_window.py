@@ -67,9 +67,19 @@ class Window(eqx.Module):
 
 
 def window_of(lin: Linearisation, sizes: Sizes) -> Window:
-    """The window that holds every block of a linearisation."""
+    """The window that holds every block of a linearisation.
+
+    **Raises:** `ValueError` if a factor couples frames that lie too far apart.
+    """
     cross, reach = False, 0
     for first, other, lag in lin.blocks:
+        limit = 1 if first in ("pose", "joint") else CHUNK - 1
+        if abs(lag) > limit:
+            raise ValueError(
+                f"a factor couples {first} and {other} {abs(lag)} frames apart; the "
+                f"structured solver knows {limit} at most: solve with a baseline, or "
+                "as several factors."
+            )
         if first == "pose" and other in ("root", "camera"):
             cross |= other == "camera" or lag != 0
         if first in ("pose", "root") and other in ("root", "camera"):
