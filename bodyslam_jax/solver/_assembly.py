@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, shifted
 from bodyslam_jax.solver._landmarks import CAMERAS, ReducedCameras
 from bodyslam_jax.solver._window import KEPT, Window, spread
 
@@ -93,11 +93,6 @@ def _transposed(x):
     return x.swapaxes(-1, -2)
 
 
-def _to_previous(x):
-    """Entry of chunk c to chunk c - 1."""
-    return jnp.concatenate([x[1:], jnp.zeros_like(x[:1])])
-
-
 def _parts(kept: Float[Array, "n k k"], window: Window) -> dict[tuple[str, str], Array]:
     """Blocks of one person, rows by columns: what it keeps of the chunk (`own`) and of
     the `next` one; cameras; globals with the right-hand side (`common`)."""
@@ -105,7 +100,7 @@ def _parts(kept: Float[Array, "n k k"], window: Window) -> dict[tuple[str, str],
     old = slice(at["before"].start, at["old_roots"].stop)
     own = slice(at["sep"].start, at["roots"].stop)
     old_cameras, cameras, common = (at[k] for k in ("old_cameras", "cameras", "common"))
-    later = _to_previous(kept)
+    later = shifted(kept, -1, 0)
     first = CAMERAS - 6 * window.reach
     wide = lambda x: jnp.pad(x, ((0, 0), (0, 0), (first, 0)))
     last = jnp.pad(later[:, old_cameras, old_cameras], ((0, 0),) + ((first, 0),) * 2)
@@ -140,7 +135,7 @@ def _cameras(lin, sizes, damping):
         wide = spread(cut(block), 0, lag, reach)
         whole = whole + wide + _transposed(wide)
     start = 6 * reach
-    following = _to_previous(whole[:, start:, :start])
+    following = shifted(whole[:, start:, :start], -1, 0)
     following = jnp.pad(following, ((0, 0), (0, 0), (CAMERAS - start, 0)))
     return whole[:, start:, start:], following
 

@@ -5,6 +5,7 @@ frame k - d; `alone` is a camera without a person.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -94,6 +95,14 @@ class Sums:
         index = own_to_global(self.sizes, person)
         self.globals = self.globals.at[index[:, None], index[None, :]].add(hessian)
         self.globals_gradient = self.globals_gradient.at[index].add(gradient)
+
+
+def shifted(x: Array, by: int, axis: int) -> Array:
+    """Row k of an axis to row k + by, either way; zeros come in."""
+    size = x.shape[axis]
+    kept = jax.lax.slice_in_dim(x, max(-by, 0), size - max(by, 0), axis=axis)
+    come_in = jnp.zeros_like(jax.lax.slice_in_dim(x, 0, abs(by), axis=axis))
+    return jnp.concatenate([come_in, kept] if by > 0 else [kept, come_in], axis=axis)
 
 
 def sizes_of(problem: Problem, state: State) -> Sizes:

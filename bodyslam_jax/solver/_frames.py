@@ -17,7 +17,7 @@ from bodyslam_jax.graph import (
     inverse_right_jacobian,
     squared_norm,
 )
-from bodyslam_jax.solver._blocks import Sums
+from bodyslam_jax.solver._blocks import Sums, shifted
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
 _GROUP = {
@@ -127,6 +127,8 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         gram = gram + jac[..., 0, :, None] * jac[..., 0, None, :]
     else:
         gram = jnp.einsum("...ra,...rb->...ab", jac, jac)
+    # A term of frame k about frame k - lag.
+    shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
     for i, (name, lag) in enumerate(local):
@@ -155,13 +157,6 @@ def _add_products(sums, local, has_common, columns, weight, factor):
                 total[person, :n, :n],
                 total[person, :n, -1],
             )
-
-
-def shift(x: Float[Array, "h t *b"], lag: int) -> Float[Array, "h t *b"]:
-    """Row k of frame axis 1 to row k - lag: a term of frame k about frame k - lag."""
-    if lag == 0:
-        return x
-    return jnp.concatenate([x[:, lag:], jnp.zeros_like(x[:, :lag])], axis=1)
 
 
 def shift_back(x: Float[Array, "h t *b"], lag: int) -> Float[Array, "h t *b"]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.solver._blocks import Linearisation, Sizes
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, shifted
 from bodyslam_jax.solver._postures import (
     Postures,
     border_of,
@@ -105,7 +105,7 @@ def _terms(
             wide = spread(cut(block), 0, lag, reach)
             roots = roots + (wide + turned(wide) if lag else wide)
         elif (first, other) == ("root", "camera"):
-            later = cut(_forward(block, max(-lag, 0)))
+            later = cut(shifted(block, max(-lag, 0), 1))
             cameras = cameras + spread(later, max(-lag, 0), max(lag, 0), reach)
     old, start = 6 * reach, 6 * CHUNK
     parts = {
@@ -137,17 +137,10 @@ def _terms(
     for other, name in (("root", "inner"), ("camera", "cameras")):
         block = lin.blocks.get(("pose", other, -1))
         if block is not None:
-            block = _forward(cut(block)[:, :, -1], 1)
+            block = shifted(cut(block)[:, :, -1], 1, 1)
             more = window.widths[name] - 6
             pairs["before", name] = jnp.pad(block, ((0, 0),) * 3 + ((0, more),))
     return pairs
-
-
-def _forward(x: Float[Array, "h t *b"], count: int) -> Float[Array, "h t *b"]:
-    """Row k of axis 1 to row k + count."""
-    if not count:
-        return x
-    return jnp.concatenate([jnp.zeros_like(x[:, :count]), x[:, :-count]], axis=1)
 
 
 def substitute_people(
@@ -163,9 +156,10 @@ def substitute_people(
     h, n = sizes.people, sizes.chunks
     last = 6 * window.reach
     of_chunks = jnp.broadcast_to(cameras.reshape(1, n, -1), (h, n, 6 * CHUNK))
-    old_cameras = _forward(of_chunks, 1)[..., 6 * CHUNK - last :]
+    old_cameras = shifted(of_chunks, 1, 1)[..., 6 * CHUNK - last :]
     common = jnp.broadcast_to(own_globals[:, None], (h, n, own_globals.shape[-1]))
-    known = [_forward(steps, 1), old_cameras, steps, of_chunks, common]
+    before = shifted(steps, 1, 1)
+    known = [before, old_cameras, steps, of_chunks, common]
     right = people.roots.side[..., -1, :] - jnp.einsum(
         "hnkm,hnk->hnm", people.roots.side[..., :-1, :], jnp.concatenate(known, axis=-1)
     )
@@ -175,8 +169,8 @@ def substitute_people(
     if people.postures is None:
         return roots.reshape(h, -1, 6), None
     values = {
-        "before": _forward(steps, 1)[..., :pose],
-        "old_roots": _forward(steps, 1)[..., pose:],
+        "before": before[..., :pose],
+        "old_roots": before[..., pose:],
         "inner": inner,
         "roots": steps[..., pose:],
         "old_cameras": old_cameras,
