@@ -34,12 +34,19 @@ from bodyslam_jax.solver._normal import (
 )
 from bodyslam_jax.solver._search import search
 from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver._triangulation import triangulate_anew
 
 GAIN = 1e-4
 """Least share of the predicted decrease at which a step is accepted."""
 MAX_DAMPING = 1e12
 CAUTION = (1e-2, 1e4)
 """Least and greatest damping of a landmark that a step would have thrown off."""
+LOST = (10.0, 0.5)
+"""Decrease of the cost for which a landmark is triangulated anew, after the first step
+and later: the cost is a negative log-likelihood."""
+NEAR = 0.01
+"""Share of the cost: landmarks are looked at again after a step that gains no more, as
+cameras are about right then, and at the end."""
 SHRINK = 0.1
 """Least factor of the damping after a good step."""
 
@@ -84,6 +91,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             stale=jnp.array(True),
             damping=jnp.asarray(self.damping, dtype),
             caution=jnp.zeros(len(y.landmarks), dtype),
+            searched=jnp.array(0),
             growth=jnp.asarray(2.0, dtype),
             cost=jnp.asarray(jnp.inf, dtype),
             first_cost=jnp.asarray(jnp.inf, dtype),
@@ -159,7 +167,23 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
         small = predicted <= jnp.maximum(enough, floor)
         done = finite & (tiny | (small & accept & (damping <= 1e-2)))
-        stuck = ~accept & ~done & (higher > MAX_DAMPING)
+        new_y = jax.tree.map(lambda a, b: jnp.where(accept, a, b), trial, y)
+        terms = jnp.where(accept, terms, lin.costs)
+        before = jnp.sum(terms)
+        nth = state.searched
+        near = accept & ((nth == 0) | (known - cost < NEAR * known))
+        look = finite & (near & (nth < 2) | done & (nth < 3))
+        least = jnp.where(nth == 0, *LOST).astype(dtype)
+        new_y, terms = jax.lax.cond(
+            look,
+            lambda s, t: triangulate_anew(problem, s, t, least),
+            lambda s, t: (s, t),
+            *(new_y, terms),
+        )
+        cost = jnp.sum(terms)
+        found = before - cost > enough
+        done = done & ~found
+        stuck = ~accept & ~done & ~found & (higher > MAX_DAMPING)
         broken = ~jnp.isfinite(known)
         row = jnp.where(last, len(self.limit), at)
         steps = state.steps.at[row].add(1, mode="drop")
@@ -174,24 +198,24 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
         history = History(
-            put(put(old.cost, i, known), i + 1, jnp.where(accept, cost, known)),
+            put(put(old.cost, i, known), i + 1, cost),
             put(put(old.terms, i, lin.costs), i + 1, terms),
             put(old.damping, i, damping),
             put(old.step, i, jnp.sqrt(length)),
-            put(old.accepted, i, accept),
+            put(old.accepted, i, accept | found),
         )
-        new_y = jax.tree.map(lambda a, b: jnp.where(accept, a, b), trial, y)
         new_damping = jnp.where(accept, lower, higher)
         loop = Loop(
             stage=following,
             prediction=prediction,
             observations=state.observations,
             final=final_of(lin, eliminated),
-            stale=accept | over,
+            stale=accept | found | over,
             damping=jnp.where(over, self.damping, new_damping).astype(dtype),
             caution=jnp.where(accept, caution, state.caution),
+            searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
             growth=jnp.where(accept | over, 2.0, 2 * state.growth).astype(dtype),
-            cost=jnp.where(accept, cost, known),
+            cost=cost,
             first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
             steps=steps,
             finished=last | ((following == len(self.limit)) & ~self.keep),

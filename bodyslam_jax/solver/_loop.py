@@ -49,6 +49,8 @@ class Loop(eqx.Module):
     damping: Float[Array, ""]
     caution: Float[Array, " l"]
     """Damping that landmarks have at least, each by itself."""
+    searched: Int[Array, ""]
+    """How often landmarks were triangulated anew in this stage."""
     growth: Float[Array, ""]
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]

@@ -9,14 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.graph import (
-    LandmarkPrior,
-    Problem,
-    Reprojection,
-    State,
-    residual_of,
-    squared_norm,
-)
+from bodyslam_jax.graph import Problem, Reprojection, State
+from bodyslam_jax.solver._triangulation import cost_by_landmark, tracks_of
 
 
 def search(problem, state, move, slope, predicted, terms):
@@ -67,12 +61,12 @@ def _settle(
     cameras; given the cameras its cost is its own, so that it need not hold up the
     step of all others.
     """
-    tracks = next((f for f in problem.factors if isinstance(f, Reprojection)), None)
+    tracks = tracks_of(problem)
     keep = jnp.zeros(len(state.landmarks), bool)
     of_tracks = jnp.zeros_like(state.scale)
     if tracks is not None:
         old = eqx.tree_at(lambda s: s.landmarks, moved, state.landmarks)
-        here, there = (_by_landmark(problem, tracks, s) for s in (old, moved))
+        here, there = (cost_by_landmark(problem, tracks, s) for s in (old, moved))
         keep = ~(there[0] + there[1] <= here[0] + here[1])
         landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
         moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
@@ -82,16 +76,3 @@ def _settle(
         for f in problem.follow(moved).factors
     ]
     return moved, keep, jnp.stack(costs)
-
-
-def _by_landmark(
-    problem: Problem, tracks: Reprojection, state: State
-) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-    """Twice the cost of each landmark's observations, and of what else is known."""
-    rho = lambda f: f.loss.rho(squared_norm(residual_of(f, state)))
-    none = jnp.zeros(len(state.landmarks), state.scale.dtype)
-    known = none
-    for factor in problem.factors:
-        if isinstance(factor, LandmarkPrior):
-            known = known + rho(factor)
-    return none.at[tracks.landmark].add(rho(tracks)), known
