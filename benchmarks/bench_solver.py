@@ -5,7 +5,8 @@
     python benchmarks/bench_solver.py joint --frames 300 --cache FOLDER  # twice
     python benchmarks/bench_solver.py breakdown --frames 1000
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
-    python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2 cg
+    python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2x10 cg
+    python benchmarks/bench_solver.py baselines --baselines jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py scales --frames 300
     python benchmarks/bench_solver.py growth
     python benchmarks/bench_solver.py calibration --frames 20 --repeats 60
@@ -26,6 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import solver_joint_peers
 import solver_peers
 from solver_calibration import calibration
 from solver_clock import timed
@@ -153,7 +155,12 @@ def main():
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="of `calibration`")
-    parser.add_argument("--baselines", nargs="+", default=["1e-2", "1e-2x10", "cg"])
+    parser.add_argument(
+        "--baselines",
+        nargs="+",
+        default=["1e-2", "1e-2x10", "cg"],
+        help="rates of Adam (x10: for ten times as long), `cg`, `jaxls`",
+    )
     parser.add_argument(
         "--peers", nargs="+", choices=solver_peers.PEERS, default=solver_peers.PEERS
     )
@@ -177,7 +184,9 @@ def main():
         "peers": lambda n: solver_peers.peers(
             n, args.peers, args.peer_python, args.repeats, args.rtol, args.peer_steps
         ),
-        "baselines": lambda n: solver_peers.joint(n, args.rtol, args.baselines),
+        "baselines": lambda n: solver_joint_peers.joint(
+            n, args.rtol, args.baselines, args.peer_python, args.peer_steps
+        ),
         "scales": lambda n: scales(n, args.rtol),
         "one": lambda n: one(n, args.steps),
     }

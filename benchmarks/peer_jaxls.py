@@ -40,11 +40,10 @@ def reprojection(values, camera, point, pixel, intrinsics, loss, min_depth):
 
 
 def main(source, target):
-    jax.config.update("jax_enable_x64", True)
-    # Compilation is timed, so must take place.
-    jax.config.update("jax_enable_compilation_cache", False)
     with np.load(source) as archive:
-        data = {name: jnp.asarray(array) for name, array in archive.items()}
+        data = dict(archive)
+    limit, rtol = int(data.pop("steps")), float(data.pop("rtol"))
+    data = {name: jnp.asarray(array) for name, array in data.items()}
     camera = jaxls.SE3Var(jnp.arange(len(data["cameras"])))
     seen = jnp.unique(data["landmark"])
     point = Point(seen)
@@ -52,16 +51,27 @@ def main(source, target):
     cost = reprojection(
         jaxls.SE3Var(data["frame"]), Point(data["landmark"]), data["pixel"], *given
     )
-    start = jaxls.VarValues.make(
-        [
-            camera.with_value(jaxlie.SE3.from_matrix(data["cameras"]).inverse()),
-            point.with_value(data["points"][seen]),
-        ]
+    start = [
+        camera.with_value(jaxlie.SE3.from_matrix(data["cameras"]).inverse()),
+        point.with_value(data["points"][seen]),
+    ]
+    found, measured = solve([cost], start, limit, rtol)
+    np.savez(
+        target,
+        cameras=found[camera].inverse().as_matrix(),
+        points=data["points"].at[seen].set(found[point]),
+        **measured,
     )
-    limit = int(data["steps"])
-    problem = jaxls.LeastSquaresProblem([cost], [camera, point]).analyze()
 
-    def solve(rtol):
+
+def solve(costs, start, limit, rtol):
+    """The values found, and what `bench_solver.py` asks of a peer: seconds of it all,
+    cost by time, steps, versions."""
+    variables = [known.variable for known in start]
+    problem = jaxls.LeastSquaresProblem(costs, variables).analyze()
+    start = jaxls.VarValues.make(start)
+
+    def run(rtol):
         clock = lambda: np.array([time.perf_counter(), time.process_time()])
         before = clock()
         result = problem.solve(
@@ -80,8 +90,8 @@ def main(source, target):
         return result, clock() - before
 
     # Stops after one step: compilation, and little else.
-    _, first = solve(np.inf)
-    (found, summary), spent = solve(float(data["rtol"]))
+    _, first = run(np.inf)
+    (found, summary), spent = run(rtol)
     steps = int(summary.iterations)
     # Its history has rejected trials too (damping rises after one), not the last cost.
     trials, damping = np.asarray(summary.cost_history), summary.lambda_history
@@ -90,18 +100,15 @@ def main(source, target):
     costs = np.where(kept, trials[1 : steps - 1], np.inf)
     costs = 0.5 * np.minimum.accumulate([trials[0], *costs, np.inf, last])
     seconds = spent[0] * np.arange(len(costs)) / steps
-    np.savez(
-        target,
-        cameras=found[camera].inverse().as_matrix(),
-        points=data["points"].at[seen].set(found[point]),
-        seconds=spent[0],
-        processor=spent[1],
-        compilation=first,
-        rows=np.stack([seconds, costs], axis=1),
-        solves=steps,
-        capped=steps >= limit,
-        versions=f"{release()}, jax {jax.__version__}",
-    )
+    return found, {
+        "seconds": spent[0],
+        "processor": spent[1],
+        "compilation": first,
+        "rows": np.stack([seconds, costs], axis=1),
+        "solves": steps,
+        "capped": steps >= limit,
+        "versions": f"{release()}, jax {jax.__version__}",
+    }
 
 
 def release():
@@ -112,4 +119,7 @@ def release():
 
 
 if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    # Compilation is timed, so must take place.
+    jax.config.update("jax_enable_compilation_cache", False)
     main(*sys.argv[1:])

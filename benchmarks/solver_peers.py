@@ -1,7 +1,6 @@
-"""The solver beside others, on one problem each; costs by one function.
+"""The solver beside Ceres, GTSAM and jaxls on cameras and landmarks.
 
-Ceres, GTSAM and jaxls on cameras and landmarks; first-order steps and stock optimistix
-with conjugate gradients on the joint problem.
+Costs are by one function.
 """
 
 import subprocess
@@ -17,14 +16,10 @@ from solver_scene import make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.camera import MIN_DEPTH
-from bodyslam_jax.solver import Stage, _baselines, solve
-from bodyslam_jax.solver._solve import restrict
+from bodyslam_jax.solver import Stage, solve
 
 NEAR = 1.001
 """Solvers are compared by the time to this multiple of the least cost of all."""
-
-CG_STEPS = 50
-"""Of optimistix with conjugate gradients, at most."""
 
 LIMIT = 600
 """Seconds that a peer's process may take."""
@@ -102,24 +97,27 @@ def note_of(result, cost):
 
 
 def table(found, curves, clocks, notes):
-    """Prints costs, times in all, and times to nearly the least cost."""
-    best = min(found.values())
+    """Prints costs, times in all, and times to nearly two of the costs: the least, and
+    the greatest, to which all get."""
+    best, worst = min(found.values()), max(found.values())
     for name, cost in found.items():
         wall, cpu = clocks[name]
         print(
             f"  {name:20s} cost {cost:.8g} ({cost / best - 1:+.2%} of the least), "
-            f"{wall[-1]:.2f} s (processor {cpu[-1]:.2f}); ",
+            f"{wall[-1]:.2f} s (processor {cpu[-1]:.2f}); within 0.1 %",
             end="",
         )
-        at = reached(curves[name], NEAR * best)
-        if at is None:
-            print(f"never within 0.1 %; {notes[name]}", flush=True)
-        else:
-            print(
-                f"within 0.1 % after {at}: {wall[at]:.2f} s "
-                f"(processor {cpu[at]:.2f}); {notes[name]}",
-                flush=True,
-            )
+        for label, goal in (("the least", best), ("the greatest", worst)):
+            at = reached(curves[name], NEAR * goal)
+            if at is None:
+                print(f" of {label} never", end=";")
+            else:
+                print(
+                    f" of {label} after {at}: {wall[at]:.2f} s (processor "
+                    f"{cpu[at]:.2f})",
+                    end=";",
+                )
+        print(f" {notes[name]}", flush=True)
 
 
 def without_lost(factor, start, names, run):
@@ -186,70 +184,3 @@ def without(factor, landmarks):
 def cast(tree, dtype):
     half = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
     return jax.tree.map(half, tree)
-
-
-def joint(frames, rtol, names):
-    """First-order steps and stock optimistix with conjugate gradients beside this
-    solver on the joint problem.
-
-    Of the names, `1e-2` is Adam at that rate for the paper's 200 + 100 steps, `1e-2x10`
-    for ten times as many with a rate that falls to 0, `cg` optimistix.
-    """
-    problem, _, start = make(frames, 1)
-    run = lambda: solve(problem, start, schedule=(Stage(rtol=rtol),))
-    solution, _, (wall, cpu) = timed(run, 1)
-    steps = int(solution.num_steps[0])
-    curve = np.asarray(solution.histories[0].cost[: steps + 1])
-    best = float(solution.cost)
-    near = reached(curve, NEAR * best) / steps
-    print(
-        f"{frames} frames, joint: structured {float(solution.first_cost):.6g} -> "
-        f"{best:.8g} in {steps} steps, {wall:.2f} s (processor {cpu:.2f}), within "
-        f"0.1 % after {near * steps:.0f}: {near * wall:.2f} s ({near * cpu:.2f})",
-        flush=True,
-    )
-    for name in names:
-        run, label = joint_peer(problem, start, rtol, name)
-        (cost, costs), _, (its_wall, its_cpu) = timed(run, 1)
-        at, its = reached(curve, cost), reached(costs, NEAR * best)
-        share = at / steps if at is not None else np.nan
-        gets = (
-            "never within 0.1 %" if its is None else f"within 0.1 % after {its} steps"
-        )
-        print(
-            f"  {label}: cost {cost:.8g} ({cost / best - 1:+.2%}), {its_wall:.2f} s "
-            f"(processor {its_cpu:.2f}), {gets}; structured is there after {at} steps, "
-            f"{share * wall:.2f} s (processor {share * cpu:.2f})",
-            flush=True,
-        )
-
-
-def joint_peer(problem, start, rtol, name):
-    """A peer on the joint problem: what gives its last cost and all, and its name."""
-    if name == "cg":
-
-        def conjugate_gradients():
-            stage = Stage(max_steps=CG_STEPS, rtol=rtol)
-            state, *_ = _baselines.optimistix_cg(problem, start, stage)
-            cost = float(cost_of(problem.follow(state), state))
-            return cost, [cost]
-
-        return conjugate_gradients, f"optimistix LM with CG, {CG_STEPS} steps at most"
-    rate, _, times = name.partition("x")
-    times, decays = int(times or 1), bool(times)
-    first_stage = ("scale", "cameras", "roots", "landmarks")
-    stages = Stage(first_stage, 200 * times), Stage(max_steps=100 * times)
-
-    def first_order():
-        state, curves = start, []
-        for stage in stages:
-            held = restrict(problem, stage.free)
-            state, costs = _baselines.adam_curve(
-                held, state, stage, float(rate), decays=decays
-            )
-            curves.append(np.asarray(costs))
-        cost = float(cost_of(problem.follow(state), state))
-        return cost, np.append(np.concatenate(curves), cost)
-
-    label = f"Adam {stages[0].max_steps} + {stages[1].max_steps}, rate {rate}"
-    return first_order, label + " that falls" * decays
