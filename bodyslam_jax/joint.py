@@ -105,6 +105,10 @@ def prepare(
             )
         if contact is not None:
             factors.append(contact)
+        there = roots.present & cameras.registered
+        upright = initialisation.upright_factor(state, there, sequence.fps, weights)
+        if upright is not None:
+            factors.append(upright)
         problem = make([*factors, walked(predict(predictor, state), state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)

@@ -59,6 +59,10 @@ class GraphWeights:
     """The same along the line of sight."""
     root_turning: float | None = 0.015
     """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
+    upright_sigma: float | None = None
+    """How far the trunk of somebody on their feet leans from where it points on
+    average, rad in a frame of 1/30 s; free without it. 0.1 suits people who walk:
+    their pelvises sway by 0.05, for some five frames at a time."""
     root_smoothness: float | None = 0.02
     """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
     are of 0.006 m; held to that, a camera that goes with the person would be thought to

@@ -9,7 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.experiments._problems import rebuild
+from bodyslam_jax.initialisation import upright_factor
 
 _SEE_SCALE = (graph.HumanMotion, graph.RootSmoothness, graph.GroundContact)
 """What ties the map's unit to metres."""
@@ -17,12 +19,15 @@ _SEE_SCALE = (graph.HumanMotion, graph.RootSmoothness, graph.GroundContact)
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
 
-STANCE_SIGMA = 0.01
-"""m a frame: how still a foot that carries stands."""
-CAMERA_SIGMA = (0.02, 0.02)
-"""rad, m per frame squared: how steadily a hand moves a camera."""
 UP_SIGMA = 0.1
 """rad: how upright people walk."""
+STANCE_SIGMA = 0.01
+"""Legs a frame: how still a foot that carries stands."""
+_STANCE_LOSS = 2.0
+"""Cauchy scale, in standard deviations: the lowest foot is not always one that
+carries, and then goes a few centimetres a frame, forward."""
+CAMERA_SIGMA = (0.02, 0.02)
+"""rad, m per frame squared: how steadily a hand moves a camera."""
 
 
 def without(*kinds: type[graph.AbstractFactor]) -> Variant:
@@ -63,7 +68,7 @@ def with_stance(problem: graph.Problem, state: graph.State) -> Start:
     body, present = _person(problem)
     low = carrying(body, state, present)
     sigma = jnp.where(low, STANCE_SIGMA, jnp.inf)
-    more = graph.StanceFoot(body=body, sigma=sigma)
+    more = graph.StanceFoot(body, sigma, loss=graph.Cauchy(jnp.asarray(_STANCE_LOSS)))
     return rebuild(problem, state, [*problem.factors, more]), state
 
 
@@ -77,14 +82,12 @@ def with_steady_camera(problem: graph.Problem, state: graph.State) -> Start:
 
 
 def with_up(problem: graph.Problem, state: graph.State) -> Start:
-    """Beside all else, people stand along their mean up direction."""
+    """Beside all else, trunks lean little about where they point on average."""
     _, present = _person(problem)
-    ups = graph.world_from_root(state)[..., :3, 1]
-    up = jnp.where(present[..., None], ups, 0.0).sum(axis=(0, 1))
-    more = graph.UpDirection(
-        up=up / jnp.linalg.norm(up), sigma=jnp.where(present, UP_SIGMA, jnp.inf)
-    )
-    return rebuild(problem, state, [*problem.factors, more]), state
+    weights = GraphWeights(upright_sigma=UP_SIGMA)
+    more = upright_factor(state, np.asarray(present), 30.0, weights)
+    factors = problem.factors if more is None else [*problem.factors, more]
+    return rebuild(problem, state, factors), state
 
 
 def carrying(

@@ -32,6 +32,7 @@ WEIGHTS: dict[str, tuple[type[graph.AbstractFactor], str]] = {
     "shape": (graph.Shape, "sigma"),
     "orientation": (graph.RootOrientation, "sigma"),
     "turning": (graph.RootTurning, "sigma"),
+    "upright": (graph.UpDirection, "sigma"),
     "smooth path": (graph.RootSmoothness, "sigma"),
     "ground": (graph.GroundContact, "sigma"),
     "landmark": (graph.Reprojection, "sigma"),

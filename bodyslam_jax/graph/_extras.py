@@ -240,12 +240,14 @@ def _away(measured: Float[Array, " 3"], place: Float[Array, " 3"]) -> Array:
 class StanceFoot(AbstractFrameFactor):
     """The foot that carries the weight does not move in the world, between k-1 and k.
 
-    Needs no learnt motion, and sees scale through the length of the leg.
+    Needs no learnt motion, and sees scale through the length of the leg. Errors are in
+    lengths of the leg: postures that err move the foot of a smaller person less, and
+    errors in metres would shrink people and world.
     """
 
     body: BodyModel
     sigma: Float[Array, "h t f"]
-    """m per frame, for the points of the feet; `inf` where one does not carry."""
+    """Legs per frame, for the points of the feet; `inf` where one does not carry."""
     loss: AbstractLoss = Squared()
     points: tuple[int, ...] = eqx.field(static=True, default=BODY25_FEET)
     """Which keypoints of BODY_25 they are."""
@@ -263,7 +265,8 @@ class StanceFoot(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         now, before = (self._feet(f, shared) for f in window)
-        return (now - before) / data[:, None]
+        leg = unit_length(self.body, shared)
+        return (now - before) / leg / data[:, None]
 
     def _feet(self, frame, shared):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")

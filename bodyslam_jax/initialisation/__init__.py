@@ -18,3 +18,4 @@ from bodyslam_jax.initialisation._scale import scale_start as scale_start
 from bodyslam_jax.initialisation._state import first_state as first_state
 from bodyslam_jax.initialisation._state import free_people as free_people
 from bodyslam_jax.initialisation._state import no_people as no_people
+from bodyslam_jax.initialisation._upright import upright_factor as upright_factor

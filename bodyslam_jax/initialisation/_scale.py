@@ -12,6 +12,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.ground import find_ground
+from bodyslam_jax.initialisation._upright import mean_up
 from bodyslam_jax.people import Roots
 from bodyslam_jax.sequence import Keypoints
 
@@ -98,12 +99,10 @@ def ground_contact(
         there &= (keypoints.confidence[:, :, _FEET] > _SEEN).any(axis=-1)
     if weights.ground_sigma is None or there.sum() < 2:
         return None
-    up = np.asarray(state.cameras[:, :3, :3] @ state.roots[..., :3, 1:2])[there]
-    up = up[..., 0].mean(axis=0)
     plane = find_ground(
         np.asarray(state.landmarks),
         np.asarray(state.cameras[:, :3, 3]),
-        up / np.linalg.norm(up),
+        mean_up(state, there),
     )
     if plane is None:
         return None
