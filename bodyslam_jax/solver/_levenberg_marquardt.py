@@ -4,6 +4,7 @@ Marquardt's damping (in proportion to each variable's own curvature, as units he
 m, rad and shape) with Nielsen's update; steps are accepted on the true robust cost. The
 linearisation is kept after a rejected step. The motion model's prediction is frozen
 within a step and made anew after each accepted one, unless it is coupled (`_coupling`).
+Landmarks that no step would bring back are triangulated anew (`_triangulation`).
 
 The stages of a schedule are phases of one loop, and differ by a mask: what they do is
 compiled once, and so is what covariances need of the last linearisation.
