@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 
 from bodyslam_jax import evaluation
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.outcome import Cameras
 from bodyslam_jax.result import Result
 
@@ -19,18 +20,18 @@ _HEADLINE = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "scale")
 
 
 def errors(
-    result: Result, cameras: Cameras, truth: Result
+    result: Result, cameras: Cameras, truth: Result, body: BodyModel
 ) -> dict[str, dict[str, float | str]]:
     """What `bodyslam evaluate` says, before and after the joint estimate.
 
     Cameras alone are judged, if they moved, by what needs neither scale nor people; for
     all else a word says what is missing.
     """
-    after = evaluation.evaluate(result, truth)
+    after = evaluation.evaluate(result, truth, body)
     found: dict[str, dict[str, float | str]] = {}
     # The people stay, unheeded: with them it is the same program.
     unscaled = dataclasses.replace(result, T_WC=cameras.T_WC)
-    before = evaluation.evaluate(unscaled, truth)
+    before = evaluation.evaluate(unscaled, truth, body)
     if cameras.kind == "moving" and np.isfinite(before["c_ate_sim3"]):
         found[ALONE] = {
             key: "no people" if key in after.people else "no scale" for key in after

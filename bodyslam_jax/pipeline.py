@@ -233,7 +233,7 @@ def _to_folder(
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         rehearsal.wait("errors")
-        result.summary["errors"] = found = accuracy.errors(result, cameras, truth)
+        result.summary["errors"] = found = accuracy.errors(result, cameras, truth, body)
         result.summary["headline"] += accuracy.headline(found)
     rehearsal.wait("files")
     watch = Stopwatch()

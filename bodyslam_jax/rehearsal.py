@@ -70,7 +70,7 @@ def rehearse(
         "people": lambda: people.estimate_bodies(sequence, body, config.people_fit),
         "prediction": lambda: _prediction(sequence, body, config),
         "outcome": lambda: made.append(_outcome(sequence, body, config)),
-        "errors": lambda: evaluation.evaluate(made[0], truth) if truth else None,
+        "errors": lambda: truth and evaluation.evaluate(made[0], truth, body),
         "files": lambda: _files(made[0], sequence, body, config),
     }
     return Rehearsal(parts)

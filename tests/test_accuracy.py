@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import accuracy
+from bodyslam_jax.body import load_body_model
 from bodyslam_jax.outcome import Cameras
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Tracks
 
+BODY = load_body_model()
 T = 30
 WOBBLE, SMALLER = 0.02, 0.005  # m, of the cameras before and after
 
@@ -68,7 +70,7 @@ def _cameras(kind: str = "moving") -> Cameras:
 
 def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
-    found = accuracy.errors(result, _cameras(), truth)
+    found = accuracy.errors(result, _cameras(), truth, BODY)
     assert list(found) == [accuracy.ALONE, accuracy.JOINT]
     alone, joint = found.values()
     # In metres though the cameras are not: the truth's size is lent to them.
@@ -91,13 +93,13 @@ def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
 @pytest.mark.parametrize("kind", ["static", "rotation"])
 def test_a_camera_without_a_path_is_not_judged_alone(kind):
     truth = _result(_path(0.0))
-    assert list(accuracy.errors(truth, _cameras(kind), truth)) == [accuracy.JOINT]
+    assert list(accuracy.errors(truth, _cameras(kind), truth, BODY)) == [accuracy.JOINT]
 
 
 def test_a_truth_without_cameras_judges_people_only():
     result = _result(_path(0.0))
     truth = dataclasses.replace(result, summary={"has_camera": False})
-    found = accuracy.errors(result, _cameras(), truth)
+    found = accuracy.errors(result, _cameras(), truth, BODY)
     assert list(found) == [accuracy.JOINT]
     (line,) = accuracy.headline(found)
     assert "C-ATE" not in line and "H-ATE" in line

@@ -115,9 +115,14 @@ def test_written_settings_are_read_back(tmp_path):
 def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
     trajectory, motion = tmp_path / "camera.txt", tmp_path / "walk.npz"
     trajectory.write_text("0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n")
-    np.savez(motion, poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
+    arrays = {"poses": np.zeros((2, 156)), "trans": np.zeros((2, 3))}
+    np.savez(motion, **arrays)
     out = tmp_path / "sequence"
     argv = ("convert-dataset", "tum-amass", trajectory, motion, out)
+    code, _, err = _run(monkeypatch, capsys, *argv)
+    assert code == 1 and "walk.npz: no array betas, mocap_framerate" in err
+    assert not out.exists()
+    np.savez(motion, **arrays, betas=np.zeros(16), mocap_framerate=120.0)
     code, said, _ = _run(monkeypatch, capsys, *argv)
     assert code == 0 and str(out) in said
     truth = out / "groundtruth"

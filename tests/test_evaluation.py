@@ -13,6 +13,7 @@ from evo.core.geometry import umeyama_alignment
 from evo.core.trajectory import PoseTrajectory3D
 
 from bodyslam_jax import evaluation
+from bodyslam_jax.body import joints, keypoints, load_body_model
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.result import Result
 
@@ -177,6 +178,11 @@ def test_root_error_by_hand():
     np.testing.assert_allclose(found.mean(), 0.4 / 9)
 
 
+@pytest.fixture(scope="module")
+def body():
+    return load_body_model(dtype=jnp.float64)
+
+
 def _evo(T_WC):
     return PoseTrajectory3D(
         timestamps=np.arange(len(T_WC), dtype=float), poses_se3=list(np.asarray(T_WC))
@@ -260,6 +266,36 @@ def test_feet_slide_only_where_the_truth_stands():
     np.testing.assert_allclose(found.mean(), 0.02)
 
 
+def test_feet_are_toes_and_heels_of_the_body_that_both_have(body):
+    """And else the joints of ankles and feet, of which the table tells."""
+    rng = np.random.default_rng(0)
+    truth = _truth(num_frames=8)
+    poses, trans = 0.2 * rng.normal(size=(1, 8, 72)), rng.normal(size=(1, 8, 3))
+    betas = rng.normal(size=(1, 10))
+    args = (body, jnp.asarray(poses), jnp.asarray(betas[:, None]), jnp.asarray(trans))
+    own = dataclasses.replace(
+        truth, poses=poses, betas=betas, trans=trans, joints=np.array(joints(*args))
+    )
+    estimate, _ = evaluation.associate(own, own, body)
+    points = keypoints(*args, layout="body25")
+    expected = np.asarray(points)[:, :, [19, 21, 22, 24]]
+    np.testing.assert_allclose(estimate.feet, expected, atol=1e-12)
+    assert "of toes and heels" in _feet_row(evaluation.evaluate(own, own, body))
+    # The other side's joints are not this body's.
+    others = dataclasses.replace(own, joints=own.joints + 0.02)
+    estimate, _ = evaluation.associate(own, others, body)
+    np.testing.assert_allclose(estimate.feet, own.joints[:, :, [7, 10, 8, 11]])
+    assert "of ankle and foot joints" in _feet_row(
+        evaluation.evaluate(own, others, body)
+    )
+
+
+def _feet_row(found):
+    """Feet that never stand slide by no figure: the row is there all the same."""
+    found = dataclasses.replace(found, values={"foot_sliding": jnp.array(0.0)})
+    return evaluation.to_table(found)
+
+
 def test_masked_frames_do_not_count(noisy):
     estimate, truth = _pair(*noisy)
     mask = jnp.ones(NUM, bool).at[40:60].set(False)
@@ -270,9 +306,50 @@ def test_masked_frames_do_not_count(noisy):
         camera_valid=x.camera_valid & mask,
         present=x.present & mask,
     )
-    near, far = (evaluate(masked(estimate, off), truth) for off in (0.0, 50.0))
+    near, far, none = (
+        evaluate(masked(estimate, off), truth) for off in (0.0, 50.0, np.nan)
+    )
     for name, value in near.items():
         np.testing.assert_allclose(value, far[name], atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(value, none[name], atol=1e-12, err_msg=name)
+
+
+def test_an_estimate_that_is_not_a_number_is_not_perfect(noisy):
+    """A single frame that counts spoils every error of camera or person."""
+    estimate, truth = _pair(*noisy)
+    broken = dataclasses.replace(
+        estimate,
+        T_WC=estimate.T_WC.at[7].set(jnp.nan),
+        joints=estimate.joints.at[:, 7].set(jnp.nan),
+        feet=estimate.feet.at[:, 7].set(jnp.nan),
+    )
+    found = evaluate(broken, truth)
+    assert "jitter_of_truth" in found
+    for name, value in found.items():
+        if "of_truth" not in name and not name.startswith("foot_sliding"):
+            assert np.isnan(value), name
+
+
+def test_one_broken_person_spoils_the_mean_of_all():
+    estimate, truth = _pair(_truth(2), _truth(2))
+    broken = dataclasses.replace(estimate, joints=estimate.joints.at[1, 7].set(jnp.nan))
+    found = evaluate(broken, truth)
+    assert float(found.people["h_ate_se3"][0]) < 1e-9
+    assert np.isnan(found["h_ate_se3"]) and float(found["c_ate_se3"]) < 1e-9
+
+
+def test_a_camera_that_stands_still_has_no_scale(noisy):
+    """Two millimetres of noise are no path; what needs none is as it was."""
+    estimate, truth = _pair(*noisy)
+    jitter = 0.002 * np.random.default_rng(0).normal(size=(NUM, 3))
+    on_a_tripod = lambda x, off: dataclasses.replace(
+        x, T_WC=x.T_WC.at[:, :3, 3].set(jnp.array([3.0, 1, 1]) + off)
+    )
+    found = evaluate(on_a_tripod(estimate, jitter), on_a_tripod(truth, 0.0))
+    for name in ("scale", "scale_error", "c_ate_sim3", "h_ate_a2", "j_ate_a2_rmse"):
+        assert np.isnan(found[name]), name
+    assert 0 < float(found["c_ate_se3"]) < 0.005
+    assert np.isfinite(found["h_ate_se3"]) and np.isfinite(found["h_ate_a3"])
 
 
 def test_padding_changes_nothing(noisy):

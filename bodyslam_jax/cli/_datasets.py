@@ -15,11 +15,12 @@ def emdb(source: Input, out: _Out, /, *, body_model: Path | None = None) -> None
     Args:
         source: Folder with *_data.pkl and images/.
         out: Sequence folder to write.
-        body_model: SMPL of the subject's gender; it makes the true joints.
+        body_model: SMPL of the subject's gender, or a folder with it; it makes the true
+            joints. Without it, it is looked for where `doctor` says.
     """
-    from bodyslam_jax import body, evaluation
+    from bodyslam_jax import evaluation
 
-    print(evaluation.convert_emdb(source, out, body.load_body_model(body_model)))
+    print(evaluation.convert_emdb(source, out, body_model))
 
 
 def threedpw(source: Input, out: _Out, /) -> None:
@@ -43,6 +44,7 @@ def rich(
     sequence: str,
     camera: int,
     body_model: Path | None = None,
+    genders: Path | None = None,
 ) -> None:
     """One still camera's view of a RICH sequence: camera, images and ground truth.
 
@@ -52,12 +54,15 @@ def rich(
         split: train, val or test.
         sequence: Name of the sequence.
         camera: Number of the camera.
-        body_model: SMPL-X of the subject's gender; it makes the true joints.
+        body_model: Folder with SMPL-X of the subjects' genders; it makes the true
+            joints.
+        genders: gender.json of RICH's toolkit, if not in its resource/ here.
     """
-    from bodyslam_jax import body, evaluation
+    from bodyslam_jax import evaluation
 
-    model = body.load_body_model(body_model)
-    print(evaluation.convert_rich(root, split, sequence, camera, out, model))
+    print(
+        evaluation.convert_rich(root, split, sequence, camera, out, body_model, genders)
+    )
 
 
 def tum_amass(

@@ -85,20 +85,29 @@ def _finish(result: Any, out: Path) -> int:
 
 
 def evaluate(
-    run: Input, groundtruth: tyro.conf.Positional[Path], /, *, json: bool = False
+    run: Input,
+    groundtruth: tyro.conf.Positional[Path],
+    /,
+    *,
+    body_model: Path | None = None,
+    json: bool = False,
 ) -> None:
     """Errors of a run folder against a ground truth: cameras, people, joints, scale.
 
     Args:
         run: Run folder.
         groundtruth: Folder with camera.txt (TUM) and body.npz (AMASS style).
+        body_model: SMPL, or a folder with it for each gender; makes true joints where
+            the ground truth holds none.
         json: Print JSON instead of a table.
     """
     import bodyslam_jax as bs
     from bodyslam_jax import evaluation
 
-    truth = evaluation.read_groundtruth(groundtruth, bs.load_body_model())
-    found = evaluation.evaluate(evaluation.read_result(run), truth)
+    truth = evaluation.read_truth(groundtruth, body_model)
+    # Toes and heels slide, where the joints of both sides are this body's.
+    body = bs.load_body_model(body_model)
+    found = evaluation.evaluate(evaluation.read_result(run), truth, body)
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
 
 

@@ -11,6 +11,7 @@ from bodyslam_jax.evaluation._datasets import convert_3dpw as convert_3dpw
 from bodyslam_jax.evaluation._datasets import convert_emdb as convert_emdb
 from bodyslam_jax.evaluation._datasets import convert_rich as convert_rich
 from bodyslam_jax.evaluation._datasets import convert_tum_amass as convert_tum_amass
+from bodyslam_jax.evaluation._datasets import read_truth as read_truth
 from bodyslam_jax.evaluation._evaluation import ROWS as ROWS
 from bodyslam_jax.evaluation._evaluation import Evaluation as Evaluation
 from bodyslam_jax.evaluation._evaluation import Trajectories as Trajectories

@@ -104,8 +104,8 @@ def similarity_from_moments(
     rotation = nearest_rotation(covariance)
     if with_scale:
         explained = jnp.sum(rotation * covariance, (-2, -1))  # tr(D S)
-        has_extent = variance > jnp.finfo(variance.dtype).tiny
-        scale = jnp.where(has_extent, explained / jnp.where(has_extent, variance, 1), 1)
+        is_point = variance <= jnp.finfo(variance.dtype).tiny  # false for NaN
+        scale = jnp.where(is_point, 1, explained / jnp.where(is_point, 1, variance))
     else:
         scale = jnp.ones_like(variance)
     moved = (rotation @ source_mean[..., None])[..., 0]
@@ -120,12 +120,14 @@ def umeyama(
 ) -> Similarity:
     """The SE(3), or with `with_scale` Sim(3), that minimises `Σ w |y - s R x - t|²`.
 
-    A weight of zero is a point that does not exist. With fewer than three points, or
-    collinear ones, one of the many minimisers; with no weight at all, the identity's
-    rotation and scale. The gradient is finite in all of these.
+    A weight of zero is a point that does not exist, whatever stands there. With fewer
+    than three points, or collinear ones, one of the many minimisers; with no weight at
+    all, the identity's rotation and scale. The gradient is finite in all of these.
     """
     if weights is None:
         weights = jnp.ones_like(target[..., 0])
+    exists = weights[..., None] != 0
+    target, source = jnp.where(exists, target, 0), jnp.where(exists, source, 0)
     total = jnp.sum(weights, -1, keepdims=True)
     w = (weights / jnp.where(total > 0, total, 1))[..., None]
     target_mean, source_mean = jnp.sum(w * target, -2), jnp.sum(w * source, -2)

@@ -46,7 +46,8 @@ def evaluate(
         return evaluate_trajectories(result, truth)
     if not isinstance(result, Result) or not isinstance(truth, Result):
         raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
-    return _evaluate(*associate(result, truth, body, offset))
+    *pair, feet = _associate(result, truth, body, offset)
+    return dataclasses.replace(_evaluate(*pair), feet=feet)
 
 
 _evaluate = jit_once(evaluate_trajectories)
@@ -70,10 +71,17 @@ def associate(
 
     **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
     """
+    return _associate(result, truth, body, offset)[:2]
+
+
+def _associate(
+    result: Result, truth: Result, body: BodyModel | None, offset: float
+) -> tuple[Trajectories, Trajectories, str]:
+    """Estimate, truth, and which points the feet are."""
     times = result.timestamps + offset
     slower = _interval(times) >= 0.999 * _interval(truth.timestamps)
     at = times if slower else truth.timestamps
-    feet, true_feet = _feet(result, truth, body)
+    feet, true_feet, kind = _feet(result, truth, body)
     found = _resample(_host(result, feet), times, at)
     true = _resample(_host(truth, true_feet), truth.timestamps, at)
     overlap = np.flatnonzero(found.close & true.close)
@@ -91,7 +99,11 @@ def associate(
         _bundle(true, frames, everybody[1], fps),
     )
     who, true_who = _match(*pair)
-    return _bundle(found, frames, who, fps), _bundle(true, frames, true_who, fps)
+    found, true = (
+        _bundle(found, frames, who, fps),
+        _bundle(true, frames, true_who, fps),
+    )
+    return found, true, kind
 
 
 def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
@@ -264,25 +276,27 @@ def _h_ate_of_all_pairs(
 
 def _feet(
     result: Result, truth: Result, body: BodyModel | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Foot points of both sides, of the same kind."""
-    if body is not None and all(_is_of(x, body) for x in (result, truth)):
-        return _toes_and_heels(result, body), _toes_and_heels(truth, body)
-    return result.joints[:, :, FEET], truth.joints[:, :, FEET]
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Foot points of both sides, of the same kind, and which."""
+    if body is not None:
+        feet, true_feet = (_feet_of(x, body) for x in (result, truth))
+        if feet is not None and true_feet is not None:
+            return feet, true_feet, "toes and heels"
+    feet, true_feet = (x.joints[:, :, FEET] for x in (result, truth))
+    return feet, true_feet, "ankle and foot joints"
 
 
-def _is_of(result: Result, body: BodyModel) -> bool:
-    """Whether the joints are this body's, to a centimetre."""
-    mine = joints(body, *_pose_shape_trans(result, body))
-    here = result.present[..., None, None]
-    return bool(
-        np.max(np.abs(np.asarray(mine) - result.joints) * here, initial=0) < 0.01
-    )
+def _feet_of(result: Result, body: BodyModel) -> np.ndarray | None:
+    """Toes and heels, if the joints are this body's, to a centimetre."""
+    mine, points = _joints_and_feet(body, *_pose_shape_trans(result, body))
+    apart = np.max(np.abs(np.asarray(mine) - result.joints), (-2, -1))
+    return np.asarray(points) if np.all(apart[result.present] < 0.01) else None
 
 
-def _toes_and_heels(result: Result, body: BodyModel) -> np.ndarray:
-    found = keypoints(body, *_pose_shape_trans(result, body), layout="body25")
-    return np.asarray(found[:, :, _TOES_AND_HEELS, :])
+@jit_once
+def _joints_and_feet(body, pose, shape, trans):
+    points = keypoints(body, pose, shape, trans, layout="body25")
+    return joints(body, pose, shape, trans), points[..., np.array(_TOES_AND_HEELS), :]
 
 
 def _pose_shape_trans(result: Result, body: BodyModel) -> tuple[Array, Array, Array]:

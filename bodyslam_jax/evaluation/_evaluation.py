@@ -15,6 +15,8 @@ from bodyslam_jax.evaluation import _metrics as metrics
 from bodyslam_jax.evaluation._alignment import Alignment, align
 
 PELVIS = 0
+STILL = 0.01
+"""m; a camera whose path has a smaller radius (root mean square) stands still."""
 FEET = (7, 10, 8, 11)
 """Left ankle and foot, right ankle and foot: what slides where no mesh is known."""
 
@@ -44,13 +46,15 @@ class Evaluation(eqx.Module):
     """Errors by name in m, rad, s: `found["c_ate_se3"]` is a mean, `..._rmse` its RMSE.
 
     A mapping: `keys`, `items`, `in` and `len` work. NaN where the truth (or the
-    estimate) lacks what the error is about.
+    estimate) lacks what the error is about, and where a frame that counts is NaN.
     """
 
     values: dict[str, Float[Array, "*b"]]
     """Cameras, and the mean over people of theirs."""
     people: dict[str, Float[Array, "*b h"]]
     """The same names, person by person, in the truth's order."""
+    feet: str = eqx.field(static=True, default="the points given")
+    """What `foot_sliding` is of."""
 
     def __getitem__(self, name: str) -> Float[Array, "*b"]:
         return self.values[name]
@@ -77,7 +81,8 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
     `c_` is the camera, `h_` the human centre, `j_` the joints. `_se3` and `_sim3` are
     alignment A1 (camera and person each on its own), `_a2`, `_a3`, `_a4` the other
     three in SE(3). `scale` is that of the camera's Sim(3) alignment (paper: "scale
-    error", best 1), `scale_error` is `|1 - scale|`.
+    error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
+    `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then.
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
@@ -95,12 +100,33 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
             truth,
             camera_valid,
         )
-        values |= {name: _mean_over_people(value) for name, value in people.items()}
+        camera_broken = _is_broken(estimate.T_WC, camera_valid)
+        counts = estimate.present & truth.present
+        broken = camera_broken | jax.vmap(_is_broken)(estimate.joints, counts)
+        mean = lambda value: _mean_over_people(value, broken)
+        values |= {name: mean(value) for name, value in people.items()}
     return Evaluation(values, people)
 
 
-def _mean_over_people(value: Float[Array, " h"]) -> Float[Array, ""]:
-    return metrics.Errors(jnp.nan_to_num(value), ~jnp.isnan(value)).mean()
+def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether something that counts is not a number."""
+    return jnp.any(valid & ~jnp.all(jnp.isfinite(x), tuple(range(1, x.ndim))))
+
+
+def _mean_over_people(
+    value: Float[Array, " h"], broken: Bool[Array, " h"]
+) -> Float[Array, ""]:
+    """Over those for whom the error exists; NaN if it is NaN as the estimate is."""
+    exists = ~jnp.isnan(value) | broken
+    return metrics.Errors(value, exists).mean()
+
+
+def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether the camera's root mean square distance from its mean is above `STILL`."""
+    (centre,) = metrics.only(valid, T_WC[:, :3, 3])
+    count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
+    (apart,) = metrics.only(valid, centre - jnp.sum(centre, 0) / count)
+    return jnp.sum(apart**2) / count > STILL**2
 
 
 def _both(name: str, errors: metrics.Errors) -> dict[str, Array]:
@@ -129,7 +155,9 @@ def _camera_errors(
         values |= _both(f"c_ate_{group}", error)
         scale = found.scale
     values["ate_s"] = values["c_ate_se3"]
-    known = jnp.any(valid)
+    known = _moves(truth.T_WC, valid)
+    for name in ("c_ate_sim3", "c_ate_sim3_rmse"):
+        values[name] = jnp.where(known, values[name], jnp.nan)
     values["scale"] = jnp.where(known, scale, jnp.nan)
     values["scale_error"] = jnp.where(known, jnp.abs(1 - scale), jnp.nan)
     moved, turned = metrics.relative_pose_errors(estimate.T_WC, truth.T_WC, valid)
@@ -170,6 +198,8 @@ def _person_errors(
             with_scale,
         )
         usable = valid if alignment == "A1" else valid & jnp.any(camera_valid)
+        if alignment == "A2":
+            usable = valid & _moves(truth.T_WC, camera_valid)
         if alignment in ("A3", "A4"):
             values |= _both(
                 f"c_ate_{name}",
@@ -191,9 +221,11 @@ def _person_errors(
         every = metrics.world_mpjpe(joints, true_joints, valid, "all", chunking)
         values |= _both(f"w_mpjpe{suffix}", first) | _both(f"wa_mpjpe{suffix}", every)
     values |= _both("rte", metrics.root_trajectory_error(centre, true_centre, valid))
-    in_camera = metrics.camera_frame(joints, estimate.T_WC)
-    true_in_camera = metrics.camera_frame(true_joints, truth.T_WC)
     seen = valid & camera_valid
+    in_camera, true_in_camera = (
+        metrics.camera_frame(*metrics.only(seen, points, T_WC))
+        for points, T_WC in ((joints, estimate.T_WC), (true_joints, truth.T_WC))
+    )
     values |= _both("mpjpe", metrics.mpjpe(in_camera, true_in_camera, seen))
     values |= _both("pa_mpjpe", metrics.pa_mpjpe(joints, true_joints, valid))
     values |= _both(
@@ -250,8 +282,14 @@ def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
         value = float(evaluation[name]) * factor if name in evaluation else math.nan
         return "–" if math.isnan(value) else f"{value:.4g}"
 
+    more = {"foot_sliding": f" of {evaluation.feet}"}
     rows = [
-        (label, cell(name, factor), cell(f"{name}_rmse", factor), unit)
+        (
+            label + more.get(name, ""),
+            cell(name, factor),
+            cell(f"{name}_rmse", factor),
+            unit,
+        )
         for name, label, unit, factor in ROWS
     ]
     return [row for row in rows if row[1] != "–"]

@@ -52,7 +52,14 @@ def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Length of each vector, with derivative 0 where it is zero."""
     # Written out: XLA on CPU does not vectorise a sum over so short an axis.
     square = sum((x[..., k] ** 2 for k in range(1, x.shape[-1])), x[..., 0] ** 2)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    # Compared so that NaN stays NaN: a broken estimate must not look perfect.
+    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
+
+
+def only(valid: Bool[Array, " t"], *arrays: Float[Array, "t ..."]) -> list[Array]:
+    """Zeros where frames do not count, so that not even NaN there spreads."""
+    shaped = lambda x: valid.reshape(valid.shape + (1,) * (x.ndim - 1))
+    return [jnp.where(shaped(x), x, 0) for x in arrays]
 
 
 def trajectory_error(
@@ -67,6 +74,7 @@ def trajectory_error(
     al., ECCV 2022, section 4. Sturm et al., IROS 2012, call the RMSE "ATE"; TRAM and
     evo's `mean` the mean. ATE-S (TRAM) is the mean of C-ATE in SE(3).
     """
+    estimate, truth = only(valid, estimate, truth)
     return Errors(norm(alignment.apply(estimate) - truth), valid)
 
 
@@ -81,6 +89,7 @@ def joint_trajectory_error(
     Henning et al., ECCV 2022, table 1, who do not say how joints are aligned: they
     move with their body here.
     """
+    estimate, truth = only(valid, estimate, truth)
     value = norm(alignment.apply(estimate) - truth)
     return Errors(value, jnp.broadcast_to(valid[:, None], value.shape))
 
@@ -102,7 +111,9 @@ def relative_pose_errors(
         moved = T[step:, :3, 3] - T[:-step, :3, 3]
         return rotation @ T[step:, :3, :3], (rotation @ moved[..., None])[..., 0]
 
-    (R, t), (R_true, t_true) = relative(estimate), relative(truth)
+    still = jnp.eye(4, dtype=truth.dtype)
+    kept = lambda T: relative(jnp.where(valid[:, None, None], T, still))
+    (R, t), (R_true, t_true) = kept(estimate), kept(truth)
     turned = jnp.swapaxes(R_true, -1, -2)
     angle = norm(jaxlie.SO3.from_matrix(turned @ R).log())
     both = valid[step:] & valid[:-step]
@@ -131,6 +142,7 @@ def mpjpe(
 
     EMDB's evaluation (`eth-ait/emdb`), where the pelvis is the middle of the hips.
     """
+    estimate, truth = only(valid, estimate, truth)
     value = norm(hip_centred(estimate) - hip_centred(truth))
     return Errors(value, jnp.broadcast_to(valid[:, None], value.shape))
 
@@ -141,6 +153,7 @@ def pa_mpjpe(
     valid: Bool[Array, " t"],
 ) -> Errors:
     """PA-MPJPE, m: after the best Sim(3) of each frame on its own (Procrustes)."""
+    estimate, truth = only(valid, estimate, truth)
     found = umeyama(truth, estimate, with_scale=True)
     value = norm(jax.vmap(Similarity.apply)(found, estimate) - truth)
     return Errors(value, jnp.broadcast_to(valid[:, None], value.shape))
@@ -182,6 +195,7 @@ def world_mpjpe(
     multiple of 100, when the last 100 frames are in no chunk. TRAM has no chunk at all
     for `n <= 100`; here that is one chunk of all frames.
     """
+    estimate, truth = only(valid, estimate, truth)
     chunk, place, used = _chunks(valid, chunking)
     num_chunks = (len(valid) + CHUNK - 1) // CHUNK
     chunk = jnp.clip(chunk, 0, num_chunks - 1)
@@ -219,6 +233,7 @@ def root_trajectory_error(
     GVHMR and TRAM). Invalid frames are dropped first. A truth that moves less than 1 mm
     in all counts as one that moved 1 mm, so that the figure stays finite.
     """
+    estimate, truth = only(valid, estimate, truth)
     order = jnp.argsort(~valid, stable=True)
     moved = norm(jnp.diff(truth[order], axis=0))
     length = jnp.sum(jnp.where(jnp.arange(1, len(valid)) < jnp.sum(valid), moved, 0))
@@ -238,6 +253,7 @@ def acceleration_error(
     WHAM takes hip-centred joints of the camera frame and leaves out the first and the
     last value; all are kept here.
     """
+    estimate, truth = only(valid, estimate, truth)
     value = norm(jnp.diff(estimate - truth, n=2, axis=0)) * fps**2
     return Errors(value, jnp.broadcast_to(_run(valid, 2)[:, None], value.shape))
 
@@ -250,6 +266,7 @@ def jitter(
     WHAM and GVHMR print a tenth of it ("10 m/s³"). EMDB's own jitter is something
     else (reference frame, and joints set to zero).
     """
+    (joints,) = only(valid, joints)
     value = norm(jnp.diff(joints, n=3, axis=0)) * fps**3
     return Errors(value, jnp.broadcast_to(_run(valid, 3)[:, None], value.shape))
 
@@ -265,6 +282,7 @@ def foot_sliding(
     WHAM `compute_foot_sliding`, with SMPL's vertices 3216, 3387, 6617, 6787 (big toes
     and heels) and 30 fps.
     """
+    estimate, truth = only(valid, estimate, truth)
     step, true_step = norm(jnp.diff(estimate, axis=0)), norm(jnp.diff(truth, axis=0))
     return Errors(step, (true_step < 0.01) & _run(valid, 1)[:, None])
 

@@ -89,7 +89,6 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     if not cameras and not bodies:
         raise ValueError(f"{path}: neither camera.txt nor body.npz in this folder.")
     people = [_read_body(file, body) for file in bodies]
-    people = [_read_body(file, body) for file in bodies]
     camera = read_tum(cameras[0]) if cameras else None
     times, T_WC = _timeline(camera, people)
     placed = [_at(person, times, camera is not None) for person in people]
