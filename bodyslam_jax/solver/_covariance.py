@@ -13,12 +13,12 @@ from bodyslam_jax.compilation import is_alone, jit_once
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
 from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
-from bodyslam_jax.solver._levenberg_marquardt import little
 from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._normal import damped, diagonals
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._selected_inverse import selected_inverse
 from bodyslam_jax.solver._solve import method_of, run
+from bodyslam_jax.solver._trial import little
 from bodyslam_jax.solver._window import window_of
 
 

@@ -1,10 +1,9 @@
 """Levenberg-Marquardt on the factor graph, in optimistix's loop.
 
-Marquardt's damping (in proportion to each variable's own curvature, as units here mix
-m, rad and shape) with Nielsen's update; steps are accepted on the true robust cost. The
-linearisation is kept after a rejected step. The motion model's prediction is frozen
-within a step and made anew after each accepted one, unless it is coupled (`_coupling`).
-Landmarks that no step would bring back are triangulated anew (`_triangulation`).
+Steps are damped, and accepted on the true robust cost (`_trial`). The linearisation is
+kept after a rejected step. The motion model's prediction is frozen within a step and
+made anew after each accepted one, unless it is coupled (`_coupling`). Landmarks that no
+step would bring back are triangulated anew (`_triangulation`).
 
 The stages of a schedule are phases of one loop, and differ by a mask: what they do is
 compiled once, and so is what covariances need of the last linearisation.
@@ -24,32 +23,18 @@ from bodyslam_jax.solver._blocks import Linearisation, sizes_of
 from bodyslam_jax.solver._coupling import with_coupling
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final, History, Loop
-from bodyslam_jax.solver._normal import (
-    Eliminated,
-    damped,
-    diagonals,
-    eliminate,
-    quadratic,
-    slope_along,
-    solve_step,
-)
-from bodyslam_jax.solver._search import search
+from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver._trial import Trial, attempt
 from bodyslam_jax.solver._triangulation import triangulate_anew
 
-GAIN = 1e-4
-"""Least share of the predicted decrease at which a step is accepted."""
 MAX_DAMPING = 1e12
-CAUTION = (1e-2, 1e4)
-"""Least and greatest damping of a landmark that a step would have thrown off."""
 LOST = (10.0, 0.5)
 """Decrease of the cost for which a landmark is triangulated anew, after the first step
 and later: the cost is a negative log-likelihood."""
 NEAR = 0.01
 """Share of the cost: landmarks are looked at again after a step that gains no more, as
 cameras are about right then, and at the end."""
-SHRINK = 0.1
-"""Least factor of the damping after a good step."""
 
 
 class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -129,62 +114,25 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         problem: Problem = args.with_prediction(prediction)
         known = jnp.sum(lin.costs)
-        diagonal = diagonals(lin, sizes)
-        damping = jnp.where(last, little(dtype), state.damping)
-        extra = damped(diagonal, damping)
-        least = jnp.where(last, 0.0, state.caution)
-        extra["landmarks"] = tuple(
-            jnp.maximum(more, least[bucket.landmark][:, None] * own)
-            for more, own, bucket in zip(
-                extra["landmarks"],
-                diagonal["landmarks"],
-                problem.layout.buckets,
-                strict=True,
-            )
-        )
-        eliminated = eliminate(problem, lin, sizes, extra)
-        move = solve_step(problem, y, lin, sizes, eliminated)
-        length = quadratic(problem, diagonal, move)
-        slope = -slope_along(problem, lin, move)
-        predicted = 0.5 * (quadratic(problem, extra, move) + slope)
-        finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
-        move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
-        slope = jnp.where(finite, slope, 0.0)
-        trial, thrown, best, terms, gain = search(
-            problem, y, move, slope, predicted, lin.costs
-        )
-        more = jnp.clip(10 * state.caution, *CAUTION)
-        caution = jnp.where(thrown, more, 0.1 * state.caution)
-        cost = jnp.sum(terms)
-        accept = finite & (predicted > 0) & (known - cost > GAIN * best * predicted)
-        shrink = jnp.maximum(1 - (2 * gain - 1) ** 3, SHRINK)
-        shrink = jnp.where(gain < 0.25, 2.0, shrink)
-        lower = jnp.maximum(damping * shrink, least_damping(dtype))
-        higher = jnp.maximum(damping, least_damping(dtype)) * state.growth
-        # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
-        eps = float(jnp.finfo(dtype).eps)
-        floor = 8 * eps * known + eps**1.25
-        tiny = predicted <= floor
+        trial = attempt(problem, y, lin, sizes, state.damping, state.caution, last)
+        accept, before = trial.accepted, jnp.sum(trial.terms)
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
-        small = predicted <= jnp.maximum(enough, floor)
-        done = finite & (tiny | (small & accept & (damping <= 1e-2)))
-        new_y = jax.tree.map(lambda a, b: jnp.where(accept, a, b), trial, y)
-        terms = jnp.where(accept, terms, lin.costs)
-        before = jnp.sum(terms)
+        done = _is_done(trial, known, enough)
         nth = state.searched
-        near = accept & ((nth == 0) | (known - cost < NEAR * known))
-        look = finite & (near & (nth < 2) | done & (nth < 3))
+        near = accept & ((nth == 0) | (known - before < NEAR * known))
+        look = trial.finite & (near & (nth < 2) | done & (nth < 3))
         least = jnp.where(nth == 0, *LOST).astype(dtype)
         new_y, terms = jax.lax.cond(
             look,
             lambda s, t: triangulate_anew(problem, s, t, least),
             lambda s, t: (s, t),
-            *(new_y, terms),
+            *(trial.state, trial.terms),
         )
         cost = jnp.sum(terms)
         found = before - cost > enough
         done = done & ~found
-        stuck = ~accept & ~done & ~found & (higher > MAX_DAMPING)
+        damping = trial.next_damping(state.growth)
+        stuck = ~accept & ~done & ~found & (damping > MAX_DAMPING)
         broken = ~jnp.isfinite(known)
         row = jnp.where(last, len(self.limit), at)
         steps = state.steps.at[row].add(1, mode="drop")
@@ -201,19 +149,18 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         history = History(
             put(put(old.cost, i, known), i + 1, cost),
             put(put(old.terms, i, lin.costs), i + 1, terms),
-            put(old.damping, i, damping),
-            put(old.step, i, jnp.sqrt(length)),
+            put(old.damping, i, trial.damping),
+            put(old.step, i, jnp.sqrt(trial.length)),
             put(old.accepted, i, accept | found),
         )
-        new_damping = jnp.where(accept, lower, higher)
         loop = Loop(
             stage=following,
             prediction=prediction,
             observations=state.observations,
-            final=final_of(lin, eliminated),
+            final=final_of(lin, trial.eliminated),
             stale=accept | found | over,
-            damping=jnp.where(over, self.damping, new_damping).astype(dtype),
-            caution=jnp.where(accept, caution, state.caution),
+            damping=jnp.where(over, self.damping, damping).astype(dtype),
+            caution=trial.caution,
             searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
             growth=jnp.where(accept | over, 2.0, 2 * state.growth).astype(dtype),
             cost=cost,
@@ -242,17 +189,16 @@ def _held(problem: Problem, free: Float[Array, " v"]) -> Problem:
     return eqx.tree_at(lambda p: p.free, problem, Step(**parts))
 
 
-def least_damping(dtype) -> float:
-    """Far below the stiffness of the softest bend of a long path of cameras, which
-    falls with the fourth power of its length: 1e-10 of a camera's own at 1,000 frames.
-    """
-    return 1e-12 if dtype == jnp.float64 else 1e-8
-
-
-def little(dtype) -> float:
-    """Damping that keeps a direction which nothing determines finite, and its variance
-    enormous."""
-    return 1e-11 if dtype == jnp.float64 else 1e-6
+def _is_done(
+    trial: Trial, known: Float[Array, ""], enough: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a step would gain less than is worth another one."""
+    # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
+    eps = float(jnp.finfo(known.dtype).eps)
+    floor = 8 * eps * known + eps**1.25
+    small = trial.predicted <= jnp.maximum(enough, floor)
+    undisturbed = trial.accepted & (trial.damping <= 1e-2)
+    return trial.finite & ((trial.predicted <= floor) | (small & undisturbed))
 
 
 def _first(problem, observations, state):
