@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 
 import bodyslam_jax.graph as g
@@ -150,31 +151,54 @@ def landmark_prior(rng, state, seen=None):
 
 
 def extra_factors(rng, state, seen=None):
-    """Everything that can be switched on, for its blocks: not all of it true."""
+    """All that `person_factors` leaves out, for its blocks: not all of it true."""
     h, t = state.roots.shape[:2]
+    i = len(state.intrinsics)
+    body = body_model()
+    normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
     late = lambda *shape, skip: jnp.full(shape, 0.05).at[:, :skip].set(jnp.inf)
+    there = jnp.ones((h, t), bool)
+    moved = there.at[:, 0].set(False)
+    steps = {
+        "translation": 0.1 * normal(h, t, 3),
+        "whitening": g.whitening_of(0.02 * jnp.eye(3) + jnp.zeros((h, t, 3, 3)), moved),
+        "correlation": g.runs(moved, 0.8),
+    }
+    turned = 0.3 * normal(h, t, 3)
     return [
         landmark_prior(rng, state, seen),
-        g.OrientationChange(
-            rotation=jnp.asarray(0.05 * rng.standard_normal((h, t, 3))),
-            sigma=late(h, t, skip=1),
+        g.HumanMotion(**steps, body=body),
+        g.HumanMotion(**steps, correlated=False),
+        g.Posture(
+            rotation=state.poses + 0.1 * normal(h, t, 23, 3),
+            sigma=jnp.full((h, t, 23), 0.3),
+            correlation=g.runs(there, 0.9),
+            correlated=False,
         ),
+        g.OrientationChange(rotation=0.05 * normal(h, t, 3), sigma=late(h, t, skip=1)),
         g.CameraPrior(cameras=state.cameras, sigma=jnp.full((t, 6), 0.3)),
         g.IntrinsicsPrior(
-            intrinsics=state.intrinsics[None], sigma=jnp.full((1, 4), 20.0)
+            intrinsics=state.intrinsics[None], sigma=jnp.full((1, i), 20.0)
         ),
         g.SquarePixels(sigma=jnp.array([3.0])),
         g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
+        g.RootSmoothness(sigma=late(h, t, skip=2), body=body),
+        g.RootTurning(sigma=late(h, t, skip=2)),
+        g.RootOrientation(
+            orientation=state.roots[..., :3, :3] @ jaxlie.SO3.exp(turned).as_matrix(),
+            sigma=jnp.full((h, t), 0.2),
+            correlation=g.runs(there, 0.9),
+        ),
         g.RootPlace(
             place=state.roots[..., :3, 3] + 0.1,
             sigma=jnp.full((h, t, 2), 0.05),
-            correlation=jnp.full((h, t), 0.9).at[:, 0].set(0.0),
+            correlation=g.runs(there, 0.9),
         ),
-        g.StanceFoot(body=body_model(), sigma=late(h, t, 4, skip=1)),
+        g.StanceFoot(body=body, sigma=late(h, t, 4, skip=1)),
         g.UpDirection(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
-            body=body_model(),
+            body=body,
             plane=jnp.array([0.1, -0.99, 0.1, 1.2]),
             sigma=late(h, t, skip=1),
         ),

@@ -47,7 +47,8 @@ class GraphWeights:
     shape_each_frame: bool = False
     """Whether each frame counts as a measurement of β of its own."""
     orientation_sigma: float | None = None
-    """Predicted turns of the person, rad a frame; none without it."""
+    """The motion model's prediction of how far the person turns in a frame of 1/30 s,
+    rad per axis; not used without it."""
     root_sigma: float | None = 0.12
     """Regressed orientation, stationary, rad per axis; not used without it."""
     root_correlation: float = 0.96
@@ -67,6 +68,12 @@ class GraphWeights:
     """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
     are of 0.006 m; held to that, a camera that goes with the person would be thought to
     move less, and the world to be smaller."""
+    stance_sigma: float | None = None
+    """How still the lowest point of the feet stands, lengths of the leg in a frame of
+    1/30 s; free without it. 0.01 suits people who walk."""
+    camera_smoothness: float | None = None
+    """Change of the camera's turn, rad, and of its step, m, in a frame of 1/30 s; free
+    without it. 0.02 suits a hand. Used where people tell how long a metre is."""
     ground_sigma: float | None = 0.04
     """How far the map's ground may be from what people stand on, m: one error for the
     whole sequence. Without it, people need not stand on anything."""

@@ -5,7 +5,6 @@ from bodyslam_jax.graph._abstract import AbstractFrameFactor as AbstractFrameFac
 from bodyslam_jax.graph._abstract import Frame as Frame
 from bodyslam_jax.graph._abstract import Shared as Shared
 from bodyslam_jax.graph._abstract import residual_of as residual_of
-from bodyslam_jax.graph._extras import BODY25_FEET as BODY25_FEET
 from bodyslam_jax.graph._extras import CameraPrior as CameraPrior
 from bodyslam_jax.graph._extras import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph._extras import IntrinsicsPrior as IntrinsicsPrior
@@ -14,7 +13,6 @@ from bodyslam_jax.graph._extras import RootPlace as RootPlace
 from bodyslam_jax.graph._extras import RootSmoothness as RootSmoothness
 from bodyslam_jax.graph._extras import RootTurning as RootTurning
 from bodyslam_jax.graph._extras import SquarePixels as SquarePixels
-from bodyslam_jax.graph._extras import StanceFoot as StanceFoot
 from bodyslam_jax.graph._extras import UpDirection as UpDirection
 from bodyslam_jax.graph._factors import HumanMotion as HumanMotion
 from bodyslam_jax.graph._factors import JointReprojection as JointReprojection
@@ -42,6 +40,9 @@ from bodyslam_jax.graph._robust import GemanMcClure as GemanMcClure
 from bodyslam_jax.graph._robust import Squared as Squared
 from bodyslam_jax.graph._robust import lift as lift
 from bodyslam_jax.graph._robust import squared_norm as squared_norm
+from bodyslam_jax.graph._stance import BODY25_FEET as BODY25_FEET
+from bodyslam_jax.graph._stance import StanceFoot as StanceFoot
+from bodyslam_jax.graph._stance import carrying as carrying
 from bodyslam_jax.graph._state import State as State
 from bodyslam_jax.graph._state import Step as Step
 from bodyslam_jax.graph._state import gauge as gauge

@@ -4,13 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._factors import _log, unit_length
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-
-BODY25_FEET = (19, 21, 22, 24)
-"""Big toe and heel, left and right."""
 
 
 class CameraPrior(AbstractFrameFactor):
@@ -86,7 +83,9 @@ class SquarePixels(AbstractIntrinsicsFactor):
 class CameraSmoothness(AbstractFrameFactor):
     """The camera keeps its velocity: turn and shift, against those before.
 
-    The shift is in units of the map: in metres, it would draw s towards 0.
+    `(Log(C_{k-1}^T C_k) - Log(C_{k-2}^T C_{k-1})) / σ_1` of C = C_WC, in rad per frame
+    squared, and `(r'_k - 2 r'_{k-1} + r'_{k-2}) / σ_2` of r' = r'_WC, in units of the
+    map per frame squared: in metres, it would draw s towards 0.
     """
 
     sigma: Float[Array, "t 2"]
@@ -111,13 +110,14 @@ class CameraSmoothness(AbstractFrameFactor):
 
 
 class RootSmoothness(AbstractFrameFactor):
-    """The pelvis keeps its velocity in the world, `r_k - 2 r_{k-1} + r_{k-2}`.
+    """The pelvis keeps its velocity in the world: `(r_k - 2 r_{k-1} + r_{k-2}) / σ`.
 
-    In metres, or with a `body` in lengths of the leg, as for `HumanMotion`.
+    `r = s r'_WC + C_WC r_CH` is in m, or with a `body` in lengths of the leg, as for
+    `HumanMotion`.
     """
 
     sigma: Float[Array, "h t"]
-    """Per frame squared; `inf` where a frame of the three is missing."""
+    """m, or legs, per frame squared; `inf` where a frame of the three is missing."""
     loss: AbstractLoss = Squared()
     body: BodyModel | None = None
     of_people = True
@@ -144,8 +144,11 @@ class RootSmoothness(AbstractFrameFactor):
 
 
 class RootTurning(AbstractFrameFactor):
-    """The person keeps turning in the world as before: angular velocities, as rotation
-    vectors from k-2 to k-1 and from k-1 to k, are the same."""
+    """The person keeps turning in the world as before.
+
+    `(Log(C_{k-1}^T C_k) - Log(C_{k-2}^T C_{k-1})) / σ` of C = C_WC C_CH: the turn from
+    k-1 to k, in rad per frame, against the one before it.
+    """
 
     sigma: Float[Array, "h t"]
     """rad per frame squared; `inf` where a frame of the three is missing."""
@@ -203,7 +206,7 @@ class RootPlace(AbstractFrameFactor):
     """
 
     place: Float[Array, "h t 3"]
-    """r̃_CH, m; z̃ above 0."""
+    """r̃_CH, m; z̃ above 0 where measured."""
     sigma: Float[Array, "h t 2"]
     """Stationary standard deviations of direction and depth, of the distance; `inf`
     where not measured."""
@@ -218,8 +221,10 @@ class RootPlace(AbstractFrameFactor):
         return ("root", 0), ("root", 1)
 
     def data(self):
-        previous = jnp.roll(self.place, 1, axis=1)
-        return self.place, previous, self.sigma, self.correlation
+        # What is missing may lie anywhere, also where there is no direction: at 0.
+        known = jnp.isfinite(self.sigma).any(axis=-1, keepdims=True)
+        place = jnp.where(known, self.place, 1.0)
+        return place, jnp.roll(place, 1, axis=1), self.sigma, self.correlation
 
     def local(self, data, window, shared):
         measured, previous, sigma, correlation = data
@@ -237,48 +242,15 @@ def _away(measured: Float[Array, " 3"], place: Float[Array, " 3"]) -> Array:
     return jnp.append(direction, share[2] - 1)
 
 
-class StanceFoot(AbstractFrameFactor):
-    """The foot that carries the weight does not move in the world, between k-1 and k.
+class UpDirection(AbstractFrameFactor):
+    """The person stands up: y of the root frame, in the world, along a known up.
 
-    Needs no learnt motion, and sees scale through the length of the leg. Errors are in
-    lengths of the leg: postures that err move the foot of a smaller person less, and
-    errors in metres would shrink people and world.
+    `(C_WC C_CH e_y - u) / σ`: the length of the difference is the angle that the trunk
+    leans by, in rad while that is small.
     """
 
-    body: BodyModel
-    sigma: Float[Array, "h t f"]
-    """Legs per frame, for the points of the feet; `inf` where one does not carry."""
-    loss: AbstractLoss = Squared()
-    points: tuple[int, ...] = eqx.field(static=True, default=BODY25_FEET)
-    """Which keypoints of BODY_25 they are."""
-    of_people = True
-    frame_fields = ("sigma",)
-
-    @property
-    def touches(self) -> tuple[Touch, ...]:
-        frames = ("camera", "root", "pose")
-        both = tuple((name, lag) for name in frames for lag in range(2))
-        return (*both, ("scale", 0), ("shape", 0))
-
-    def data(self):
-        return self.sigma
-
-    def local(self, data, window, shared):
-        now, before = (self._feet(f, shared) for f in window)
-        leg = unit_length(self.body, shared)
-        return (now - before) / leg / data[:, None]
-
-    def _feet(self, frame, shared):
-        p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
-        p_C = p_H[jnp.array(self.points)] @ frame.root[:3, :3].T + frame.root[:3, 3]
-        return p_C @ frame.camera[:3, :3].T + shared.scale * frame.camera[:3, 3]
-
-
-class UpDirection(AbstractFrameFactor):
-    """The person stands up: y of the root frame, in the world, along a known up."""
-
     up: Float[Array, " 3"]
-    """Unit vector in the world."""
+    """u, a unit vector in the world."""
     sigma: Float[Array, "h t"]
     """rad; `inf` where the person is not there."""
     loss: AbstractLoss = Squared()

@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
-from bodyslam_jax.graph._extras import BODY25_FEET
 from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
+from bodyslam_jax.graph._stance import BODY25_FEET
 from bodyslam_jax.graph._state import State
 
 SOLE = 0.018

@@ -13,7 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph._check import (
+    check_factor,
+    check_prior,
+    check_shapes,
+    check_state,
+)
 from bodyslam_jax.graph._factors import (
     HumanMotion,
     OrientationChange,
@@ -147,14 +154,18 @@ def make_problem(
     gauge (first camera, one coordinate of the farthest), intrinsics unless
     `free_intrinsics`, and s where no factor touches it.
 
-    **Raises:** `ValueError` if a measurement is not finite, an index is out of range,
-    shapes do not fit, or the problem does not fit into memory.
+    **Raises:** `ValueError` if shapes or kinds of arrays do not fit, a value is not
+    finite or means nothing (a pose that is not rigid, sigma 0, a correlation of 1), an
+    index is out of range, or the problem does not fit into memory.
     """
     factors = tuple(factors)
-    num_frames, num_landmarks = len(state.cameras), len(state.landmarks)
-    _check_finite("state", state)
+    sizes = check_state(state)
     for factor in factors:
-        _check_factor(factor, state)
+        check_factor(factor, sizes)
+    if motion is not None:
+        check_shapes(motion, "motion", dict(sizes))
+    if free is not None:
+        check_shapes(free, "free", dict(sizes))
     tracks = [f for f in factors if isinstance(f, Reprojection)]
     if len(tracks) > 1:
         raise ValueError(
@@ -164,8 +175,8 @@ def make_problem(
     landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
     for factor in factors:
         if isinstance(factor, LandmarkPrior):
-            _check_prior(factor, landmark)
-    layout = make_layout(num_frames, num_landmarks, frame, landmark)
+            check_prior(factor, landmark)
+    layout = make_layout(sizes["t"], sizes["l"], frame, landmark)
     _check_memory(layout, state)
     if free is None:
         touched = {
@@ -184,90 +195,10 @@ def make_problem(
             landmarks=ones.landmarks,
             intrinsics=ones.intrinsics * float(free_intrinsics),
         )
-    movable = jax.tree.map(lambda x: bool(np.any(np.asarray(x))), free)
+    moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
+    movable = jax.tree.map(moves, free)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
     return Problem(factors, free, motion, layout, variables)
-
-
-def _check_finite(name, tree):
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
-            count = int(np.sum(~np.isfinite(leaf)))
-            where = jax.tree_util.keystr(path)
-            raise ValueError(f"{name}{where}: {count} values are not finite.")
-
-
-def _check_factor(factor, state):
-    name = type(factor).__name__
-    for path, leaf in jax.tree_util.tree_leaves_with_path(factor):
-        where = name + jax.tree_util.keystr(path)
-        if not eqx.is_array(leaf) or not jnp.issubdtype(leaf.dtype, jnp.floating):
-            continue
-        values = np.asarray(leaf)
-        if "sigma" in where:
-            if not (values > 0).all():
-                raise ValueError(f"{where}: found {values.min()}, expected above 0.")
-        elif not np.isfinite(values).all():
-            bad = int(np.sum(~np.isfinite(values)))
-            raise ValueError(f"{where}: {bad} values are not finite.")
-    if isinstance(factor, Reprojection):
-        _check_tracks(factor, state)
-    elif isinstance(factor, LandmarkPrior):
-        if factor.place.shape != state.landmarks.shape:
-            raise ValueError(
-                f"LandmarkPrior: {len(factor.place)} places, expected one for each of "
-                f"{len(state.landmarks)} landmarks."
-            )
-    elif isinstance(factor, AbstractFrameFactor):
-        _check_frames(factor, state)
-    else:
-        raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
-
-
-def _check_tracks(factor, state):
-    frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
-    for what, index, limit in (
-        ("frame", frame, len(state.cameras)),
-        ("landmark", landmark, len(state.landmarks)),
-    ):
-        if len(index) and not (index.min() >= 0 and index.max() < limit):
-            raise ValueError(
-                f"Reprojection.{what}: indices {index.min()} to {index.max()}, "
-                f"expected 0 to {limit - 1}."
-            )
-    if len(frame):
-        pair = np.sort(frame.astype(np.int64) * len(state.landmarks) + landmark)
-        twice = pair[1:][pair[1:] == pair[:-1]]
-        if len(twice):
-            f, l = divmod(int(twice[0]), len(state.landmarks))
-            raise ValueError(
-                f"Reprojection: landmark {l} is observed twice in frame {f} "
-                f"({len(twice)} such observations), expected once at most."
-            )
-
-
-def _check_prior(factor, landmark):
-    known = np.asarray(factor.whitening).any(axis=(1, 2))
-    known = known & ~np.isin(np.arange(len(known)), landmark)
-    if known.any():
-        raise ValueError(
-            f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
-            "observation; expected both, or a `whitening` of 0."
-        )
-
-
-def _check_frames(factor, state):
-    lead = (len(state.roots), len(state.cameras))
-    if not factor.of_people:
-        if factor.touches == (("intrinsics", 0),):
-            return
-        lead = lead[1:]
-    for leaf in jax.tree.leaves(factor.data()):
-        if leaf.shape[: len(lead)] != lead:
-            raise ValueError(
-                f"{type(factor).__name__}: measurements of shape {leaf.shape}, "
-                f"expected to begin with {lead} (people and frames of the state)."
-            )
 
 
 def _check_memory(layout, state):

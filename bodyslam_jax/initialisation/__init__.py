@@ -7,9 +7,11 @@ ground under people's feet.
 """
 
 from bodyslam_jax.initialisation._factors import PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE
+from bodyslam_jax.initialisation._factors import STANCE_LOSS as STANCE_LOSS
 from bodyslam_jax.initialisation._factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation._factors import map_factor as map_factor
 from bodyslam_jax.initialisation._factors import motion_factor as motion_factor
+from bodyslam_jax.initialisation._factors import optional_factors as optional_factors
 from bodyslam_jax.initialisation._factors import people_factors as people_factors
 from bodyslam_jax.initialisation._factors import revisit_factor as revisit_factor
 from bodyslam_jax.initialisation._scale import ScaleStart as ScaleStart

@@ -1,0 +1,229 @@
+"""The door of a problem: what fits is let in, what does not is refused in one line."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+
+import bodyslam_jax.graph as g
+
+T, L, M = 3, 6, 5
+"""Frames, landmarks and observations; one person."""
+
+
+def ones(*shape):
+    return jnp.asarray(np.ones(shape))
+
+
+def zeros(*shape):
+    return jnp.asarray(np.zeros(shape))
+
+
+def eye(n, *lead):
+    return jnp.asarray(np.tile(np.eye(n), (*lead, 1, 1)))
+
+
+@functools.cache
+def fitting() -> tuple[g.State, dict[str, g.AbstractFactor]]:
+    """A state and factors of each kind that has a check of its own; nothing is true."""
+    state = g.State(
+        scale=jnp.ones(()),
+        cameras=eye(4, T),
+        roots=eye(4, 1, T),
+        poses=zeros(1, T, 23, 3),
+        shapes=zeros(1, 10),
+        landmarks=zeros(L, 3),
+        intrinsics=jnp.array([600.0, 600, 320, 240]),
+    )
+    body = scenes.body_model()
+    track = jnp.arange(M)
+    factors = [
+        g.Reprojection(track % T, track, zeros(M, 2), ones(M), g.Cauchy(1.5)),
+        g.LandmarkPrior(zeros(L, 3), zeros(L, 3, 3)),
+        g.JointReprojection(
+            body, zeros(1, T, 25, 2), ones(1, T, 25), g.GemanMcClure(jnp.array(3.0))
+        ),
+        g.HumanMotion(zeros(1, T, 3), zeros(1, T, 3, 3), zeros(1, T), body=body),
+        g.Posture(zeros(1, T, 23, 3), ones(1, T, 23), zeros(1, T)),
+        g.CameraPrior(eye(4, T), ones(T, 6)),
+        g.IntrinsicsPrior(state.intrinsics[None], ones(1, 4)),
+        g.SquarePixels(ones(1)),
+        g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
+        g.RootPlace(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
+        g.StanceFoot(body, ones(1, T, 4)),
+        g.UpDirection(jnp.array([0.0, -1, 0]), ones(1, T)),
+    ]
+    return state, {type(factor).__name__: factor for factor in factors}
+
+
+def make(state=None, *, motion=None, free=None, **replaced):
+    fits, factors = fitting()
+    factors = list({**factors, **replaced}.values())
+    return g.make_problem(factors, state or fits, motion=motion, free=free)
+
+
+def changed(what, where, value):
+    """One array of a state or a factor, exchanged where no constructor looks."""
+    replace = value if callable(value) else lambda _: value
+    return eqx.tree_at(lambda x: getattr(x, where), what, replace_fn=replace)
+
+
+def test_what_fits_is_let_in():
+    problem = make()
+    assert len(problem.factors) == len(fitting()[1])
+    assert problem.variables == tuple(v for v in g.VARIABLES if v != "intrinsics")
+
+
+NAN = lambda x: x.at[(0,) * x.ndim].set(jnp.nan)
+SHORT = lambda x: x[:, :-1]
+
+
+@pytest.mark.parametrize(
+    "where, value, message",
+    [
+        ("roots", SHORT, "roots: shape (1, 2, 4, 4), expected (1, 3, 4, 4)"),
+        ("poses", SHORT, "poses: shape (1, 2, 23, 3), expected (1, 3, 23, 3)"),
+        ("shapes", zeros(2, 10), "shapes: shape (2, 10), expected (1, 10)"),
+        ("cameras", zeros(4, 4), "cameras: shape (4, 4), expected (t, 4, 4)"),
+        ("cameras", lambda x: 2 * x, "cameras: 3 of 3 are no rigid poses"),
+        ("cameras", NAN, "1 values are not finite"),
+        ("roots", lambda x: x.at[0, 1, 0, 0].set(-1.0), "1 of 3 are no rigid poses"),
+        ("roots", lambda x: x.at[0, 2, 3, 0].set(1.0), "the first at (0, 2)"),
+        ("intrinsics", zeros(5), "5 numbers, expected 4 or 8"),
+        ("scale", 1.0, "scale: found 1.0, expected an array"),
+        ("landmarks", jnp.arange(18).reshape(6, 3), "int64, expected floating point"),
+    ],
+)
+def test_a_state_that_is_none_is_refused(where, value, message):
+    state, factors = fitting()
+    with pytest.raises(ValueError) as refused:
+        g.make_problem(list(factors.values()), changed(state, where, value))
+    assert message in str(refused.value) and str(refused.value).startswith("state")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "name, where, value, message",
+    [
+        ("Reprojection", "pixel", NAN, "not finite"),
+        ("Reprojection", "pixel", lambda x: x[:-1], "(4, 2), expected (5, 2)"),
+        ("Reprojection", "pixel", zeros(M, 3), "(5, 3), expected (5, 2)"),
+        ("Reprojection", "frame", lambda x: x.at[0].set(99), "0 to 2"),
+        ("Reprojection", "frame", zeros(M), "float64, expected integers"),
+        ("Reprojection", "landmark", lambda x: x.at[0].set(-1), "0 to 5"),
+        ("Reprojection", "sigma", ones(1), "(1,), expected (5,)"),
+        ("Reprojection", "sigma", lambda x: x.at[0].set(0.0), "above 0"),
+        ("Reprojection", "loss", g.Cauchy(0.0), "loss.scale: found 0.0"),
+        ("Reprojection", "loss", g.Cauchy(float("nan")), "not finite"),
+        ("LandmarkPrior", "place", lambda x: x[:5], "(5, 3), expected (6, 3)"),
+        ("LandmarkPrior", "whitening", ones(L, 3, 3), "1 landmarks have a prior"),
+        ("JointReprojection", "pixel", NAN, "not finite"),
+        ("JointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
+        ("JointReprojection", "sigma", ones(1, T, 24), "expected (1, 3, 25)"),
+        ("JointReprojection", "layout", "coco", "layout: found 'coco'"),
+        ("JointReprojection", "bias", float("nan"), "bias: 1 values are not finite"),
+        ("HumanMotion", "translation", SHORT, "(1, 2, 3), expected (1, 3, 3)"),
+        ("HumanMotion", "correlation", ones(1, T), "found 1.0, expected between"),
+        ("Posture", "correlation", 1.5 * ones(1, T), "found 1.5, expected between"),
+        ("Posture", "sigma", ones(1, 1, 23), "(1, 1, 23), expected (1, 3, 23)"),
+        ("CameraPrior", "cameras", lambda x: 2 * x, "3 of 3 are no rigid poses"),
+        ("IntrinsicsPrior", "intrinsics", zeros(1, 8), "(1, 8), expected (1, 4)"),
+        ("SquarePixels", "sigma", ones(T), "(3,), expected (1,)"),
+        ("RootOrientation", "orientation", zeros(1, T, 3, 3), "no rigid rotations"),
+        ("RootPlace", "place", zeros(1, T, 3), "a depth of 0.0 m, expected above 0"),
+        ("StanceFoot", "sigma", ones(1, T, 3), "(1, 3, 3), expected (1, 3, 4)"),
+        ("StanceFoot", "points", (19, 21, 22, 25), "19 to 25, expected 0 to 24"),
+        ("UpDirection", "up", ones(4), "(4,), expected (3,)"),
+    ],
+)
+def test_measurements_that_do_not_fit_are_refused(name, where, value, message):
+    factor = fitting()[1][name]
+    static = where in ("layout", "points")
+    if static:
+        factor = dataclasses.replace(factor, **{where: value})
+    else:
+        factor = changed(factor, where, value)
+    with pytest.raises(ValueError) as refused:
+        make(**{name: factor})
+    assert message in str(refused.value) and str(refused.value).startswith(name)
+    assert "\n" not in str(refused.value)
+
+
+def test_no_frames_are_refused():
+    state, _ = fitting()
+    none = dataclasses.replace(
+        state,
+        cameras=state.cameras[:0],
+        roots=state.roots[:, :0],
+        poses=state.poses[:, :0],
+    )
+    with pytest.raises(ValueError, match="0 frames, expected 1 or more"):
+        g.make_problem([], none)
+
+
+def test_who_is_there_and_what_may_move_must_fit_too():
+    state, _ = fitting()
+    people = g.MotionPredictor(lambda *_: None, None, None, jnp.ones((1, T + 1), bool))
+    with pytest.raises(ValueError, match=r"motion.present: shape \(1, 4\)"):
+        make(motion=people)
+    free = changed(state.zero_step(), "cameras", ones(T, 4, 4))
+    with pytest.raises(ValueError, match=r"free.cameras: shape \(3, 4, 4\)"):
+        make(free=free)
+
+
+def test_two_observations_in_one_frame_are_refused():
+    factor = fitting()[1]["Reprojection"]
+    twice = lambda x: jnp.concatenate([x, x[:1]]) if jnp.ndim(x) else x
+    with pytest.raises(ValueError, match="observed twice"):
+        make(Reprojection=jax.tree.map(twice, factor))
+
+
+def test_nothing_is_known_of_landmarks_that_nobody_sees():
+    state, factors = fitting()
+    prior = changed(factors["LandmarkPrior"], "whitening", ones(L, 3, 3))
+    with pytest.raises(ValueError, match="6 landmarks have a prior and no"):
+        g.make_problem([prior], state)
+
+
+def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
+    monkeypatch.setattr("os.sysconf", lambda name: 1000)
+    with pytest.raises(ValueError, match="frames fit"):
+        make()
+
+
+def test_under_a_transformation_shapes_alone_are_looked_at():
+    state, factors = fitting()
+
+    def residual(state, scale):
+        seen = changed(factors["Reprojection"], "sigma", scale * ones(M))
+        return g.make_problem([seen], state).factors[0].residual(state)
+
+    found = jax.eval_shape(residual, state, jnp.zeros(()))
+    assert found.shape == (M, 2)
+    short = changed(state, "landmarks", zeros(L, 2))
+    with pytest.raises(ValueError, match=r"shape \(6, 2\), expected \(6, 3\)"):
+        jax.eval_shape(residual, short, jnp.ones(()))
+
+
+def test_what_is_missing_may_be_zero_and_costs_nothing(quick_compilation):
+    state, factors = fitting()
+    missing = {}
+    for name in ("CameraPrior", "RootOrientation", "RootPlace"):
+        factor = changed(factors[name], factors[name].frame_fields[0], jnp.zeros_like)
+        never = lambda x: jnp.full_like(x, jnp.inf)
+        missing[name] = changed(factor, "sigma", never)
+    make(**missing)
+
+    def cost(cameras, roots):
+        moved = dataclasses.replace(state, cameras=cameras, roots=roots)
+        return sum(factor.cost(moved) for factor in missing.values())
+
+    slope = jax.value_and_grad(cost, (0, 1))
+    value, slopes = jax.jit(slope)(state.cameras, state.roots)
+    assert value == 0
+    assert not slopes[0].any() and not slopes[1].any()
