@@ -1,11 +1,13 @@
 """Stage results kept on disk, so that an interrupted run is finished, not repeated.
 
 A stage's result is a dataclass of arrays and plain values. It is stored as an `.npz`
-named after a hash of all that it was computed from: another input, other settings or
-another version of the package simply do not find it.
+named after a hash of all that it was computed from: another input, other settings,
+other weights in a file that they name, or another state of the package simply do not
+find it.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import logging
@@ -19,22 +21,49 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bodyslam_jax import __version__
+from bodyslam_jax.body import search_paths
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 _EDGE = 1 << 20
 _SOURCE = "source.json"
-_UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
-_UNREADABLE += (zipfile.BadZipFile, zlib.error)
+UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
+UNREADABLE += (zipfile.BadZipFile, zlib.error)
+"""What `load` raises of a file that is damaged, or of another state of the package."""
+_FILES = ("body_model", "motion_model", "motion")
+"""Settings that name a file: what it holds counts, and not where it lies."""
 
 
 def fingerprint(*parts: Any) -> str:
-    """A hash of settings, arrays and files (by size and content of their ends)."""
-    digest = hashlib.sha256(__version__.encode())
+    """A hash of settings, arrays and files (by size and content of their ends).
+
+    Files that settings name count as files, and so does the package as it is.
+    """
+    digest = hashlib.sha256(_package())
     for part in parts:
         _update(digest, part)
     return digest.hexdigest()[:16]
+
+
+def body_model_file(setting: str | None) -> Path | None:
+    """The file or folder that `body_model` of the settings stands for.
+
+    Without a setting it is what was found on this machine, `None` where that is the
+    body that ships.
+    """
+    if setting is not None:
+        return Path(setting)
+    return next((path for path in search_paths() if path.is_file()), None)
+
+
+@functools.cache
+def _package() -> bytes:
+    """A hash of the package's source, and of the models and motion that ship."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted([*root.rglob("*.py"), *root.rglob("*.npz")]):
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()
 
 
 def _update(digest: Any, part: Any) -> None:
@@ -58,13 +87,22 @@ def _update(digest: Any, part: Any) -> None:
         digest.update(type(part).__name__.encode())
         for field in dataclasses.fields(part):
             digest.update(field.name.encode())
-            _update(digest, getattr(part, field.name))
+            value = getattr(part, field.name)
+            if field.name in _FILES and (value is None or isinstance(value, str)):
+                value = _named_file(field.name, value)
+            _update(digest, value)
     elif isinstance(part, (tuple, list)):
         digest.update(str(len(part)).encode())
         for item in part:
             _update(digest, item)
     else:
         digest.update(repr(part).encode())
+
+
+def _named_file(name: str, setting: str | None) -> Path | None:
+    if name == "body_model":
+        return body_model_file(setting)
+    return None if setting is None else Path(setting)  # what ships is the package's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +121,7 @@ class Cache:
         if path.exists():
             try:
                 found = load(path, kind)
-            except _UNREADABLE as error:
+            except UNREADABLE as error:
                 log.warning("%s: not readable (%s); computed again", path, error)
             else:
                 log.info("%s: taken from an earlier run", name)

@@ -23,7 +23,7 @@ from bodyslam_jax import (
 )
 from bodyslam_jax import body as body_
 from bodyslam_jax import joint as joint_
-from bodyslam_jax.cache import Cache, fingerprint
+from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config
 from bodyslam_jax.outcome import Cameras, Joint, assemble, describe
 from bodyslam_jax.rehearsal import Rehearsal, rehearse
@@ -129,7 +129,8 @@ def before_joint(
             lambda: reconstruction.estimate(sequence, tracks, config),
         )
     sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
-    key = fingerprint(sequence, config.people_fit, config.people, config.body_model)
+    model = body_model_file(config.body_model)
+    key = fingerprint(sequence, config.people_fit, config.people, model)
     with watch("people"):
         rehearsal.wait("people")
         bodies = cache.stage(

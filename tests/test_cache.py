@@ -4,7 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodyslam_jax import cache as cache_
 from bodyslam_jax.cache import Cache, fingerprint, load, save
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
 
 
@@ -84,3 +86,45 @@ def test_fingerprint_of_a_file_is_its_content(tmp_path):
     assert fingerprint(first) != fingerprint(second)
     second.write_bytes(b"one")
     assert fingerprint(first) == fingerprint(second)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda file: Config(motion_model=file),
+        lambda file: Config(body_model=file),
+        lambda file: Simulation(motion=file),
+    ],
+)
+def test_fingerprint_of_settings_sees_into_their_files(tmp_path, settings):
+    """As where a motion model is trained anew and written over the last one."""
+    first, second = tmp_path / "a" / "model.npz", tmp_path / "b" / "model.npz"
+    for path in (first, second):
+        path.parent.mkdir()
+        path.write_bytes(b"one")
+    before = fingerprint((settings(str(first)),))
+    assert before == fingerprint((settings(str(second)),))
+    first.write_bytes(b"two")
+    assert before != fingerprint((settings(str(first)),))
+    assert before != fingerprint((settings(None),))
+
+
+def test_fingerprint_sees_the_body_that_the_machine_has(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    before = fingerprint(Config())
+    for content in (b"one", b"two"):
+        (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
+        monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(tmp_path))
+        file = cache_.body_model_file(None)
+        assert file == tmp_path / "SMPL_NEUTRAL.npz"
+        found = fingerprint(Config())
+        assert found != before
+        assert found == fingerprint(Config(body_model=str(file)))
+        before = found
+
+
+def test_fingerprint_sees_the_package(monkeypatch):
+    """Another state of the source may compute something else."""
+    before = fingerprint(1)
+    monkeypatch.setattr(cache_, "_package", lambda: b"edited")
+    assert fingerprint(1) != before

@@ -1,8 +1,11 @@
 """Experiments on small made-up problems: variants, perturbations, weights, rows."""
 
+import csv
 import json
 import math
+import shutil
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +14,20 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
-from bodyslam_jax import cli, experiments, solver
+from bodyslam_jax import cli, experiments, motion, solver, synthetic
 from bodyslam_jax.config import Config, Experiment
-from bodyslam_jax.experiments import _paper, _reports, _tables
+from bodyslam_jax.experiments import (
+    _ablation,
+    _paper,
+    _plans,
+    _reports,
+    _tables,
+    _weights,
+)
 from bodyslam_jax.experiments._case import simulations
 from bodyslam_jax.experiments._journal import Journal
 from bodyslam_jax.experiments._plans import PLANS
+from bodyslam_jax.experiments._problems import with_scale
 from bodyslam_jax.experiments._score import NAMES
 from bodyslam_jax.experiments._structure import shake
 from bodyslam_jax.experiments._variants import carrying
@@ -73,6 +84,17 @@ def test_variants_leave_out_and_add_what_they_say(scene):
         found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
         off = {k for k, v in found.items() if v != full[k]}
         assert len(off) == 1 and float(found[off.pop()]) == 0, name
+    prior = scenes.landmark_prior(np.random.default_rng(6), start, problem.factors[0])
+    also = g.make_problem([*problem.factors, prior], start, motion=predictor)
+    blind, _ = experiments.VARIANTS["no landmarks"](also, start)
+    found = blind.cost_by_term(start)
+    assert found["Reprojection"] == found["LandmarkPrior"] == 0
+    assert not blind.free.landmarks.any() and blind.free.cameras.any()
+    apart, _ = experiments.VARIANTS["no places seen again"](also, start)
+    assert apart.cost_by_term(start) == {**also.cost_by_term(start), "LandmarkPrior": 0}
+    # Nothing of the kind is there to be left out.
+    for name in ("no places seen again", "no ground", "no smooth path"):
+        assert experiments.VARIANTS[name](problem, start)[0] is problem
     for name in ("with stance foot", "with steady camera", "with up direction"):
         found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
         assert len(found) == len(full) + 1
@@ -129,6 +151,55 @@ def test_weights_scale_residuals_and_missing_stays_missing(scene):
     assert np.isinf(new)[np.isinf(old)].all()
     with pytest.raises(ValueError, match="nosuch"):
         experiments.reweighted(problem, ("nosuch",), jnp.zeros(1))
+
+
+def _steep(calls, last=math.inf):
+    """Stands in for a solve: an error that is least at 1, and how often it was asked.
+
+    The state is a little larger each time, and counts: what was interrupted has to find
+    that again too.
+    """
+
+    def error_and_gradient(trial, names, value, state):
+        calls.append(1)
+        if len(calls) > last:
+            raise KeyboardInterrupt
+        error = ((value - 1.0) ** 2).sum()
+        gradient = 2 * (value - 1.0) + 0.01 * state.scale
+        return error, gradient, with_scale(state, 1.1 * state.scale)
+
+    return error_and_gradient
+
+
+def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
+    problem, truth, start = scene
+    body, there = scenes.body_model(), jnp.ones((1, 12), bool)
+    seen = experiments.trajectories(truth, body, there, there[0], jnp.asarray(30.0))
+    trials = [experiments.Trial(problem, start, seen, body, there[0])] * 2
+    names = ("motion", "shape")
+    learn = lambda steps, **kw: experiments.learn_weights(
+        trials, steps=steps, names=names, **kw
+    )
+    monkeypatch.setattr(_weights, "error_and_gradient", _steep(calls := []))
+    whole = learn(6)
+    assert len(calls) == 12 and (np.diff(whole.history) < 0).all()
+
+    file = tmp_path / "stages" / "progress.npz"
+    monkeypatch.setattr(_weights, "error_and_gradient", _steep([], last=7))
+    with pytest.raises(KeyboardInterrupt):
+        learn(6, progress=file)
+    monkeypatch.setattr(_weights, "error_and_gradient", _steep(calls := []))
+    rest = learn(6, progress=file)
+    assert len(calls) == 6  # three steps were done
+    np.testing.assert_array_equal(rest.history, whole.history)
+    np.testing.assert_array_equal(rest.path, whole.path)
+    learn(6, progress=file)
+    assert len(calls) == 6
+
+    with pytest.raises(ValueError, match="progress.npz.*motion"):
+        experiments.learn_weights(trials, names=("motion", "posture"), progress=file)
+    file.write_bytes(b"PK cut short")
+    np.testing.assert_array_equal(learn(6, progress=file).path, whole.path)
 
 
 def test_rows_are_computed_once(tmp_path):
@@ -197,6 +268,61 @@ def test_choice_of_sequences():
     assert [(s.sequence, s.family) for s in one] == [("M4", "room"), ("M4", "follow")]
 
 
+def test_sequences_of_one_seed_are_not_copies_of_one_another():
+    on = Experiment(seed=1, frames=2)
+    settings = simulations(on, ("E1", "M1"), ("room", "follow"))
+    shapes = [synthetic.simulate(s).person.shape for s in settings]
+    for i, shape in enumerate(shapes):
+        assert all(np.abs(shape - other).max() > 0.1 for other in shapes[:i])
+    assert simulations(on, ("E1", "M1"), ("room", "follow")) == settings
+    others = simulations(Experiment(seed=2, frames=2), ("E1",), ("room",))
+    assert others[0].seed != settings[0].seed
+    assert simulations(Experiment(), ("E1",), ("room",))[0].seed is None
+
+
+def test_seed_goes_for_what_is_shaken_too(tmp_path, monkeypatch):
+    seeds = []
+
+    def by_sequence(*given):
+        (compute,) = (x for x in given if callable(x))
+        seeds.append(compute.keywords["seed"])
+        return []
+
+    monkeypatch.setattr(_plans, "by_sequence", by_sequence)
+    for seed in (None, 3):
+        PLANS["landmarks"](Experiment(seed=seed), Config(), tmp_path)
+    assert seeds == [0, 3]
+
+
+def test_rows_follow_what_files_hold(tmp_path):
+    """A motion model that was trained anew gives other rows."""
+    file = tmp_path / "walk.npz"
+    on, config = Experiment(motion=str(file)), Config(motion_model=str(file))
+    paths = set()
+    for content in (b"one", b"two"):
+        file.write_bytes(content)
+        for name in ("table1", "motion", "weights"):
+            for job in PLANS[name](on, config, tmp_path).jobs:
+                paths.add(Journal(tmp_path).path(name, job.label, *job.key))
+    assert len(paths) == 2 * (20 + 1 + 8)
+
+
+def test_missing_files_are_told_before_anything_is_computed(tmp_path):
+    gone = str(tmp_path / "gone.npz")
+    for on, config in (
+        (Experiment(motion_models=(gone,)), Config()),
+        (Experiment(motion=gone), Config()),
+        (Experiment(), Config(motion_model=gone)),
+    ):
+        with pytest.raises(FileNotFoundError, match="gone.npz: no such"):
+            experiments.run_experiment("ablation", tmp_path / "out", on, config)
+    (tmp_path / "bad.npz").write_bytes(b"")
+    bad = Experiment(motion_models=(str(tmp_path / "bad.npz"),))
+    with pytest.raises(ValueError, match="bad.npz: not a motion model"):
+        experiments.run_experiment("ablation", tmp_path / "out", bad)
+    assert not (tmp_path / "out").exists()
+
+
 def test_unknown_experiment_and_folder(tmp_path):
     with pytest.raises(ValueError, match="nosuch.*table1"):
         experiments.run_experiment("nosuch", tmp_path)
@@ -242,10 +368,15 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
     assert [p.rsplit("/", 1)[1] for p in written] == names
     text = (tmp_path / "table1.md").read_text()
     assert "Simulated sequences" in text and "other data" in text
-    # Ours in mm, then the paper's own row of E1.
-    ours = "| E1-room |" + 12 * " 12.5 |" + " 0.800 | 0.800 |"
-    assert text.count(ours) == 1
-    assert "| E1 | 108.1 | 44.3 | 42.4 | 43.5 | 114.0 |" in text
+    # Ours in mm, the paper's beside each of them.
+    theirs = [108.1, 44.3, 114.0, 56.3, 154.8, 118.8]
+    both = "".join(f" 12.5 | {x} |" for x in theirs) + " 0.800 | 0.671 | 0.800 | 0.940"
+    assert text.count(f"| E1-room |{both} |") == 1
+    first, _ = csv.DictReader((tmp_path / "table1.csv").read_text().splitlines())
+    assert first["the paper's J-ATE Sim(3) full, mm"] == "115.9"
+    for method in ("depth", "start", "scale_only", "per_frame"):
+        assert first[f"H-ATE Sim(3) {method}, mm"] == "12.5"
+        assert first[f"scale {method}"] == "0.8"
     (tmp_path / "table1.md").unlink()
     code = _run(monkeypatch, ["nosuch", "--out", str(tmp_path)])
     assert code == 2 and not (tmp_path / "table1.md").exists()
@@ -266,15 +397,21 @@ def test_reports_of_made_up_rows(tmp_path):
     row |= {name: 0.1 for name in stages} | {f"{n}/scale": 1.0 for n in stages}
     _reports.write_structure(tmp_path, [row], noise="real")
     text = (tmp_path / "landmarks.md").read_text()
-    assert "| E2-room | 100.0 | 100.0 |" in text
-    assert "| E2-room | 193.0 | 213.1 | 139.7 | 138.5 |" in text
+    both = "100.0 | 193.0 | 100.0 | 100.0 | 213.1 | 100.0 | 139.7 | 100.0 | 138.5"
+    assert f"| E2-room | {both} |" in text
+    assert "193.0" in (tmp_path / "landmarks.csv").read_text()
 
     row = {"sequence": "M2-room", "label": "no keypoints", "status": "converged"}
     row |= {name: 0.02 for name in NAMES} | {"scale_ratio": None, "cost": 12.0}
-    (*_, picture) = _reports.write_ablation(tmp_path, [row], noise="low")
+    short = {"sequence": "M2-room", "label": "no ground", "status": "no such term"}
+    more = {**row, "label": "motion model short", "past": 2.0}
+    rows = [row, short, more]
+    (*_, picture) = _reports.write_ablation(tmp_path, rows, noise="low")
     assert picture.name == "ablation_M2-room.png" and picture.stat().st_size > 0
     text = (tmp_path / "ablation.md").read_text()
-    assert "| no keypoints | 20.0 | 20.0 | 20.0 | 20.0 | – |" in text
+    assert "| no keypoints | 20.0 | 20.0 | 20.0 | 20.0 | – | – | – |" in text
+    assert "| motion model short | 20.0 | 20.0 | 20.0 | 20.0 | – | – | 2 |" in text
+    assert "| no ground |" + 10 * " – |" + " no such term |" in text
 
     names = ["motion", "shape"]
     row = {"names": names, "log": [0.0, 0.7], "factor": [1.0, 2.0]}
@@ -282,10 +419,13 @@ def test_reports_of_made_up_rows(tmp_path):
     one = {"sequence": "E1-room", "set": "training"}
     for when in ("before", "after"):
         one |= {f"{when}/{k}": 0.5 for k in ("error", "scale", "j_ate_se3")}
-    row["rows"] = [one, {**one, "set": "test", "sequence": "D1-room"}]
-    _reports.write_weights(tmp_path, [row], noise="real")
+    other = {**one, "set": "test", "sequence": "D1-room"}
+    _reports.write_weights(tmp_path, [row, one, other], noise="real")
     text = (tmp_path / "weights.md").read_text()
     assert "| shape | 2.00 | 0.25 |" in text and "## test sequences" in text
+    # Learnt, and interrupted before any sequence was judged.
+    _reports.write_weights(tmp_path, [row], noise="real")
+    assert "| shape | 2.00 | 0.25 |" in (tmp_path / "weights.md").read_text()
 
 
 @pytest.mark.slow
@@ -301,8 +441,89 @@ def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
     for name in ("table1.md", "table1.csv", "table1.png", "table1_paths.png"):
         assert (tmp_path / name).stat().st_size > 0
     assert "| M1-follow |" in (tmp_path / "table1.md").read_text()
+    (cells,) = csv.DictReader((tmp_path / "table1.csv").read_text().splitlines())
+    assert all(cells.values())
+    assert 0.7 < row["depth/scale"] < 1.5  # what is seen at the feet is about as far
     caplog.clear()
     assert not _run(monkeypatch, argv)
     assert "1 rows, 1 of them done" in caplog.text
     assert "taken from an earlier run" in caplog.text
     assert "joint: cost" not in caplog.text
+
+
+@pytest.fixture
+def few(tmp_path, monkeypatch, quick_compilation):
+    """Less of everything that is many times the same; a motion model of one's own."""
+    names = ("full", "no landmarks", "no smooth path", "no places seen again")
+    chosen = {name: experiments.VARIANTS[name] for name in names}
+    monkeypatch.setattr(_plans, "VARIANTS", chosen)
+    name = "errors of frames independent"
+    monkeypatch.setattr(_ablation, "SETTINGS", {name: _ablation.SETTINGS[name]})
+    monkeypatch.setattr(_plans, "NOISE_LEVELS", ("low",))
+    monkeypatch.setattr(_plans, "LEARNING_STEPS", 3)
+    file = tmp_path / "own.npz"
+    shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
+    return str(file)
+
+
+@pytest.mark.slow
+def test_every_plan_on_forty_frames(tmp_path, few, caplog):
+    """Each row is computed, has all that its report says, and is kept."""
+    caplog.set_level("INFO")
+
+    def on(*sequences):
+        return Experiment(
+            sequences=sequences,
+            family="follow",
+            frames=40,
+            noise="low",
+            motion_models=(few,),
+        )
+
+    asked = {
+        "scale": on("M1"),
+        "landmarks": on("E2"),  # one of the paper's
+        "motion": on("M1"),
+        "ablation": on("M1"),
+        "weights": on("M1", "E2"),
+    }
+    rows = {}
+    for name, settings in asked.items():
+        experiments.run_experiment(name, tmp_path, settings)
+        jobs = PLANS[name](settings, Config(), tmp_path / "stages").jobs
+        journal = Journal(tmp_path / "rows")
+        paths = [journal.path(name, job.label, *job.key) for job in jobs]
+        rows[name] = [json.loads(path.read_text()) for path in paths]
+        table = (tmp_path / f"{name}.csv").read_text().splitlines()
+        for column, *cells in zip(*csv.reader(table), strict=True):
+            assert any(cells), (name, column)
+        assert (tmp_path / f"{name}.md").stat().st_size > 0
+        caplog.clear()
+        experiments.run_experiment(name, tmp_path, settings)
+        assert f"{len(jobs)} rows, {len(jobs)} of them done" in caplog.text
+
+    (scale,) = rows["scale"]
+    assert scale["perturbation"] == list(experiments.PERTURBATIONS)
+    assert scale["spread"] < 0.02 and np.abs(scale["deviation"]).max() < 0.15
+
+    (shaken,) = rows["landmarks"]
+    assert shaken["landmarks"] < 0.01 < 0.05 < shaken["perturbed"]
+
+    ablated = {row["label"]: row for row in rows["ablation"]}
+    full, own = ablated["full"], ablated["motion model own"]
+    assert own["past"] == full["past"] == motion.load_motion_model(few).past
+    assert own["j_ate_se3"] == pytest.approx(full["j_ate_se3"], rel=1e-3)
+    assert full["c_ate_se3"] < 0.01 < ablated["no landmarks"]["c_ate_se3"]
+    first, *others = (ablated[order]["cost"] for order in _ablation.ORDERS)
+    assert first == pytest.approx(full["cost"], rel=1e-3) and first < min(others)
+    known = {"converged", "no such term"}
+    solved = [row for name, row in ablated.items() if "order" not in name]
+    assert {row["status"] for row in solved} <= known
+
+    learnt, trained, tested = rows["weights"]
+    history = learnt["history"]
+    assert len(history) == 3 and history[2] < history[1] < history[0]
+    assert (trained["sequence"], trained["set"]) == ("M1-follow", "training")
+    assert (tested["sequence"], tested["set"]) == ("E2-follow", "test")
+    assert trained["before/error"] == pytest.approx(history[0], rel=1e-3)
+    assert trained["after/error"] < trained["before/error"]

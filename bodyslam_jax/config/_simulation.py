@@ -51,6 +51,8 @@ class Experiment:
     motion: str | None = None
     """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
     seed: int | None = None
-    """Everything random follows from it; without it the sequence's own."""
+    """Everything random follows from it and the sequence's name; without it from the
+    name alone."""
     motion_models: tuple[str, ...] = ()
-    """Other motion models' weights to compare with, for `ablation`."""
+    """Other motion models' weights to compare with, such as of models that see more
+    past frames or fewer, for `ablation`."""

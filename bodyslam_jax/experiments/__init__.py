@@ -14,7 +14,7 @@ from bodyslam_jax.experiments._command import run_experiment as run_experiment
 from bodyslam_jax.experiments._comparison import METHODS as METHODS
 from bodyslam_jax.experiments._comparison import compare_methods as compare_methods
 from bodyslam_jax.experiments._comparison import depth_scale as depth_scale
-from bodyslam_jax.experiments._learning import learn_and_test as learn_and_test
+from bodyslam_jax.experiments._learning import judge as judge
 from bodyslam_jax.experiments._problems import rescaled as rescaled
 from bodyslam_jax.experiments._problems import without_map as without_map
 from bodyslam_jax.experiments._scale import PERTURBATIONS as PERTURBATIONS

@@ -6,10 +6,10 @@ import time
 import equinox as eqx
 import jax
 
-from bodyslam_jax import graph, joint, solver
+from bodyslam_jax import graph, joint, motion, solver
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments._case import Case
-from bodyslam_jax.experiments._variants import VARIANTS
+from bodyslam_jax.experiments._variants import FULL, VARIANTS
 
 INDEPENDENT = {
     "motion_correlation": 0.0,
@@ -31,31 +31,28 @@ _TRIAL = 20
 def ablate(
     case: Case, prepared: joint.Prepared, variant: str
 ) -> dict[str, float | str]:
-    """Errors of one of `VARIANTS`, solved from the start of the full problem, m."""
+    """Errors of one of `VARIANTS`, solved from the start of the full problem, m.
+
+    Where there is nothing to leave out, nothing is solved, and `status` says so.
+    """
     problem, start = VARIANTS[variant](prepared.problem, prepared.state)
-    solution, stage = joint.solve_stage(problem, start, case.config, "joint")
-    return _row(case, prepared, solution.state, stage)
+    if variant == FULL:
+        return _past(case.config) | _solved(case, prepared, case.config)
+    if problem is prepared.problem:
+        return {"status": "no such term"}
+    return _solved(case, prepared, case.config, (problem, start))
 
 
 def with_weights(case: Case, weights: GraphWeights) -> dict[str, float | str]:
     """Errors with other weights from beginning to end, m."""
     config = dataclasses.replace(case.config, weights=weights)
-    prepared = case.prepare(config)
-    solution, stage = joint.solve_stage(
-        prepared.problem, prepared.state, config, "joint"
-    )
-    return _row(case, prepared, solution.state, stage)
+    return _solved(case, case.prepare(config), config)
 
 
 def with_motion_model(case: Case, file: str) -> dict[str, float | str]:
     """Errors with another motion model, such as one that sees fewer past frames."""
-    config: Config = dataclasses.replace(case.config, motion_model=file)
-    prepared = case.prepare(config)
-    solution, stage = joint.solve_stage(
-        prepared.problem, prepared.state, config, "joint"
-    )
-    past = prepared.problem.motion.model[0].past  # pyright: ignore
-    return {"past": float(past), **_row(case, prepared, solution.state, stage)}
+    config = dataclasses.replace(case.config, motion_model=file)
+    return _past(config) | _solved(case, case.prepare(config), config)
 
 
 def compare_orders(
@@ -74,16 +71,30 @@ def compare_orders(
     per_step = _time_of_gradient(problem, state)
     count = max(int(seconds / per_step), _TRIAL)
     equal = (solver.Stage(max_steps=count),)
-    paper = tuple(
-        dataclasses.replace(stage, max_steps=n)
-        for stage, n in zip(schedule, (200, 100), strict=True)
-    )
+    paper = solver.paper_schedule("adam")
     for name, stages in zip(ORDERS[1:], (equal, paper), strict=True):
         found = solver.solve(problem, state, solver="adam", schedule=stages)
         steps = sum(stage.max_steps for stage in stages)
         row = _row(case, prepared, found.state, {}, found, per_step * steps)
         rows[name] = {**row, "steps": float(steps)}
     return rows
+
+
+def _past(config: Config) -> dict[str, float | str]:
+    """How many past frames the motion model sees."""
+    return {"past": float(motion.load_motion_model(config.motion_model).past)}
+
+
+def _solved(
+    case: Case,
+    prepared: joint.Prepared,
+    config: Config,
+    start: tuple[graph.Problem, graph.State] | None = None,
+) -> dict[str, float | str]:
+    """The row of a solution: from `start`, or else of the problem as prepared."""
+    problem, state = start or (prepared.problem, prepared.state)
+    solution, stage = joint.solve_stage(problem, state, config, "joint")
+    return _row(case, prepared, solution.state, stage)
 
 
 def _timed(run) -> tuple[solver.Solution, float]:

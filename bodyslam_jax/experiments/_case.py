@@ -1,6 +1,7 @@
 """A simulated sequence, brought to where experiments begin as the pipeline does it."""
 
 import dataclasses
+import zlib
 from collections.abc import Sequence as Ordered
 from pathlib import Path
 
@@ -86,19 +87,28 @@ def make_case(
 def simulations(
     experiment: Experiment, sequences: Ordered[str], families: Ordered[str]
 ) -> list[Simulation]:
-    """What an experiment runs on: its own sequences unless others were asked for."""
+    """What an experiment runs on: its own sequences unless others were asked for.
+
+    A seed that was chosen makes every sequence another one, and not all of them the
+    same: their names count as well.
+    """
     chosen = experiment.sequences or tuple(sequences)
     kinds = families
     if experiment.family is not None:
         kinds = (
             ("room", "follow") if experiment.family == "both" else (experiment.family,)
         )
+    chance = lambda name: (
+        None
+        if experiment.seed is None
+        else zlib.crc32(f"{name}-{experiment.seed}".encode())
+    )
     return [
         Simulation(
             sequence=sequence,  # pyright: ignore
             family=family,  # pyright: ignore
             length=experiment.frames,
-            seed=experiment.seed,
+            seed=chance(f"{sequence}-{family}"),
             motion=experiment.motion,
             noise=experiment.noise,
         )

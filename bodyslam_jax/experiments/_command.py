@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 
 from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.experiments._jobs import check_files
 from bodyslam_jax.experiments._journal import Journal, Row
 from bodyslam_jax.experiments._plans import PLANS
 
@@ -24,10 +25,12 @@ def run_experiment(
     left out, and said so.
 
     **Raises:** `ValueError` if there is no such experiment, if `out` cannot be written,
-    or if no row could be computed.
+    or if no row could be computed; `ValueError` or `FileNotFoundError`, before anything
+    is computed, if a file that the settings name cannot be used.
     """
     if name not in PLANS:
         raise ValueError(f"no experiment {name!r}; expected one of {sorted(PLANS)}.")
+    check_files(experiment, config)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -48,7 +51,7 @@ def run_experiment(
     for job in plan.jobs:
         try:
             rows.append(journal.row(name, job.label, job.key, job.compute))
-        except ValueError as error:
+        except (FileNotFoundError, ValueError) as error:
             log.warning("%s %s: left out: %s", name, job.label, error)
             continue
         if job in missing or job is plan.jobs[-1]:

@@ -2,94 +2,37 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import motion
+from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments import _ablation, _reports
-from bodyslam_jax.experiments._case import Case, make_case, simulations
+from bodyslam_jax.experiments._case import Case, simulations
 from bodyslam_jax.experiments._comparison import compare_methods
+from bodyslam_jax.experiments._jobs import Job, Plan, by_sequence, cases, cost, named
 from bodyslam_jax.experiments._journal import Row
-from bodyslam_jax.experiments._learning import learn_and_test
+from bodyslam_jax.experiments._learning import described, judge
 from bodyslam_jax.experiments._paper import STRUCTURE
 from bodyslam_jax.experiments._scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments._structure import landmark_ablation
-from bodyslam_jax.experiments._variants import VARIANTS
-from bodyslam_jax.synthetic import LENGTH
+from bodyslam_jax.experiments._table1 import write_table1
+from bodyslam_jax.experiments._variants import FULL, VARIANTS
+from bodyslam_jax.experiments._weights import Learned, Trial, learn_weights, make_trial
 
 ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
-FRONT, SOLVE, COMPILE = 0.15, 0.08, 25.0
-"""Processor time on a 2.5 GHz core: the stages before the joint estimate, s a frame; a
-solve of everything, s a frame; a problem of new shapes, s."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One row: what it follows from, what it costs, how it is computed."""
-
-    label: str
-    key: tuple[Any, ...]
-    seconds: float
-    """Of processor time, about."""
-    compute: Callable[[], Row]
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """An experiment: its rows in their order, and the report on those that are done."""
-
-    jobs: list[Job]
-    write: Callable[[Path, list[Row]], list[Path]]
-
-
-def _named(settings: Simulation) -> str:
-    return f"{settings.sequence}-{settings.family}"
-
-
-def _cost(settings: Simulation, solves: float, shapes: float) -> float:
-    frames = settings.length or LENGTH[settings.sequence]
-    return frames * (FRONT + SOLVE * solves) + COMPILE * shapes
-
-
-def _cases(config: Config, stages: Path) -> Callable[[Simulation], Case]:
-    """Makes cases, and keeps the last one: rows of one sequence follow one another."""
-
-    @functools.lru_cache(maxsize=1)
-    def case(settings: Simulation) -> Case:
-        return make_case(settings, config, cache=stages)
-
-    return case
-
-
-def _by_sequence(
-    experiment: Experiment,
-    config: Config,
-    stages: Path,
-    sequences: Sequence[str],
-    families: Sequence[str],
-    compute: Callable[[Case], Row],
-    cost: tuple[float, float],
-) -> list[Job]:
-    """One row a sequence."""
-    case = _cases(config, stages)
-
-    def job(settings: Simulation) -> Job:
-        name = _named(settings)
-        run = lambda: {"sequence": name, **compute(case(settings))}
-        return Job(name, (settings, config), _cost(settings, *cost), run)
-
-    return [job(s) for s in simulations(experiment, sequences, families)]
+NOISE_LEVELS = ("none", "low", "real")
+LEARNING_STEPS = 12
 
 
 def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """All methods on all ten sequences, both families."""
-    jobs = _by_sequence(
+    jobs = by_sequence(
         experiment, config, stages, ALL, ("room", "follow"), compare_methods, (2.0, 4.0)
     )
-    return Plan(jobs, functools.partial(_reports.write_table1, noise=experiment.noise))
+    return Plan(jobs, functools.partial(write_table1, noise=experiment.noise))
 
 
 def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -103,7 +46,7 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
             "spread": found.spread,
         }
 
-    jobs = _by_sequence(
+    jobs = by_sequence(
         experiment,
         config,
         stages,
@@ -117,13 +60,13 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """Shaken cameras, optimised with and without landmarks: the paper's five."""
-    jobs = _by_sequence(
+    jobs = by_sequence(
         experiment,
         config,
         stages,
         tuple(STRUCTURE),
         ("room",),
-        landmark_ablation,
+        functools.partial(landmark_ablation, seed=experiment.seed or 0),
         (2.5, 4.0),
     )
     return Plan(
@@ -146,13 +89,14 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
     def write(out: Path, rows: list[Row]) -> list[Path]:
         return _reports.write_motion(out, rows, source, config)
 
-    key = (Path(source), config.motion_model, config.body_model)
+    model = config.motion_model and Path(config.motion_model)
+    key = (Path(source), model, body_model_file(config.body_model))
     return Plan([Job("motion", key, 60.0, compute)], write)
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """Terms off and on, other weights, noise levels, first against second order."""
-    case = _cases(config, stages)
+    case = cases(config, stages)
 
     @functools.lru_cache(maxsize=1)
     def prepared(settings: Simulation):
@@ -162,13 +106,13 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
     begun: set[Simulation] = set()
 
     def add(settings: Simulation, label: str, compute, solves=1.0, extra=()):
-        name = _named(settings)
+        name = named(settings)
         row = lambda: {"sequence": name, "label": label, **compute()}
-        cost = _cost(settings, solves, solves)
+        seconds = cost(settings, solves, solves)
         if settings in begun:
-            cost -= _cost(settings, 0.0, 0.0)  # stages before the solve are kept
+            seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are kept
         begun.add(settings)
-        jobs.append(Job(f"{name}-{label}", (settings, config, *extra), cost, row))
+        jobs.append(Job(f"{name}-{label}", (settings, config, *extra), seconds, row))
 
     for s in simulations(experiment, ("M2", "D1"), ("room",)):
         for v in VARIANTS:
@@ -184,9 +128,9 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         )
         for order in _ablation.ORDERS:
             add(s, order, lambda o=order, f=orders: f()[o], solves=2.0)
-        for noise in ("none", "low", "real"):
+        for noise in NOISE_LEVELS:
             quiet = dataclasses.replace(s, noise=noise)
-            one = lambda q=quiet: _ablation.ablate(case(q), prepared(q), "full")
+            one = lambda q=quiet: _ablation.ablate(case(q), prepared(q), FULL)
             add(quiet, f"noise: {noise}", one)
     return Plan(
         jobs, functools.partial(_reports.write_ablation, noise=experiment.noise)
@@ -194,25 +138,44 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Weights learnt on some sequences, and the gain on the others."""
+    """Weights learnt on some sequences, and what each of all sequences gains.
+
+    Cameras and map stay as bundle adjustment left them, which takes landmarks out of
+    the problem: what is learnt is how people are weighed.
+    """
     chosen = simulations(
         experiment, ("E1", "M1", "M4", "D2", "E2", "M2", "D1"), ("room",)
     )
     half = (len(chosen) + 1) // 2
     training, test = chosen[:half], chosen[half:]
+    key = (tuple(training), config, LEARNING_STEPS)
+    mark = fingerprint(*key)
+    case = cases(config, stages)
 
-    def compute() -> Row:
-        make = lambda s: make_case(s, config, cache=stages)
-        return learn_and_test([make(s) for s in training], [make(s) for s in test])
+    @functools.lru_cache(maxsize=half)
+    def trial(settings: Simulation) -> Trial:
+        prepared = case(settings).prepare()
+        return make_trial(case(settings), prepared, hold_cameras=True)
 
-    seconds = sum(_cost(s, 8.0, 1.0) for s in training) + sum(
-        _cost(s, 2.0, 1.0) for s in test
-    )
-    key = (tuple(training), tuple(test), config)
-    job = Job("weights", key, seconds, compute)
-    return Plan(
-        [job], functools.partial(_reports.write_weights, noise=experiment.noise)
-    )
+    @functools.cache
+    def learned() -> Learned:
+        folder = stages / f"weights-{mark}"
+        learn = lambda: learn_weights(
+            [trial(s) for s in training],
+            steps=LEARNING_STEPS,
+            progress=folder / "progress.npz",
+        )
+        return Cache(folder).stage("learned", mark, Learned, learn)
+
+    seconds = sum(cost(s, 8.0, 1.0) for s in training)
+    jobs = [Job("learnt", key, seconds, lambda: described(learned()))]
+    for group, settings in (("training", training), ("test", test)):
+        for s in settings:
+            told = {"sequence": named(s), "set": group}
+            row = lambda s=s, told=told: {**told, **judge(trial(s), learned())}
+            jobs.append(Job(f"{group}-{named(s)}", (s, *key), cost(s, 2.0, 1.0), row))
+    write = functools.partial(_reports.write_weights, noise=experiment.noise)
+    return Plan(jobs, write)
 
 
 PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {

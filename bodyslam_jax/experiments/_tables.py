@@ -1,4 +1,4 @@
-"""Rows as Markdown and CSV, with the paper's own figures beside ours."""
+"""Rows as Markdown and CSV: one table or several, under what they are of."""
 
 import csv
 import dataclasses
@@ -8,6 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.experiments._paper import OTHER_DATA
+
+Row = dict[str, Any]
+MM = 1e3
+"""From a row's metres to a table's millimetres."""
 Cell = str | float | int | None
 
 
@@ -70,3 +75,24 @@ def write_text(path: Path, text: str) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text)
     os.replace(partial, path)
+
+
+def intro(title: str, noise: str, *lines: str) -> str:
+    """Title, what the data are, and `lines` on what follows."""
+    about = f"Simulated sequences, noise level `{noise}`. {OTHER_DATA}"
+    return "\n".join([f"# {title}", "", about, *lines, "", ""])
+
+
+def write_tables(
+    out: Path,
+    name: str,
+    head: str,
+    parts: Sequence[tuple[str, Sequence[Column], Sequence[Row]]],
+) -> list[Path]:
+    """`name.md` with all parts under their titles, `name.csv` with the first."""
+    text = head
+    for title, columns, rows in parts:
+        text += f"## {title}\n\n{markdown(columns, rows, mean=len(rows) > 1)}\n"
+    write_text(out / f"{name}.md", text)
+    write_text(out / f"{name}.csv", to_csv(parts[0][1], parts[0][2]))
+    return [out / f"{name}.md", out / f"{name}.csv"]

@@ -3,17 +3,24 @@
 import dataclasses
 from collections.abc import Callable
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from bodyslam_jax import graph
-from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.experiments._problems import rebuild
-from bodyslam_jax.initialisation import upright_factor
+from bodyslam_jax.graph import carrying
+from bodyslam_jax.initialisation import STANCE_LOSS, upright_factor
 
-_SEE_SCALE = (graph.HumanMotion, graph.RootSmoothness, graph.GroundContact)
+_SEE_SCALE = (
+    graph.HumanMotion,
+    graph.RootSmoothness,
+    graph.StanceFoot,
+    graph.GroundContact,
+)
 """What ties the map's unit to metres."""
 
 Start = tuple[graph.Problem, graph.State]
@@ -23,18 +30,20 @@ UP_SIGMA = 0.1
 """rad: how upright people walk."""
 STANCE_SIGMA = 0.01
 """Legs a frame: how still a foot that carries stands."""
-_STANCE_LOSS = 2.0
-"""Cauchy scale, in standard deviations: the lowest foot is not always one that
-carries, and then goes a few centimetres a frame, forward."""
 CAMERA_SIGMA = (0.02, 0.02)
 """rad, m per frame squared: how steadily a hand moves a camera."""
 
 
 def without(*kinds: type[graph.AbstractFactor]) -> Variant:
-    """The problem without these terms; s is held where nothing is left to see it."""
+    """The problem without these terms; s is held where nothing is left to see it.
+
+    Where they measure nothing, it is the very problem that was given.
+    """
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
         muted = graph.mute(problem, *kinds)
+        if eqx.tree_equal(muted, problem):
+            return problem, state
         seeing = [f for f in problem.factors if isinstance(f, _SEE_SCALE)]
         if all(isinstance(f, kinds) for f in seeing):
             muted = dataclasses.replace(muted, free=graph.hold(muted.free, "scale"))
@@ -53,6 +62,14 @@ def held(*names: str) -> Variant:
     return variant
 
 
+def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
+    """No point of the map is seen; points stay, since nothing else says where they
+    are, and cameras are free."""
+    return held("landmarks")(
+        *without(graph.Reprojection, graph.LandmarkPrior)(problem, state)
+    )
+
+
 def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
     """β as the regressor has it, not as people alone have moved it, and held there."""
     (said,) = (f for f in problem.factors if isinstance(f, graph.Shape))
@@ -68,7 +85,7 @@ def with_stance(problem: graph.Problem, state: graph.State) -> Start:
     body, present = _person(problem)
     low = carrying(body, state, present)
     sigma = jnp.where(low, STANCE_SIGMA, jnp.inf)
-    more = graph.StanceFoot(body, sigma, loss=graph.Cauchy(jnp.asarray(_STANCE_LOSS)))
+    more = graph.StanceFoot(body, sigma, loss=graph.Cauchy(jnp.asarray(STANCE_LOSS)))
     return rebuild(problem, state, [*problem.factors, more]), state
 
 
@@ -90,18 +107,6 @@ def with_up(problem: graph.Problem, state: graph.State) -> Start:
     return rebuild(problem, state, factors), state
 
 
-def carrying(
-    body: BodyModel, state: graph.State, present: Bool[Array, "h t"]
-) -> Bool[Array, "h t 4"]:
-    """Which of toes and heels is lowest, along the body's up axis, in k-1 and in k."""
-    points = local_keypoints(body, state.poses, state.shapes[:, None], "body25")
-    height: Float[Array, "h t 4"] = points[..., np.array(graph.BODY25_FEET), 1]
-    lowest = height == height.min(axis=-1, keepdims=True)
-    lowest = lowest & present[..., None]
-    before = jnp.concatenate([jnp.zeros_like(lowest[:, :1]), lowest[:, :-1]], axis=1)
-    return lowest & before
-
-
 def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     motion = problem.motion
     if motion is None:
@@ -109,14 +114,17 @@ def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     return motion.body, motion.present
 
 
+FULL = "full"
 VARIANTS: dict[str, Variant] = {
-    "full": lambda problem, state: (problem, state),
+    FULL: lambda problem, state: (problem, state),
     "no motion model": without(graph.HumanMotion),
     "no ground": without(graph.GroundContact),
     "nothing that sees scale": without(
         graph.HumanMotion, graph.RootSmoothness, graph.GroundContact
     ),
     "no smooth path": without(graph.RootSmoothness),
+    "no landmarks": without_landmarks,
+    "no places seen again": without(graph.LandmarkPrior),
     "no keypoints": without(graph.JointReprojection),
     "no regressed postures": without(graph.Posture),
     "no regressed orientation": without(graph.RootOrientation),

@@ -9,6 +9,7 @@ loss' scale: λ = σ^-2, so log λ falls by twice as much.
 import dataclasses
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from bodyslam_jax import evaluation, graph, joint, solver
+from bodyslam_jax import cache, evaluation, graph, joint, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.experiments._case import Case
 from bodyslam_jax.experiments._problems import without_map
@@ -66,6 +67,17 @@ class Learned:
     """Logarithm of the factor on each standard deviation or robust scale."""
     history: Float[np.ndarray, " n"]
     """Mean error over the training sequences before each step."""
+    path: Float[np.ndarray, "n w"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """What a step of learning leaves for the next, as arrays."""
+
+    names: tuple[str, ...]
+    standing: tuple[np.ndarray, ...]
+    """Weights, Adam's memory, and the solution of each sequence."""
+    history: Float[np.ndarray, " n"]
     path: Float[np.ndarray, "n w"]
 
 
@@ -165,34 +177,75 @@ def learn_weights(
     steps: int = 12,
     rate: float = 0.15,
     names: tuple[str, ...] | None = None,
+    progress: Path | None = None,
 ) -> Learned:
     """Adam on the mean training error over `trials`, each solved from its last answer.
 
-    **Raises:** `ValueError` if there is no trial.
+    What a step leaves for the next is kept in the file `progress`: learning that was
+    interrupted goes on from there, and comes to the same.
+
+    **Raises:** `ValueError` if there is no trial, or if `progress` has other weights.
     """
     if not trials:
         raise ValueError("no sequence to learn from.")
     names = names or names_of(trials[0].problem)
     value = jnp.zeros(len(names))
     method = optax.adam(rate)
-    memory = method.init(value)
-    states = [trial.state for trial in trials]
+    standing = (value, method.init(value), [trial.state for trial in trials])
     history, path = [], []
-    for step in range(steps):
-        total, slope = 0.0, PRIOR * 2 * value
-        for i, trial in enumerate(trials):
-            error, gradient, states[i] = error_and_gradient(
-                trial, names, value, states[i]
-            )
-            total += float(error) / len(trials)
-            # A solve that failed says nothing; one sequence decides no more than 1.
-            gradient = jnp.nan_to_num(gradient)
-            size = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
-            slope = slope + gradient * jnp.minimum(1.0, 5.0 / size) / len(trials)
-        history.append(total)
+    if progress is not None and (kept := _read(progress, names)) is not None:
+        form = jax.tree.structure(standing)
+        standing = jax.tree.unflatten(form, [jnp.asarray(x) for x in kept.standing])
+        history, path = list(kept.history), list(kept.path)
+    for step in range(len(history), steps):
+        value, memory, states = standing
+        error, slope, states = _mean_error(trials, names, value, states)
+        history.append(error)
         path.append(np.asarray(value))
-        log.info("weights: step %d of %d, error %.4g", step + 1, steps, total)
-        change, memory = method.update(slope, memory)
+        log.info("weights: step %d of %d, error %.4g", step + 1, steps, error)
+        # optax takes powers of Python's numbers.
+        with jax.numpy_dtype_promotion("standard"):
+            change, memory = method.update(slope, memory)
         value = jnp.clip(optax.apply_updates(value, change), -2.0, 2.0)
+        standing = (value, memory, states)
+        if progress is not None:
+            leaves = tuple(np.asarray(x) for x in jax.tree.leaves(standing))
+            progress.parent.mkdir(parents=True, exist_ok=True)
+            kept = Progress(names, leaves, np.array(history), np.array(path))
+            cache.save(progress, kept)
     best = int(np.argmin(history))
     return Learned(names, path[best], np.array(history), np.array(path))
+
+
+def _mean_error(
+    trials: Sequence[Trial],
+    names: tuple[str, ...],
+    value: Float[Array, " w"],
+    states: Sequence[graph.State],
+) -> tuple[float, Float[Array, " w"], list[graph.State]]:
+    """The mean training error, its gradient with that of the prior, new solutions."""
+    total, slope, found = 0.0, PRIOR * 2 * value, []
+    for trial, state in zip(trials, states, strict=True):
+        error, gradient, state = error_and_gradient(trial, names, value, state)
+        total += float(error) / len(trials)
+        # A solve that failed says nothing; one sequence decides no more than 1.
+        gradient = jnp.nan_to_num(gradient)
+        size = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
+        slope = slope + gradient * jnp.minimum(1.0, 5.0 / size) / len(trials)
+        found.append(state)
+    return total, slope, found
+
+
+def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
+    """What an earlier run left, `None` if it is nothing that can be read."""
+    if not progress.exists():
+        return None
+    try:
+        kept = cache.load(progress, Progress)
+    except cache.UNREADABLE as error:
+        log.warning("%s: not readable (%s); learnt from the start", progress, error)
+        return None
+    if kept.names != names:
+        raise ValueError(f"{progress}: weights {kept.names}, expected {names}.")
+    log.info("weights: %d steps taken from an earlier run", len(kept.history))
+    return kept
