@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.graph import _memory
 
 T, L, M = 3, 6, 5
 """Frames, landmarks and observations; one person."""
@@ -191,9 +193,31 @@ def test_nothing_is_known_of_landmarks_that_nobody_sees():
 
 
 def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
-    monkeypatch.setattr("os.sysconf", lambda name: 1000)
+    """And that many do."""
+
+    def people_of(frames):
+        rng = np.random.default_rng(0)
+        return scenes.truth(rng, frames, 1, 0)
+
+    monkeypatch.setattr(_memory, "memory", lambda: 2**27)
+    with pytest.raises(
+        ValueError, match=r"need about 0\.\d GiB, found 0\.1 GiB"
+    ) as error:
+        g.make_problem([], people_of(400))
+    (fit,) = re.findall(r"about (\d+) frames fit", str(error.value))
+    assert 20 < int(fit) < 400
+    g.make_problem([], people_of(int(0.9 * int(fit))))
     with pytest.raises(ValueError, match="frames fit"):
-        make()
+        g.make_problem([], people_of(int(1.2 * int(fit))))
+
+
+def test_a_container_may_use_less_than_the_machine_has(monkeypatch, tmp_path):
+    limit, other = tmp_path / "memory.max", tmp_path / "none"
+    limit.write_text("1048576\n")
+    monkeypatch.setattr(_memory, "_LIMITS", (str(other), str(limit)))
+    assert _memory.memory() == 2**20
+    limit.write_text("max\n")
+    assert _memory.memory() > 2**28
 
 
 def test_under_a_transformation_shapes_alone_are_looked_at():

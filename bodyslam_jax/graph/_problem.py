@@ -3,7 +3,6 @@
 `make_problem` is the door: it checks everything that the solver relies on.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -28,7 +27,8 @@ from bodyslam_jax.graph._factors import (
     Reprojection,
 )
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
-from bodyslam_jax.graph._layout import CHUNK, Layout, make_layout
+from bodyslam_jax.graph._layout import Layout, make_layout
+from bodyslam_jax.graph._memory import check_memory
 from bodyslam_jax.graph._state import State, Step, gauge
 from bodyslam_jax.motion import leg_length
 
@@ -177,7 +177,7 @@ def make_problem(
         if isinstance(factor, LandmarkPrior):
             check_prior(factor, landmark)
     layout = make_layout(sizes["t"], sizes["l"], frame, landmark)
-    _check_memory(layout, state)
+    check_memory(layout, state)
     if free is None:
         touched = {
             name
@@ -199,24 +199,3 @@ def make_problem(
     movable = jax.tree.map(moves, free)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
     return Problem(factors, free, motion, layout, variables)
-
-
-def _check_memory(layout, state):
-    """Refuses what cannot fit: bytes grow linearly with frames, and say so."""
-    item = state.scale.dtype.itemsize
-    people = len(state.roots)
-    person = 69 + 12  # what stays of a chunk: a posture and two roots
-    front = CHUNK * 6 * layout.bandwidth + people * (person + 10) + 16
-    pivot = 6 * CHUNK + people * person
-    window = 2 * person + 6 * CHUNK + 24
-    postures = CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)
-    chunk = 3 * pivot * front + people * (window**2 + postures)
-    tables = sum(40 * bucket.row.size for bucket in layout.buckets)
-    need = item * (chunk * layout.num_chunks + tables)
-    have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if need > have:
-        fit = int(len(state.cameras) * have / need)
-        raise ValueError(
-            f"{len(state.cameras)} frames need about {need / 2**30:.0f} GiB, found "
-            f"{have / 2**30:.0f} GiB: about {fit} frames fit."
-        )
