@@ -91,9 +91,15 @@ def prepare(
     )
     if anybody:
         factors += initialisation.people_factors(sequence, roots, weights, body)
-        walked = lambda seen, state: initialisation.motion_factor(
-            seen, state.shapes, body, weights, shared_error=shared
-        )
+        there = roots.present & cameras.registered
+        walked = lambda seen, state: [
+            initialisation.motion_factor(
+                seen, state.shapes, body, weights, shared_error=shared
+            ),
+            *initialisation.optional_factors(
+                state, seen, there, sequence.fps, body, weights
+            ),
+        ]
         if moving:
             contact = initialisation.ground_contact(
                 state,
@@ -105,11 +111,10 @@ def prepare(
             )
         if contact is not None:
             factors.append(contact)
-        there = roots.present & cameras.registered
         upright = initialisation.upright_factor(state, there, sequence.fps, weights)
         if upright is not None:
             factors.append(upright)
-        problem = make([*factors, walked(predict(predictor, state), state)], state)
+        problem = make([*factors, *walked(predict(predictor, state), state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
         seen = predict(predictor, state)
@@ -124,7 +129,7 @@ def prepare(
                 *(start.ground, start.ground_error),
             )
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
-        factors.append(walked(seen, state))
+        factors += walked(seen, state)
     if not factors:
         raise ValueError(
             f"{sequence.name}: no landmarks and no people; expected a camera moving "
@@ -171,7 +176,9 @@ def _settle_people(
         problem,
         graph.Reprojection,
         graph.HumanMotion,
+        graph.OrientationChange,
         graph.RootSmoothness,
+        graph.StanceFoot,
         graph.GroundContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")
@@ -226,9 +233,13 @@ def estimate(
 def solve_stage(
     problem: graph.Problem, state: graph.State, config: Config, name: str
 ) -> tuple[solver.Solution, dict]:
-    """`solver.solve` with a line for the log and what the report says of it."""
+    """`solver.solve` with a line for the log and what the report says of it.
+
+    The `joint` problem takes the steps of the paper, any other the last of them.
+    """
     start = time.perf_counter()
-    schedule = solver.PAPER_SCHEDULE if name == "joint" else (solver.Stage(),)
+    schedule = solver.paper_schedule(config.solver)
+    schedule = schedule if name == "joint" else schedule[-1:]
     schedule = tuple(dataclasses.replace(stage, atol=ENOUGH) for stage in schedule)
     solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
     before, after = float(solution.first_cost), float(solution.cost)

@@ -64,6 +64,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
     monkeypatch.setattr(initialisation, "scale_start", scale_start)
     monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
+    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
     monkeypatch.setattr(joint, "predict", lambda *_: None)

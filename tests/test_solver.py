@@ -13,16 +13,18 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import (
     Stage,
     clock,
     marginals,
-    observability,
     restrict,
     solve,
 )
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
+from bodyslam_jax.solver._gmres import RESTART, gmres
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._mapping import in_turn
@@ -31,7 +33,15 @@ from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._tables import gather
 from bodyslam_jax.solver._triangular import invert_lower
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 TIGHT = (Stage(rtol=1e-13, max_steps=60),)
+STOCK = [
+    "optimistix",
+    "jaxopt_lm",
+    # Its program takes as long to compile as those of both others.
+    pytest.param("jaxopt_gn", marks=pytest.mark.slow),
+]
 
 
 # One scene serves most tests, as shapes decide what is compiled.
@@ -50,9 +60,14 @@ def make(
 ):
     rng = np.random.default_rng(seed)
     state = scenes.truth(rng, frames, people, landmarks)
-    factors = [scenes.reprojection(rng, state, noise=0.5 * noise)]
+    # The loss as an array: a test that differentiates by it compiles nothing anew.
+    loss = jnp.asarray(1.5)
+    factors = [scenes.reprojection(rng, state, noise=0.5 * noise, loss=loss)]
     if people:
-        factors += scenes.person_factors(rng, state, noise=noise)
+        # In one program: one by one its operations take five times as long to compile.
+        scenes.body_model()
+        measure = lambda state: scenes.person_factors(rng, state, noise=noise)
+        factors += eqx.filter_jit(measure, compiler_options=quick_options())(state)
     if known:
         factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
     if extras:
@@ -63,23 +78,30 @@ def make(
 
 def dense(problem, state):
     """Jacobian and residual of a problem in its free coordinates, without structure."""
+    return tuple(np.asarray(x) for x in _dense(problem, state))
+
+
+def _dense_of(problem, state):
     zero, unravel = ravel_pytree(state.zero_step())
     mask, _ = ravel_pytree(mask_of(problem))
 
-    @jax.jit
     def residual(x):
         rows = lifted(state.retract(unravel(x * mask)), problem)
-        return jnp.concatenate([r.reshape(-1) for r in rows])
+        flat = jnp.concatenate([r.reshape(-1) for r in rows])
+        return flat, flat
 
-    return np.asarray(jax.jit(jax.jacfwd(residual))(zero)), np.asarray(residual(zero))
+    return jax.jacfwd(residual, has_aux=True)(zero)
 
 
-@eqx.filter_jit
-def structured_step(problem, state, damping):
+def _structured_step(problem, state, damping):
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
     extra = damped(diagonals(lin, sizes), damping)
     return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
+
+
+_dense = kept(_dense_of, quick_options)
+structured_step = kept(_structured_step, quick_options)
 
 
 def unpadded(step, state):
@@ -132,15 +154,43 @@ def test_step_is_that_of_the_dense_normal_equations(options):
     assert abs(found - expected).max() < 1e-9 * abs(expected).max()
 
 
-def test_all_second_order_solvers_reach_the_same_optimum():
+def test_gauss_newton_reaches_the_same_optimum():
     problem, _, start = make()
-    costs = {
-        name: float(solve(problem, start, solver=name, schedule=TIGHT).cost)
-        for name in ("structured", "optimistix", "jaxopt_lm", "jaxopt_gn")
-    }
-    best = costs.pop("structured")
-    for name, cost in costs.items():
-        assert cost == pytest.approx(best, rel=1e-8), name
+    best = solve(problem, start, schedule=TIGHT)
+    found = solve(problem, start, schedule=TIGHT, damping=0.0)
+    assert best.status == found.status == "converged"
+    assert found.histories[0].damping[0] == 0
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-8)
+
+
+@pytest.mark.parametrize("solver", STOCK)
+def test_all_second_order_solvers_reach_the_same_optimum(solver):
+    problem, _, start = make()
+    best = solve(problem, start, schedule=TIGHT)
+    found = solve(problem, start, solver=solver, schedule=TIGHT)
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-8)
+
+
+@pytest.mark.parametrize("solver", [*STOCK, "adam"])
+def test_a_stock_solver_that_meets_nan_gives_back_the_start_and_says_so(solver):
+    problem, _, start = make()
+    lost = problem.factors[0].pixel.at[3].set(jnp.nan)
+    problem = eqx.tree_at(lambda p: p.factors[0].pixel, problem, lost)
+    schedule = (Stage(max_steps=12),) if solver == "adam" else TIGHT
+    found = solve(problem, start, solver=solver, schedule=schedule)
+    assert found.status == "cost is not finite"
+    assert jnp.array_equal(found.state.cameras, start.cameras)
+
+
+def test_first_order_steps_end_by_themselves_only_where_the_cost_stays():
+    problem, _, start = make()
+    found = solve(problem, start, solver="adam", schedule=(Stage(max_steps=12),))
+    assert found.status == "ran out of steps"
+    assert found.num_steps == (12,)
+    assert found.cost < found.first_cost
+    loose = (Stage(max_steps=12, rtol=2.0),)
+    found = solve(problem, start, solver="adam", schedule=loose)
+    assert found.status == "converged"
 
 
 def test_landmarks_known_besides_reach_the_same_optimum_as_in_stock_solvers():
@@ -235,11 +285,15 @@ def test_the_world_and_unit_of_the_map_do_not_matter():
 def test_starts_are_mapped_over_in_one_go():
     problem, truth, start = make()
     rng = np.random.default_rng(1)
-    starts = [scenes.perturb(rng, problem, truth, size=0.01) for _ in range(3)]
+    starts = [scenes.perturb(rng, problem, truth, size=0.01) for _ in range(2)]
+    # What is mapped cannot be refused: it comes back, and the status says so.
+    starts.append(eqx.tree_at(lambda s: s.landmarks, start, jnp.nan * start.landmarks))
     batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
-    together = jax.vmap(lambda s: solve(problem, s, schedule=TIGHT).cost)(batch)
-    alone = [float(solve(problem, s, schedule=TIGHT).cost) for s in starts]
-    assert np.allclose(together, alone, rtol=1e-8)
+    together = jax.vmap(lambda s: solve(problem, s, schedule=TIGHT))(batch)
+    assert together.status.tolist() == ["converged"] * 2 + ["cost is not finite"]
+    assert jnp.isnan(together.state.landmarks[2]).all()
+    alone = [float(solve(problem, s, schedule=TIGHT).cost) for s in starts[:2]]
+    assert np.allclose(together.cost[:2], alone, rtol=1e-8)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="maps all at once")
@@ -277,7 +331,7 @@ def test_triangular_matrices_of_any_width_are_inverted():
     rng = np.random.default_rng(0)
     for n in (1, 24, 25, 69):
         lower = np.tril(rng.standard_normal((2, n, n))) + 4 * np.sqrt(n) * np.eye(n)
-        inverse = invert_lower(jnp.asarray(lower))
+        inverse = jax.jit(invert_lower)(jnp.asarray(lower))
         assert np.allclose(inverse @ lower, np.eye(n), atol=1e-12)
 
 
@@ -292,10 +346,27 @@ def test_single_precision_reaches_the_same_optimum():
     assert float(single.cost) == pytest.approx(float(double.cost), rel=1e-4)
 
 
+@pytest.mark.slow
+def test_single_precision_serves_people_and_covariances_too():
+    problem, _, start = make(people=1, frames=12)
+    half = lambda tree: jax.tree.map(
+        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree
+    )
+    double = solve(problem, start, schedule=TIGHT)
+    single = solve(half(problem), half(start))
+    assert single.state.poses.dtype == jnp.float32
+    assert float(single.cost) == pytest.approx(float(double.cost), rel=1e-3)
+    spread = marginals(half(problem), single.state)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(spread))
+    exact = marginals(problem, double.state)
+    # Rounding, and the damping that keeps it from harm, tell more than noise does.
+    assert 0.5 < float(spread.scale) / float(exact.scale) < 2
+
+
 @pytest.mark.parametrize(
     "options",
     [
-        {"frames": 24, "landmarks": 150, "known": True},
+        {"frames": 24, "landmarks": 150, "known": True, "free_intrinsics": True},
         pytest.param(
             {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
         ),
@@ -315,17 +386,22 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options):
         moved = state.retract(unravel(x))
         centres = moved.scale * moved.cameras[:, :3, 3]
         pelvis = g.world_from_root(moved)[..., :3, 3].reshape(-1, 3)
-        return centres, moved.scale * moved.landmarks, pelvis
+        ours = centres, moved.scale * moved.landmarks, pelvis, moved.shapes
+        return *ours, moved.scale[None, None], moved.intrinsics[None]
 
     spread = marginals(problem, state)
-    found = spread.cameras, spread.landmarks, spread.people.reshape(-1, 3, 3)
-    for by_step, block in zip(jax.jacfwd(metric)(zero), found, strict=True):
+    people = spread.people.reshape(-1, 3, 3)
+    intrinsics = spread.intrinsics[None] if options.get("free_intrinsics") else []
+    found = spread.cameras, spread.landmarks, people, spread.shapes
+    found = *found, spread.scale[None, None, None], intrinsics
+    assert spread.intrinsics.shape == (4 * len(intrinsics),) * 2
+    for by_step, block in zip(jax.jit(jax.jacfwd(metric))(zero), found, strict=True):
         if not len(block):
             continue
         expected = np.einsum("lin,nm,ljm->lij", by_step, inverse, by_step)
         size = np.trace(expected, axis1=1, axis2=2)
         error = abs(np.asarray(block) - expected).max(axis=(1, 2))
-        known = size < 10 * np.median(size)  # the rest is as good as not seen
+        known = size <= 10 * np.median(size)  # the rest is as good as not seen
         assert known.sum() > 0.8 * len(known)
         assert (error[known] < 1e-3 * size[known] + 1e-12).all()
 
@@ -334,7 +410,8 @@ def test_marginal_covariances_are_mapped_over():
     problem, _, start = make(known=True)
     states = [start, solve(problem, start, schedule=TIGHT).state]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    found = jax.jit(jax.vmap(lambda s: marginals(problem, s)))(batch)
+    mapped = jax.vmap(lambda s: marginals(problem, s))
+    found = eqx.filter_jit(mapped, compiler_options=quick_options())(batch)
     for k, state in enumerate(states):
         alone = marginals(problem, state)
         for one, other in (
@@ -342,8 +419,10 @@ def test_marginal_covariances_are_mapped_over():
             (found.landmarks, alone.landmarks),
         ):
             size = np.abs(other).max(axis=(-2, -1), keepdims=True)
-            assert (size > 0).sum() > 5
-            assert (np.abs(one[k] - other) <= 1e-5 * size).all()
+            # A point that is as good as not seen is where rounding puts it.
+            known = (size > 0) & (size < 1e3)
+            assert known.sum() > 5
+            assert (np.abs(one[k] - other) * known <= 1e-9 * size).all()
 
 
 def test_factors_that_reach_too_far_are_refused():
@@ -362,37 +441,50 @@ def test_factors_that_reach_too_far_are_refused():
         solve(problem, start)
 
 
-def test_turning_on_the_spot_is_reported():
-    problem, truth, _ = make(noise=0.0)
-    still = truth.cameras.at[:, :3, 3].multiply(1e-9)
-    state = eqx.tree_at(lambda s: s.cameras, truth, still)
-    factor = problem.factors[0]
-    seen = factor.pixel + factor.residual(state) * factor.sigma[:, None]
-    factor = eqx.tree_at(lambda f: f.pixel, factor, seen)
-    problem = g.make_problem([factor], state)
-    found = solve(problem, state)
-    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(found.state))
-    report = observability(problem, state, marginals(problem, state))
-    assert any("landmarks" in line for line in report), report
-
-
 def test_gradient_of_a_solution_is_that_of_solving_again():
+    """By pixels, and by weights: the sigmas and the scale of the loss."""
     problem, _, start = make()
     rng = np.random.default_rng(5)
-    along = jnp.asarray(rng.standard_normal((7, 3)))
-    toward = jnp.asarray(rng.standard_normal(problem.factors[0].pixel.shape))
+    draw = lambda *shape: jnp.asarray(rng.standard_normal(shape))
+    factor, along = problem.factors[0], draw(7, 3)
+    toward, unequal = draw(*factor.pixel.shape), draw(*factor.sigma.shape)
     start = solve(problem, start, schedule=TIGHT).state
 
-    def value(pixel):
-        there = eqx.tree_at(lambda p: p.factors[0].pixel, problem, pixel)
-        found = solve(there, start, schedule=(Stage(rtol=1e-15, max_steps=60),))
+    def value(by):
+        changed = dataclasses.replace(
+            factor,
+            pixel=factor.pixel + by[0] * toward,
+            sigma=factor.sigma * jnp.exp(by[1] * unequal),
+            loss=g.Cauchy(factor.loss.scale * jnp.exp(by[2])),
+        )
+        there = eqx.tree_at(lambda p: p.factors, problem, (changed,))
+        # The start depends on what the derivative is taken by; the solution does not.
+        near = eqx.tree_at(lambda s: s.landmarks, start, start.landmarks + by[0])
+        found = solve(there, near, schedule=(Stage(rtol=1e-15, max_steps=60),))
         return jnp.sum(along * found.state.cameras[:, :3, 3])
 
     # Solving again is exact to 1e-8 or so, which the step must be far above.
-    pixel, size = problem.factors[0].pixel, 1e-2
-    slope = jnp.sum(jax.grad(value)(pixel) * toward)
-    numeric = value(pixel + size * toward) - value(pixel - size * toward)
-    assert float(slope) == pytest.approx(float(numeric) / (2 * size), rel=1e-3)
+    size, zero = 1e-2, jnp.zeros(3)
+    for slope, step in zip(jax.grad(value)(zero), size * jnp.eye(3), strict=True):
+        numeric = float(value(step) - value(-step)) / (2 * size)
+        assert float(slope) == pytest.approx(numeric, rel=1e-3)
+
+
+def test_a_linear_system_is_solved_or_its_solution_is_nan():
+    rng = np.random.default_rng(0)
+    n = RESTART + 10
+    matrix = np.eye(n) + 0.5 * rng.standard_normal((n, n)) / np.sqrt(n)
+    right = jnp.asarray(rng.standard_normal(n))
+    solved = jax.jit(
+        lambda a, b: gmres(lambda x, share: share * b - a @ x, b, rtol=1e-12)
+    )
+    found = solved(jnp.asarray(matrix), right)
+    assert np.allclose(matrix @ found, right, atol=1e-9)
+    assert (solved(jnp.asarray(matrix), 0 * right) == 0).all()
+    # What is left by a cyclic shift falls after as many products as there are unknowns,
+    # which are more than are made before starting anew.
+    shift = jnp.roll(jnp.eye(n), 1, axis=0)
+    assert jnp.isnan(solved(shift, jnp.eye(n)[0])).all()
 
 
 @pytest.mark.parametrize(
@@ -443,8 +535,12 @@ def test_a_person_in_a_single_frame_and_no_landmarks():
     assert jnp.allclose(found.state.roots[:, 3:], start.roots[:, 3:])
 
 
-def test_another_size_of_state_is_refused():
+def test_another_size_of_state_and_what_is_not_finite_are_refused():
     problem, _, start = make()
+    lost = start.cameras.at[2, :3, 3].set(jnp.nan)
+    lost = eqx.tree_at(lambda s: s.cameras, start, lost)
+    with pytest.raises(ValueError, match="state.cameras: 3 of 112 values are not fin"):
+        solve(problem, lost)
     short = eqx.tree_at(lambda s: s.cameras, start, start.cameras[:-1])
     with pytest.raises(ValueError, match="6 frames"):
         solve(problem, short)
@@ -472,6 +568,14 @@ def test_a_cost_that_is_not_finite_is_a_status():
     found = solve(problem, start)
     assert found.status == "cost is not finite"
     assert jnp.array_equal(found.state.cameras, start.cameras)
+
+
+def test_groups_of_variables_go_by_their_names():
+    with pytest.raises(ValueError, match=r"\['camera', 'pose'\], .*'cameras'"):
+        Stage(("camera", "landmarks", "pose"))
+    problem, _, _ = make()
+    with pytest.raises(ValueError, match="'scales'"):
+        restrict(problem, ("scales",))
 
 
 class Seen(eqx.Module):

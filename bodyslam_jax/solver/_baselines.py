@@ -2,7 +2,7 @@
 
 They see a flat step from the first state (poses do not add, steps do) and the lifted
 residuals; the motion model's prediction stays as it is at the start, but for what is
-coupled, which they differentiate in full.
+coupled, which they differentiate in full. Each is one program with all that it needs.
 """
 
 import warnings
@@ -18,8 +18,26 @@ from jax.flatten_util import ravel_pytree
 from bodyslam_jax.graph import Problem, State, Step
 from bodyslam_jax.solver._blocks import mask_of
 from bodyslam_jax.solver._levenberg_marquardt import lifted
+from bodyslam_jax.solver._solution import is_finite
 
 ADAM_RATE = 1e-2
+SETTLED = 10
+"""First-order steps over which the cost must stay as it is."""
+
+
+def run(name, problem, state, stage):
+    """One stage of the solver of this name: state, its cost, steps and result.
+
+    A state that is not finite, or whose cost is not, is not returned: the one that the
+    stage began with is.
+    """
+    before = problem.follow(state).cost(state)
+    found, count, result = _METHODS[name](problem, state, stage)
+    cost = problem.follow(found).cost(found)
+    good = jnp.isfinite(cost) & is_finite(found)
+    state = jax.tree.map(lambda new, old: jnp.where(good, new, old), found, state)
+    result = optx.RESULTS.where(good, result, optx.RESULTS.nonfinite)
+    return state, jnp.where(good, cost, before), count, result
 
 
 class _Flat(eqx.Module):
@@ -138,19 +156,37 @@ def _jaxopt(name, problem, state, stage):
     # jaxopt multiplies truth values and numbers.
     with jax.numpy_dtype_promotion("standard"):
         found = method.run(start, arrays)
-    count = found.state.iter_num
-    return flat.retract(unravel(found.params)), count, optx.RESULTS.successful
+    converged = found.state.error <= options["tol"]
+    return flat.retract(unravel(found.params)), found.state.iter_num, _result(converged)
+
+
+def _result(converged):
+    return optx.RESULTS.where(
+        converged,
+        optx.RESULTS.successful,
+        optx.RESULTS.nonlinear_max_steps_reached,
+    )
 
 
 def adam(problem, state, stage):
-    """First-order steps, as the paper took: `stage.max_steps` of them."""
-    state, _ = adam_curve(problem, state, stage, ADAM_RATE)
-    return state, jnp.array(stage.max_steps), optx.RESULTS.successful
+    """First-order steps, as the paper took: `stage.max_steps` of them.
+
+    Converged is what has kept its cost, within the stage's tolerance, for a while: the
+    steps are of fixed length and never end by themselves.
+    """
+    state, costs = adam_curve(problem, state, stage, ADAM_RATE)
+    finite, settled = jnp.isfinite(costs), jnp.array(False)
+    if len(costs) >= SETTLED:
+        enough = jnp.maximum(stage.rtol * costs[-1], stage.atol)
+        settled = jnp.ptp(costs[-SETTLED:]) <= enough
+    result = _result(settled)
+    result = optx.RESULTS.where(finite.all(), result, optx.RESULTS.nonfinite)
+    return state, finite.sum(), result
 
 
 def adam_curve(problem, state, stage, rate, *, decays=False):
     """The state after these steps, and the cost before each; `decays`: the rate falls
-    to 0 as a cosine does."""
+    to 0 as a cosine does. Where the cost is not finite the steps end."""
     flat, zero = _flat(problem, state)
     rate = jnp.asarray(rate, state.scale.dtype)
     found, costs = _adam(flat, zero, rate, stage.max_steps, decays)
@@ -163,16 +199,27 @@ def _adam(flat, start, rate, count, decays):
     falls = optax.cosine_decay_schedule(1.0, max(count, 1))
 
     def one(carry, k):
-        step, memory = carry
+        step, known, memory = carry
         cost, gradient = jax.value_and_grad(flat.cost)(step)
+        good = jnp.isfinite(cost)
+        known = jax.tree.map(lambda new, old: jnp.where(good, new, old), step, known)
         # optax takes powers of Python's numbers.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(gradient, memory)
             length = rate * falls(k) if decays else rate
         length = length.astype(rate.dtype)
-        step = jax.tree.map(lambda s, c: s - length * c, step, change)
-        return (step, memory), cost
+        step = jax.tree.map(lambda s, c: s - length * c, known, change)
+        return (step, known, memory), cost
 
-    carry = start, method.init(start)
-    (step, _), costs = jax.lax.scan(one, carry, jnp.arange(count))
-    return step, costs
+    carry = start, start, method.init(start)
+    (step, known, _), costs = jax.lax.scan(one, carry, jnp.arange(count))
+    good = jnp.isfinite(flat.cost(step))
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), step, known), costs
+
+
+_METHODS = {
+    "optimistix": optimistix,
+    "jaxopt_lm": jaxopt_lm,
+    "jaxopt_gn": jaxopt_gn,
+    "adam": adam,
+}

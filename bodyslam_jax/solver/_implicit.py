@@ -6,27 +6,60 @@ derivative of the robust cost is used (Gauss-Newton's would be wrong wherever re
 are not 0), solved for by GMRES with the structured factorisation as preconditioner: a
 few products. Nothing is unrolled. Predictions of the motion model are held when F is
 taken, as the solver holds them, but they move with x and p when F is differentiated.
+Where GMRES does not converge the derivative is NaN: the equations are as good as
+singular, or the state is no minimum.
 """
+
+import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
+from bodyslam_jax.compilation import is_alone, is_traced, quick_options
 from bodyslam_jax.graph import Problem, Reprojection, State, Step
+from bodyslam_jax.kept import kept
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
 from bodyslam_jax.solver._coupling import with_gradient
+from bodyslam_jax.solver._gmres import gmres
 from bodyslam_jax.solver._linearise import linearise
+from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver._tables import gather
 
 _LITTLE = {"float64": 1e-9, "float32": 1e-5}
+"""Damping of the preconditioner."""
+_RTOL = {"float64": 1e-10, "float32": 1e-5}
+"""Share of the adjoint at which GMRES ends."""
 
 
 def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Problem:
     """What a cotangent on the solution is on everything in the (padded) problem."""
+    given = problem, state, cotangent
+    if is_traced(given):
+        return in_turn(_program(False))(*given)
+    return _program(is_alone())(*given)
+
+
+@functools.cache
+def _program(alone: bool) -> Callable[..., Problem]:
+    if alone:
+        return kept(_cotangent_of_problem, quick_options)
+    return eqx.filter_jit(_cotangent_of_problem)
+
+
+def _cotangent_of_problem(problem, state, cotangent):
     problem = _without_single_views(problem)
     zero = state.zero_step()
-    mask = _determined(problem, state)
+    diagonal = _diagonal(problem, state)
+    mask = jax.tree.map(
+        lambda m, d: jnp.where(d > 0, m, 0.0), mask_of(problem), diagonal
+    )
+    # Standard deviations: in metres and radians, points that nobody sees well would
+    # decide alone when the rest is good enough.
+    unit = jax.tree.map(lambda d: jax.lax.rsqrt(jnp.where(d > 0, d, 1.0)), diagonal)
     masked = lambda step: jax.tree.map(lambda m, s: m * s, mask, step)
     _, pull = jax.vjp(state.retract, zero)
     (right,) = pull(cotangent)
@@ -45,21 +78,23 @@ def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Pr
 
         return jax.grad(cost)(step)
 
-    _, transpose = jax.vjp(lambda d: gradient(d, arrays), zero)
-    held = jax.tree.map(lambda m: 1 - m, mask)
-
-    def operator(step):
-        (product,) = transpose(masked(step))
-        rest = jax.tree.map(lambda k, s: k * s, held, step)
-        return jax.tree.map(lambda a, b: a + b, masked(product), rest)
-
+    _, transpose = jax.vjp(gradient, zero, arrays)
     precondition = _preconditioner(problem, state)
-    tolerance = 1e3 * float(jnp.finfo(state.scale.dtype).eps)
-    adjoint, _ = jax.scipy.sparse.linalg.gmres(
-        operator, right, M=precondition, tol=tolerance, restart=20, maxiter=5
-    )
-    _, pull = jax.vjp(lambda a: gradient(zero, a), arrays)
-    (result,) = pull(jax.tree.map(jnp.negative, masked(adjoint)))
+    flat, unravel = ravel_pytree(right)
+    scale, _ = ravel_pytree(unit)
+
+    def left_of(scaled, share):
+        step = unravel(scaled * scale)
+        product, _ = transpose(masked(step))
+        # A held coordinate is its own equation.
+        image = jax.tree.map(
+            lambda b, m, p, x: share * b - jnp.where(m > 0, m * p, x),
+            *(right, mask, product, step),
+        )
+        return ravel_pytree(precondition(image))[0] / scale
+
+    adjoint = unravel(scale * gmres(left_of, flat, _RTOL[flat.dtype.name]))
+    _, result = transpose(jax.tree.map(jnp.negative, masked(adjoint)))
     return result
 
 
@@ -78,19 +113,19 @@ def _without_single_views(problem: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
 
 
-def _determined(problem: Problem, state: State) -> Step:
-    """The mask, without coordinates that no measurement sees."""
+def _diagonal(problem: Problem, state: State) -> Step:
+    """Of `J^T J`: 0 for coordinates that no measurement sees."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
     diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
-    mask, zero = mask_of(problem), state.zero_step()
+    zero = state.zero_step()
     count = sizes.intrinsics
     landmarks = zero.landmarks
     for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
         moved = jnp.moveaxis(own, 1, 2)
         landmarks = landmarks.at[bucket.landmark].set(moved, mode="drop")
     poses = diagonal.get("pose", zero.poses).reshape(zero.poses.shape)
-    there = Step(
+    return Step(
         scale=diagonal["globals"][0],
         cameras=diagonal["camera"],
         roots=diagonal["root"],
@@ -99,7 +134,6 @@ def _determined(problem: Problem, state: State) -> Step:
         landmarks=landmarks,
         intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,
     )
-    return jax.tree.map(lambda m, d: jnp.where(d > 0, m, 0.0), mask, there)
 
 
 def _preconditioner(problem: Problem, state: State):

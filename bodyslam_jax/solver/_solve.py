@@ -3,13 +3,13 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
 
 from bodyslam_jax.compilation import is_alone, is_traced, quick_options
 from bodyslam_jax.graph import VARIABLES, Problem, State
@@ -20,9 +20,10 @@ from bodyslam_jax.solver._levenberg_marquardt import (
     StructuredLevenbergMarquardt,
     lifted,
 )
-from bodyslam_jax.solver._loop import Final, History
+from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
+from bodyslam_jax.solver._solution import Solution, only, outcome
 
 Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
 
@@ -39,42 +40,35 @@ class Stage:
     atol: float = 0.0
     """The same in units of the cost: a half is what a standard deviation is worth."""
 
+    def __post_init__(self):
+        _check_names(self.free)
+
+
+def _check_names(free: tuple[str, ...]) -> None:
+    unknown = sorted(set(free) - set(VARIABLES))
+    if unknown:
+        raise ValueError(f"free: {unknown}, expected names among {list(VARIABLES)}.")
+
 
 PAPER_SCHEDULE = (
     Stage(("scale", "cameras", "roots", "landmarks"), max_steps=20, rtol=1e-4),
     Stage(),
 )
 """Section 3.6: first where cameras and people are, then everything."""
-
-
+PAPER_STEPS = (200, 100)
+"""The paper's number of steps in each, which are of first order."""
 HISTORY = 64
 """The length of a history is a multiple of this: schedules share a compilation."""
 
 
-class Solution(eqx.Module):
-    """The best state found. What failed says so in `status`; a state is never NaN."""
-
-    state: State
-    result: optx.RESULTS
-    cost: Float[Array, ""]
-    """Negative log-likelihood at `state`."""
-    histories: tuple[History, ...]
-    """Of each stage."""
-    num_steps: tuple[Array, ...]
-    """Iterations of each stage, accepted or not."""
-    first_cost: Float[Array, ""]
-    """Negative log-likelihood at the start, with the motion predicted there."""
-
-    @property
-    def status(self) -> str:
-        """`converged`, or what kept it from that."""
-        if self.result == optx.RESULTS.successful:
-            return "converged"
-        if self.result == optx.RESULTS.nonlinear_max_steps_reached:
-            return "ran out of steps"
-        if self.result == optx.RESULTS.nonfinite:
-            return "cost is not finite"
-        return "no step lowers the cost"
+def paper_schedule(solver: Solver) -> tuple[Stage, ...]:
+    """`PAPER_SCHEDULE`; with the paper's own number of steps for first-order ones."""
+    if solver != "adam":
+        return PAPER_SCHEDULE
+    return tuple(
+        dataclasses.replace(stage, max_steps=count)
+        for stage, count in zip(PAPER_SCHEDULE, PAPER_STEPS, strict=True)
+    )
 
 
 def solve(
@@ -87,14 +81,26 @@ def solve(
 ) -> Solution:
     """Minimises the cost of a problem from a first state.
 
-    `structured` is the solver for real videos; the others are baselines for small
-    problems. Pure: jits, differentiates with respect to everything in `problem`, and
-    maps over problems or states of one shape: one after another on a CPU, which is no
-    slower there, at once elsewhere; `over_devices` gives each device a share. Threads
-    may solve at the same time.
+    - `solver`: `structured` is the one for real videos. The others are baselines for
+      small problems: `optimistix` and `jaxopt_lm` (Levenberg-Marquardt), `jaxopt_gn`
+      (Gauss-Newton) and `adam` (first-order steps, as many as a stage has).
+    - `schedule`: stages one after another, each with its free variables, most steps
+      and tolerances; `PAPER_SCHEDULE` is the paper's.
+    - `damping`: of the first step of each stage, as a share of each variable's own
+      curvature; later steps adapt it. 0 is Gauss-Newton: full steps as long as they
+      lower the cost. Baselines have their own.
+
+    Pure: jits, differentiates, and maps over problems or states of one shape: one after
+    another on a CPU, which is no slower there, at once elsewhere; `over_devices` gives
+    each device a share. Threads may solve at the same time.
+
+    Derivatives, of `structured`, are those of `state` and `cost` with respect to all of
+    `problem`, by the implicit function theorem; a solution does not depend on where it
+    started. They are NaN where their equations could not be solved.
 
     **Raises:** `ValueError` if `state` does not have the sizes the problem was made
-    for. Failure to converge is a `status`.
+    for, or is not finite. Failure to converge is a `status`, and so is what is not
+    finite within `jit`.
     """
     expected = problem.free.cameras.shape[0], problem.free.landmarks.shape[0]
     found = state.cameras.shape[0], state.landmarks.shape[0]
@@ -103,15 +109,27 @@ def solve(
             f"state: {found[0]} frames and {found[1]} landmarks, expected "
             f"{expected[0]} and {expected[1]} as in the problem."
         )
+    _check_finite(state)
     if solver != "structured":
         return _solve_baseline(problem, state, solver, schedule)
-    padded, start = pad(problem, state)
+    padded, start = pad(problem, jax.lax.stop_gradient(state))
     solution = _differentiable(padded, start, schedule, damping, is_alone())
     return eqx.tree_at(
         lambda s: s.state,
         solution,
         unpad(solution.state, *found),
     )
+
+
+def _check_finite(state: State) -> None:
+    for name, value in vars(state).items():
+        if is_traced(value):
+            continue
+        bad = int(np.sum(~np.isfinite(np.asarray(value))))
+        if bad:
+            raise ValueError(
+                f"state.{name}: {bad} of {value.size} values are not finite."
+            )
 
 
 def method_of(
@@ -162,24 +180,6 @@ def _run(problem, state, method):
     return outcome(state, found.value, found.result, found.stats)
 
 
-def outcome(start, best, result, stats) -> tuple[Solution, Final]:
-    """What the loop leaves behind, as a solution; the start, if no cost was finite."""
-    better = jnp.isfinite(stats["cost"])
-    best = jax.tree.map(lambda new, old: jnp.where(better, new, old), best, start)
-    stages = range(len(stats["steps"]))
-    histories = tuple(jax.tree.map(lambda x: x[i], stats["history"]) for i in stages)
-    counts = tuple(stats["steps"][i] for i in stages)
-    solution = Solution(
-        state=best,
-        result=result,
-        cost=stats["cost"],
-        histories=histories,
-        num_steps=counts,
-        first_cost=stats["first_cost"],
-    )
-    return solution, stats["final"]
-
-
 @eqx.filter_custom_vjp
 def _differentiable(problem, state, schedule, damping, alone):
     return _solve(problem, state, schedule, damping, alone)
@@ -189,15 +189,6 @@ def _solve(problem, state, schedule, damping, alone):
     method = method_of(schedule, damping, state.scale.dtype)
     solution, _ = run(restrict_to_all(problem, schedule), state, method, alone=alone)
     return only(solution, len(schedule))
-
-
-def only(solution: Solution, count: int) -> Solution:
-    """Without the idle stages that make all schedules one program."""
-    return dataclasses.replace(
-        solution,
-        histories=solution.histories[:count],
-        num_steps=solution.num_steps[:count],
-    )
 
 
 @_differentiable.def_fwd
@@ -227,7 +218,11 @@ def _backward(found, cotangent, perturbed, problem, state, schedule, damping, al
 
 
 def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
-    """The same problem with only these groups free."""
+    """The same problem with only these groups free.
+
+    **Raises:** `ValueError` for a name that is not among `VARIABLES`.
+    """
+    _check_names(free)
     variables = tuple(name for name in problem.variables if name in free)
     return dataclasses.replace(problem, variables=variables)
 
@@ -238,11 +233,22 @@ def restrict_to_all(problem: Problem, schedule: tuple[Stage, ...]) -> Problem:
 
 
 def _solve_baseline(problem, state, solver, schedule):
-    run, first = getattr(_baselines, solver), problem.follow(state).cost(state)
-    counts = []
-    result = optx.RESULTS.successful
+    program = _baseline(is_alone() and not is_traced((problem, state)))
+    first = cost = _cost(problem, state)
+    counts, result = [], optx.RESULTS.successful
     for stage in schedule:
-        state, count, result = run(restrict(problem, stage.free), state, stage)
+        held = restrict(problem, stage.free)
+        state, cost, count, result = program(solver, held, state, stage)
         counts.append(count)
-    cost = problem.follow(state).cost(state)
     return Solution(state, result, cost, (), tuple(counts), first)
+
+
+@functools.cache
+def _baseline(alone: bool) -> Callable[..., Any]:
+    run = _baselines.run
+    return kept(run, quick_options) if alone else eqx.filter_jit(run)
+
+
+@eqx.filter_jit
+def _cost(problem, state):
+    return problem.follow(state).cost(state)

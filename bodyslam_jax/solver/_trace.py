@@ -15,12 +15,10 @@ from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
+from bodyslam_jax.solver._solution import Solution, only, outcome
 from bodyslam_jax.solver._solve import (
-    Solution,
     Stage,
     method_of,
-    only,
-    outcome,
     restrict,
     restrict_to_all,
 )
