@@ -213,7 +213,7 @@ def learn_weights(
             progress.parent.mkdir(parents=True, exist_ok=True)
             kept = Progress(names, leaves, np.array(history), np.array(path))
             cache.save(progress, kept)
-    best = int(np.argmin(history))
+    best = int(np.nanargmin(history))
     return Learned(names, path[best], np.array(history), np.array(path))
 
 
@@ -225,11 +225,13 @@ def _mean_error(
 ) -> tuple[float, Float[Array, " w"], list[graph.State]]:
     """The mean training error, its gradient with that of the prior, new solutions."""
     total, slope, found = 0.0, PRIOR * 2 * value, []
-    for trial, state in zip(trials, states, strict=True):
+    for k, (trial, state) in enumerate(zip(trials, states, strict=True)):
         error, gradient, state = error_and_gradient(trial, names, value, state)
         total += float(error) / len(trials)
         # A solve that failed says nothing; one sequence decides no more than 1.
-        gradient = jnp.nan_to_num(gradient)
+        if not np.all(np.isfinite(gradient)):
+            log.warning("training sequence %d: no gradient, left out of this step", k)
+            gradient = jnp.zeros_like(gradient)
         size = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
         slope = slope + gradient * jnp.minimum(1.0, 5.0 / size) / len(trials)
         found.append(state)
