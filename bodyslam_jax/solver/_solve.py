@@ -114,11 +114,7 @@ def solve(
         return _solve_baseline(problem, state, solver, schedule)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     solution = _differentiable(padded, start, schedule, damping, is_alone())
-    return eqx.tree_at(
-        lambda s: s.state,
-        solution,
-        unpad(solution.state, *found),
-    )
+    return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *found))
 
 
 def _check_finite(state: State) -> None:

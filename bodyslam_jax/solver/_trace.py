@@ -16,12 +16,7 @@ from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
 from bodyslam_jax.solver._solution import Solution, only, outcome
-from bodyslam_jax.solver._solve import (
-    Stage,
-    method_of,
-    restrict,
-    restrict_to_all,
-)
+from bodyslam_jax.solver._solve import Stage, method_of, restrict, restrict_to_all
 
 
 def trace(
