@@ -20,9 +20,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 _OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 """Of XLA's two ways to make code of fused operations on a CPU, the older one: the
 solver's program compiles in half the time with it, and runs as fast."""
-_EFFORTLESS = {"xla_backend_optimization_level": 0}
-"""On a CPU, machine code as it comes: half to a quarter of the time to compile, and
-twice that to run, which is 0.1 s more for 1,000 frames."""
+_EFFORTLESS = {"xla_backend_optimization_level": 1}
+"""On a CPU, machine code nearly as it comes: less time to compile, and more to run,
+which is 0.1 s for 1,000 frames. Not level 0: with XLA's older emitters a `where` took
+the wrong branch there (jaxlib 0.10.2)."""
 
 
 def jit_once(function: F) -> F:
