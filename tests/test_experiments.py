@@ -30,7 +30,6 @@ from bodyslam_jax.experiments._plans import PLANS
 from bodyslam_jax.experiments._problems import with_scale
 from bodyslam_jax.experiments._score import NAMES
 from bodyslam_jax.experiments._structure import shake
-from bodyslam_jax.experiments._variants import carrying
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
 """Postures held: compiled in a few seconds."""
@@ -106,7 +105,7 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     regressed = said.shape[0][np.isfinite(np.asarray(said.sigma)[0]).all(axis=-1)]
     assert not np.allclose(start.shapes[0], regressed.mean(axis=0))
     np.testing.assert_allclose(state.shapes[0], regressed.mean(axis=0))
-    low = carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
+    low = g.carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
     assert low.shape == (1, 12, 4) and not low[:, 0].any()
     assert (low.sum(axis=-1) <= 1).all()
 

@@ -9,7 +9,7 @@ import scenes
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.initialisation._factors import optional_factors
+from bodyslam_jax.initialisation import optional_factors
 
 T = 4
 

@@ -12,8 +12,11 @@ from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.experiments._problems import rebuild
-from bodyslam_jax.graph import carrying
-from bodyslam_jax.initialisation import STANCE_LOSS, upright_factor
+from bodyslam_jax.initialisation import (
+    stance_factor,
+    steady_camera_factor,
+    upright_factor,
+)
 
 _SEE_SCALE = (
     graph.HumanMotion,
@@ -26,12 +29,12 @@ _SEE_SCALE = (
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
 
-UP_SIGMA = 0.1
-"""rad: how upright people walk."""
-STANCE_SIGMA = 0.01
-"""Legs a frame: how still a foot that carries stands."""
-CAMERA_SIGMA = (0.02, 0.02)
-"""rad, m per frame squared: how steadily a hand moves a camera."""
+ASKED_FOR = GraphWeights(upright_sigma=0.1, stance_sigma=0.01, camera_smoothness=0.02)
+"""Of what is off by default: how upright people walk, rad; how still a foot that
+carries stands, legs a frame; how steadily a hand moves a camera, rad and m per frame
+squared."""
+_FPS = 30.0
+"""Of the simulated sequences."""
 
 
 def without(*kinds: type[graph.AbstractFactor]) -> Variant:
@@ -80,31 +83,20 @@ def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
     return held("shapes")(problem, dataclasses.replace(state, shapes=shapes))
 
 
-def with_stance(problem: graph.Problem, state: graph.State) -> Start:
-    """Beside all else, the lowest point of the feet stands still."""
-    body, present = _person(problem)
-    low = carrying(body, state, present)
-    sigma = jnp.where(low, STANCE_SIGMA, jnp.inf)
-    more = graph.StanceFoot(body, sigma, loss=graph.Cauchy(jnp.asarray(STANCE_LOSS)))
-    return rebuild(problem, state, [*problem.factors, more]), state
+def beside(
+    make: Callable[
+        [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.AbstractFactor | None
+    ],
+) -> Variant:
+    """One more term, if there is anything for it to say."""
 
+    def variant(problem: graph.Problem, state: graph.State) -> Start:
+        body, present = _person(problem)
+        more = make(body, state, np.asarray(present))
+        factors = problem.factors if more is None else [*problem.factors, more]
+        return rebuild(problem, state, factors), state
 
-def with_steady_camera(problem: graph.Problem, state: graph.State) -> Start:
-    """Beside all else, the camera keeps its velocity."""
-    turn, shift = CAMERA_SIGMA
-    sigma = jnp.array([turn, shift]) / jnp.array([1.0, float(state.scale)])
-    sigma = jnp.broadcast_to(sigma, (len(state.cameras), 2)).at[:2].set(jnp.inf)
-    more = graph.CameraSmoothness(sigma=sigma)
-    return rebuild(problem, state, [*problem.factors, more]), state
-
-
-def with_up(problem: graph.Problem, state: graph.State) -> Start:
-    """Beside all else, trunks lean little about where they point on average."""
-    _, present = _person(problem)
-    weights = GraphWeights(upright_sigma=UP_SIGMA)
-    more = upright_factor(state, np.asarray(present), 30.0, weights)
-    factors = problem.factors if more is None else [*problem.factors, more]
-    return rebuild(problem, state, factors), state
+    return variant
 
 
 def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
@@ -132,8 +124,14 @@ VARIANTS: dict[str, Variant] = {
     "no regressed shape": without(graph.Shape),
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
-    "with stance foot": with_stance,
-    "with steady camera": with_steady_camera,
-    "with up direction": with_up,
+    "with stance foot": beside(
+        lambda body, state, there: stance_factor(state, there, _FPS, body, ASKED_FOR)
+    ),
+    "with steady camera": beside(
+        lambda body, state, there: steady_camera_factor(state, _FPS, ASKED_FOR)
+    ),
+    "with up direction": beside(
+        lambda body, state, there: upright_factor(state, there, _FPS, ASKED_FOR)
+    ),
 }
 """What `ablation` solves, from the start of the full problem but for what is held."""

@@ -7,13 +7,16 @@ ground under people's feet.
 """
 
 from bodyslam_jax.initialisation._factors import PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE
-from bodyslam_jax.initialisation._factors import STANCE_LOSS as STANCE_LOSS
 from bodyslam_jax.initialisation._factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation._factors import map_factor as map_factor
 from bodyslam_jax.initialisation._factors import motion_factor as motion_factor
-from bodyslam_jax.initialisation._factors import optional_factors as optional_factors
 from bodyslam_jax.initialisation._factors import people_factors as people_factors
 from bodyslam_jax.initialisation._factors import revisit_factor as revisit_factor
+from bodyslam_jax.initialisation._optional import optional_factors as optional_factors
+from bodyslam_jax.initialisation._optional import stance_factor as stance_factor
+from bodyslam_jax.initialisation._optional import (
+    steady_camera_factor as steady_camera_factor,
+)
 from bodyslam_jax.initialisation._scale import ScaleStart as ScaleStart
 from bodyslam_jax.initialisation._scale import ground_contact as ground_contact
 from bodyslam_jax.initialisation._scale import scale_start as scale_start

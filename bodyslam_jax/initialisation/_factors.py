@@ -1,8 +1,5 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
-import math
-from typing import TypeGuard
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -16,9 +13,6 @@ from bodyslam_jax.sequence import Sequence, Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
 """px: what a track's noise can be; outside, it is the model that is wrong."""
-STANCE_LOSS = 2.0
-"""Cauchy scale, in standard deviations: the lowest foot is not always one that
-carries, and then goes a few centimetres a frame, forward."""
 
 
 def map_factor(
@@ -200,43 +194,3 @@ def _steps(seen, shapes, body, weights, shared_error):
     whitening = whitening / jnp.sqrt(1 + shared_error**2 * told)
     leg = motion.leg_length(body, shapes)[:, None, None]
     return step / leg, whitening * leg[..., None]
-
-
-def optional_factors(
-    state: graph.State,
-    seen: motion.Prediction,
-    there: Bool[np.ndarray, "h t"],
-    fps: float,
-    body: BodyModel,
-    weights: GraphWeights,
-) -> list[graph.AbstractFactor]:
-    """What is off unless a weight says how far it is trusted.
-
-    People turn as the motion model predicts, the foot that carries stands, the camera
-    keeps its velocity. The last is in units of the map, by the state's scale.
-    """
-    factors: list[graph.AbstractFactor] = []
-    per_frame = 30.0 / fps
-    if _is_on(weights.orientation_sigma):
-        sigma = weights.orientation_sigma * per_frame
-        factors.append(
-            graph.OrientationChange(
-                rotation=jnp.where(seen.valid[..., None], seen.rotation, 0.0),
-                sigma=jnp.where(seen.valid, sigma, jnp.inf),
-            )
-        )
-    if _is_on(weights.stance_sigma):
-        stands = graph.carrying(body, state, jnp.asarray(there))
-        sigma = jnp.where(stands, weights.stance_sigma * per_frame, jnp.inf)
-        loss = graph.Cauchy(jnp.asarray(STANCE_LOSS))
-        factors.append(graph.StanceFoot(body, sigma, loss=loss))
-    if _is_on(weights.camera_smoothness):
-        sigma = np.full((len(state.cameras), 2), np.inf)
-        sigma[2:] = weights.camera_smoothness * per_frame**2
-        sigma[:, 1] /= float(state.scale)
-        factors.append(graph.CameraSmoothness(jnp.asarray(sigma)))
-    return factors
-
-
-def _is_on(sigma: float | None) -> TypeGuard[float]:
-    return sigma is not None and math.isfinite(sigma)
