@@ -3,6 +3,7 @@
     python benchmarks/bench_solver.py landmarks --frames 100 300 1000
     python benchmarks/bench_solver.py joint --frames 300 1000
     python benchmarks/bench_solver.py joint --frames 300 --cache FOLDER  # twice
+    python benchmarks/bench_solver.py joint --frames 1000 --mixed
     python benchmarks/bench_solver.py breakdown --frames 1000
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2x10 cg
@@ -36,7 +37,7 @@ from solver_scene import make
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, over_devices, solve
 from bodyslam_jax.solver._assembly import assemble
-from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._blocks import cast, sizes_of
 from bodyslam_jax.solver._chunks import factorise
 from bodyslam_jax.solver._landmarks import eliminate_landmarks
 from bodyslam_jax.solver._linearise import linearise
@@ -47,8 +48,8 @@ from bodyslam_jax.solver._tables import gather
 from bodyslam_jax.solver._window import window_of
 
 
-def report(name, problem, truth, start, schedule, repeats):
-    run = lambda: solve(problem, start, schedule=schedule)
+def report(name, problem, truth, start, schedule, mixed, repeats):
+    run = lambda: solve(problem, start, schedule=schedule, mixed_precision=mixed)
     solution, first, (wall, cpu) = timed(run, repeats)
     steps = sum(int(n) for n in solution.num_steps)
     cost_of = eqx.filter_jit(lambda p, s: p.cost(s))
@@ -66,10 +67,10 @@ def report(name, problem, truth, start, schedule, repeats):
     return solution
 
 
-def breakdown(problem, state, repeats):
+def breakdown(problem, state, mixed, repeats):
     """Where an iteration spends its time: each part compiled and timed by itself."""
     problem, state = pad(problem, state)
-    sizes = sizes_of(problem, state)
+    sizes = sizes_of(problem, state, np.dtype(np.float32) if mixed else None)
     rows = []
 
     def part(name, function, *arrays):
@@ -82,8 +83,9 @@ def breakdown(problem, state, repeats):
 
     seen = gather(problem)
     part("cost of a trial", lambda p, s: p.cost(s), problem, state)
-    lin = part("residuals and Jacobians", linearise, problem, seen, state)
+    lin = part("residuals and Jacobians", linearise, problem, seen, state, sizes.dtype)
     damping = damped(diagonals(lin, sizes), jnp.asarray(1e-4, state.scale.dtype))
+    lin, damping = cast((lin, damping), sizes.dtype)
     reduced = part(
         "landmarks",
         eliminate_landmarks,
@@ -122,19 +124,21 @@ def scales(frames, rtol, factors=(0.4, 0.63, 0.79, 1.26, 1.59, 2.5)):
     )
 
 
-def growth(sizes, steps):
+def growth(sizes, steps, mixed):
     """Time of an iteration and peak memory of the joint problem, each size in a process
     of its own."""
     for frames in sizes:
         command = [sys.executable, __file__, "one", "--frames", str(frames)]
-        subprocess.run([*command, "--steps", str(steps)], check=True)
+        options = ["--steps", str(steps), *["--mixed"] * mixed]
+        subprocess.run([*command, *options], check=True)
 
 
-def one(frames, steps):
+def one(frames, steps, mixed):
     problem, _, start = make(frames, 1)
     peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     before = peak()
-    run = lambda: solve(problem, start, schedule=(Stage(max_steps=steps, rtol=0.0),))
+    schedule = (Stage(max_steps=steps, rtol=0.0),)
+    run = lambda: solve(problem, start, schedule=schedule, mixed_precision=mixed)
     solution, _, (wall, cpu) = timed(run, 3)
     count = int(solution.num_steps[0])
     print(
@@ -151,6 +155,11 @@ def main():
     parser.add_argument("what", choices=subjects.split())
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
+    parser.add_argument(
+        "--mixed",
+        action="store_true",
+        help="in double precision, but for steps (landmarks, joint, breakdown, growth)",
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
@@ -177,7 +186,7 @@ def main():
     if args.what == "scales":
         jax.config.update("jax_num_cpu_devices", args.devices)
     if args.what == "growth":
-        growth(args.frames, args.steps)
+        growth(args.frames, args.steps, args.mixed)
         return
     others = {
         "calibration": lambda n: calibration(n, args.repeats, args.noise),
@@ -188,7 +197,7 @@ def main():
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps
         ),
         "scales": lambda n: scales(n, args.rtol),
-        "one": lambda n: one(n, args.steps),
+        "one": lambda n: one(n, args.steps, args.mixed),
     }
     for frames in args.frames:
         if args.what in others:
@@ -200,12 +209,13 @@ def main():
             len(f.frame) for f in problem.factors if isinstance(f, g.Reprojection)
         )
         name = f"{frames} / {len(truth.landmarks)} / {count} {np.dtype(dtype).name}"
+        name += ", mixed" if args.mixed else ""
         if args.what == "breakdown":
             print(name)
-            breakdown(problem, start, args.repeats)
+            breakdown(problem, start, args.mixed, args.repeats)
             continue
         schedule = (Stage(rtol=args.rtol),)
-        report(name, problem, truth, start, schedule, args.repeats)
+        report(name, problem, truth, start, schedule, args.mixed, args.repeats)
 
 
 if __name__ == "__main__":

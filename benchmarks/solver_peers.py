@@ -65,10 +65,12 @@ def peers(frames, names, python, repeats, rtol, steps):
         share = result["rows"][:, 0] / result["rows"][-1, 0]
         clocks[name] = (wall * share, cpu * share)
         notes[name] = note_of(result, found[name])
-    for dtype in (np.float64, np.float32):
-        name = f"structured {np.dtype(dtype).name}"
-        p, s = cast((problem, start), dtype)
-        ours = lambda p=p, s=s: solve(p, s, schedule=(Stage(rtol=rtol),))
+    for label in ("float64", "mixed", "float32"):
+        name, mixed = f"structured {label}", label == "mixed"
+        p, s = cast((problem, start), np.float64 if mixed else np.dtype(label))
+        ours = lambda p=p, s=s, mixed=mixed: solve(
+            p, s, schedule=(Stage(rtol=rtol),), mixed_precision=mixed
+        )
         solution, first, (wall, cpu) = timed(ours, repeats)
         taken = int(solution.num_steps[0])
         found[name] = float(cost_of(problem, cast(solution.state, np.float64)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
-from test_solver import dense, make
+from problems import dense, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Marginals, marginals, observability, solve

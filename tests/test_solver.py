@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
+from problems import dense, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.compilation import quick_options
@@ -23,9 +24,8 @@ from bodyslam_jax.solver import (
     restrict,
     solve,
 )
-from bodyslam_jax.solver._blocks import mask_of, sizes_of
+from bodyslam_jax.solver._blocks import sizes_of
 from bodyslam_jax.solver._gmres import RESTART, gmres
-from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
@@ -44,55 +44,6 @@ STOCK = [
 ]
 
 
-# One scene serves most tests, as shapes decide what is compiled.
-SEED = 2
-
-
-def make(
-    seed=SEED,
-    people=0,
-    frames=7,
-    landmarks=25,
-    extras=False,
-    known=False,
-    noise=1.0,
-    **options,
-):
-    rng = np.random.default_rng(seed)
-    state = scenes.truth(rng, frames, people, landmarks)
-    # The loss as an array: a test that differentiates by it compiles nothing anew.
-    loss = jnp.asarray(1.5)
-    factors = [scenes.reprojection(rng, state, noise=0.5 * noise, loss=loss)]
-    if people:
-        # In one program: one by one its operations take five times as long to compile.
-        scenes.body_model()
-        measure = lambda state: scenes.person_factors(rng, state, noise=noise)
-        factors += eqx.filter_jit(measure, compiler_options=quick_options())(state)
-    if known:
-        factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
-    if extras:
-        factors += scenes.extra_factors(rng, state, factors[0])
-    problem = g.make_problem(factors, state, **options)
-    return problem, state, scenes.perturb(rng, problem, state)
-
-
-def dense(problem, state):
-    """Jacobian and residual of a problem in its free coordinates, without structure."""
-    return tuple(np.asarray(x) for x in _dense(problem, state))
-
-
-def _dense_of(problem, state):
-    zero, unravel = ravel_pytree(state.zero_step())
-    mask, _ = ravel_pytree(mask_of(problem))
-
-    def residual(x):
-        rows = lifted(state.retract(unravel(x * mask)), problem)
-        flat = jnp.concatenate([r.reshape(-1) for r in rows])
-        return flat, flat
-
-    return jax.jacfwd(residual, has_aux=True)(zero)
-
-
 def _structured_step(problem, state, damping):
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
@@ -100,7 +51,6 @@ def _structured_step(problem, state, damping):
     return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
 
 
-_dense = kept(_dense_of, quick_options)
 structured_step = kept(_structured_step, quick_options)
 
 

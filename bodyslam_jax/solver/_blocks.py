@@ -7,6 +7,7 @@ frame k - d; `alone` is a camera without a person.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.graph import Problem, State, Step
@@ -21,6 +22,8 @@ class Sizes(eqx.Module):
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
+    dtype: np.dtype = eqx.field(static=True)
+    """Of blocks and factors: the state's, or a lower one (see `solve`)."""
 
     @property
     def own_globals(self) -> int:
@@ -56,6 +59,12 @@ class Linearisation(eqx.Module):
     """Of each factor."""
 
 
+def cast(tree, dtype: np.dtype):
+    """All real numbers of a tree in another precision."""
+    change = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(change, tree)
+
+
 class Observations(eqx.Module):
     """Measurements of landmarks, gathered once per solve.
 
@@ -83,6 +92,7 @@ class Sums:
         self.globals_gradient = jnp.zeros(sizes.globals, dtype)
 
     def add(self, key: tuple[str, str, int], value: Array) -> None:
+        value = value.astype(self.sizes.dtype)
         known = self.blocks.get(key)
         self.blocks[key] = value if known is None else known + value
 
@@ -105,7 +115,8 @@ def shifted(x: Array, by: int, axis: int) -> Array:
     return jnp.concatenate([come_in, kept] if by > 0 else [kept, come_in], axis=axis)
 
 
-def sizes_of(problem: Problem, state: State) -> Sizes:
+def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> Sizes:
+    """`dtype` of blocks, the state's without it."""
     held = "intrinsics" not in problem.variables
     return Sizes(
         people=state.roots.shape[0],
@@ -113,6 +124,7 @@ def sizes_of(problem: Problem, state: State) -> Sizes:
         bandwidth=problem.layout.bandwidth,
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
+        dtype=state.scale.dtype if dtype is None else dtype,
     )
 
 

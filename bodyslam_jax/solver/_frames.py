@@ -119,7 +119,8 @@ def _add_products(sums, local, has_common, columns, weight, factor):
     joint, of_people = factor.per_joint, factor.of_people
     ends = [sum(c.shape[-1] for c in columns[: i + 1]) for i in range(len(columns))]
     parts = [slice(e - c.shape[-1], e) for e, c in zip(ends, columns, strict=True)]
-    jac = jnp.concatenate(columns, axis=-1) * weight
+    whole = jnp.concatenate(columns, axis=-1) * weight
+    jac = whole.astype(sums.sizes.dtype)
     if jac.shape[-2] <= 3:
         gram = sum(
             jac[..., r, :, None] * jac[..., r, None, :] for r in range(1, jac.shape[-2])
@@ -127,12 +128,16 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         gram = gram + jac[..., 0, :, None] * jac[..., 0, None, :]
     else:
         gram = jnp.einsum("...ra,...rb->...ab", jac, jac)
+    if jac.dtype == whole.dtype:
+        slope = gram[..., -1]
+    else:
+        slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
     # A term of frame k about frame k - lag.
     shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
     for i, (name, lag) in enumerate(local):
-        own = shift(gram[..., parts[i], -1], lag)
+        own = shift(slope[..., parts[i]], lag)
         if joint:
             own = own.reshape(*own.shape[:2], 69)
         sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
@@ -150,12 +155,13 @@ def _add_products(sums, local, has_common, columns, weight, factor):
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if has_common:
         n = sums.sizes.own_globals if of_people else 1 + sums.sizes.intrinsics
-        total = jnp.sum(gram[..., spread, spread.start :], axis=1)
+        total = jnp.sum(gram[..., spread, spread], axis=1).astype(whole.dtype)
+        down = jnp.sum(slope[..., spread], axis=1)
         for person in range(total.shape[0]):
             sums.add_globals(
                 person if of_people else None,
                 total[person, :n, :n],
-                total[person, :n, -1],
+                down[person, :n],
             )
 
 

@@ -50,7 +50,7 @@ def eliminate_landmarks(
     sizes: Sizes,
 ) -> ReducedCameras:
     """Sums what all groups take away; to be added to the cameras' own blocks."""
-    dtype = problem.free.scale.dtype
+    dtype = sizes.dtype
     n, count = sizes.chunks, sizes.intrinsics
     band = jnp.zeros((n, CAMERAS, sizes.bandwidth * CAMERAS), dtype)
     side = jnp.zeros((n, CAMERAS, count + 1), dtype)

@@ -15,6 +15,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -59,6 +60,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Whether to factorise once more at the end, hardly damped, for covariances."""
     length: int = eqx.field(static=True)
     """Of the history."""
+    dtype: np.dtype = eqx.field(static=True)
+    """Of blocks and factors."""
     norm: Callable[..., Any] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -66,7 +69,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         s, n, k = len(self.limit), self.length, len(args.factors)
         observations = gather(args)
         # Filled in by the first step: each part is compiled once.
-        struct = eqx.filter_eval_shape(_first, args, observations, y)
+        struct = eqx.filter_eval_shape(_first, args, observations, y, self.dtype)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
         stage = self._after(jnp.array(-1))
         return Loop(
@@ -104,11 +107,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         last = state.stage == len(self.limit)
         at = jnp.minimum(state.stage, len(self.limit) - 1)
         args = _held(args, self.free[at])
-        sizes = sizes_of(args, y)
+        sizes = sizes_of(args, y, self.dtype)
 
         lin, prediction = jax.lax.cond(
             state.stale,
-            lambda _: _linearise_anew(args, state.observations, y),
+            lambda _: _linearise_anew(args, state.observations, y, self.dtype),
             lambda _: (state.final.lin, state.prediction),
             None,
         )
@@ -201,9 +204,9 @@ def _is_done(
     return trial.finite & ((trial.predicted <= floor) | (small & undisturbed))
 
 
-def _first(problem, observations, state):
-    lin, prediction = _linearise_anew(problem, observations, state)
-    sizes = sizes_of(problem, state)
+def _first(problem, observations, state, dtype):
+    lin, prediction = _linearise_anew(problem, observations, state, dtype)
+    sizes = sizes_of(problem, state, dtype)
     extra = damped(diagonals(lin, sizes), jnp.ones_like(state.scale))
     return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
 
@@ -214,10 +217,10 @@ def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
     return Final(lin, eliminated.factor, None if people is None else people.roots)
 
 
-def _linearise_anew(problem, observations, state):
+def _linearise_anew(problem, observations, state, dtype):
     seen = problem.predict(state)
     problem = problem.with_prediction(seen)
-    lin = linearise(problem, observations, state)
+    lin = linearise(problem, observations, state, dtype)
     return with_coupling(problem, lin, state), seen
 
 

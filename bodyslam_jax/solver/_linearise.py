@@ -6,6 +6,7 @@ landmarks dense tables, frames by landmarks of a group (`_tables.py`).
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from bodyslam_jax.graph import (
     AbstractFrameFactor,
@@ -21,10 +22,16 @@ from bodyslam_jax.solver._tables import add_prior, linearise_landmarks
 
 @eqx.filter_jit
 def linearise(
-    problem: Problem, observations: Observations | None, state: State
+    problem: Problem,
+    observations: Observations | None,
+    state: State,
+    dtype: np.dtype | None = None,
 ) -> Linearisation:
-    """All blocks at a state; held coordinates have zero rows and columns."""
-    sums = Sums(sizes_of(problem, state), state)
+    """All blocks at a state; held coordinates have zero rows and columns.
+
+    Blocks are kept in `dtype`, gradients and costs in the state's own.
+    """
+    sums = Sums(sizes_of(problem, state, dtype), state)
     landmarks, priors = (), []
     for factor in problem.factors:
         if isinstance(factor, Reprojection):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, Step
 from bodyslam_jax.solver._assembly import assemble
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, cast, own_to_global
 from bodyslam_jax.solver._chunks import Factor, back_substitute, factorise
 from bodyslam_jax.solver._landmarks import (
     CAMERAS,
@@ -37,7 +37,7 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
     """The diagonal of `J^T J`, by group; landmarks in the order of the tables."""
     dtype = lin.globals.dtype
     t = sizes.chunks * CAMERAS // 6
-    diagonal = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1)
+    diagonal = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).astype(dtype)
     camera = jnp.zeros((t, 6), dtype)
     for key in (("alone", "alone", 0), ("camera", "camera", 0)):
         if key in lin.blocks:
@@ -50,7 +50,7 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
         "camera": camera,
         "root": root,
         "landmarks": tuple(
-            jnp.moveaxis(jnp.diagonal(table.own, axis1=1, axis2=2), 2, 1)
+            jnp.moveaxis(jnp.diagonal(table.own, axis1=1, axis2=2), 2, 1).astype(dtype)
             for table in lin.landmarks
         ),
     }
@@ -70,7 +70,8 @@ def damped(diagonal: dict, damping: Float[Array, ""]) -> dict:
 def eliminate(
     problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
 ) -> Eliminated:
-    """Factorises the damped normal equations."""
+    """Factorises the damped normal equations, in the precision of `sizes`."""
+    lin, damping = cast((lin, damping), sizes.dtype)
     reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
     window = window_of(lin, sizes)
     people = None
@@ -89,12 +90,12 @@ def solve_step(
     sizes: Sizes,
     eliminated: Eliminated,
 ) -> Step:
-    """The step that solves the factorised equations."""
+    """The step that solves the factorised equations, in the state's own precision."""
     h, n = sizes.people, sizes.chunks
+    lin, zero = cast((lin, state.zero_step()), sizes.dtype)
     steps, common = back_substitute(eliminated.factor, sizes)
     head = steps.shape[1] - CAMERAS
     cameras = steps[:, head:].reshape(n * CAMERAS // 6, 6)
-    zero = state.zero_step()
     roots, poses = zero.roots, zero.poses
     if eliminated.people is not None:
         steps = steps[:, :head].reshape(n, h, -1).swapaxes(0, 1)
@@ -113,7 +114,7 @@ def solve_step(
         common[1 : 1 + i],
         zero.landmarks,
     )
-    return Step(
+    step = Step(
         scale=common[0],
         cameras=cameras,
         roots=roots,
@@ -122,6 +123,7 @@ def solve_step(
         landmarks=landmarks,
         intrinsics=intrinsics,
     )
+    return cast(step, state.scale.dtype)
 
 
 def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:

@@ -76,7 +76,7 @@ def pose_diagonal(lin: Linearisation) -> Float[Array, "h t 69"]:
         block = lin.blocks.get((kind, kind, 0))
         if block is not None:
             diagonal = jnp.diagonal(block, axis1=-2, axis2=-1)
-            total = total + diagonal.reshape(total.shape)
+            total = total + diagonal.reshape(total.shape).astype(total.dtype)
     return total
 
 

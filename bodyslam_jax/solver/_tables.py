@@ -101,9 +101,9 @@ def linearise_landmarks(
         both = over(common)
         tables.append(
             LandmarkBlocks(
-                cross=cross[here].reshape(n, f, 6, 3, g),
-                cross_intrinsics=both[:, :-1],
-                own=over(own),
+                cross=cross[here].reshape(n, f, 6, 3, g).astype(sizes.dtype),
+                cross_intrinsics=both[:, :-1].astype(sizes.dtype),
+                own=over(own).astype(sizes.dtype),
                 gradient=both[:, -1],
             )
         )
@@ -130,7 +130,10 @@ def add_prior(
         eqx.tree_at(
             lambda t: (t.own, t.gradient),
             table,
-            (table.own + of(own, bucket), table.gradient + of(gradient, bucket)),
+            (
+                table.own + of(own.astype(table.own.dtype), bucket),
+                table.gradient + of(gradient, bucket),
+            ),
         )
         for bucket, table in zip(problem.layout.buckets, tables, strict=True)
     )

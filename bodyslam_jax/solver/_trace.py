@@ -78,6 +78,7 @@ def clock(
     *,
     schedule: tuple[Stage, ...] = (Stage(),),
     damping: float = 1e-4,
+    mixed_precision: bool = False,
 ) -> tuple[Solution, tuple[np.ndarray, ...]]:
     """`solve` with the wall time of each iteration, s, for each stage.
 
@@ -89,7 +90,8 @@ def clock(
     t, l = len(state.cameras), len(state.landmarks)
     problem, start = pad(problem, state)
     problem = restrict_to_all(problem, schedule)
-    method = method_of(schedule, damping, state.scale.dtype)
+    dtype = state.scale.dtype
+    method = method_of(schedule, damping, dtype, mixed=mixed_precision)
     loop = _begin(method, problem, start)
     arrays, static = eqx.partition(loop, eqx.is_array)
     program = eqx.filter_jit(_advance, compiler_options=quick_options())

@@ -1,0 +1,65 @@
+"""Small problems that tests of the solver share, and their dense equations."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scenes
+from jax.flatten_util import ravel_pytree
+
+import bodyslam_jax.graph as g
+from bodyslam_jax.compilation import quick_options
+from bodyslam_jax.kept import kept
+from bodyslam_jax.solver._blocks import mask_of
+from bodyslam_jax.solver._levenberg_marquardt import lifted
+
+# One scene serves most tests, as shapes decide what is compiled.
+SEED = 2
+
+
+def make(
+    seed=SEED,
+    people=0,
+    frames=7,
+    landmarks=25,
+    extras=False,
+    known=False,
+    noise=1.0,
+    **options,
+):
+    rng = np.random.default_rng(seed)
+    state = scenes.truth(rng, frames, people, landmarks)
+    # The loss as an array: a test that differentiates by it compiles nothing anew.
+    loss = jnp.asarray(1.5)
+    factors = [scenes.reprojection(rng, state, noise=0.5 * noise, loss=loss)]
+    if people:
+        # In one program: one by one its operations take five times as long to compile.
+        scenes.body_model()
+        measure = lambda state: scenes.person_factors(rng, state, noise=noise)
+        factors += eqx.filter_jit(measure, compiler_options=quick_options())(state)
+    if known:
+        factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
+    if extras:
+        factors += scenes.extra_factors(rng, state, factors[0])
+    problem = g.make_problem(factors, state, **options)
+    return problem, state, scenes.perturb(rng, problem, state)
+
+
+def dense(problem, state):
+    """Jacobian and residual of a problem in its free coordinates, without structure."""
+    return tuple(np.asarray(x) for x in _dense(problem, state))
+
+
+def _dense_of(problem, state):
+    zero, unravel = ravel_pytree(state.zero_step())
+    mask, _ = ravel_pytree(mask_of(problem))
+
+    def residual(x):
+        rows = lifted(state.retract(unravel(x * mask)), problem)
+        flat = jnp.concatenate([r.reshape(-1) for r in rows])
+        return flat, flat
+
+    return jax.jacfwd(residual, has_aux=True)(zero)
+
+
+_dense = kept(_dense_of, quick_options)

@@ -1,0 +1,103 @@
+"""Steps in single precision, on the way to the same place in double precision."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import dense, make
+
+from bodyslam_jax.solver import Stage, clock, solve
+from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._solve import method_of, run
+
+TIGHT = (Stage(rtol=1e-12, max_steps=60),)
+
+
+def mixed(problem, state, schedule=TIGHT):
+    return solve(problem, state, schedule=schedule, mixed_precision=True)
+
+
+def test_it_ends_where_double_precision_ends():
+    problem, _, start = make()
+    best = solve(problem, start, schedule=TIGHT)
+    found = mixed(problem, start)
+    assert found.status == "converged"
+    assert {x.dtype for x in jax.tree.leaves(found.state)} == {np.dtype(np.float64)}
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-11)
+    np.testing.assert_allclose(found.state.cameras, best.state.cameras, atol=1e-5)
+
+    def slope(state):
+        jacobian, residual = dense(problem, state)
+        return abs(jacobian.T @ residual).max()
+
+    assert slope(found.state) < 1e-4 * slope(start)
+
+
+def test_only_factors_are_in_single_precision():
+    problem, _, start = make()
+    problem, start = pad(problem, start)
+    method = method_of((Stage(max_steps=1),), 1e-4, start.scale.dtype, mixed=True)
+    _, final = run(problem, start, method)
+    single, double = np.dtype(np.float32), np.dtype(np.float64)
+    assert {x.dtype for x in jax.tree.leaves(final.factor)} == {single}
+    assert {x.dtype for x in final.lin.blocks.values()} == {single}
+    assert {x.dtype for x in final.lin.gradient.values()} == {double}
+    assert {t.gradient.dtype for t in final.lin.landmarks} == {double}
+    assert final.lin.costs.dtype == double
+
+
+def test_the_state_s_own_single_precision_is_left_as_it_is():
+    problem, _, start = make()
+    to_single = lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x
+    problem, start = jax.tree.map(to_single, (problem, start))
+    schedule = (Stage(max_steps=5),)
+    plain = solve(problem, start, schedule=schedule)
+    found = mixed(problem, start, schedule)
+    assert found.cost.dtype == jnp.float32
+    assert float(found.cost) == float(plain.cost)
+
+
+def test_it_maps_over_starts_and_has_the_derivatives_of_double_precision():
+    problem, _, start = make()
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), start)
+    both = jax.jit(jax.vmap(lambda s: mixed(problem, s).cost))(batch)
+    np.testing.assert_allclose(both, float(mixed(problem, start).cost), rtol=1e-12)
+
+    def place(sigma, mixed_precision):
+        other = eqx.tree_at(lambda p: p.factors[0].sigma, problem, sigma)
+        found = solve(other, start, schedule=TIGHT, mixed_precision=mixed_precision)
+        return jnp.sum(found.state.cameras[-1, :3, 3])
+
+    sigma = problem.factors[0].sigma
+    by_mixed = jax.grad(place)(sigma, True)
+    by_double = jax.grad(place)(sigma, False)
+    scale = float(abs(by_double).max())
+    assert scale > 0
+    np.testing.assert_allclose(by_mixed, by_double, atol=1e-4 * scale)
+
+
+@pytest.mark.slow
+def test_on_the_clock_it_is_the_same_solve():
+    problem, _, start = make()
+    plain = mixed(problem, start)
+    found, _ = clock(problem, start, schedule=TIGHT, mixed_precision=True)
+    assert found.num_steps == plain.num_steps
+    assert float(found.cost) == pytest.approx(float(plain.cost), rel=1e-10)
+
+
+def test_a_baseline_has_one_precision():
+    problem, _, start = make()
+    with pytest.raises(ValueError, match="mixed_precision: adam has one precision"):
+        solve(problem, start, solver="adam", mixed_precision=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_people_and_a_scale_ten_times_off(factor):
+    problem, _, start = make(frames=12, people=1)
+    best = solve(problem, start, schedule=TIGHT)
+    off = eqx.tree_at(lambda s: s.scale, start, factor * start.scale)
+    found = mixed(problem, off)
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-6)
+    assert float(found.state.scale) == pytest.approx(float(best.state.scale), rel=1e-3)
