@@ -29,3 +29,18 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def bodies(tmp_path_factory):
+    """A folder of made-up SMPL and SMPL-X models of every gender."""
+    import dataset_cases  # not before XLA's flags are set
+
+    return dataset_cases.make_bodies(tmp_path_factory.mktemp("models"))
+
+
+@pytest.fixture
+def no_body_models(monkeypatch, tmp_path):
+    """Hides those of whoever runs the tests."""
+    monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))

@@ -10,7 +10,6 @@ from dataset_cases import (
     RICH,
     emdb_data,
     make_3dpw,
-    make_bodies,
     make_emdb,
     make_pair,
     make_rich,
@@ -25,15 +24,8 @@ from bodyslam_jax.evaluation._datasets import read_truth
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
-@pytest.fixture(scope="module")
-def bodies(tmp_path_factory):
-    return make_bodies(tmp_path_factory.mktemp("models"))
-
-
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
+def command(monkeypatch, capsys, no_body_models):
     return lambda *argv: _run(monkeypatch, capsys, *argv)
 
 

@@ -339,11 +339,13 @@ def test_an_estimate_that_is_not_a_number_is_not_perfect(noisy):
 
 
 def test_one_broken_person_spoils_the_mean_of_all():
+    """Whether it is the estimate or the truth that is not a number."""
     estimate, truth = _pair(_truth(2), _truth(2))
-    broken = dataclasses.replace(estimate, joints=estimate.joints.at[1, 7].set(jnp.nan))
-    found = evaluate(broken, truth)
-    assert float(found.people["h_ate_se3"][0]) < 1e-9
-    assert np.isnan(found["h_ate_se3"]) and float(found["c_ate_se3"]) < 1e-9
+    spoilt = lambda x: dataclasses.replace(x, joints=x.joints.at[1, 7].set(jnp.nan))
+    for pair in ((spoilt(estimate), truth), (estimate, spoilt(truth))):
+        found = evaluate(*pair)
+        assert float(found.people["h_ate_se3"][0]) < 1e-9
+        assert np.isnan(found["h_ate_se3"]) and float(found["c_ate_se3"]) < 1e-9
 
 
 def test_a_camera_that_stands_still_has_no_scale(noisy):

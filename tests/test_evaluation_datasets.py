@@ -12,7 +12,6 @@ from dataset_cases import (
     dump,
     emdb_data,
     make_3dpw,
-    make_bodies,
     make_emdb,
     make_images,
     make_pair,
@@ -26,23 +25,12 @@ from bodyslam_jax import evaluation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.evaluation._datasets import read_truth
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-
-@pytest.fixture(scope="module")
-def bodies(tmp_path_factory):
-    return make_bodies(tmp_path_factory.mktemp("models"))
+pytestmark = pytest.mark.usefixtures("quick_compilation", "no_body_models")
 
 
 @pytest.fixture(scope="module")
 def body():
     return load_body_model(dtype=jnp.float64)
-
-
-@pytest.fixture(autouse=True)
-def no_models_of_ones_own(monkeypatch, tmp_path):
-    monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
 
 
 @pytest.fixture

@@ -100,9 +100,11 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
             truth,
             camera_valid,
         )
-        camera_broken = _is_broken(estimate.T_WC, camera_valid)
         counts = estimate.present & truth.present
-        broken = camera_broken | jax.vmap(_is_broken)(estimate.joints, counts)
+        broken = jnp.zeros(len(counts), bool)
+        for side in (estimate, truth):
+            broken |= _is_broken(side.T_WC, camera_valid)
+            broken |= jax.vmap(_is_broken)(side.joints, counts)
         mean = lambda value: _mean_over_people(value, broken)
         values |= {name: mean(value) for name, value in people.items()}
     return Evaluation(values, people)
@@ -116,7 +118,7 @@ def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array
 def _mean_over_people(
     value: Float[Array, " h"], broken: Bool[Array, " h"]
 ) -> Float[Array, ""]:
-    """Over those for whom the error exists; NaN if it is NaN as the estimate is."""
+    """Over those for whom the error exists; NaN if it is NaN as what counts is."""
     exists = ~jnp.isnan(value) | broken
     return metrics.Errors(value, exists).mean()
 
