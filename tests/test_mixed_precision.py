@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from problems import dense, make
 
+from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.solver import Stage, clock, solve
+from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._solve import method_of, run
+from bodyslam_jax.solver._tables import gather
 
 TIGHT = (Stage(rtol=1e-12, max_steps=60),)
 
@@ -45,6 +48,24 @@ def test_only_factors_are_in_single_precision():
     assert {x.dtype for x in final.lin.gradient.values()} == {double}
     assert {t.gradient.dtype for t in final.lin.landmarks} == {double}
     assert final.lin.costs.dtype == double
+
+
+def test_slopes_and_costs_are_those_of_double_precision():
+    problem, _, state = make(frames=12, people=1)
+    problem, state = pad(problem, state)
+    whole = eqx.filter_jit(linearise, compiler_options=quick_options())
+    double = whole(problem, gather(problem), state)
+    single = whole(problem, gather(problem), state, np.dtype(np.float32))
+    slopes = lambda lin: (
+        (lin.gradient, lin.globals_gradient, lin.costs),
+        [table.gradient for table in lin.landmarks],
+    )
+    pairs = zip(*map(jax.tree.leaves, (slopes(double), slopes(single))), strict=True)
+    for expected, found in pairs:
+        np.testing.assert_allclose(found, expected, atol=1e-13 * abs(expected).max())
+    some = single.blocks["pose", "pose", 0]
+    assert some.dtype == np.float32
+    np.testing.assert_allclose(some, double.blocks["pose", "pose", 0], rtol=1e-4)
 
 
 def test_the_state_s_own_single_precision_is_left_as_it_is():
