@@ -14,8 +14,7 @@ from solver_clock import reached, timed
 from solver_peers import LIMIT, NEAR, cost_of, note_of
 from solver_scene import make
 
-from bodyslam_jax.solver import Stage, _baselines, solve
-from bodyslam_jax.solver._solve import restrict
+from bodyslam_jax.solver import Stage, _baselines, restrict, solve
 
 CG_STEPS = 50
 """Of optimistix with conjugate gradients, at most."""

@@ -44,6 +44,17 @@ def jit_once(function: F) -> F:
     return call  # pyright: ignore[reportReturnType]
 
 
+def in_full_precision(function: F) -> F:
+    """The same with products of all bits, where float32 on a GPU would keep ten."""
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
 def is_alone() -> bool:
     """Whether what is called now is not part of a larger `jit`."""
     return not isinstance(jnp.zeros(()) + 1, jax.core.Tracer)

@@ -68,6 +68,13 @@ def test_slopes_and_costs_are_those_of_double_precision():
     np.testing.assert_allclose(some, double.blocks["pose", "pose", 0], rtol=1e-4)
 
 
+def test_products_are_of_all_bits_where_a_gpu_would_leave_some_out():
+    problem, _, start = make()
+    program = str(jax.make_jaxpr(lambda s: mixed(problem, s).cost)(start))
+    assert "precision=(Precision.HIGHEST, Precision.HIGHEST)" in program
+    assert "precision=None" not in program
+
+
 def test_the_state_s_own_single_precision_is_left_as_it_is():
     problem, _, start = make()
     to_single = lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.compilation import is_alone, jit_once
+from bodyslam_jax.compilation import in_full_precision, is_alone, jit_once
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
 from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
@@ -55,6 +55,7 @@ def marginals(problem: Problem, state: State) -> Marginals:
 
 
 @jit_once
+@in_full_precision
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)
     lin = final.lin

@@ -18,7 +18,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from bodyslam_jax.compilation import is_alone, is_traced, quick_options
+from bodyslam_jax.compilation import (
+    in_full_precision,
+    is_alone,
+    is_traced,
+    quick_options,
+)
 from bodyslam_jax.graph import Problem, Reprojection, State, Step
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
@@ -50,6 +55,7 @@ def _program(alone: bool) -> Callable[..., Problem]:
     return eqx.filter_jit(_cotangent_of_problem)
 
 
+@in_full_precision
 def _cotangent_of_problem(problem, state, cotangent):
     problem = _without_single_views(problem)
     zero = state.zero_step()

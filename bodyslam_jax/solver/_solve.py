@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.compilation import is_alone, is_traced, quick_options
+from bodyslam_jax.compilation import (
+    in_full_precision,
+    is_alone,
+    is_traced,
+    quick_options,
+)
 from bodyslam_jax.graph import VARIABLES, Problem, State
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
@@ -23,52 +28,11 @@ from bodyslam_jax.solver._levenberg_marquardt import (
 from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
+from bodyslam_jax.solver._schedule import Solver, Stage, check_names
 from bodyslam_jax.solver._solution import Solution, only, outcome
 
-Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """One run of the solver with some groups of variables free."""
-
-    free: tuple[str, ...] = VARIABLES
-    """Among the fields of `State`; what the problem holds stays held."""
-    max_steps: int = 50
-    rtol: float = 1e-8
-    """Relative decrease of the cost at which to stop."""
-    atol: float = 0.0
-    """The same in units of the cost: a half is what a standard deviation is worth."""
-
-    def __post_init__(self):
-        _check_names(self.free)
-
-
-def _check_names(free: tuple[str, ...]) -> None:
-    unknown = sorted(set(free) - set(VARIABLES))
-    if unknown:
-        raise ValueError(f"free: {unknown}, expected names among {list(VARIABLES)}.")
-
-
-PAPER_SCHEDULE = (
-    Stage(("scale", "cameras", "roots", "landmarks"), max_steps=20, rtol=1e-4),
-    Stage(),
-)
-"""Section 3.6: first where cameras and people are, then everything."""
-PAPER_STEPS = (200, 100)
-"""The paper's number of steps in each, which are of first order."""
 HISTORY = 64
 """The length of a history is a multiple of this: schedules share a compilation."""
-
-
-def paper_schedule(solver: Solver) -> tuple[Stage, ...]:
-    """`PAPER_SCHEDULE`; with the paper's own number of steps for first-order ones."""
-    if solver != "adam":
-        return PAPER_SCHEDULE
-    return tuple(
-        dataclasses.replace(stage, max_steps=count)
-        for stage, count in zip(PAPER_SCHEDULE, PAPER_STEPS, strict=True)
-    )
 
 
 def solve(
@@ -182,6 +146,7 @@ def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
     return kept(_run, quick_options) if alone else eqx.filter_jit(_run)
 
 
+@in_full_precision
 def _run(problem, state, method):
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
@@ -233,7 +198,7 @@ def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
 
     **Raises:** `ValueError` for a name that is not among `VARIABLES`.
     """
-    _check_names(free)
+    check_names(free)
     variables = tuple(name for name in problem.variables if name in free)
     return dataclasses.replace(problem, variables=variables)
 

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.compilation import is_traced, quick_options
+from bodyslam_jax.compilation import in_full_precision, is_traced, quick_options
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
+from bodyslam_jax.solver._schedule import Stage
 from bodyslam_jax.solver._solution import Solution, only, outcome
-from bodyslam_jax.solver._solve import Stage, method_of, restrict, restrict_to_all
+from bodyslam_jax.solver._solve import method_of, restrict, restrict_to_all
 
 
 def trace(
@@ -49,6 +50,7 @@ def _trace(problem, state, observe, schedule, damping):
     return unpad(state, t, l), joined
 
 
+@in_full_precision
 def _stage(problem, state, see, stage, damping):
     method = method_of((stage,), damping, state.scale.dtype)
     start = method.init(lifted, state, problem, {}, None, None, frozenset())
@@ -117,6 +119,7 @@ def _begin(method, problem, state):
     return method.init(lifted, state, problem, {}, None, None, frozenset())
 
 
+@in_full_precision
 def _advance(method, problem, state, arrays, static):
     loop = eqx.combine(arrays, static)
     y, loop, _ = method.step(lifted, state, problem, {}, loop, frozenset())

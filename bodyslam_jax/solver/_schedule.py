@@ -1,0 +1,49 @@
+"""What `solve` is asked to do: by which solver, in which stages."""
+
+import dataclasses
+from typing import Literal
+
+from bodyslam_jax.graph import VARIABLES
+
+Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One run of the solver with some groups of variables free."""
+
+    free: tuple[str, ...] = VARIABLES
+    """Among the fields of `State`; what the problem holds stays held."""
+    max_steps: int = 50
+    rtol: float = 1e-8
+    """Relative decrease of the cost at which to stop."""
+    atol: float = 0.0
+    """The same in units of the cost: a half is what a standard deviation is worth."""
+
+    def __post_init__(self):
+        check_names(self.free)
+
+
+def check_names(free: tuple[str, ...]) -> None:
+    unknown = sorted(set(free) - set(VARIABLES))
+    if unknown:
+        raise ValueError(f"free: {unknown}, expected names among {list(VARIABLES)}.")
+
+
+PAPER_SCHEDULE = (
+    Stage(("scale", "cameras", "roots", "landmarks"), max_steps=20, rtol=1e-4),
+    Stage(),
+)
+"""Section 3.6: first where cameras and people are, then everything."""
+PAPER_STEPS = (200, 100)
+"""The paper's number of steps in each, which are of first order."""
+
+
+def paper_schedule(solver: Solver) -> tuple[Stage, ...]:
+    """`PAPER_SCHEDULE`; with the paper's own number of steps for first-order ones."""
+    if solver != "adam":
+        return PAPER_SCHEDULE
+    return tuple(
+        dataclasses.replace(stage, max_steps=count)
+        for stage, count in zip(PAPER_SCHEDULE, PAPER_STEPS, strict=True)
+    )
