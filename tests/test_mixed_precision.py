@@ -8,7 +8,7 @@ import pytest
 from problems import dense, make
 
 from bodyslam_jax.compilation import quick_options
-from bodyslam_jax.solver import Stage, clock, solve
+from bodyslam_jax.solver import Stage, clock, solve, trace
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._solve import method_of, run
@@ -106,12 +106,16 @@ def test_it_maps_over_starts_and_has_the_derivatives_of_double_precision():
 
 
 @pytest.mark.slow
-def test_on_the_clock_it_is_the_same_solve():
+def test_on_the_clock_and_watched_it_is_the_same_solve():
     problem, _, start = make()
     plain = mixed(problem, start)
     found, _ = clock(problem, start, schedule=TIGHT, mixed_precision=True)
     assert found.num_steps == plain.num_steps
     assert float(found.cost) == pytest.approx(float(plain.cost), rel=1e-10)
+    settings = dict(schedule=TIGHT, mixed_precision=True)
+    _, costs = trace(problem, start, problem.cost, **settings)
+    assert len(costs) == 1 + TIGHT[0].max_steps
+    assert float(costs[-1]) == pytest.approx(float(plain.cost), rel=1e-10)
 
 
 def test_a_baseline_has_one_precision():

@@ -1,21 +1,26 @@
 """The blocks of landmarks: dense tables of frames by landmarks of a group.
 
 All buckets are linearised at once, as pieces of one chunk's frames by `g` landmarks.
-Derivatives by camera, intrinsics and the residual itself are rows of one array, whose
-Gram matrix holds the camera's block, the intrinsics' and both gradients.
+What observations say is worked out in the camera frame (`_pixels.py`). Cameras take the
+sum over their landmarks, which is then turned to the axes of their steps.
 """
 
-import functools
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from bodyslam_jax.camera import project
 from bodyslam_jax.graph import CHUNK, LandmarkPrior, Problem, Reprojection, State
-from bodyslam_jax.solver._blocks import LandmarkBlocks, Observations, Sizes, Sums
+from bodyslam_jax.solver._blocks import LandmarkBlocks, Observations, Sums
+from bodyslam_jax.solver._pixels import (
+    Pixels,
+    cross,
+    dot,
+    see,
+    symmetric,
+    times,
+    transposed,
+)
 
 
 def gather(problem: Problem) -> Observations | None:
@@ -56,40 +61,37 @@ def linearise_landmarks(
 ) -> tuple[LandmarkBlocks, ...]:
     """Tables of all buckets; what cameras and intrinsics gather goes to `sums`."""
     sizes = sums.sizes
-    dtype = state.scale.dtype
+    dtype = sizes.dtype
     if seen is None:
-        sums.costs.append(jnp.zeros((), dtype))
+        sums.costs.append(jnp.zeros((), state.scale.dtype))
         return ()
-    rows, by_l, cost = _rows(problem, factor, seen, state, sizes)
-    sums.costs.append(cost)
-    wide = rows.reshape(*rows.shape[:3], -1)
-    # Fused sums: a matrix product for each frame of a piece would be far too small.
-    gram = jnp.sum(wide[:, :, :, None] * wide[:, :, None], axis=-1)
-    if "cameras" in sizes.variables:
-        # As a product: a scatter would take its pieces one by one.
-        chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
-        belongs = (chunk == seen.chunk).astype(dtype)
-        of_camera = belongs @ gram[:, :, :6].reshape(len(gram), -1)
-        of_camera = of_camera.reshape(-1, 6, gram.shape[-1])
-        sums.add(("alone", "alone", 0), of_camera[..., :6])
-        sums.add_gradient("camera_alone", of_camera[..., -1])
-        if sizes.intrinsics:
-            mixed = jnp.pad(of_camera[..., 6:-1], ((0, 0), (0, 0), (1, 10)))
-            sums.add(("alone", "globals", 0), mixed)
+    pixels = see(problem, factor, seen, state, sizes)
+    sums.costs.append(pixels.cost)
     if sizes.intrinsics:
-        total = jnp.sum(gram[:, :, 6:, 6:], axis=(0, 1))
         # The scale, first of the globals, moves no pixel.
         sums.add_globals(
             None,
-            jnp.pad(total[:-1, :-1], ((1, 0), (1, 0))),
-            jnp.pad(total[:-1, -1], (1, 0)),
+            jnp.pad(pixels.intrinsics, ((1, 0), (1, 0))),
+            jnp.pad(pixels.intrinsics_slope, (1, 0)),
         )
-    pick = lambda x, c: x[:, :, :, c]
-    outer = lambda a, b: a[:, :, :, None] * b[:, :, None]
-    product = lambda a: _add(outer(pick(a, c), pick(by_l, c)) for c in (0, 1))
-    cross = product(rows[:, :, :6])
-    common = jnp.sum(product(rows[:, :, 6:]), axis=1)
-    own = jnp.sum(product(by_l), axis=1)
+    free_c = jnp.zeros((len(seen.chunk), CHUNK, 6), dtype)
+    if "cameras" in sizes.variables:
+        _add_cameras(problem, seen, state, pixels, sums)
+        free_c = problem.free.cameras.reshape(-1, CHUNK, 6)[seen.chunk].astype(dtype)
+    free = jnp.moveaxis(problem.free.landmarks[seen.landmark], 2, 1)
+    free_l = free.astype(dtype)
+    C = [[x.astype(dtype) for x in column] for column in pixels.C]
+    rows = transposed(C)
+    # P^T P C^T, and C times that
+    by_l = [times(pixels.square, row) for row in rows]
+    moved = symmetric(lambda i, j: dot(rows[i], by_l[j]))
+    turned = transposed([cross(x, pixels.point) for x in by_l])
+    side = [jnp.stack(x, 2) for x in turned] + [-jnp.stack(x, 2) for x in moved]
+    table = jnp.stack(side, 2) * free_c[..., None, None] * free_l[:, None, None]
+    down = lambda vector: jnp.stack([jnp.sum(x, axis=1) for x in vector], 1)
+    own = jnp.stack([down(x) for x in moved], 1) * free_l[:, None] * free_l[:, :, None]
+    common = [down(times(C, x)) * free_l for x in pixels.by_intrinsics]
+    slope = down(times(pixels.C, pixels.slope)) * free
     tables, start = [], 0
     for bucket in problem.layout.buckets:
         n, f, g = bucket.row.shape
@@ -98,16 +100,53 @@ def linearise_landmarks(
         over = lambda x, here=here, n=n: (
             x[here].reshape(n, -1, *x.shape[1:]).sum(axis=1)
         )
-        both = over(common)
+        none = [jnp.zeros((n, 0, 3, g), dtype)]
+        mixed = [over(x)[:, None] for x in common]
         tables.append(
             LandmarkBlocks(
-                cross=cross[here].reshape(n, f, 6, 3, g).astype(sizes.dtype),
-                cross_intrinsics=both[:, :-1].astype(sizes.dtype),
-                own=over(own).astype(sizes.dtype),
-                gradient=both[:, -1],
+                cross=table[here].reshape(n, f, 6, 3, g),
+                cross_intrinsics=jnp.concatenate(mixed or none, axis=1),
+                own=over(own),
+                gradient=over(slope),
             )
         )
     return tuple(tables)
+
+
+def _add_cameras(
+    problem: Problem, seen: Observations, state: State, pixels: Pixels, sums: Sums
+) -> None:
+    """Adds what all landmarks of a frame say of its camera."""
+    sizes, point = sums.sizes, pixels.point
+    chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
+    belongs = chunk == seen.chunk
+    # As a product: a scatter would take its pieces one by one.
+    of_frames = lambda x: (belongs.astype(x.dtype) @ x.reshape(len(x), -1)).reshape(
+        -1, *x.shape[2:]
+    )
+    total = lambda columns: jnp.stack(
+        [jnp.stack([jnp.sum(x, axis=-1) for x in column], -1) for column in columns], -1
+    )
+    # By the turn and by the place in the camera's axes: dp_C = [p]x ω - C^T dr'
+    half = [cross(x, point) for x in pixels.square]
+    rows = transposed(half)
+    both = symmetric(lambda i, j: cross(rows[i], point)[j])
+    corner, side = total(both), -total(half)
+    upper = jnp.concatenate([corner, side], axis=-1)
+    lower = jnp.concatenate([side.swapaxes(-1, -2), total(pixels.square)], axis=-1)
+    free = problem.free.cameras
+    C, none = state.cameras[:, :3, :3], jnp.zeros_like(state.cameras[:, :3, :3])
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=C.dtype), C.shape)
+    turn = jnp.block([[eye, none], [none, C]]) * free[..., None]
+    low = turn.astype(sizes.dtype)
+    block = of_frames(jnp.concatenate([upper, lower], axis=-2))
+    sums.add(("alone", "alone", 0), low @ block @ low.swapaxes(-1, -2))
+    both_ways = lambda x: [*cross(x, point), *(-y for y in x)]
+    slope = of_frames(total([both_ways(pixels.slope)]))
+    sums.add_gradient("camera_alone", (turn @ slope)[..., 0])
+    if sizes.intrinsics:
+        mixed = low @ of_frames(total([both_ways(x) for x in pixels.by_intrinsics]))
+        sums.add(("alone", "globals", 0), jnp.pad(mixed, ((0, 0), (0, 0), (1, 10))))
 
 
 def add_prior(
@@ -137,53 +176,3 @@ def add_prior(
         )
         for bucket, table in zip(problem.layout.buckets, tables, strict=True)
     )
-
-
-def _rows(
-    problem: Problem,
-    factor: Reprojection,
-    seen: Observations,
-    state: State,
-    sizes: Sizes,
-) -> tuple[Float[Array, "u b r 2 g"], Float[Array, "u b 3 2 g"], Float[Array, ""]]:
-    """Weighted derivatives by camera and intrinsics, and the residual; derivatives by
-    landmark; the cost. Held coordinates have rows of zeros."""
-    camera = state.cameras.reshape(-1, CHUNK, 4, 4)[seen.chunk][..., :3, :, None]
-    C, centre = camera[:, :, :, :3], camera[:, :, :, 3]
-    point = jnp.moveaxis(state.landmarks[seen.landmark], 2, 1)[:, None]
-    offset = point - centre
-    # p_C = C^T (l - r'), one row of C after another
-    p_C = _add(C[:, :, i] * offset[:, :, i, None] for i in range(3))
-    pixels = lambda i, p: jnp.moveaxis(project(i, jnp.moveaxis(p, 2, -1)), -1, 2)
-    pixel, push = jax.linearize(lambda p: pixels(state.intrinsics, p), p_C)
-    basis = jnp.eye(3, dtype=p_C.dtype)[:, None, None, :, None]
-    basis = jnp.broadcast_to(basis, (3, *p_C.shape))
-    by_p = jax.vmap(push, out_axes=2)(basis)
-    error = (pixel - seen.pixel) * seen.weight[:, :, None]
-    s = error[:, :, 0] ** 2 + error[:, :, 1] ** 2
-    root_weight = jnp.sqrt(factor.loss.weight(s))
-    weight = (seen.weight * root_weight)[:, :, None, None]
-    by_p = by_p * weight
-    # dp_C/dl = C^T, dp_C/dr' = -C^T, dp_C/dω = [p_C]x for C Exp(ω)
-    by_l = _add(by_p[:, :, None, k] * C[:, :, :, k, None] for k in range(3))
-    p = p_C[:, :, :, None]
-    ahead, behind = (lambda x: jnp.roll(x, -1, 2)), (lambda x: jnp.roll(x, 1, 2))
-    turn = ahead(by_p) * behind(p) - behind(by_p) * ahead(p)
-    free_c = problem.free.cameras.reshape(-1, CHUNK, 6)[seen.chunk]
-    if "cameras" not in sizes.variables:
-        free_c = jnp.zeros_like(free_c)
-    free_l = jnp.moveaxis(problem.free.landmarks[seen.landmark], 2, 1)
-    by_c = jnp.concatenate([turn, -by_l], axis=2) * free_c[..., None, None]
-    by_l = by_l * free_l[:, None, :, None]
-    parts = [by_c]
-    if sizes.intrinsics:
-        by_i = jax.jacfwd(lambda i: pixels(i, p_C))(state.intrinsics)
-        by_i = by_i * problem.free.intrinsics
-        parts.append(jnp.moveaxis(by_i, -1, 2) * weight)
-    parts.append((error * root_weight[:, :, None])[:, :, None])
-    cost = 0.5 * jnp.sum(factor.loss.rho(s))
-    return jnp.concatenate(parts, axis=2), by_l, cost
-
-
-def _add(terms):
-    return functools.reduce(jnp.add, terms)

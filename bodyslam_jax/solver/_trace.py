@@ -27,6 +27,7 @@ def trace(
     *,
     schedule: tuple[Stage, ...] = (Stage(),),
     damping: float = 1e-4,
+    mixed_precision: bool = False,
 ) -> tuple[State, Any]:
     """Runs each stage for all of its `max_steps` and notes `observe(state)` each time.
 
@@ -34,25 +35,27 @@ def trace(
     state and the notes, of `1 + Σ max_steps` rows: the first state's, then one an
     iteration. Pure; costs the same whatever the states are; maps as `solve` does.
     """
-    watched = lambda problem, state: _trace(problem, state, observe, schedule, damping)
+    settings = observe, schedule, damping, mixed_precision
+    watched = lambda problem, state: _trace(problem, state, *settings)
     return (in_turn(watched) if is_traced(state) else watched)(problem, state)
 
 
-def _trace(problem, state, observe, schedule, damping):
+def _trace(problem, state, observe, schedule, damping, mixed):
     t, l = len(state.cameras), len(state.landmarks)
     problem, state = pad(problem, state)
     see = lambda y: observe(unpad(y, t, l))
     notes = [jax.tree.map(lambda x: x[None], see(state))]
     for stage in schedule:
-        state, seen = _stage(restrict(problem, stage.free), state, see, stage, damping)
+        held = restrict(problem, stage.free)
+        state, seen = _stage(held, state, see, stage, damping, mixed)
         notes.append(seen)
     joined = jax.tree.map(lambda *x: jnp.concatenate(x), *notes)
     return unpad(state, t, l), joined
 
 
 @in_full_precision
-def _stage(problem, state, see, stage, damping):
-    method = method_of((stage,), damping, state.scale.dtype)
+def _stage(problem, state, see, stage, damping, mixed):
+    method = method_of((stage,), damping, state.scale.dtype, mixed=mixed)
     start = method.init(lifted, state, problem, {}, None, None, frozenset())
     arrays, static = eqx.partition(start, eqx.is_array)
 
