@@ -165,6 +165,9 @@ def main():
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="of `calibration`")
     parser.add_argument(
+        "--robust", action="store_true", help="`calibration` with outliers"
+    )
+    parser.add_argument(
         "--baselines",
         nargs="+",
         default=["1e-2", "1e-2x10", "cg"],
@@ -189,7 +192,7 @@ def main():
         growth(args.frames, args.steps, args.mixed)
         return
     others = {
-        "calibration": lambda n: calibration(n, args.repeats, args.noise),
+        "calibration": lambda n: calibration(n, args.repeats, args.noise, args.robust),
         "peers": lambda n: solver_peers.peers(
             n, args.peers, args.peer_python, args.repeats, args.rtol, args.peer_steps
         ),

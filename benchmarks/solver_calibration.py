@@ -7,13 +7,15 @@ import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, marginals, solve
 
 
-def calibration(frames, draws, noise=1.0):
+def calibration(frames, draws, noise=1.0, robust=False):
     """Errors over what the covariances say, on simulated noise that is as the weights
     have it: per group the mean normalised error squared (1 is right) and the share of
-    coordinates within 1.96 standard deviations (0.95 is right)."""
+    coordinates within 1.96 standard deviations (0.95 is right). `robust`: with gross
+    outliers among the pixels, and robust losses."""
+    how = {} if robust else dict(outliers=0.0, loss=g.Squared())
     squares, inside = {}, {}
     for draw in range(draws):
-        scene = make(frames, outliers=0.0, loss=g.Squared(), draw=draw, noise=noise)
+        scene = make(frames, draw=draw, noise=noise, **how)
         problem, truth, _ = scene
         found = solve(problem, truth, schedule=(Stage(rtol=1e-9),)).state
         spread = marginals(problem, found)
@@ -42,7 +44,8 @@ def calibration(frames, draws, noise=1.0):
             squares.setdefault(name, []).extend(np.sum(error[known] * solved, 1) / d)
             share = abs(error[known]) < 1.96 * deviation[known]
             inside.setdefault(name, []).extend(share.ravel())
-    print(f"{frames} frames, {draws} draws of {noise:g} times the noise")
+    kind = "robust losses" if robust else "squared losses"
+    print(f"{frames} frames, {draws} draws of {noise:g} times the noise, {kind}")
     for name, values in squares.items():
         print(f"  {name:10s} {np.mean(values):6.3f} {np.mean(inside[name]):6.3f}")
     return {name: (np.mean(v), np.mean(inside[name])) for name, v in squares.items()}

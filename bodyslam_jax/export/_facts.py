@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.signal import savgol_filter
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.export._run import frame_rate
@@ -75,7 +74,12 @@ def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
 def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, "t d"]:
     """Moving average; straight lines at the ends, where an average would lag."""
     size = min(int(_SMOOTHING * fps) | 1, len(points) - 1 + len(points) % 2)
-    return np.asarray(savgol_filter(points, size, 1, axis=0)) if size > 2 else points
+    if size < 3:
+        return points
+    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    beyond = ((size // 2, size // 2), (0, 0))
+    wide = np.pad(points, beyond, mode="reflect", reflect_type="odd")
+    return np.lib.stride_tricks.sliding_window_view(wide, size, axis=0).mean(axis=-1)
 
 
 def foot_skating(result: Result, person: int) -> float:

@@ -17,7 +17,6 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import KEYPOINT_SPREAD
@@ -90,7 +89,10 @@ def ar1(
     """Stationary first-order autoregressive noise along the first axis, deviation 1."""
     x = rng.standard_normal(shape)
     x[1:] *= np.sqrt(1 - correlation**2)
-    return np.asarray(lfilter([1.0], [1.0, -correlation], x, axis=0))
+    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    for k in range(1, len(x)):
+        x[k] += correlation * x[k - 1]
+    return x
 
 
 def project(
