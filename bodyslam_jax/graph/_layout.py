@@ -1,10 +1,10 @@
 """Where the observations of landmarks lie in dense blocks; NumPy, at the door.
 
 Tracks are nearly contiguous in time. So frames are cut into chunks, landmarks are put
-into groups that start in the same chunk and span as many, and each group is a dense
-table of frames by landmarks with holes: no list of pairs is ever made, and the reduced
-camera matrix is formed by a few matrix products. Shapes are rounded up, so that videos
-of about the same length compile once.
+into groups that lie within the same few, and each group is a dense table of frames by
+landmarks with holes: no list of pairs is ever made, and the reduced camera matrix is
+formed by a few matrix products. Shapes are rounded up, so that videos of about the same
+length compile once.
 """
 
 import itertools
@@ -17,6 +17,8 @@ from jaxtyping import Array, Int
 CHUNK = 10
 """Frames in a chunk."""
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
+_SIZES = (16, 24, 48)
+"""Landmarks in a group."""
 _MAX_BUCKETS = 3
 
 
@@ -70,20 +72,13 @@ def make_layout(
     widths = _choose_widths(span[seen], num_chunks)
     order = np.lexsort((frame, landmark))
     begin = np.searchsorted(landmark[order], np.arange(num_landmarks + 1))
-    parts = []
-    for lower, width in zip((0, *widths), widths):
-        members = np.flatnonzero(seen & (span > lower) & (span <= width))
-        if len(members):
-            chunk = np.minimum(start[members], num_chunks - width)
-            parts.append((members, chunk, width))
-    size = min(
-        (16, 32, 48, 64),
-        key=lambda g: sum(
-            np.sum(-(-np.bincount(chunk) // g)) * (g * width + 8)
-            for _, chunk, width in parts
-        ),
-    )
-    buckets = [_fill(*part, size, frame, order, begin) for part in parts]
+    members = np.flatnonzero(seen)
+    tracks = start[members], start[members] + span[members]
+    best = min((_pack(*tracks, widths, size, num_chunks) for size in _SIZES), key=_cost)
+    buckets = [
+        _fill(chunks, [members[g] for g in groups], width, size, frame, order, begin)
+        for width, chunks, groups, size in best
+    ]
     return Layout(tuple(buckets), num_chunks, max(widths[-1], 2))
 
 
@@ -97,31 +92,69 @@ def _choose_widths(span, num_chunks):
         for lower in itertools.combinations(below, count):
             chosen = np.array((*lower, top))
             width = chosen[np.searchsorted(chosen, span)]
-            cost = np.sum(width.astype(float) ** 2 + 2 * width) * (1 + 0.03 * count)
+            cost = np.sum(width.astype(float) ** 2 + 7 * width) * (1 + 0.03 * count)
             if cost < best_cost:
                 best, best_cost = tuple(chosen.tolist()), cost
     return best
 
 
-def _fill(members, chunk, width, size, frame, order, begin):
-    """The tables of one bucket: landmarks by first chunk, `size` to a group."""
+def _pack(start, stop, widths, size, num_chunks):
+    """Groups of up to `size` landmarks, the longest tracks first: of each width, the
+    first chunk of each group and its members.
+
+    A group takes what begins and ends within it, shorter tracks too where there is
+    room: empty places cost as much as full ones.
+    """
+    order = np.lexsort((stop, start))
+    start, stop = start[order], stop[order]
+    first = np.searchsorted(start, np.arange(num_chunks + 1))
+    free = np.ones(len(order), bool)
+    buckets = []
+    for lower, width in zip((*widths[-2::-1], 0), widths[::-1], strict=True):
+        due = stop - start > lower
+        chunks, groups, at = [], [], 0
+        while (left := free[at:] & due[at:]).any():
+            at += int(np.argmax(left))
+            chunk = min(int(start[at]), num_chunks - width)
+            near = slice(first[chunk], first[chunk + width])
+            fits = free[near] & (stop[near] <= chunk + width)
+            taken = np.concatenate(
+                [np.flatnonzero(fits & due[near]), np.flatnonzero(fits & ~due[near])]
+            )
+            taken = near.start + taken[:size]
+            free[taken] = False
+            chunks.append(chunk)
+            groups.append(order[taken])
+        if groups:
+            buckets.append((width, chunks, groups, size))
+    return buckets
+
+
+def _cost(buckets):
+    """What the tables cost, in units of what a landmark's 36 products of cameras do."""
+    return sum(
+        round_up(len(groups)) * (width**2 * (size + 8) + 7 * width * size + 40)
+        for width, _, groups, size in buckets
+    )
+
+
+def _fill(chunks, groups, width, size, frame, order, begin):
+    """The tables of one bucket."""
     num_rows, num_landmarks = len(order), len(begin) - 1
-    members = members[np.argsort(chunk, kind="stable")]
-    chunk = np.sort(chunk)
-    counts = np.bincount(chunk)
-    rank = np.arange(len(members)) - np.searchsorted(chunk, chunk)
-    groups_before = np.concatenate([[0], np.cumsum(-(-counts // size))])
-    group = groups_before[chunk] + rank // size
-    slot = rank % size
-    n = round_up(int(groups_before[-1]))
+    n = round_up(len(groups))
     first_chunk = np.zeros(n, np.int32)
-    first_chunk[group] = chunk
+    first_chunk[: len(groups)] = chunks
     table = np.full((n, size), num_landmarks, np.int32)
+    count = np.array([len(group) for group in groups])
+    group = np.repeat(np.arange(len(groups)), count)
+    slot = np.concatenate([np.arange(c) for c in count])
+    members = np.concatenate(groups)
     table[group, slot] = members
     row = np.full((n, width * CHUNK, size), num_rows, np.int32)
     length = begin[members + 1] - begin[members]
     which = np.repeat(np.arange(len(members)), length)
     within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
     source = order[begin[members][which] + within]
-    row[group[which], frame[source] - chunk[which] * CHUNK, slot[which]] = source
+    at = frame[source] - first_chunk[group][which] * CHUNK
+    row[group[which], at, slot[which]] = source
     return Bucket(jnp.asarray(first_chunk), jnp.asarray(table), jnp.asarray(row), width)
