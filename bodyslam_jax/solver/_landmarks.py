@@ -70,11 +70,11 @@ def eliminate_landmarks(
             )
             y = mix(cross.reshape(width * CAMERAS, 3, -1)).reshape(width * CAMERAS, -1)
             e = mix(extra).reshape(count + 1, -1)
-            product = y @ y.T
             for i in range(width):
                 rest = (width - i) * CAMERAS
                 start = (chunk + i, zero, zero)
-                strip = product[i * CAMERAS : (i + 1) * CAMERAS, i * CAMERAS :]
+                here = slice(i * CAMERAS, (i + 1) * CAMERAS)
+                strip = y[here] @ y[i * CAMERAS :].T
                 known = jax.lax.dynamic_slice(band, start, (1, CAMERAS, rest))
                 band = jax.lax.dynamic_update_slice(band, known - strip[None], start)
             start = (chunk, zero, zero)
