@@ -1,10 +1,8 @@
 """Factorises the system of chunks, from one end to the other.
 
-A front slides along: it holds one chunk as pivot and all that the pivot touches; what
-elimination leaves on the rest is carried to the next.
+Before a chunk is factorised, all that the chunks before it leave on it is taken from it
+at once ("left-looking"): nothing is carried along but the factors themselves.
 """
-
-import itertools
 
 import equinox as eqx
 import jax
@@ -18,7 +16,7 @@ from bodyslam_jax.solver._triangular import half_of
 
 
 class Factor(eqx.Module):
-    """The factorised front of each chunk, and the globals' own."""
+    """Each chunk, factorised, and what is left of the globals."""
 
     half: Float[Array, "n q q"]
     """`L^-1` of each pivot."""
@@ -28,58 +26,36 @@ class Factor(eqx.Module):
 
 
 def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
-    """Slides the front along the chunks."""
+    """One chunk after another, less what those before it left on it."""
     n, r, q = chunks.coupling.shape
     tail = sizes.globals + 1
     head = q - CAMERAS
-    middle = r - head - CAMERAS - tail
-    dtype = chunks.pivot.dtype
-    gap = lambda height: jnp.zeros((height, q), dtype)
+    reach = (r - head - tail) // CAMERAS
 
-    def step(front, chunk):
-        pivot, coupling = chunk
-        known = front[q:, :q]
-        coupling = coupling + jnp.concatenate(
-            [gap(head), known[:middle], gap(CAMERAS), known[middle:]]
-        )
-        # The lower part of the front is all there is of it.
-        half = half_of(pivot + front[:q, :q])
-        side = coupling @ half.T
-        rest = _spread(front[q:, q:], head, middle)
-        return rest - _lower_square(side, tail), (half, side)
+    def step(sides, chunk):
+        k, pivot, coupling = chunk
+        people, later, common = coupling[:head], coupling[head:-tail], coupling[-tail:]
+        for back in range(1, reach + 1):
+            # What lies before the first chunk is not written yet: zeros.
+            before = jax.lax.dynamic_index_in_dim(sides, (k - back) % n, 0, False)
+            width = q if back == 1 else CAMERAS
+            start = head + back * CAMERAS - width
+            update = before[start:] @ before[start : start + width].T
+            wide = ((0, 0), (q - width, 0))
+            pivot = pivot - jnp.pad(update[:width], ((q - width, 0), wide[1]))
+            common = common - jnp.pad(update[-tail:], wide)
+            middle = update[width:-tail]
+            below = len(later) - len(middle)
+            later = later - jnp.pad(middle, ((0, below), wide[1]))
+        half = half_of(pivot)
+        side = jnp.concatenate([people, later, common]) @ half.T
+        return jax.lax.dynamic_update_index_in_dim(sides, side, k, 0), half
 
-    front = jnp.zeros((r, r), dtype)
-    front, (half, side) = jax.lax.scan(step, front, (chunks.pivot, chunks.coupling))
-    return Factor(half, side, chunks.corner + front[-tail:, -tail:])
-
-
-def _lower_square(side: Array, tail: int) -> Array:
-    """`side side^T` below the diagonal, in three strips; the last `tail` in full."""
-    width = side.shape[0]
-    cuts = [0, width // 3, min(2 * width // 3, width - tail), width]
-    strips = []
-    for start, stop in itertools.pairwise(cuts):
-        strip = side[start:stop] @ side[:stop].T
-        strips.append(jnp.pad(strip, ((0, 0), (0, width - stop))))
-    return jnp.concatenate(strips)
-
-
-def _spread(rest, head, middle):
-    """Makes room in the front for the people and cameras that enter it."""
-    rows = [
-        jnp.zeros((head, rest.shape[1]), rest.dtype),
-        rest[:middle],
-        jnp.zeros((CAMERAS, rest.shape[1]), rest.dtype),
-        rest[middle:],
-    ]
-    tall = jnp.concatenate(rows, axis=0)
-    columns = [
-        jnp.zeros((tall.shape[0], head), rest.dtype),
-        tall[:, :middle],
-        jnp.zeros((tall.shape[0], CAMERAS), rest.dtype),
-        tall[:, middle:],
-    ]
-    return jnp.concatenate(columns, axis=1)
+    sides = jnp.zeros_like(chunks.coupling)
+    each = jnp.arange(n), chunks.pivot, chunks.coupling
+    sides, half = jax.lax.scan(step, sides, each)
+    ends = sides[:, -tail:].swapaxes(0, 1).reshape(tail, -1)
+    return Factor(half, sides, chunks.corner - ends @ ends.T)
 
 
 def back_substitute(
