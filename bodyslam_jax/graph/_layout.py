@@ -17,8 +17,9 @@ from jaxtyping import Array, Int
 CHUNK = 10
 """Frames in a chunk."""
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
-_SIZES = (16, 24, 48)
-"""Landmarks in a group."""
+_SIZE = 24
+"""Landmarks in a group. Its best value is between 16 and 32, and flat; one that follows
+the tracks would make videos of the same length compile anew."""
 _MAX_BUCKETS = 3
 
 
@@ -74,16 +75,17 @@ def make_layout(
     begin = np.searchsorted(landmark[order], np.arange(num_landmarks + 1))
     members = np.flatnonzero(seen)
     tracks = start[members], start[members] + span[members]
-    best = min((_pack(*tracks, widths, size, num_chunks) for size in _SIZES), key=_cost)
     buckets = [
-        _fill(chunks, [members[g] for g in groups], width, size, frame, order, begin)
-        for width, chunks, groups, size in best
+        _fill(chunks, [members[group] for group in groups], width, frame, order, begin)
+        for width, chunks, groups in _pack(*tracks, widths, num_chunks)
     ]
     return Layout(tuple(buckets), num_chunks, max(widths[-1], 2))
 
 
 def _choose_widths(span, num_chunks):
-    """At most three widths, so that the tables hold as few empty products as can be."""
+    """At most three widths, so that tables hold few empty products; one more must save
+    a tenth of them, as it costs compilation and wide groups take short tracks along.
+    """
     allowed = [w for w in _WIDTHS if w < num_chunks] + [num_chunks]
     top = next(w for w in allowed if w >= span.max())
     below = [w for w in allowed if w < top]
@@ -92,18 +94,19 @@ def _choose_widths(span, num_chunks):
         for lower in itertools.combinations(below, count):
             chosen = np.array((*lower, top))
             width = chosen[np.searchsorted(chosen, span)]
-            cost = np.sum(width.astype(float) ** 2 + 7 * width) * (1 + 0.03 * count)
+            cost = np.sum(width.astype(float) ** 2 + 7 * width) * (1 + 0.1 * count)
             if cost < best_cost:
                 best, best_cost = tuple(chosen.tolist()), cost
     return best
 
 
-def _pack(start, stop, widths, size, num_chunks):
-    """Groups of up to `size` landmarks, the longest tracks first: of each width, the
+def _pack(start, stop, widths, num_chunks):
+    """Groups of up to `_SIZE` landmarks, the longest tracks first: of each width, the
     first chunk of each group and its members.
 
     A group takes what begins and ends within it, shorter tracks too where there is
-    room: empty places cost as much as full ones.
+    room, and the number of groups is rounded up with shorter tracks: empty places cost
+    as much as full ones.
     """
     order = np.lexsort((stop, start))
     start, stop = start[order], stop[order]
@@ -112,45 +115,41 @@ def _pack(start, stop, widths, size, num_chunks):
     buckets = []
     for lower, width in zip((*widths[-2::-1], 0), widths[::-1], strict=True):
         due = stop - start > lower
-        chunks, groups, at = [], [], 0
-        while (left := free[at:] & due[at:]).any():
-            at += int(np.argmax(left))
-            chunk = min(int(start[at]), num_chunks - width)
+        chunks, groups = [], []
+        while free.any():
+            left = free & due
+            if not left.any():
+                if len(groups) in (0, round_up(len(groups), parts=2)):
+                    break
+                left = free
+            chunk = min(int(start[np.argmax(left)]), num_chunks - width)
             near = slice(first[chunk], first[chunk + width])
             fits = free[near] & (stop[near] <= chunk + width)
             taken = np.concatenate(
                 [np.flatnonzero(fits & due[near]), np.flatnonzero(fits & ~due[near])]
             )
-            taken = near.start + taken[:size]
+            taken = near.start + taken[:_SIZE]
             free[taken] = False
             chunks.append(chunk)
             groups.append(order[taken])
         if groups:
-            buckets.append((width, chunks, groups, size))
+            buckets.append((width, chunks, groups))
     return buckets
 
 
-def _cost(buckets):
-    """What the tables cost, in units of what a landmark's 36 products of cameras do."""
-    return sum(
-        round_up(len(groups)) * (width**2 * (size + 8) + 7 * width * size + 40)
-        for width, _, groups, size in buckets
-    )
-
-
-def _fill(chunks, groups, width, size, frame, order, begin):
+def _fill(chunks, groups, width, frame, order, begin):
     """The tables of one bucket."""
     num_rows, num_landmarks = len(order), len(begin) - 1
     n = round_up(len(groups))
     first_chunk = np.zeros(n, np.int32)
     first_chunk[: len(groups)] = chunks
-    table = np.full((n, size), num_landmarks, np.int32)
+    table = np.full((n, _SIZE), num_landmarks, np.int32)
     count = np.array([len(group) for group in groups])
     group = np.repeat(np.arange(len(groups)), count)
     slot = np.concatenate([np.arange(c) for c in count])
     members = np.concatenate(groups)
     table[group, slot] = members
-    row = np.full((n, width * CHUNK, size), num_rows, np.int32)
+    row = np.full((n, width * CHUNK, _SIZE), num_rows, np.int32)
     length = begin[members + 1] - begin[members]
     which = np.repeat(np.arange(len(members)), length)
     within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
