@@ -5,6 +5,7 @@
     python benchmarks/bench_solver.py joint --frames 300 --cache FOLDER  # twice
     python benchmarks/bench_solver.py joint --frames 1000 --mixed
     python benchmarks/bench_solver.py breakdown --frames 1000
+    python benchmarks/bench_solver.py landmarks --frames 1000 --tails
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2x10 cg
     python benchmarks/bench_solver.py baselines --baselines jaxls --peer-python PYTHON
@@ -160,6 +161,11 @@ def main():
         action="store_true",
         help="in double precision, but for steps (landmarks, joint, breakdown, growth)",
     )
+    parser.add_argument(
+        "--tails",
+        action="store_true",
+        help="some tracks last long (landmarks, joint, breakdown, peers)",
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
@@ -194,7 +200,13 @@ def main():
     others = {
         "calibration": lambda n: calibration(n, args.repeats, args.noise, args.robust),
         "peers": lambda n: solver_peers.peers(
-            n, args.peers, args.peer_python, args.repeats, args.rtol, args.peer_steps
+            n,
+            args.peers,
+            args.peer_python,
+            args.repeats,
+            args.rtol,
+            args.peer_steps,
+            args.tails,
         ),
         "baselines": lambda n: solver_joint_peers.joint(
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps
@@ -207,7 +219,7 @@ def main():
             others[args.what](frames)
             continue
         people = 0 if args.what == "landmarks" else 1
-        problem, truth, start = make(frames, people, dtype=dtype)
+        problem, truth, start = make(frames, people, dtype=dtype, tails=args.tails)
         count = sum(
             len(f.frame) for f in problem.factors if isinstance(f, g.Reprojection)
         )

@@ -57,11 +57,15 @@ def make_scene(frames, people, rng, scale=1.3):
     return scale, cameras, roots, poses
 
 
-def make_tracks(frames, cameras, scale, rng, per_frame=9.6):
-    """Points seen in a run of frames each; about 10 new ones a frame."""
+def make_tracks(frames, cameras, scale, rng, tails, per_frame=9.6):
+    """Points seen in a run of frames each; about 10 new ones a frame. With `tails` each
+    is as likely to be lost in the next frame as any other, and some last long."""
     count = int(per_frame * frames)
     start = rng.integers(-int(TRACK) // 2, frames - 2, count)
-    length = np.clip(rng.gamma(4.0, TRACK / 4, count), 4, 3 * TRACK).astype(int)
+    if tails:
+        length = 3 + rng.geometric(1 / (TRACK - 3), count)
+    else:
+        length = np.clip(rng.gamma(4.0, TRACK / 4, count), 4, 3 * TRACK).astype(int)
     stop = np.minimum(start + length, frames)
     start = np.maximum(start, 0)
     keep = stop - start >= 3
@@ -90,12 +94,13 @@ def make(
     loss=None,
     draw=0,
     noise=1.0,
+    tails=False,
 ):
     """A problem, its true state, and a start; `draw` numbers the noise on one scene,
-    and `noise` multiplies it, with the sigmas."""
+    and `noise` multiplies it, with the sigmas; `tails`: some tracks last long."""
     rng = np.random.default_rng(seed)
     scale, cameras, roots, poses = make_scene(frames, people, rng)
-    points, frame, landmark = make_tracks(frames, cameras, scale, rng)
+    points, frame, landmark = make_tracks(frames, cameras, scale, rng, tails)
     array = lambda x: jnp.asarray(np.asarray(x, dtype))
     truth = g.State(
         scale=array(scale),
