@@ -69,7 +69,13 @@ def unpadded(step, state):
     "options",
     [
         {"frames": 33, "landmarks": 60, "known": True},
+        # Long tracks: a chunk touches five others.
+        {"frames": 53, "landmarks": 60, "length": 50},
         {"frames": 12, "people": 1},
+        pytest.param(
+            {"frames": 43, "people": 1, "landmarks": 40, "length": 40},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"frames": 12, "people": 2, "extras": True, "free_intrinsics": True},
             marks=pytest.mark.slow,
@@ -319,6 +325,10 @@ def test_single_precision_serves_people_and_covariances_too():
         {"frames": 24, "landmarks": 150, "known": True, "free_intrinsics": True},
         pytest.param(
             {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"frames": 43, "people": 1, "landmarks": 60, "length": 40},
+            marks=pytest.mark.slow,
         ),
     ],
 )
