@@ -48,7 +48,7 @@ def cards(
                 f"{100 * tall:.0f}{plus_minus} cm",
                 f"person-{person % 4}",
                 "barefoot, from the estimated shape",
-                "feet on the floor move at "
+                "the lower foot (its joint, median) moves at "
                 f"{100 * facts.foot_skating(result, person):.0f} cm/s (0 is perfect)",
             )
         )
