@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from bodyslam_jax import export
 from bodyslam_jax.body import load_body_model
@@ -153,3 +154,13 @@ def test_skating_is_the_speed_of_the_foot_that_stands():
     assert facts.foot_skating(result, 0) < 1e-12
     result.joints[0, :, 10, 0] = 0.3 * result.timestamps
     np.testing.assert_allclose(facts.foot_skating(result, 0), 0.3)
+
+
+def test_paths_are_smoothed_by_a_moving_average_that_keeps_lines():
+    path = np.random.default_rng(4).standard_normal((60, 2))
+    inside = slice(7, -7)
+    expected = savgol_filter(path, 15, 1, axis=0)[inside]
+    np.testing.assert_allclose(facts.smoothed(path, 30.0)[inside], expected, atol=1e-12)
+    line = np.linspace(0, 3, 60)[:, None] * [1.0, -2.0]
+    np.testing.assert_allclose(facts.smoothed(line, 30.0), line, atol=1e-12)
+    np.testing.assert_array_equal(facts.smoothed(path[:2], 30.0), path[:2])

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from bodyslam_jax import synthetic
+from bodyslam_jax.synthetic import _measuring
 
 
 @pytest.mark.parametrize("num_frames", [2, 10, 200])
@@ -39,3 +41,13 @@ def test_noise_and_outliers_have_the_size_asked_for():
     wrong = synthetic.scene(2, 60, 400, outliers=0.1)
     share = (np.linalg.norm(wrong.uv - clean.uv, axis=1) > 1).mean()
     assert abs(share - 0.1) < 0.02
+
+
+def test_lasting_noise_is_an_autoregressive_filter_of_white_noise():
+    """Against SciPy's filter; its deviation is 1 from the first frame on."""
+    found = _measuring.ar1(np.random.default_rng(3), (400, 2000), 0.9)
+    white = np.random.default_rng(3).standard_normal((400, 2000))
+    white[1:] *= np.sqrt(1 - 0.9**2)
+    expected = lfilter([1.0], [1.0, -0.9], white, axis=0)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert abs(found[[0, 1, 10, 399]].std(axis=1) - 1).max() < 0.06
