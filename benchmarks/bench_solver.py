@@ -5,7 +5,7 @@
     python benchmarks/bench_solver.py joint --frames 300 --cache FOLDER  # twice
     python benchmarks/bench_solver.py joint --frames 1000 --mixed
     python benchmarks/bench_solver.py breakdown --frames 1000
-    python benchmarks/bench_solver.py landmarks --frames 1000 --tails
+    python benchmarks/bench_solver.py landmarks --frames 1000 --tracks long
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2x10 cg
     python benchmarks/bench_solver.py baselines --baselines jaxls --peer-python PYTHON
@@ -99,7 +99,8 @@ def breakdown(problem, state, mixed, repeats):
     if sizes.people:
         people = part("people", eliminate_people, lin, sizes, window, damping)
     kept = None if people is None else people.kept
-    chunks = part("assembly", assemble, lin, sizes, reduced, kept, window, damping)
+    given = lin, sizes, reduced, kept, window, damping, problem.layout.order
+    chunks = part("assembly", assemble, *given)
     factor = part("factorisation", factorise, chunks, sizes)
     whole = Eliminated(damping, window, people, factor)
     part("back-substitution", solve_step, problem, state, lin, sizes, whole)
@@ -162,9 +163,11 @@ def main():
         help="in double precision, but for steps (landmarks, joint, breakdown, growth)",
     )
     parser.add_argument(
-        "--tails",
-        action="store_true",
-        help="some tracks last long (landmarks, joint, breakdown, peers)",
+        "--tracks",
+        choices=["short", "long", "again"],
+        default="short",
+        help="some last long, or go on on the way back (landmarks, joint, breakdown, "
+        "peers)",
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rtol", type=float, default=1e-6)
@@ -206,7 +209,7 @@ def main():
             args.repeats,
             args.rtol,
             args.peer_steps,
-            args.tails,
+            args.tracks,
         ),
         "baselines": lambda n: solver_joint_peers.joint(
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps
@@ -219,7 +222,7 @@ def main():
             others[args.what](frames)
             continue
         people = 0 if args.what == "landmarks" else 1
-        problem, truth, start = make(frames, people, dtype=dtype, tails=args.tails)
+        problem, truth, start = make(frames, people, dtype=dtype, tracks=args.tracks)
         count = sum(
             len(f.frame) for f in problem.factors if isinstance(f, g.Reprojection)
         )

@@ -34,9 +34,9 @@ def cost_of(problem, state):
     return problem.cost(state)
 
 
-def peers(frames, names, python, repeats, rtol, steps, tails):
+def peers(frames, names, python, repeats, rtol, steps, tracks):
     """Peers and this solver, in turn, on one problem."""
-    problem, _, start = make(frames, 0, tails=tails)
+    problem, _, start = make(frames, 0, tracks=tracks)
     (factor,) = problem.factors
     count = len(np.unique(factor.landmark))
     run = lambda name, factor: run_peer(name, factor, start, python, rtol, steps)

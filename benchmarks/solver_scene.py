@@ -15,6 +15,8 @@ from bodyslam_jax.camera import project
 INTRINSICS = np.array([900.0, 900.0, 640.0, 360.0])
 TRACK = 16.0
 """Mean length of a track, frames."""
+AGAIN = 0.3
+"""Share of the points that are seen on the way back too."""
 
 
 def turn(axis, angle):
@@ -27,9 +29,12 @@ def turn(axis, angle):
     return R
 
 
-def make_scene(frames, people, rng, scale=1.3):
-    """A hand-held camera that follows people who walk, points all along the way."""
+def make_scene(frames, people, rng, back, scale=1.3):
+    """A hand-held camera that follows people who walk, points all along the way; with
+    `back` it turns round half-way, and all go back as they came."""
     k = np.arange(frames)
+    if back:
+        k = np.minimum(k, k[::-1])
     wave = lambda size, period, phase: size * np.sin(2 * np.pi * k / period + phase)
     yaw, pitch = wave(0.2, 170, 0.3) + wave(0.03, 23, 1), wave(0.06, 61, 2)
     cameras = np.tile(np.eye(4), (frames, 1, 1))
@@ -57,12 +62,13 @@ def make_scene(frames, people, rng, scale=1.3):
     return scale, cameras, roots, poses
 
 
-def make_tracks(frames, cameras, scale, rng, tails, per_frame=9.6):
-    """Points seen in a run of frames each; about 10 new ones a frame. With `tails` each
-    is as likely to be lost in the next frame as any other, and some last long."""
+def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
+    """Points seen in a run of frames each; about 10 new ones a frame. Of `long` tracks
+    each is as likely to be lost in the next frame as any other, and some last long;
+    some points of `again` are seen a second time, on the way back."""
     count = int(per_frame * frames)
     start = rng.integers(-int(TRACK) // 2, frames - 2, count)
-    if tails:
+    if tracks == "long":
         length = 3 + rng.geometric(1 / (TRACK - 3), count)
     else:
         length = np.clip(rng.gamma(4.0, TRACK / 4, count), 4, 3 * TRACK).astype(int)
@@ -82,6 +88,12 @@ def make_tracks(frames, cameras, scale, rng, tails, per_frame=9.6):
     )
     landmark = np.repeat(np.arange(len(start)), stop - start)
     frame = np.concatenate([np.arange(a, b) for a, b in zip(start, stop, strict=True)])
+    if tracks == "again":
+        twice = (rng.random(len(start)) < AGAIN)[landmark]
+        frame = np.concatenate([frame, frames - 1 - frame[twice]])
+        landmark = np.concatenate([landmark, landmark[twice]])
+        # Tracks about the turning point have some of these frames already.
+        frame, landmark = np.unique([frame, landmark], axis=1)
     return points, frame, landmark
 
 
@@ -94,13 +106,13 @@ def make(
     loss=None,
     draw=0,
     noise=1.0,
-    tails=False,
+    tracks="short",
 ):
     """A problem, its true state, and a start; `draw` numbers the noise on one scene,
-    and `noise` multiplies it, with the sigmas; `tails`: some tracks last long."""
+    and `noise` multiplies it, with the sigmas; `tracks` are of `make_tracks`."""
     rng = np.random.default_rng(seed)
-    scale, cameras, roots, poses = make_scene(frames, people, rng)
-    points, frame, landmark = make_tracks(frames, cameras, scale, rng, tails)
+    scale, cameras, roots, poses = make_scene(frames, people, rng, tracks == "again")
+    points, frame, landmark = make_tracks(frames, cameras, scale, rng, tracks)
     array = lambda x: jnp.asarray(np.asarray(x, dtype))
     truth = g.State(
         scale=array(scale),

@@ -26,13 +26,14 @@ def make(
     known=False,
     noise=1.0,
     length=8,
+    again=False,
     **options,
 ):
     rng = np.random.default_rng(seed)
     state = scenes.truth(rng, frames, people, landmarks)
     # The loss as an array: a test that differentiates by it compiles nothing anew.
     loss = jnp.asarray(1.5)
-    factors = [scenes.reprojection(rng, state, 0.5 * noise, length, loss)]
+    factors = [scenes.reprojection(rng, state, 0.5 * noise, length, loss, again)]
     if people:
         # In one program: one by one its operations take five times as long to compile.
         scenes.body_model()

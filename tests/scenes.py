@@ -60,19 +60,22 @@ def truth(rng, frames=12, people=1, landmarks=40, scale=1.7):
     )
 
 
-def observations(rng, state, length=8):
-    """Frame and landmark of each observation: runs of frames, with holes."""
+def observations(rng, state, length=8, again=False):
+    """Frame and landmark of each observation: runs of frames, with holes; with `again`
+    the camera goes back as it came, and sees every other point on its way."""
     frames, count = len(state.cameras), len(state.landmarks)
     start = rng.integers(-length // 2, frames - 1, count)
     seen = (np.arange(frames)[:, None] >= start) & (
         np.arange(frames)[:, None] < start + rng.integers(3, length + 1, count)
     )
+    if again:
+        seen[:, ::2] |= seen[::-1, ::2]
     seen &= rng.random(seen.shape) < 0.9
     return np.nonzero(seen)
 
 
-def reprojection(rng, state, noise=0.5, length=8, loss=1.5):
-    frame, landmark = observations(rng, state, length)
+def reprojection(rng, state, noise=0.5, length=8, loss=1.5, again=False):
+    frame, landmark = observations(rng, state, length, again)
     camera = np.asarray(state.cameras)[frame]
     offset = np.asarray(state.landmarks)[landmark] - camera[:, :3, 3]
     p_C = np.einsum("mji,mj->mi", camera[:, :3, :3], offset)

@@ -177,14 +177,20 @@ def test_gauge_holds_seven_numbers(rng):
     assert not free[0].any()
 
 
+@pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize("frames, landmarks", [(3, 5), (47, 60), (230, 400)])
-def test_layout_holds_every_observation_once(rng, frames, landmarks):
+def test_layout_holds_every_observation_once(rng, frames, landmarks, again):
     state = scenes.truth(rng, frames=frames, people=0, landmarks=landmarks)
-    frame, landmark = scenes.observations(rng, state, length=25)
+    frame, landmark = scenes.observations(rng, state, 25, again)
     layout = g.make_layout(frames, landmarks, frame, landmark)
     seen = []
+    order = layout.order
+    assert (order is not None) == (again and frames > 100)
+    order = np.arange(layout.num_chunks) if order is None else np.asarray(order)
+    assert sorted(order) == list(range(layout.num_chunks))
     for b in layout.buckets:
         at = np.asarray(b.first_chunk)[:, None] * g.CHUNK + np.arange(b.row.shape[1])
+        at = order[at // g.CHUNK] * g.CHUNK + at % g.CHUNK
         at = np.broadcast_to(at[:, :, None], b.row.shape)
         who = np.broadcast_to(np.asarray(b.landmark)[:, None], b.row.shape)
         row = np.asarray(b.row)
@@ -194,3 +200,21 @@ def test_layout_holds_every_observation_once(rng, frames, landmarks):
         assert (np.asarray(b.first_chunk) + b.width <= layout.num_chunks).all()
         seen.append(row[there])
     assert sorted(np.concatenate(seen)) == list(range(len(frame)))
+
+
+def test_a_place_that_is_seen_again_does_not_widen_the_band(rng):
+    frames, landmarks = 600, 3000
+    state = scenes.truth(rng, frames=frames, people=0, landmarks=landmarks)
+    seen = scenes.observations(rng, state, 25, again=True)
+    for people in (0, 1):
+        layout = g.make_layout(frames, landmarks, *seen, people)
+        assert layout.num_chunks == 60
+        assert layout.bandwidth <= 10
+        place = np.argsort(np.asarray(layout.order))
+        assert np.abs(np.diff(place)).max() <= layout.reach <= 4
+    # Without, the order of time is kept, which costs nothing.
+    seen = scenes.observations(rng, state, 25)
+    layout = g.make_layout(frames, landmarks, *seen)
+    assert layout.order is None
+    assert layout.reach == 1
+    assert layout.bandwidth <= 6

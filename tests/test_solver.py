@@ -71,6 +71,12 @@ def unpadded(step, state):
         {"frames": 33, "landmarks": 60, "known": True},
         # Long tracks: a chunk touches five others.
         {"frames": 53, "landmarks": 60, "length": 50},
+        # The camera goes there and back: chunks do not stand in the order of time.
+        {"frames": 53, "landmarks": 60, "again": True, "free_intrinsics": True},
+        pytest.param(
+            {"frames": 73, "people": 1, "landmarks": 80, "again": True},
+            marks=pytest.mark.slow,
+        ),
         {"frames": 12, "people": 1},
         pytest.param(
             {"frames": 43, "people": 1, "landmarks": 40, "length": 40},
@@ -95,8 +101,10 @@ def unpadded(step, state):
     ],
 )
 def test_step_is_that_of_the_dense_normal_equations(options):
+    options = dict(options)
     held, without = options.pop("held", None), options.pop("without", ())
     problem, _, state = make(1, **options)
+    assert (problem.layout.order is not None) == options.get("again", False)
     kept = tuple(f for f in problem.factors if not isinstance(f, without))
     problem = dataclasses.replace(problem, factors=kept)
     problem = restrict(problem, tuple(set(g.VARIABLES) - {held}))
@@ -323,6 +331,7 @@ def test_single_precision_serves_people_and_covariances_too():
     "options",
     [
         {"frames": 24, "landmarks": 150, "known": True, "free_intrinsics": True},
+        {"frames": 53, "landmarks": 90, "known": True, "again": True},
         pytest.param(
             {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
         ),
@@ -334,6 +343,7 @@ def test_single_precision_serves_people_and_covariances_too():
 )
 def test_marginal_covariances_are_blocks_of_the_inverse(options):
     problem, state, _ = make(9, **options)
+    assert (problem.layout.order is not None) == options.get("again", False)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac
     diagonal = np.diag(hessian)
@@ -364,6 +374,20 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options):
         known = size <= 10 * np.median(size)  # the rest is as good as not seen
         assert known.sum() > 0.8 * len(known)
         assert (error[known] < 1e-3 * size[known] + 1e-12).all()
+
+
+@pytest.mark.slow
+def test_marginal_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
+    problem, state, _ = make(9, frames=123, people=2, landmarks=80, again=True)
+    assert problem.layout.order is not None
+    monkeypatch.setattr("bodyslam_jax.graph._ordering._GAIN", 0.0)
+    in_time = g.make_problem(problem.factors, state)
+    assert in_time.layout.order is None
+    found, expected = marginals(problem, state), marginals(in_time, state)
+    for name in ("scale", "cameras", "people", "shapes", "landmarks"):
+        one, other = getattr(found, name), getattr(expected, name)
+        size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
+        assert (np.abs(one - other) <= 1e-5 * size).all()
 
 
 def test_marginal_covariances_are_mapped_over():

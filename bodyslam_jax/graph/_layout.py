@@ -3,8 +3,9 @@
 Tracks are nearly contiguous in time. So frames are cut into chunks, landmarks are put
 into groups that lie within the same few, and each group is a dense table of frames by
 landmarks with holes: no list of pairs is ever made, and the reduced camera matrix is
-formed by a few matrix products. Shapes are rounded up, so that videos of about the same
-length compile once.
+formed by a few matrix products. Where places are seen again, chunks stand in another
+order than that of time (`_ordering.py`). Shapes are rounded up, so that videos of about
+the same length compile once.
 """
 
 import itertools
@@ -13,6 +14,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
+
+from bodyslam_jax.graph._ordering import order_chunks
 
 CHUNK = 10
 """Frames in a chunk."""
@@ -27,6 +30,7 @@ class Bucket(eqx.Module):
     """`n` groups of `g` landmarks that span `width` chunks (`f` frames) each."""
 
     first_chunk: Int[Array, " n"]
+    """The place where its chunks begin."""
     landmark: Int[Array, "n g"]
     """Row in the state; the number of landmarks for padding."""
     row: Int[Array, "n f g"]
@@ -41,7 +45,11 @@ class Layout(eqx.Module):
     num_chunks: int = eqx.field(static=True)
     """Chunks, rounded up to a size that other videos share."""
     bandwidth: int = eqx.field(static=True)
-    """Chunks that a landmark, or a factor over frames, can connect; 2 or more."""
+    """Places that a landmark, or a factor over frames, can connect; 2 or more."""
+    order: Int[Array, " c"] | None = None
+    """The chunk at each place; `None` in the order of time."""
+    reach: int = eqx.field(static=True, default=1)
+    """Places between a chunk and the next in time, at most."""
 
 
 def round_up(count: int, parts: int = 4) -> int:
@@ -58,11 +66,18 @@ def make_layout(
     num_landmarks: int,
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
+    num_people: int = 0,
 ) -> Layout:
     """Groups `m` observations of landmarks; every index is known to be in range."""
     num_chunks = round_up(-(-num_frames // CHUNK), parts=8)
     if len(frame) == 0:
         return Layout((), num_chunks, 2)
+    pairs = np.unique(landmark.astype(int) * num_chunks + frame // CHUNK)
+    order, reach = order_chunks(*divmod(pairs, num_chunks), num_chunks, num_people)
+    if order is not None:
+        # From here on a frame is where it stands.
+        frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
+        num_frames = num_chunks * CHUNK
     first = np.full(num_landmarks, num_frames)
     last = np.full(num_landmarks, -1)
     np.minimum.at(first, landmark, frame)
@@ -71,15 +86,26 @@ def make_layout(
     start = np.where(seen, first // CHUNK, 0)
     span = np.where(seen, last // CHUNK - start + 1, 0)
     widths = _choose_widths(span[seen], num_chunks)
-    order = np.lexsort((frame, landmark))
-    begin = np.searchsorted(landmark[order], np.arange(num_landmarks + 1))
+    rows = np.lexsort((frame, landmark))
+    begin = np.searchsorted(landmark[rows], np.arange(num_landmarks + 1))
     members = np.flatnonzero(seen)
     tracks = start[members], start[members] + span[members]
     buckets = [
-        _fill(chunks, [members[group] for group in groups], width, frame, order, begin)
+        _fill(chunks, [members[group] for group in groups], width, frame, rows, begin)
         for width, chunks, groups in _pack(*tracks, widths, num_chunks)
     ]
-    return Layout(tuple(buckets), num_chunks, max(widths[-1], 2))
+    reach = _next_width(reach, num_chunks)
+    return Layout(
+        tuple(buckets),
+        num_chunks,
+        max(widths[-1], reach + 1),
+        None if order is None else jnp.asarray(order, jnp.int32),
+        reach,
+    )
+
+
+def _next_width(count, num_chunks):
+    return next(w for w in (*_WIDTHS, num_chunks) if count <= w)
 
 
 def _choose_widths(span, num_chunks):
@@ -137,9 +163,9 @@ def _pack(start, stop, widths, num_chunks):
     return buckets
 
 
-def _fill(chunks, groups, width, frame, order, begin):
+def _fill(chunks, groups, width, frame, rows, begin):
     """The tables of one bucket."""
-    num_rows, num_landmarks = len(order), len(begin) - 1
+    num_rows, num_landmarks = len(rows), len(begin) - 1
     n = round_up(len(groups))
     first_chunk = np.zeros(n, np.int32)
     first_chunk[: len(groups)] = chunks
@@ -153,7 +179,7 @@ def _fill(chunks, groups, width, frame, order, begin):
     length = begin[members + 1] - begin[members]
     which = np.repeat(np.arange(len(members)), length)
     within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
-    source = order[begin[members][which] + within]
+    source = rows[begin[members][which] + within]
     at = frame[source] - first_chunk[group][which] * CHUNK
     row[group[which], at, slot[which]] = source
     return Bucket(jnp.asarray(first_chunk), jnp.asarray(table), jnp.asarray(row), width)

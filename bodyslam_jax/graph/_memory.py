@@ -29,7 +29,7 @@ def memory_needed(layout: Layout, state: State) -> int:
     item = state.scale.dtype.itemsize
     people = len(state.roots)
     person = 69 + 12  # what stays of a chunk: a posture and two roots
-    front = CHUNK * 6 * layout.bandwidth + people * (person + 10) + 16
+    front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
     pivot = 6 * CHUNK + people * person
     window = 2 * person + 6 * CHUNK + 24
     postures = CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)

@@ -176,7 +176,7 @@ def make_problem(
     for factor in factors:
         if isinstance(factor, LandmarkPrior):
             check_prior(factor, landmark)
-    layout = make_layout(sizes["t"], sizes["l"], frame, landmark)
+    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"])
     check_memory(layout, state)
     if free is None:
         touched = {

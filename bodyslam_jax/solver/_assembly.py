@@ -4,11 +4,14 @@ After landmarks, inner postures and inner roots are gone, a chunk keeps for each
 its last posture and its last roots, and its cameras. People couple with the next chunk
 only, cameras over the band of the tracks, all with the globals. Memory grows linearly
 with frames.
+
+Chunks stand in the order of time, or in that of `Layout.order`, where the next in time
+is up to `reach` places away, either way.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, shifted
@@ -20,7 +23,8 @@ class Chunks(eqx.Module):
     """The system `[pivot, coupling^T]` of each of `n` chunks; right-hand side included.
 
     A pivot is `[people, cameras]` of one chunk, `q` wide. Its coupling has the rows
-    `[people and cameras of the next chunk, cameras of the chunks after, globals, rhs]`.
+    `[people of the next chunks, cameras of the next chunks, globals, rhs]`: as many
+    chunks as the reach is, and as the band is wide.
     """
 
     pivot: Float[Array, "n q q"]
@@ -36,14 +40,15 @@ def assemble(
     kept: Float[Array, "h n k k"] | None,
     window: Window,
     damping: dict[str, Array],
+    order: Int[Array, " n"] | None,
 ) -> Chunks:
-    """Puts all blocks of the kept variables in place."""
+    """Puts all blocks of the kept variables in place; all but `reduced` come in the
+    order of time."""
     n, g = sizes.chunks, sizes.globals
     dtype = reduced.band.dtype
     zeros = lambda *shape: jnp.zeros((n, *shape), dtype)
     own, following = _cameras(lin, sizes, damping["camera"])
-    own = own + reduced.band[..., :CAMERAS]
-    tail = _camera_tail(lin, sizes, reduced)
+    tail = _camera_tail(lin, sizes, dtype)
     corner = _corner(lin, sizes, reduced, damping["globals"])
     people, across = [], []
     for person in range(sizes.people):
@@ -63,26 +68,55 @@ def assemble(
         beside = lambda block, i=i: [
             block if j == i else zeros(width, width) for j in range(len(people))
         ]
-        lines.append([*beside(part["own", "own"]), across[i]])
+        lines.append([*beside(part["own", "own"]), part["own", "cameras"]])
         below.append([*beside(part["next", "own"]), part["next", "cameras"]])
         index = jnp.append(own_to_global(sizes, i), g)
         tails.append(zeros(g + 1, width).at[:, index].set(part["common", "own"]))
-    lines.append([*(_transposed(x) for x in across), own])
     below.append([*(part["next cameras", "own"] for part in people), following])
+    after = _stack(below)
+    placed = lambda x: x if order is None else x[order]
+    across = [placed(x) for x in across]
+    lines = [[placed(x) for x in line] for line in lines]
+    own = placed(own) + reduced.band[..., :CAMERAS]
+    lines.append([*(_transposed(x) for x in across), own])
+    tails = [placed(x) for x in tails]
+    tail = placed(tail) + _reduced_tail(sizes, reduced)
     band = _transposed(reduced.band[..., CAMERAS:])
     head = width * len(people)
-    after = jnp.concatenate([zeros(band.shape[1], head), band], axis=-1)
-    coupling = _stack(below)
-    coupling = jnp.concatenate(
-        [
-            coupling[:, :head],
-            coupling[:, head:] + after[:, :CAMERAS],
-            after[:, CAMERAS:],
-            _stack([[*tails, tail]]),
-        ],
-        axis=1,
-    )
+    band = jnp.concatenate([zeros(band.shape[1], head), band], axis=-1)
+    if order is None:
+        coupling = [
+            after[:, :head],
+            after[:, head:] + band[:, :CAMERAS],
+            band[:, CAMERAS:],
+        ]
+    else:
+        band = jnp.pad(band, ((0, 0), (sizes.reach * head, 0), (0, 0)))
+        coupling = [band + _in_place(after, order, sizes.reach, band.shape[1])]
+    coupling = jnp.concatenate([*coupling, _stack([[*tails, tail]])], axis=1)
     return Chunks(_stack(lines), coupling, corner)
+
+
+def _in_place(
+    after: Float[Array, "n q q"], order: Int[Array, " n"], reach: int, count: int
+) -> Float[Array, "n c q"]:
+    """Blocks of the next chunk in time (rows) against each, where they stand."""
+    n, q, _ = after.shape
+    head = q - CAMERAS
+    place = jnp.argsort(order)
+    follower = jnp.roll(place, -1)
+    turned = (follower < place)[:, None, None]
+    block = jnp.where(turned, _transposed(after), after)
+    apart = jnp.abs(follower - place)[:, None]
+    first = jnp.minimum(place, follower)
+    # The last has no follower; those without measurements, which may stand anywhere,
+    # have nothing to do with theirs.
+    first = jnp.where((jnp.arange(n) < n - 1) & (apart[:, 0] <= reach), first, n)
+    people = (apart - 1) * head + jnp.arange(head)
+    cameras = reach * head + (apart - 1) * CAMERAS + jnp.arange(CAMERAS)
+    row = jnp.concatenate([people, cameras], axis=1)
+    out = jnp.zeros((n, count, q), after.dtype)
+    return out.at[first[:, None], row].add(block, mode="drop")
 
 
 def _stack(lines: list[list[Array]]) -> Array:
@@ -140,12 +174,19 @@ def _cameras(lin, sizes, damping):
     return whole[:, start:, start:], following
 
 
-def _camera_tail(lin, sizes, reduced):
-    """Globals and right-hand side (rows) against each chunk's cameras."""
+def _reduced_tail(sizes, reduced):
+    """What landmarks leave of it, chunks as they stand."""
     n, g, i = sizes.chunks, sizes.globals, sizes.intrinsics
     tail = jnp.zeros((n, g + 1, CAMERAS), reduced.band.dtype)
     if i:
-        tail = tail.at[:, 1 : 1 + i].add(_transposed(reduced.with_intrinsics))
+        tail = tail.at[:, 1 : 1 + i].set(_transposed(reduced.with_intrinsics))
+    return tail.at[:, -1].set(reduced.rhs)
+
+
+def _camera_tail(lin, sizes, dtype):
+    """Globals and right-hand side (rows) against each chunk's cameras."""
+    n, g = sizes.chunks, sizes.globals
+    tail = jnp.zeros((n, g + 1, CAMERAS), dtype)
     alone = lin.blocks.get(("alone", "globals", 0))
     if alone is not None:
         index = own_to_global(sizes, None)
@@ -156,7 +197,7 @@ def _camera_tail(lin, sizes, reduced):
         for person in range(sizes.people):
             wide = _transposed(common[person].reshape(n, CAMERAS, -1))
             tail = tail.at[:, own_to_global(sizes, person)].add(wide)
-    right = reduced.rhs
+    right = jnp.zeros((n, CAMERAS), dtype)
     for name in ("camera", "camera_alone"):
         if name in lin.gradient:
             gradient = lin.gradient[name].reshape(-1, n, CAMERAS)

@@ -19,6 +19,8 @@ class Sizes(eqx.Module):
     people: int = eqx.field(static=True)
     chunks: int = eqx.field(static=True)
     bandwidth: int = eqx.field(static=True)
+    reach: int = eqx.field(static=True)
+    """Places between a chunk and the next in time, at most."""
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
@@ -122,6 +124,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
         people=state.roots.shape[0],
         chunks=problem.layout.num_chunks,
         bandwidth=problem.layout.bandwidth,
+        reach=problem.layout.reach,
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
         dtype=state.scale.dtype if dtype is None else dtype,

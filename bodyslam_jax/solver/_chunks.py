@@ -1,7 +1,8 @@
 """Factorises the system of chunks, from one end to the other.
 
 Before a chunk is factorised, all that the chunks before it leave on it is taken from it
-at once ("left-looking"): nothing is carried along but the factors themselves.
+at once ("left-looking"): nothing is carried along but the factors themselves. Chunks
+are taken as they stand: in the order of time, or of what they see (`Layout.order`).
 """
 
 import equinox as eqx
@@ -30,18 +31,30 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     n, r, q = chunks.coupling.shape
     tail = sizes.globals + 1
     head = q - CAMERAS
-    reach = (r - head - tail) // CAMERAS
+    near = sizes.reach * head
+    reach = (r - near - tail) // CAMERAS
 
     def step(sides, chunk):
         k, pivot, coupling = chunk
-        people, later, common = coupling[:head], coupling[head:-tail], coupling[-tail:]
+        people, later, common = coupling[:near], coupling[near:-tail], coupling[-tail:]
         for back in range(1, reach + 1):
             # What lies before the first chunk is not written yet: zeros.
             before = jax.lax.dynamic_index_in_dim(sides, (k - back) % n, 0, False)
-            width = q if back == 1 else CAMERAS
-            start = head + back * CAMERAS - width
-            update = before[start:] @ before[start : start + width].T
+            first, start = (back - 1) * head, near + (back - 1) * CAMERAS
+            rows = before[start:]
+            if first < near:
+                rows = jnp.concatenate([before[first:near], rows])
+            # Of people and of cameras this chunk's come first.
+            mine = head if first < near else 0
+            beside = max(near - first - head, 0)
+            width = mine + CAMERAS
+            own = _without(rows[: width + beside], mine, beside)
+            update = rows @ own.T
             wide = ((0, 0), (q - width, 0))
+            if beside:
+                more = update[mine : mine + beside]
+                people = people - jnp.pad(more, ((0, near - beside), wide[1]))
+                update = _without(update, mine, beside)
             pivot = pivot - jnp.pad(update[:width], ((q - width, 0), wide[1]))
             common = common - jnp.pad(update[-tail:], wide)
             middle = update[width:-tail]
@@ -58,13 +71,19 @@ def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     return Factor(half, sides, chunks.corner - ends @ ends.T)
 
 
+def _without(rows, first, count):
+    """All rows but `count` of them."""
+    return jnp.concatenate([rows[:first], rows[first + count :]]) if count else rows
+
+
 def back_substitute(
     factor: Factor, sizes: Sizes
 ) -> tuple[Float[Array, "n q"], Float[Array, " g"]]:
-    """Steps of all chunks, and of the globals."""
+    """Steps of all chunks, as they stand, and of the globals."""
     n, r, q = factor.side.shape
     g = sizes.globals
     head = q - CAMERAS
+    near = sizes.reach * head
     corner = factor.corner
     lower = jnp.linalg.cholesky(corner[:g, :g], symmetrize_input=False)
     common = jax.scipy.linalg.cho_solve((lower, True), corner[:g, -1])
@@ -74,8 +93,8 @@ def back_substitute(
         # -1 for the right-hand side: the whole table, without a copy of a part.
         known = jnp.concatenate([following, common, -jnp.ones_like(common[:1])])
         here = -half.T @ (known @ side)
-        kept = following[head : r - g - 1 - CAMERAS]
-        return jnp.concatenate([here[:head], here[head:], kept]), here
+        people, cameras = following[: near - head], following[near:-CAMERAS]
+        return jnp.concatenate([here[:head], people, here[head:], cameras]), here
 
     start = jnp.zeros(r - g - 1, corner.dtype)
     _, steps = jax.lax.scan(step, start, (factor.half, factor.side), reverse=True)

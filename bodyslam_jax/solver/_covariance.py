@@ -63,7 +63,11 @@ def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
         diagonals(lin, sizes), jnp.asarray(little(state.scale.dtype), state.scale.dtype)
     )
     fronts, windows, common = selected_inverse(
-        final.factor, final.roots, window_of(lin, sizes), sizes
+        final.factor,
+        final.roots,
+        window_of(lin, sizes),
+        sizes,
+        problem.layout.order,
     )
     common = common * _outer(_free_globals(problem, sizes))
     cameras, people = _centres(problem, state, sizes, fronts)

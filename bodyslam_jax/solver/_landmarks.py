@@ -18,7 +18,8 @@ CAMERAS = 6 * CHUNK
 
 
 class ReducedCameras(eqx.Module):
-    """What landmarks leave on `n` chunks of cameras, and on intrinsics."""
+    """What landmarks leave on `n` chunks of cameras (as they stand), and on
+    intrinsics."""
 
     band: Float[Array, "n c w"]
     """Row chunk against itself and the next ones, `c = 6 B`, `w = bandwidth * c`."""
@@ -101,7 +102,8 @@ def substitute_landmarks(
     intrinsics: Float[Array, " i"],
     out: Float[Array, "l 3"],
 ) -> Float[Array, "l 3"]:
-    """Steps of the landmarks from those of cameras and intrinsics, into `out`."""
+    """Steps of the landmarks from those of cameras, as their chunks stand, and of
+    intrinsics, into `out`."""
     for bucket, table, damp in zip(
         problem.layout.buckets, tables, damping, strict=True
     ):

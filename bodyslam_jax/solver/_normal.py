@@ -78,7 +78,8 @@ def eliminate(
     if sizes.people:
         people = eliminate_people(lin, sizes, window, damping)
     kept = None if people is None else people.kept
-    chunks = assemble(lin, sizes, reduced, kept, window, damping)
+    order = problem.layout.order
+    chunks = assemble(lin, sizes, reduced, kept, window, damping, order)
     return Eliminated(damping, window, people, factorise(chunks, sizes))
 
 
@@ -95,7 +96,11 @@ def solve_step(
     lin, zero = cast((lin, state.zero_step()), sizes.dtype)
     steps, common = back_substitute(eliminated.factor, sizes)
     head = steps.shape[1] - CAMERAS
-    cameras = steps[:, head:].reshape(n * CAMERAS // 6, 6)
+    of_cameras = lambda x: x[:, head:].reshape(n * CAMERAS // 6, 6)
+    as_they_stand = of_cameras(steps)
+    if problem.layout.order is not None:
+        steps = steps[jnp.argsort(problem.layout.order)]
+    cameras = of_cameras(steps)
     roots, poses = zero.roots, zero.poses
     if eliminated.people is not None:
         steps = steps[:, :head].reshape(n, h, -1).swapaxes(0, 1)
@@ -110,7 +115,7 @@ def solve_step(
         problem,
         lin.landmarks,
         eliminated.damping["landmarks"],
-        cameras,
+        as_they_stand,
         common[1 : 1 + i],
         zero.landmarks,
     )

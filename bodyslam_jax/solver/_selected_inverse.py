@@ -7,7 +7,7 @@ step. The dense inverse is never formed.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.solver._blocks import Sizes, own_to_global
 from bodyslam_jax.solver._chunks import Factor
@@ -17,49 +17,71 @@ from bodyslam_jax.solver._window import Window
 
 
 def selected_inverse(
-    factor: Factor, roots: Roots | None, window: Window, sizes: Sizes
+    factor: Factor,
+    roots: Roots | None,
+    window: Window,
+    sizes: Sizes,
+    order: Int[Array, " n"] | None,
 ) -> tuple[Float[Array, "n f f"], Float[Array, "n w w"], Float[Array, "g g"]]:
     """Covariance of each chunk's roots (all of them, person by person), cameras and the
-    globals; of the cameras of its band with the globals; of the globals."""
-    _, r, q = factor.side.shape
+    globals, in the order of time; of the cameras of its band with the globals, chunks
+    as they stand; of the globals."""
+    r, q = factor.side.shape[1:]
     g = sizes.globals
     head = q - CAMERAS
-    middle = r - 1 - g - head - CAMERAS
+    near = sizes.reach * head
     dtype = factor.half.dtype
     eye = jnp.eye(g, dtype=dtype)
     lower = jnp.linalg.cholesky(factor.corner[:g, :g], symmetrize_input=False)
     common = jax.scipy.linalg.cho_solve((lower, True), eye)
     start = jnp.zeros((r - 1, r - 1), dtype).at[-g:, -g:].set(common)
-    last = jnp.arange(g) + q + r - 1 - g
-    kept = jnp.concatenate([jnp.arange(q), q + head + jnp.arange(middle), last])
-    pair = jnp.concatenate([jnp.arange(2 * q), last])
-    band = jnp.concatenate(
-        [head + jnp.arange(CAMERAS), q + head + jnp.arange(CAMERAS + middle), last]
-    )
+    split = jnp.split(jnp.arange(q + r - 1), [head, q, q + near, q + r - 1 - g])
+    own_people, own_cameras, people, cameras, last = split
+    kept = own_people, people[: near - head], own_cameras, cameras[:-CAMERAS], last
+    kept, band = jnp.concatenate(kept), jnp.concatenate([own_cameras, cameras, last])
+
+    def pair(apart):
+        """This chunk, the one that stands so many places after it, and the globals."""
+        block = lambda start, width: start + (apart - 1) * width + jnp.arange(width)
+        other = block(q, head), block(q + near, CAMERAS)
+        return jnp.concatenate([own_people, own_cameras, *other, last])
 
     def step(known, chunk):
-        half, side, following = chunk
+        half, side, neighbours = chunk
         gain = half.T @ side[:-1].T
         mixed = -gain @ known
         own = half.T @ half - mixed @ gain.T
         whole = jnp.block([[own, mixed], [mixed.T, known]])
         part = lambda index: whole[index[:, None], index[None, :]]
-        # Roots that went with their chunk touch the chunk before: both stand here.
-        front = _with_inner(part(pair), following, window, sizes)
-        return part(kept), (front, part(band))
+        pairs = [part(pair(apart)) for apart in neighbours or (1,)]
+        return part(kept), (pairs, part(band))
 
-    by_chunk = jax.tree.map(lambda x: x.swapaxes(0, 1), roots)
-    following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), by_chunk)
-    chunks = factor.half, factor.side, following
-    known, (fronts, windows) = jax.lax.scan(step, start, chunks, reverse=True)
-    # Before the first chunk there is none; after the last, what `step` made is empty.
-    own = jnp.concatenate([jnp.arange(q), r - 1 - g + jnp.arange(g)])
+    scan = lambda *neighbours: jax.lax.scan(
+        step, start, (factor.half, factor.side, neighbours), reverse=True
+    )
+    if order is None:
+        _, ((pairs,), windows) = scan()
+    else:
+        place = jnp.argsort(order)
+        follower = jnp.roll(place, -1)
+        ahead = follower - place
+        near_by = lambda apart: jnp.clip(apart, 1, sizes.reach)[order]
+        _, ((after, before), windows) = scan(
+            near_by(ahead), near_by(-jnp.roll(ahead, 1))
+        )
+        turned = jnp.r_[q : 2 * q, 0:q, 2 * q : 2 * q + g]
+        before = before[follower][:, turned][:, :, turned]
+        pairs = jnp.where((ahead > 0)[:, None, None], after[place], before)
+    # Roots that went with their chunk touch the chunk before: both stand in a pair. The
+    # first chunk has none before it.
     at = q + jnp.arange(q + g)
-    alone = jnp.zeros((2 * q + g, 2 * q + g), dtype)
-    alone = alone.at[at[:, None], at].set(known[own[:, None], own])
-    first = jax.tree.map(lambda x: x[0], by_chunk)
-    first = _with_inner(alone, first, window, sizes)
-    return jnp.concatenate([first[None], fronts[:-1]]), windows, common
+    own = jnp.r_[0:q, 2 * q : 2 * q + g]
+    alone = jnp.zeros_like(pairs[:1])
+    alone = alone.at[:, at[:, None], at].set(pairs[:1, own[:, None], own])
+    pairs = jnp.concatenate([alone, pairs[:-1]])
+    by_chunk = jax.tree.map(lambda x: x.swapaxes(0, 1), roots)
+    with_inner = lambda given: _with_inner(*given, window, sizes)
+    return jax.lax.map(with_inner, (pairs, by_chunk)), windows, common
 
 
 def _with_inner(

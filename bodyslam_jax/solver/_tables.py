@@ -34,10 +34,12 @@ def gather(problem: Problem) -> Observations | None:
     chunks = [
         b.first_chunk[:, None] + np.arange(b.width, dtype=np.int32) for b in buckets
     ]
+    chunk = jnp.concatenate([c.reshape(-1) for c in chunks])
+    order = problem.layout.order
     return Observations(
         pixel=jnp.moveaxis(factor.pixel[row], -1, 2),
         weight=1 / factor.sigma[row],
-        chunk=jnp.concatenate([c.reshape(-1) for c in chunks]),
+        chunk=chunk if order is None else order[chunk],
         landmark=landmark,
     )
 
@@ -47,7 +49,7 @@ def _cut(table: Int[Array, "n f g"]) -> Int[Array, "u b g"]:
 
 
 def frames_of(first_chunk: Int[Array, " n"], width: int) -> Int[Array, "n f"]:
-    """Frames that each group spans."""
+    """Frames that each group spans, as their chunks stand."""
     within = jnp.arange(width * CHUNK, dtype=first_chunk.dtype)
     return first_chunk[:, None] * CHUNK + within
 

@@ -1,0 +1,88 @@
+"""In which order chunks of frames are eliminated; NumPy, at the door.
+
+A landmark connects all chunks that see it. In the order of time, a place that is seen
+again connects what lies far apart, and the band of the camera matrix becomes as wide as
+the video is long. Chunks then stand in the order of the second eigenvector of the
+Laplacian of their graph, which puts side by side what sees the same (S. Barnard, A.
+Pothen, H. Simon, A spectral algorithm for envelope reduction of sparse matrices, 1993).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_PERSON = 81
+"""Coordinates that a person keeps of a chunk, about."""
+_CAMERAS = 60
+_GAIN = 0.7
+"""An order other than time's must save this much: it is gathered to and fro."""
+_TOGETHER = 4096
+"""Landmarks that are counted at once."""
+
+
+class Ordering(NamedTuple):
+    """Where chunks stand."""
+
+    order: Int[np.ndarray, " n"] | None
+    """The chunk at each place; `None` in the order of time."""
+    reach: int
+    """Places between a chunk and the next in time, at most."""
+
+
+def order_chunks(
+    landmark: Int[np.ndarray, " p"],
+    chunk: Int[np.ndarray, " p"],
+    num_chunks: int,
+    num_people: int,
+) -> Ordering:
+    """The order of time, unless another costs clearly less; `p` pairs of a landmark and
+    a chunk that sees it, none of them twice and sorted by landmark."""
+    in_time = Ordering(None, 1)
+    begin = np.flatnonzero(np.diff(landmark, prepend=-1))
+    cost = lambda place, reach: _cost(place[chunk], begin, reach, num_people)
+    count = int(chunk.max()) + 1
+    if count <= 3:
+        return in_time
+    order = _spectral(landmark, chunk, begin, count)
+    place = np.argsort(order)
+    reach = int(np.abs(np.diff(place)).max())
+    if cost(place, reach) > _GAIN * cost(np.arange(count), 1):
+        return in_time
+    # Chunks without measurements are last; nothing couples them with others.
+    return Ordering(np.append(order, np.arange(count, num_chunks)), reach)
+
+
+def _cost(place, begin, reach, num_people):
+    """Products that landmarks and the factorisation of one chunk after another take."""
+    last = np.maximum.reduceat(place, begin)
+    span = last - np.minimum.reduceat(place, begin) + 1.0
+    own = num_people * _PERSON
+    rows = reach * own + max(span.max() - 1, reach) * _CAMERAS
+    chunks = (place.max() + 1) * (own + _CAMERAS) * rows**2
+    return chunks + 3 * _CAMERAS**2 * np.sum(span**2)
+
+
+def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
+    shared = _shared(landmark, chunk, begin, count)
+    k = np.arange(count - 1)
+    # Time connects neighbours: people do, and an interruption parts no graph.
+    in_time = 1 + shared[k, k + 1].mean()
+    shared[k, k + 1] += in_time
+    shared[k + 1, k] += in_time
+    np.fill_diagonal(shared, 0)
+    _, vectors = np.linalg.eigh(np.diag(shared.sum(axis=1)) - shared)
+    order = np.argsort(vectors[:, 1], kind="stable")
+    return order if order[0] < order[-1] else order[::-1]
+
+
+def _shared(landmark, chunk, begin, count) -> Float[np.ndarray, "c c"]:
+    """How many landmarks two chunks both see."""
+    shared = np.zeros((count, count))
+    row = np.searchsorted(landmark[begin], landmark)
+    for first in range(0, len(begin), _TOGETHER):
+        here = slice(*np.searchsorted(row, [first, first + _TOGETHER]))
+        sees = np.zeros((_TOGETHER, count), np.float32)
+        sees[row[here] - first, chunk[here]] = 1
+        shared += sees.T @ sees
+    return shared
