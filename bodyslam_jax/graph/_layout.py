@@ -94,18 +94,11 @@ def make_layout(
         _fill(chunks, [members[group] for group in groups], width, frame, rows, begin)
         for width, chunks, groups in _pack(*tracks, widths, num_chunks)
     ]
-    reach = _next_width(reach, num_chunks)
-    return Layout(
-        tuple(buckets),
-        num_chunks,
-        max(widths[-1], reach + 1),
-        None if order is None else jnp.asarray(order, jnp.int32),
-        reach,
-    )
-
-
-def _next_width(count, num_chunks):
-    return next(w for w in (*_WIDTHS, num_chunks) if count <= w)
+    if order is not None:
+        order = jnp.asarray(order, jnp.int32)
+        reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
+    bandwidth = max(widths[-1], reach + 1)
+    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach)
 
 
 def _choose_widths(span, num_chunks):

@@ -64,7 +64,8 @@ def _cost(place, begin, reach, num_people):
 
 
 def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
-    shared = _shared(landmark, chunk, begin, count)
+    # A band is as wide for one landmark as for a hundred.
+    shared = np.log1p(_shared(landmark, chunk, begin, count))
     k = np.arange(count - 1)
     # Time connects neighbours: people do, and an interruption parts no graph.
     in_time = 1 + shared[k, k + 1].mean()
