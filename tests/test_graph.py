@@ -1,6 +1,7 @@
 """State, losses, factors, and where their measurements lie."""
 
 import inspect
+import itertools
 
 import equinox as eqx
 import jax
@@ -206,12 +207,14 @@ def test_a_place_that_is_seen_again_does_not_widen_the_band(rng):
     frames, landmarks = 600, 3000
     state = scenes.truth(rng, frames=frames, people=0, landmarks=landmarks)
     seen = scenes.observations(rng, state, 25, again=True)
-    for people in (0, 1):
-        layout = g.make_layout(frames, landmarks, *seen, people)
-        assert layout.num_chunks == 60
+    for people, more in itertools.product((0, 1), (0, 20)):
+        # People may be seen in more frames than landmarks are.
+        layout = g.make_layout(frames + more, landmarks, *seen, people)
+        assert layout.num_chunks == 60 + 4 * (more > 0)
         assert layout.bandwidth <= 10
         place = np.argsort(np.asarray(layout.order))
-        assert np.abs(np.diff(place)).max() <= layout.reach <= 4
+        apart = np.abs(np.diff(place[: 60 + more // 10]))
+        assert apart.max() <= layout.reach <= 4
     # Without, the order of time is kept, which costs nothing.
     seen = scenes.observations(rng, state, 25)
     layout = g.make_layout(frames, landmarks, *seen)

@@ -69,12 +69,15 @@ def make_layout(
     num_people: int = 0,
 ) -> Layout:
     """Groups `m` observations of landmarks; every index is known to be in range."""
-    num_chunks = round_up(-(-num_frames // CHUNK), parts=8)
+    count = -(-num_frames // CHUNK)
+    num_chunks = round_up(count, parts=8)
     if len(frame) == 0:
         return Layout((), num_chunks, 2)
-    pairs = np.unique(landmark.astype(int) * num_chunks + frame // CHUNK)
-    order, reach = order_chunks(*divmod(pairs, num_chunks), num_chunks, num_people)
+    pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
+    order, reach = order_chunks(*divmod(pairs, count), count, num_people)
     if order is not None:
+        # Padding is last, and nothing couples it with the rest.
+        order = np.append(order, np.arange(count, num_chunks))
         # From here on a frame is where it stands.
         frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
         num_frames = num_chunks * CHUNK

@@ -24,7 +24,7 @@ _TOGETHER = 4096
 class Ordering(NamedTuple):
     """Where chunks stand."""
 
-    order: Int[np.ndarray, " n"] | None
+    order: Int[np.ndarray, " c"] | None
     """The chunk at each place; `None` in the order of time."""
     reach: int
     """Places between a chunk and the next in time, at most."""
@@ -33,15 +33,23 @@ class Ordering(NamedTuple):
 def order_chunks(
     landmark: Int[np.ndarray, " p"],
     chunk: Int[np.ndarray, " p"],
-    num_chunks: int,
+    count: int,
     num_people: int,
 ) -> Ordering:
-    """The order of time, unless another costs clearly less; `p` pairs of a landmark and
-    a chunk that sees it, none of them twice and sorted by landmark."""
+    """The order of time of `count` chunks, unless another costs clearly less; `p` pairs
+    of a landmark and a chunk that sees it, none of them twice and sorted by landmark.
+    """
     in_time = Ordering(None, 1)
     begin = np.flatnonzero(np.diff(landmark, prepend=-1))
-    cost = lambda place, reach: _cost(place[chunk], begin, reach, num_people)
-    count = int(chunk.max()) + 1
+    own = num_people * _PERSON
+
+    def cost(place, reach):
+        """Products that landmarks and the factorisation of all chunks take."""
+        at = place[chunk]
+        span = np.maximum.reduceat(at, begin) - np.minimum.reduceat(at, begin) + 1.0
+        rows = reach * own + max(span.max() - 1, reach) * _CAMERAS
+        return count * (own + _CAMERAS) * rows**2 + 3 * _CAMERAS**2 * np.sum(span**2)
+
     if count <= 3:
         return in_time
     order = _spectral(landmark, chunk, begin, count)
@@ -49,18 +57,7 @@ def order_chunks(
     reach = int(np.abs(np.diff(place)).max())
     if cost(place, reach) > _GAIN * cost(np.arange(count), 1):
         return in_time
-    # Chunks without measurements are last; nothing couples them with others.
-    return Ordering(np.append(order, np.arange(count, num_chunks)), reach)
-
-
-def _cost(place, begin, reach, num_people):
-    """Products that landmarks and the factorisation of one chunk after another take."""
-    last = np.maximum.reduceat(place, begin)
-    span = last - np.minimum.reduceat(place, begin) + 1.0
-    own = num_people * _PERSON
-    rows = reach * own + max(span.max() - 1, reach) * _CAMERAS
-    chunks = (place.max() + 1) * (own + _CAMERAS) * rows**2
-    return chunks + 3 * _CAMERAS**2 * np.sum(span**2)
+    return Ordering(order, reach)
 
 
 def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:

@@ -109,8 +109,8 @@ def _in_place(
     block = jnp.where(turned, _transposed(after), after)
     apart = jnp.abs(follower - place)[:, None]
     first = jnp.minimum(place, follower)
-    # The last has no follower; those without measurements, which may stand anywhere,
-    # have nothing to do with theirs.
+    # The last has no follower. Between the last of the video and padding, which may
+    # stand far from it, there is nothing.
     first = jnp.where((jnp.arange(n) < n - 1) & (apart[:, 0] <= reach), first, n)
     people = (apart - 1) * head + jnp.arange(head)
     cameras = reach * head + (apart - 1) * CAMERAS + jnp.arange(CAMERAS)
