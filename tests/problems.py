@@ -27,6 +27,7 @@ def make(
     noise=1.0,
     length=8,
     again=False,
+    steady=False,
     **options,
 ):
     rng = np.random.default_rng(seed)
@@ -41,6 +42,9 @@ def make(
         factors += eqx.filter_jit(measure, compiler_options=quick_options())(state)
     if known:
         factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
+    if steady:
+        sigma = jnp.full((frames, 2), 0.05).at[:2].set(jnp.inf)
+        factors.append(g.CameraSmoothness(sigma=sigma))
     if extras:
         factors += scenes.extra_factors(rng, state, factors[0])
     problem = g.make_problem(factors, state, **options)

@@ -71,8 +71,15 @@ def unpadded(step, state):
         {"frames": 33, "landmarks": 60, "known": True},
         # Long tracks: a chunk touches five others.
         {"frames": 53, "landmarks": 60, "length": 50},
-        # The camera goes there and back: chunks do not stand in the order of time.
-        {"frames": 53, "landmarks": 60, "again": True, "free_intrinsics": True},
+        # The camera goes there and back: chunks do not stand in the order of time, by
+        # which it is held steady.
+        {
+            "frames": 53,
+            "landmarks": 60,
+            "again": True,
+            "steady": True,
+            "free_intrinsics": True,
+        },
         pytest.param(
             {"frames": 73, "people": 1, "landmarks": 80, "again": True},
             marks=pytest.mark.slow,
