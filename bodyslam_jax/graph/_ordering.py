@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 _PERSON = 81
 """Coordinates that a person keeps of a chunk, about."""
 _CAMERAS = 60
+"""Coordinates of its cameras: 6 of each of `CHUNK` frames."""
 _GAIN = 0.7
 """An order other than time's must save this much: it is gathered to and fro."""
 _TOGETHER = 4096
