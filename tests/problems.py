@@ -10,8 +10,11 @@ from jax.flatten_util import ravel_pytree
 import bodyslam_jax.graph as g
 from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.kept import kept
-from bodyslam_jax.solver._blocks import mask_of
+from bodyslam_jax.solver._blocks import mask_of, sizes_of
 from bodyslam_jax.solver._levenberg_marquardt import lifted
+from bodyslam_jax.solver._linearise import linearise
+from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver._tables import gather
 
 # One scene serves most tests, as shapes decide what is compiled.
 SEED = 2
@@ -69,3 +72,13 @@ def _dense_of(problem, state):
 
 
 _dense = kept(_dense_of, quick_options)
+
+
+def _structured_step(problem, state, damping):
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state)
+    extra = damped(diagonals(lin, sizes), damping)
+    return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
+
+
+structured_step = kept(_structured_step, quick_options)

@@ -197,7 +197,7 @@ def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
 
     def people_of(frames):
         rng = np.random.default_rng(0)
-        return scenes.truth(rng, frames, 1, 0)
+        return scenes.truth(rng, frames, 20, 0)
 
     monkeypatch.setattr(_memory, "memory", lambda: 2**27)
     with pytest.raises(

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
-from problems import dense, make
+from problems import dense, make, structured_step
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import (
     Stage,
     clock,
@@ -24,13 +23,9 @@ from bodyslam_jax.solver import (
     restrict,
     solve,
 )
-from bodyslam_jax.solver._blocks import sizes_of
 from bodyslam_jax.solver._gmres import RESTART, gmres
-from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._mapping import in_turn
-from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._tables import gather
 from bodyslam_jax.solver._triangular import invert_lower
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -42,16 +37,6 @@ STOCK = [
     # Its program takes as long to compile as those of both others.
     pytest.param("jaxopt_gn", marks=pytest.mark.slow),
 ]
-
-
-def _structured_step(problem, state, damping):
-    sizes = sizes_of(problem, state)
-    lin = linearise(problem, gather(problem), state)
-    extra = damped(diagonals(lin, sizes), damping)
-    return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
-
-
-structured_step = kept(_structured_step, quick_options)
 
 
 def unpadded(step, state):

@@ -1,5 +1,6 @@
 """What is estimated, and why: state, error terms, problem."""
 
+from bodyslam_jax.graph._abstract import JOINTS as JOINTS
 from bodyslam_jax.graph._abstract import AbstractFactor as AbstractFactor
 from bodyslam_jax.graph._abstract import AbstractFrameFactor as AbstractFrameFactor
 from bodyslam_jax.graph._abstract import Frame as Frame
@@ -33,6 +34,7 @@ from bodyslam_jax.graph._layout import round_up as round_up
 from bodyslam_jax.graph._problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph._problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph._problem import Problem as Problem
+from bodyslam_jax.graph._problem import joints_of as joints_of
 from bodyslam_jax.graph._problem import make_problem as make_problem
 from bodyslam_jax.graph._robust import AbstractLoss as AbstractLoss
 from bodyslam_jax.graph._robust import Cauchy as Cauchy

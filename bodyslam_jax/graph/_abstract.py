@@ -18,6 +18,9 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph._robust import AbstractLoss, squared_norm
 from bodyslam_jax.graph._state import State
 
+JOINTS = tuple(range(23))
+"""All joints below the pelvis, as `State.poses` counts them."""
+
 Touch = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
 
@@ -95,6 +98,11 @@ class AbstractFrameFactor(AbstractFactor):
     ) -> tuple[Float[Array, "*b d"], dict[Touch, Float[Array, "*b d n"]]] | None:
         """The same for all frames at once, leading axes `h t` (or `t`)."""
         return None
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Which joints of the touched poses the residual may depend on."""
+        return JOINTS
 
     @property
     def num_lags(self) -> int:

@@ -19,7 +19,10 @@ from bodyslam_jax.graph._abstract import (
     Touch,
 )
 from bodyslam_jax.graph._displacement import before, displacements
-from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
+from bodyslam_jax.graph._keypoint_jacobian import (
+    keypoint_jacobian,
+    turning_joints,
+)
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
 from bodyslam_jax.motion import leg_length
@@ -63,6 +66,10 @@ class JointReprojection(AbstractFrameFactor):
     @property
     def touches(self) -> tuple[Touch, ...]:
         return ("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0)
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return turning_joints(self.body, self.layout)
 
     def data(self):
         return self.pixel, self.sigma

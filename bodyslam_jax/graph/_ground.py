@@ -7,7 +7,10 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
-from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
+from bodyslam_jax.graph._keypoint_jacobian import (
+    keypoint_jacobian,
+    turning_joints,
+)
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._stance import BODY25_FEET
 from bodyslam_jax.graph._state import State
@@ -40,6 +43,10 @@ class GroundContact(AbstractFrameFactor):
     def touches(self) -> tuple[Touch, ...]:
         frames = (("camera", 0), ("root", 0), ("pose", 0))
         return (*frames, ("scale", 0), ("shape", 0))
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return turning_joints(self.body, "body25", BODY25_FEET)
 
     def data(self):
         return self.sigma

@@ -19,6 +19,8 @@ from bodyslam_jax.body import (
     rest_joints,
 )
 from bodyslam_jax.body._skeleton import KEYPOINT_JOINT, SURFACE_POINTS
+from bodyslam_jax.compilation import is_traced
+from bodyslam_jax.graph._abstract import JOINTS
 
 
 def _ancestors() -> np.ndarray:
@@ -27,6 +29,32 @@ def _ancestors() -> np.ndarray:
     for joint in range(1, 24):
         above[:, joint] += above[:, PARENTS[joint]]
     return np.minimum(above, 1.0)
+
+
+def turning_joints(
+    body: BodyModel, layout: str, points: tuple[int, ...] | None = None
+) -> tuple[int, ...]:
+    """Joints below the pelvis, from 0, whose turns move these keypoints (or all).
+
+    Nothing hangs below a wrist that a detector of 25 keypoints sees. Every joint, where
+    pose blend shapes let each one move the skin, or the body is not known yet.
+    """
+    if is_traced(body) or body.pose_dirs.shape[-1]:
+        return JOINTS
+    names = KEYPOINT_NAMES[layout]
+    picks, weight = np.asarray(body.picks), np.asarray(body.skin_weight)
+    on = np.asarray(body.skin_joint)
+    moved = np.zeros(24, bool)
+    above = _ancestors() > 0
+    for name in names if points is None else [names[i] for i in points]:
+        if name in SURFACE_POINTS:
+            vertex = picks[SURFACE_POINTS.index(name)]
+            moved |= above[:, on[vertex][weight[vertex] != 0]].any(axis=1)
+        else:
+            joint = KEYPOINT_JOINT[name]
+            at_joint = np.arange(24) == joint
+            moved |= above[:, joint] & (~at_joint | (name in DETECTOR_BIAS))
+    return tuple(np.flatnonzero(moved[1:]).tolist())
 
 
 def keypoint_jacobian(

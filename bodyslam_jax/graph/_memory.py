@@ -28,11 +28,12 @@ def memory_needed(layout: Layout, state: State) -> int:
     """Bytes that the solver's tables take, about."""
     item = state.scale.dtype.itemsize
     people = len(state.roots)
-    person = 69 + 12  # what stays of a chunk: a posture and two roots
+    pose = 3 * len(layout.joints)
+    person = pose + 12  # what stays of a chunk: a posture and two roots
     front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
     pivot = 6 * CHUNK + people * person
     window = 2 * person + 6 * CHUNK + 24
-    postures = CHUNK * 4 * 69 * (2 * 69 + 6 * CHUNK + 12)
+    postures = CHUNK * 4 * pose * (2 * pose + 6 * CHUNK + 12)
     chunk = 3 * pivot * front + people * (window**2 + postures)
     tables = sum(40 * bucket.row.size for bucket in layout.buckets)
     return item * (chunk * layout.num_chunks + tables)

@@ -140,6 +140,16 @@ def _with_prediction(factor, seen):
     return factor
 
 
+def joints_of(factors: Sequence[AbstractFactor]) -> tuple[int, ...]:
+    """Joints that factors tie to more than the same joint in other frames."""
+    found: set[int] = set()
+    for factor in factors:
+        if isinstance(factor, AbstractFrameFactor) and not factor.per_joint:
+            if any(name == "pose" for name, _ in factor.touches):
+                found |= set(factor.joints)
+    return tuple(sorted(found))
+
+
 def make_problem(
     factors: Sequence[AbstractFactor],
     state: State,
@@ -176,7 +186,8 @@ def make_problem(
     for factor in factors:
         if isinstance(factor, LandmarkPrior):
             check_prior(factor, landmark)
-    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"])
+    joints = joints_of(factors)
+    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"], joints)
     check_memory(layout, state)
     if free is None:
         touched = {

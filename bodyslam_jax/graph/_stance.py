@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._factors import unit_length
+from bodyslam_jax.graph._keypoint_jacobian import turning_joints
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State
 
@@ -40,6 +41,10 @@ class StanceFoot(AbstractFrameFactor):
         frames = ("camera", "root", "pose")
         both = tuple((name, lag) for name in frames for lag in range(2))
         return (*both, ("scale", 0), ("shape", 0))
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return turning_joints(self.body, "body25", self.points)
 
     def data(self):
         return self.sigma

@@ -1,7 +1,8 @@
 """The blocks of the normal equations, and how many of them there are.
 
 Names of blocks: `("pose", "root", d)` couples the pose of frame k with the root of
-frame k - d; `alone` is a camera without a person.
+frame k - d; `joint` is a pose whose joints do not interact, `apart` one of joints that
+nothing else touches, and `alone` a camera without a person.
 """
 
 import equinox as eqx
@@ -24,6 +25,8 @@ class Sizes(eqx.Module):
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
+    joints: tuple[int, ...] = eqx.field(static=True)
+    """Of `Layout`: those whose turns are the group `pose`."""
     dtype: np.dtype = eqx.field(static=True)
     """Of blocks and factors: the state's, or a lower one (see `solve`)."""
 
@@ -127,6 +130,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
         reach=problem.layout.reach,
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
+        joints=problem.layout.joints,
         dtype=state.scale.dtype if dtype is None else dtype,
     )
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.solver._apart import split_poses
 from bodyslam_jax.solver._blocks import Linearisation, mask_of
 
 
@@ -39,10 +40,11 @@ def with_coupling(problem: Problem, lin: Linearisation, state: State) -> Lineari
 def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisation:
     """The same blocks with another gradient."""
     count = lin.globals.shape[0] - 1 - step.shapes.size
+    poses = split_poses(step.poses, problem.layout.joints)
     gradient = {}
     for name, known in lin.gradient.items():
-        if name == "pose":
-            gradient[name] = step.poses.reshape(known.shape)
+        if name in poses:
+            gradient[name] = poses[name]
         elif name == "root":
             gradient[name] = step.roots
         else:

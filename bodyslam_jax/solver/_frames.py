@@ -17,6 +17,7 @@ from bodyslam_jax.graph import (
     inverse_right_jacobian,
     squared_norm,
 )
+from bodyslam_jax.solver._apart import groups_of, pick, split_poses
 from bodyslam_jax.solver._blocks import Sums, shifted
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
@@ -57,6 +58,8 @@ def linearise_frames(
     for touch in local:
         free = _free_of(problem, *touch, joint)
         part = parts[touch]
+        if touch[0] == "pose" and not joint:
+            part, free = (pick(x, sums.sizes.joints, width=3) for x in (part, free))
         columns.append(rows(part, part.shape[-1]) * free[..., None, :])
     common = [name for name in _COMMON if (name, 0) in touches]
     if common:
@@ -139,16 +142,23 @@ def _add_products(sums, local, has_common, columns, weight, factor):
     for i, (name, lag) in enumerate(local):
         own = shift(slope[..., parts[i]], lag)
         if joint:
-            own = own.reshape(*own.shape[:2], 69)
-        sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
+            for group, part in split_poses(own, sums.sizes.joints).items():
+                sums.add_gradient(group, part)
+        else:
+            sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
         for j, (other, other_lag) in enumerate(local):
             here, there = (_RANK[name], lag), (_RANK[other], other_lag)
             if here > there:
                 continue
             block = shift(gram[..., parts[i], parts[j]], lag)
-            # Blocks between joints that do not interact stay apart (23 of 3 x 3).
-            key = ("joint", "joint") if joint else (name, other)
-            key = key if of_people else ("alone", "alone")
+            if joint:
+                # Joints that do not interact here stay so: 3 x 3 each.
+                for group, joints in groups_of(sums.sizes.joints).items():
+                    group = "joint" if group == "pose" else group
+                    part = pick(block, joints, 2)
+                    sums.add((group, group, other_lag - lag), part)
+                continue
+            key = (name, other) if of_people else ("alone", "alone")
             sums.add((*key, other_lag - lag), squeeze(block))
         if has_common:
             block = shift(gram[..., parts[i], spread], lag)

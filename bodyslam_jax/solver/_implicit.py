@@ -26,6 +26,7 @@ from bodyslam_jax.compilation import (
 )
 from bodyslam_jax.graph import Problem, Reprojection, State, Step
 from bodyslam_jax.kept import kept
+from bodyslam_jax.solver._apart import join_poses
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
 from bodyslam_jax.solver._coupling import with_gradient
 from bodyslam_jax.solver._gmres import gmres
@@ -130,12 +131,12 @@ def _diagonal(problem: Problem, state: State) -> Step:
     for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
         moved = jnp.moveaxis(own, 1, 2)
         landmarks = landmarks.at[bucket.landmark].set(moved, mode="drop")
-    poses = diagonal.get("pose", zero.poses).reshape(zero.poses.shape)
+    known = {name: diagonal[name] for name in ("pose", "apart") if name in diagonal}
     return Step(
         scale=diagonal["globals"][0],
         cameras=diagonal["camera"],
         roots=diagonal["root"],
-        poses=poses,
+        poses=join_poses(known, sizes.joints, zero.poses),
         shapes=diagonal["globals"][1 + count :].reshape(zero.shapes.shape),
         landmarks=landmarks,
         intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,

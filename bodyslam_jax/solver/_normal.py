@@ -11,6 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.solver._apart import (
+    apart_diagonal,
+    join_poses,
+    solve_apart,
+    split_poses,
+)
 from bodyslam_jax.solver._assembly import assemble
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, cast, own_to_global
 from bodyslam_jax.solver._chunks import Factor, back_substitute, factorise
@@ -56,6 +62,8 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
     }
     if "pose" in lin.gradient:
         result["pose"] = pose_diagonal(lin)
+    if "apart" in lin.gradient:
+        result["apart"] = apart_diagonal(lin)
     return result
 
 
@@ -108,7 +116,10 @@ def solve_step(
         roots, moved = substitute_people(
             eliminated.people, sizes, eliminated.window, steps, cameras, own
         )
-        poses = poses if moved is None else moved.reshape(poses.shape)
+        found = {} if moved is None else {"pose": moved}
+        if "apart" in lin.gradient:
+            found["apart"] = solve_apart(lin, eliminated.damping["apart"])
+        poses = join_poses(found, sizes.joints, poses)
     i = sizes.intrinsics
     intrinsics = common[1 : 1 + i] if i else zero.intrinsics
     landmarks = substitute_landmarks(
@@ -136,9 +147,9 @@ def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
     total = jnp.sum(diagonal["camera"] * step.cameras**2)
     total = total + jnp.sum(diagonal["root"] * step.roots**2)
     total = total + jnp.sum(diagonal["globals"] * _globals(diagonal, step) ** 2)
-    if "pose" in diagonal:
-        poses = step.poses.reshape(*step.poses.shape[:2], -1)
-        total = total + jnp.sum(diagonal["pose"] * poses**2)
+    for name, moved in split_poses(step.poses, problem.layout.joints).items():
+        if name in diagonal:
+            total = total + jnp.sum(diagonal[name] * moved**2)
     for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
         moved = step.landmarks[bucket.landmark]
         total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
@@ -155,9 +166,9 @@ def slope_along(problem, lin, step):
         total = total + jnp.sum(gradient["camera"] * step.cameras)
     if "root" in gradient:
         total = total + jnp.sum(gradient["root"] * step.roots)
-    if "pose" in gradient:
-        poses = step.poses.reshape(*step.poses.shape[:2], -1)
-        total = total + jnp.sum(gradient["pose"] * poses)
+    for name, moved in split_poses(step.poses, problem.layout.joints).items():
+        if name in gradient:
+            total = total + jnp.sum(gradient[name] * moved)
     for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
         moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
         total = total + jnp.sum(table.gradient * moved)

@@ -24,7 +24,6 @@ from bodyslam_jax.solver._postures import (
 from bodyslam_jax.solver._triangular import half_of
 from bodyslam_jax.solver._window import (
     KEPT,
-    POSE,
     Pairs,
     Window,
     add_pairs,
@@ -60,7 +59,7 @@ def eliminate_people(
     """Eliminates inner postures and roots of all people; `damping` joins diagonals."""
     h, n = sizes.people, sizes.chunks
     terms = _terms(lin, sizes, window, damping["root"])
-    chain = posture_blocks(lin, damping["pose"]) if window.postures else None
+    chain = posture_blocks(lin, damping["pose"]) if window.pose else None
     together = group_size(h * n)
     cut = lambda x: x.reshape(h * n // together, together, *x.shape[2:])
     of_chunks = lambda x: cut(x.reshape(h, n, CHUNK, *x.shape[2:]))
@@ -150,7 +149,7 @@ def substitute_people(
     steps: Float[Array, "h n p"],
     cameras: Float[Array, "t 6"],
     own_globals: Float[Array, "h g"],
-) -> tuple[Float[Array, "h t 6"], Float[Array, "h t 69"] | None]:
+) -> tuple[Float[Array, "h t 6"], Float[Array, "h t c"] | None]:
     """Steps of all roots and postures, from what each person keeps of the chunks, from
     those of cameras and of the person's globals."""
     h, n = sizes.people, sizes.chunks
@@ -164,7 +163,7 @@ def substitute_people(
         "hnkm,hnk->hnm", people.roots.side[..., :-1, :], jnp.concatenate(known, axis=-1)
     )
     inner = jnp.einsum("hnmi,hnm->hni", people.roots.half, right)
-    pose = window.widths["sep"]
+    pose = window.pose
     roots = jnp.concatenate([inner, steps[..., pose:]], axis=-1)
     if people.postures is None:
         return roots.reshape(h, -1, 6), None
@@ -183,4 +182,4 @@ def substitute_people(
     given = people.postures, border, steps[..., :pose]
     group = lambda given: substitute_postures(*given)
     poses = jax.lax.map(group, jax.tree.map(cut, given))
-    return roots.reshape(h, -1, 6), poses.reshape(h, -1, POSE)
+    return roots.reshape(h, -1, 6), poses.reshape(h, -1, pose)

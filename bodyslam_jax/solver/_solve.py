@@ -17,7 +17,7 @@ from bodyslam_jax.compilation import (
     is_traced,
     quick_options,
 )
-from bodyslam_jax.graph import VARIABLES, Problem, State
+from bodyslam_jax.graph import VARIABLES, Problem, State, joints_of
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
@@ -67,7 +67,8 @@ def solve(
     started. They are NaN where their equations could not be solved.
 
     **Raises:** `ValueError` if `state` does not have the sizes the problem was made
-    for, or is not finite, or a baseline is to mix precisions. Failure to converge is a
+    for, or is not finite, if factors put in later see joints that those it was made
+    with did not, or if a baseline is to mix precisions. Failure to converge is a
     `status`, and so is what is not finite within `jit`.
     """
     expected = problem.free.cameras.shape[0], problem.free.landmarks.shape[0]
@@ -82,6 +83,7 @@ def solve(
         if mixed_precision:
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
         return _solve_baseline(problem, state, solver, schedule)
+    _check_joints(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
@@ -97,6 +99,16 @@ def _check_finite(state: State) -> None:
             raise ValueError(
                 f"state.{name}: {bad} of {value.size} values are not finite."
             )
+
+
+def _check_joints(problem: Problem) -> None:
+    """Refuses factors that were put in later, where the layout does not hold them."""
+    more = set(joints_of(problem.factors)) - set(problem.layout.joints)
+    if more and not is_traced(problem):
+        raise ValueError(
+            f"problem.factors: they see joints {sorted(more)}, which those that the "
+            "problem was made with did not; make it anew with `make_problem`."
+        )
 
 
 def method_of(

@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation, Sizes
 
-POSE = 69
 KEPT = ("before", "old_roots", "old_cameras", "sep", "roots", "cameras", "common")
 """The groups that stay, in this order."""
 
@@ -30,8 +29,8 @@ Pairs = dict[tuple[str, str], Array]
 class Window(eqx.Module):
     """Static sizes of the groups."""
 
-    postures: bool = eqx.field(static=True)
-    """Whether postures are among the variables."""
+    pose: int = eqx.field(static=True)
+    """Coordinates of a posture; 0 where postures are not among the variables."""
     cross: bool = eqx.field(static=True)
     """Whether postures couple with cameras, or with roots of other frames."""
     reach: int = eqx.field(static=True)
@@ -40,12 +39,12 @@ class Window(eqx.Module):
 
     @property
     def widths(self) -> dict[str, int]:
-        pose, last = POSE * self.postures, 6 * self.reach
+        last = 6 * self.reach
         return {
-            "before": pose,
+            "before": self.pose,
             "old_roots": last,
             "old_cameras": last,
-            "sep": pose,
+            "sep": self.pose,
             "inner": 6 * CHUNK - last,
             "roots": last,
             "cameras": 6 * CHUNK,
@@ -55,7 +54,7 @@ class Window(eqx.Module):
     @property
     def person(self) -> int:
         """What a person keeps of a chunk: its last posture and roots."""
-        return POSE * self.postures + 6 * self.reach
+        return self.pose + 6 * self.reach
 
     def slices(self, names: tuple[str, ...]) -> dict[str, slice]:
         """Where groups stand, one after another."""
@@ -73,7 +72,7 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
     """
     cross, reach = False, 0
     for first, other, lag in lin.blocks:
-        limit = 1 if first in ("pose", "joint") else CHUNK - 1
+        limit = 1 if first in ("pose", "joint", "apart") else CHUNK - 1
         if abs(lag) > limit:
             raise ValueError(
                 f"a factor couples {first} and {other} {abs(lag)} frames apart; the "
@@ -84,7 +83,8 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
             cross |= other == "camera" or lag != 0
         if first in ("pose", "root") and other in ("root", "camera"):
             reach = max(reach, abs(lag))
-    return Window("pose" in lin.gradient, cross, reach, sizes.own_globals)
+    pose = 3 * len(sizes.joints) * ("pose" in lin.gradient)
+    return Window(pose, cross, reach, sizes.own_globals)
 
 
 def _block(pairs: Pairs, row: str, column: str) -> Array | None:
