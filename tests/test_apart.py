@@ -61,7 +61,7 @@ def test_steps_do_not_depend_on_which_joints_are_solved_apart(layout, without):
             factors[i] = dataclasses.replace(factor, **parts)
     problem = g.make_problem(factors, state)
     assert len(problem.layout.joints) == (0 if without else 15)
-    whole = dataclasses.replace(problem.layout, joints=g.JOINTS)
+    whole = dataclasses.replace(problem.layout, limbs=(g.JOINTS,))
     together = dataclasses.replace(problem, layout=whole)
     step, same = (
         structured_step(*pad(p, state), jnp.asarray(1e-3)) for p in (problem, together)
@@ -97,9 +97,32 @@ def test_chains_of_single_joints_are_solved_exactly():
     np.testing.assert_allclose(by_joint(step), expected[..., 0], rtol=1e-9)
 
 
+def test_limbs_are_what_factors_see_together():
+    rng = np.random.default_rng(0)
+    state = scenes.truth(rng, frames=4, people=1, landmarks=8)
+    factors = scenes.person_factors(rng, state)
+    legs = (0, 3, 6, 9), (1, 4, 7, 10)
+    *found, trunk = g.limbs_of(factors)
+    assert tuple(found) == legs
+    assert trunk == (2, 5, 8, *range(11, 19))
+    extras = scenes.extra_factors(rng, state)
+    stance = [f for f in extras if isinstance(f, g.StanceFoot)]
+    assert g.limbs_of(stance) == legs
+    # The lower foot stands on the ground: a measurement of both.
+    ground = [f for f in extras if isinstance(f, g.GroundContact)]
+    assert g.limbs_of([*factors, *ground]) == (tuple(sorted(sum(legs, ()))), trunk)
+    assert g.limbs_of([f for f in factors if f.per_joint]) == ()
+
+
 def test_factors_put_in_later_that_see_more_joints_are_refused():
     problem, _, start = make(frames=12, people=1)
     bare = [f for f in problem.factors if not isinstance(f, g.JointReprojection)]
     other = dataclasses.replace(g.make_problem(bare, start), factors=problem.factors)
-    with pytest.raises(ValueError, match=r"see joints \[0, 1.* make it anew with"):
+    with pytest.raises(
+        ValueError, match=r"see joints \[0, 3, 6, 9\] together.* make it anew with"
+    ):
+        solve(other, start)
+    more = [*problem.factors, *scenes.extra_factors(np.random.default_rng(0), start)]
+    other = dataclasses.replace(problem, factors=tuple(more))
+    with pytest.raises(ValueError, match=r"see joints \[0, 1, 3, .* together"):
         solve(other, start)

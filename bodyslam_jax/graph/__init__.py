@@ -4,6 +4,7 @@ from bodyslam_jax.graph._abstract import JOINTS as JOINTS
 from bodyslam_jax.graph._abstract import AbstractFactor as AbstractFactor
 from bodyslam_jax.graph._abstract import AbstractFrameFactor as AbstractFrameFactor
 from bodyslam_jax.graph._abstract import Frame as Frame
+from bodyslam_jax.graph._abstract import Limbs as Limbs
 from bodyslam_jax.graph._abstract import Shared as Shared
 from bodyslam_jax.graph._abstract import residual_of as residual_of
 from bodyslam_jax.graph._extras import CameraPrior as CameraPrior
@@ -34,7 +35,7 @@ from bodyslam_jax.graph._layout import round_up as round_up
 from bodyslam_jax.graph._problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph._problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph._problem import Problem as Problem
-from bodyslam_jax.graph._problem import joints_of as joints_of
+from bodyslam_jax.graph._problem import limbs_of as limbs_of
 from bodyslam_jax.graph._problem import make_problem as make_problem
 from bodyslam_jax.graph._robust import AbstractLoss as AbstractLoss
 from bodyslam_jax.graph._robust import Cauchy as Cauchy

@@ -21,6 +21,9 @@ from bodyslam_jax.graph._state import State
 JOINTS = tuple(range(23))
 """All joints below the pelvis, as `State.poses` counts them."""
 
+Limbs = tuple[tuple[int, ...], ...]
+"""Groups of joints."""
+
 Touch = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
 
@@ -100,9 +103,9 @@ class AbstractFrameFactor(AbstractFactor):
         return None
 
     @property
-    def joints(self) -> tuple[int, ...]:
-        """Which joints of the touched poses the residual may depend on."""
-        return JOINTS
+    def limbs(self) -> Limbs:
+        """Joints of the touched poses on which one row of the residual may depend."""
+        return (JOINTS,)
 
     @property
     def num_lags(self) -> int:

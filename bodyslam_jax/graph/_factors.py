@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.body import KEYPOINT_NAMES, BodyModel, local_keypoints
 from bodyslam_jax.camera import project
 from bodyslam_jax.graph._abstract import (
     AbstractFactor,
     AbstractFrameFactor,
     Frame,
+    Limbs,
     Shared,
     Touch,
 )
@@ -68,8 +69,11 @@ class JointReprojection(AbstractFrameFactor):
         return ("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0)
 
     @property
-    def joints(self) -> tuple[int, ...]:
-        return turning_joints(self.body, self.layout)
+    def limbs(self) -> Limbs:
+        count = len(KEYPOINT_NAMES[self.layout])
+        return tuple(
+            turning_joints(self.body, self.layout, (point,)) for point in range(count)
+        )
 
     def data(self):
         return self.pixel, self.sigma

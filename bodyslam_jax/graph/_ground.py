@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
+from bodyslam_jax.graph._abstract import AbstractFrameFactor, Limbs, Touch
 from bodyslam_jax.graph._keypoint_jacobian import (
     keypoint_jacobian,
     turning_joints,
@@ -45,8 +45,8 @@ class GroundContact(AbstractFrameFactor):
         return (*frames, ("scale", 0), ("shape", 0))
 
     @property
-    def joints(self) -> tuple[int, ...]:
-        return turning_joints(self.body, "body25", BODY25_FEET)
+    def limbs(self) -> Limbs:
+        return (turning_joints(self.body, "body25", BODY25_FEET),)
 
     def data(self):
         return self.sigma

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from bodyslam_jax.graph._abstract import JOINTS
+from bodyslam_jax.graph._abstract import JOINTS, Limbs
 from bodyslam_jax.graph._ordering import order_chunks
 
 CHUNK = 10
@@ -51,9 +51,14 @@ class Layout(eqx.Module):
     """The chunk at each place; `None` in the order of time."""
     reach: int = eqx.field(static=True, default=1)
     """Places between a chunk and the next in time, at most."""
-    joints: tuple[int, ...] = eqx.field(static=True, default=JOINTS)
-    """Joints that a factor ties to something else. Of the others, such as hands that no
-    keypoint sees, each is a chain in time by itself."""
+    limbs: Limbs = eqx.field(static=True, default=(JOINTS,))
+    """Joints that factors see together, as those of one leg; narrow limbs first. Of
+    joints in none, such as hands that no keypoint sees, each is a chain by itself."""
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """All joints that are in a limb, limb after limb."""
+        return sum(self.limbs, ())
 
 
 def round_up(count: int, parts: int = 4) -> int:
@@ -71,13 +76,13 @@ def make_layout(
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
     num_people: int = 0,
-    joints: tuple[int, ...] = JOINTS,
+    limbs: Limbs = (JOINTS,),
 ) -> Layout:
     """Groups `m` observations of landmarks; every index is known to be in range."""
     count = -(-num_frames // CHUNK)
     num_chunks = round_up(count, parts=8)
     if len(frame) == 0:
-        return Layout((), num_chunks, 2, joints=joints)
+        return Layout((), num_chunks, 2, limbs=limbs)
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
     order, reach = order_chunks(*divmod(pairs, count), count, num_people)
     if order is not None:
@@ -106,7 +111,7 @@ def make_layout(
         order = jnp.asarray(order, jnp.int32)
         reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
     bandwidth = max(widths[-1], reach + 1)
-    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, joints)
+    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs)
 
 
 def _choose_widths(span, num_chunks):

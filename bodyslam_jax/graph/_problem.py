@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.compilation import is_traced
-from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor, Limbs
 from bodyslam_jax.graph._check import (
     check_factor,
     check_prior,
@@ -140,14 +140,20 @@ def _with_prediction(factor, seen):
     return factor
 
 
-def joints_of(factors: Sequence[AbstractFactor]) -> tuple[int, ...]:
-    """Joints that factors tie to more than the same joint in other frames."""
-    found: set[int] = set()
+def limbs_of(factors: Sequence[AbstractFactor]) -> Limbs:
+    """Joints that factors see together, narrow limbs first; none that only its own
+    measurements and those of other frames tie to anything."""
+    found: list[set[int]] = []
     for factor in factors:
-        if isinstance(factor, AbstractFrameFactor) and not factor.per_joint:
-            if any(name == "pose" for name, _ in factor.touches):
-                found |= set(factor.joints)
-    return tuple(sorted(found))
+        if not isinstance(factor, AbstractFrameFactor) or factor.per_joint:
+            continue
+        if not any(name == "pose" for name, _ in factor.touches):
+            continue
+        for joints in map(set, factor.limbs):
+            near = [limb for limb in found if limb & joints]
+            found = [limb for limb in found if not limb & joints]
+            found += [joints.union(*near)] if joints else []
+    return tuple(sorted((tuple(sorted(x)) for x in found), key=lambda x: (len(x), x)))
 
 
 def make_problem(
@@ -186,8 +192,8 @@ def make_problem(
     for factor in factors:
         if isinstance(factor, LandmarkPrior):
             check_prior(factor, landmark)
-    joints = joints_of(factors)
-    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"], joints)
+    limbs = limbs_of(factors)
+    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"], limbs)
     check_memory(layout, state)
     if free is None:
         touched = {

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
+from bodyslam_jax.graph._abstract import AbstractFrameFactor, Limbs, Touch
 from bodyslam_jax.graph._factors import unit_length
 from bodyslam_jax.graph._keypoint_jacobian import turning_joints
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
@@ -43,8 +43,8 @@ class StanceFoot(AbstractFrameFactor):
         return (*both, ("scale", 0), ("shape", 0))
 
     @property
-    def joints(self) -> tuple[int, ...]:
-        return turning_joints(self.body, "body25", self.points)
+    def limbs(self) -> Limbs:
+        return tuple(turning_joints(self.body, "body25", (k,)) for k in self.points)
 
     def data(self):
         return self.sigma

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.graph import Limbs, Problem, State, Step
 
 
 class Sizes(eqx.Module):
@@ -25,10 +25,14 @@ class Sizes(eqx.Module):
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
-    joints: tuple[int, ...] = eqx.field(static=True)
-    """Of `Layout`: those whose turns are the group `pose`."""
+    limbs: Limbs = eqx.field(static=True)
+    """Of `Layout`: their joints' turns are the group `pose`."""
     dtype: np.dtype = eqx.field(static=True)
     """Of blocks and factors: the state's, or a lower one (see `solve`)."""
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return sum(self.limbs, ())
 
     @property
     def own_globals(self) -> int:
@@ -130,7 +134,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
         reach=problem.layout.reach,
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
-        joints=problem.layout.joints,
+        limbs=problem.layout.limbs,
         dtype=state.scale.dtype if dtype is None else dtype,
     )
 

@@ -2,9 +2,13 @@
 
 Inside a chunk of B frames the joint coordinates of all frames but the last go, frame
 after frame, the same step in all chunks and people at once. What they leave couples the
-border of the chunk (`_window.py`). Border columns are stored as rows, one after another
-in memory, as products of these are half as fast again. Exact.
+border of the chunk (`_window.py`). Joints that no measurement sees together, such as
+those of the two legs, are limbs: each is eliminated by itself, limbs of one width at
+once. Border columns are stored as rows, one after another in memory, as products of
+these are half as fast again. Exact.
 """
+
+import functools
 
 import equinox as eqx
 import jax
@@ -13,20 +17,25 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation
+from bodyslam_jax.solver._limbs import cut, diagonal, flat, joined, to_dense, whole
 from bodyslam_jax.solver._triangular import half_of
 from bodyslam_jax.solver._window import Pairs, Window
 
 
-class Postures(eqx.Module):
-    """What elimination leaves, and what back-substitution needs."""
+class Limbs(eqx.Module):
+    """What elimination of `l` limbs of one width leaves, for back-substitution."""
 
-    half: Float[Array, "*n e p p"]
+    half: Float[Array, "*n l e p p"]
     """`L^-1` of each pivot `L L^T`, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "*n b e p"]
+    solved: Float[Array, "*n l b e p"]
     """`L^-1` times border columns, transposed."""
     link: Float[Array, "*m r r"]
     """Coupling of the next frame (rows) with each eliminated one; joint by joint
     (3 x 3) where joints do not interact over time."""
+
+
+Postures = tuple[Limbs, ...]
+"""One entry for each width."""
 
 
 def border_of(window: Window) -> tuple[str, ...]:
@@ -38,29 +47,31 @@ def border_of(window: Window) -> tuple[str, ...]:
     return "before", *between, "common"
 
 
-def _pose_blocks(blocks: dict, damping: Float[Array, "*b p"]) -> tuple[Array, Array]:
-    """Postures with themselves, `*b p p`, and with those of the frame before, like
-    `Postures.link`."""
+def _pose_blocks(
+    window: Window, blocks: dict, damping: Float[Array, "g B c"]
+) -> tuple[list[Array], list[Array]]:
+    """Limbs with themselves, `g B l p p`, and with those of the frame before, like
+    `Limbs.link`."""
     dtype = damping.dtype
-    width = damping.shape[-1]
-    own = damping[..., None] * jnp.eye(width, dtype=dtype)
-    if ("pose", "pose", 0) in blocks:
-        own = own + blocks["pose", "pose", 0]
-    if ("joint", "joint", 0) in blocks:
-        own = own + _to_dense(blocks["joint", "joint", 0])
-    none = jnp.zeros((*damping.shape[:-1], width // 3, 3, 3), dtype)
-    link = blocks.get(("joint", "joint", 1), none)
-    if ("pose", "pose", 1) in blocks:
-        link = blocks["pose", "pose", 1] + _to_dense(link)
+    own = [
+        x[..., None] * jnp.eye(x.shape[-1], dtype=dtype)
+        for x in cut(window, damping, 2)
+    ]
+    joint = blocks.get(("joint", "joint", 0))
+    if joint is not None:
+        small = cut(window, joint, 2, 3)
+        own = [x + to_dense(y) for x, y in zip(own, small, strict=True)]
+    dense = blocks.get(("pose", "pose", 0))
+    if dense is not None:
+        own = [x + y for x, y in zip(own, diagonal(window, dense), strict=True)]
+    none = jnp.zeros((*damping.shape[:-1], window.pose // 3, 3, 3), dtype)
+    link = cut(window, blocks.get(("joint", "joint", 1), none), 2, 3)
+    dense = blocks.get(("pose", "pose", 1))
+    if dense is not None:
+        link = [
+            to_dense(x) + y for x, y in zip(link, diagonal(window, dense), strict=True)
+        ]
     return own, link
-
-
-def _to_dense(small: Float[Array, "*b j 3 3"]) -> Float[Array, "*b p p"]:
-    """Blocks down the diagonal, by a product: scatters of so many are slow."""
-    count = small.shape[-3]
-    eye = jnp.eye(count, dtype=small.dtype)
-    full = small[..., :, :, None, :] * eye[:, None, :, None]
-    return full.reshape(*small.shape[:-3], 3 * count, 3 * count)
 
 
 def _link_times(link: Array, x: Float[Array, "*b p c"]) -> Float[Array, "*b p c"]:
@@ -72,7 +83,7 @@ def _link_times(link: Array, x: Float[Array, "*b p c"]) -> Float[Array, "*b p c"
     return (term(0) + term(1) + term(2)).reshape(x.shape)
 
 
-def pose_diagonal(lin: Linearisation) -> Float[Array, "h t p"]:
+def pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
     total = jnp.zeros_like(lin.gradient["pose"])
     for kind in ("pose", "joint"):
         block = lin.blocks.get((kind, kind, 0))
@@ -82,64 +93,101 @@ def pose_diagonal(lin: Linearisation) -> Float[Array, "h t p"]:
     return total
 
 
-def posture_blocks(lin: Linearisation, damping: Float[Array, "h t p"]) -> tuple:
+def posture_blocks(lin: Linearisation, damping: Float[Array, "h t c"]) -> tuple:
     """What `eliminate_postures` takes, of all frames; leading axes `h t`."""
     blocks = {k: v for k, v in lin.blocks.items() if k[0] in ("pose", "joint")}
     return blocks, lin.gradient["pose"], damping
 
 
 def eliminate_postures(
-    window: Window, blocks: dict, gradient: Array, damping: Float[Array, "g B p"]
+    window: Window, blocks: dict, gradient: Array, damping: Float[Array, "g B c"]
 ) -> tuple[Postures, Pairs]:
     """Eliminates all postures but the last of each of `g` chunks, at the same time.
 
     Returns what they leave on pairs of the window's groups, too.
     """
-    own, link = _pose_blocks(blocks, damping)
-    slices = window.slices(border_of(window))
+    # Limbs of one width, of all chunks, one after another: products of one batch axis
+    # are faster than those of two.
+    first_limbs = lambda xs: [flat(x.swapaxes(1, 2)) for x in xs]
+    own, link = map(first_limbs, _pose_blocks(window, blocks, damping))
     at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
     put = jax.lax.dynamic_update_index_in_dim
     turned = lambda x: x.swapaxes(-1, -2)
-    raw = lambda k: _rows(window, blocks, gradient, k)
+    raw = lambda k: [flat(x) for x in _rows(window, blocks, gradient, k)]
 
-    def step(k, carry):
-        pivot, rows, halves, solved = carry
+    def eliminate(k, own, link, raw, known):
+        pivot, rows, halves, solved = known
         half = half_of(pivot)
         here = rows @ turned(half)
         forward = _link_times(at(link, k + 1), turned(half))
         pivot = at(own, k + 1) - forward @ turned(forward)
-        rows = raw(k + 1) - here @ turned(forward)
+        rows = raw - here @ turned(forward)
         return pivot, rows, put(halves, half, k, 1), put(solved, here, k, 2)
 
-    before = at(link, 0) if link.ndim == 4 else _to_dense(at(link, 0))
-    rows = raw(0).at[:, : window.pose].set(turned(before))
-    halves = jnp.zeros((len(rows), CHUNK - 1, *own.shape[2:]), rows.dtype)
-    solved = jnp.zeros((*rows.shape[:2], CHUNK - 1, window.pose), rows.dtype)
-    carry = own[:, 0], rows, halves, solved
-    pivot, rows, halves, solved = jax.lax.fori_loop(0, CHUNK - 1, step, carry)
-    wide = solved.reshape(*rows.shape[:2], -1)
-    update = -(wide @ turned(wide))
-    names = list(slices)
+    def step(k, carry):
+        given = own, link, raw(k + 1), carry
+        return [eliminate(k, *limbs) for limbs in zip(*given, strict=True)]
+
+    def first(own, link, rows):
+        before = at(link, 0) if link.ndim == 4 else to_dense(at(link, 0))
+        rows = rows.at[:, : own.shape[-1]].set(turned(before))
+        halves = jnp.zeros((len(own), CHUNK - 1, *own.shape[2:]), rows.dtype)
+        solved = jnp.zeros((*rows.shape[:2], CHUNK - 1, rows.shape[2]), rows.dtype)
+        return own[:, 0], rows, halves, solved
+
+    start = [first(*limbs) for limbs in zip(own, link, raw(0), strict=True)]
+    found = jax.lax.fori_loop(0, CHUNK - 1, step, start)
+    by_chunk = lambda x: x.reshape(len(gradient), -1, *x.shape[1:])
+    postures = tuple(
+        Limbs(by_chunk(halves), by_chunk(solved), by_chunk(coupling[:, 1:]))
+        for (_, _, halves, solved), coupling in zip(found, link, strict=True)
+    )
+    wide = [solved.reshape(*solved.shape[:2], -1) for _, _, _, solved in found]
+    updates = [by_chunk(-(x @ turned(x))) for x in wide]
+    pivots = [by_chunk(pivot) for pivot, *_ in found]
+    rows = [by_chunk(rows) for _, rows, *_ in found]
+    return postures, _left(window, pivots, rows, updates)
+
+
+def _left(
+    window: Window, pivots: list[Array], rows: list[Array], updates: list[Array]
+) -> Pairs:
+    """What limbs leave on pairs of groups, from pivots and rows of the last posture and
+    from what the others take from the border."""
+    widths = [size for _, size in window.limbs]
+    # What the limb was in the chunk before comes first, then the rest of the border.
+    mine = lambda xs: [x[:, :, :p] for x, p in zip(xs, widths, strict=True)]
+    rest = lambda xs: [x[:, :, p:] for x, p in zip(xs, widths, strict=True)]
+    on_mine = lambda xs: [x[..., :p] for x, p in zip(xs, widths, strict=True)]
+    on_rest = lambda xs: [x[..., p:] for x, p in zip(xs, widths, strict=True)]
+    both = functools.reduce(
+        jnp.add, (jnp.sum(x, axis=1) for x in on_rest(rest(updates)))
+    )
+    before, last = joined(on_mine(rest(updates))), joined(rest(rows))
     left = {
-        (name, other): update[:, slices[name], slices[other]]
-        for i, name in enumerate(names)
-        for other in names[: i + 1]
+        ("before", "before"): whole(window, on_mine(mine(updates))),
+        ("before", "sep"): whole(window, mine(rows)),
+        ("sep", "sep"): whole(window, pivots),
     }
-    left["sep", "sep"] = pivot
-    left |= {(name, "sep"): rows[:, part] for name, part in slices.items()}
-    return Postures(halves, solved, link[:, 1:]), left
+    slices = window.slices(border_of(window)[1:])
+    names = list(slices)
+    for i, name in enumerate(names):
+        left[name, "before"] = before[:, slices[name]]
+        left[name, "sep"] = last[:, slices[name]]
+        for other in names[: i + 1]:
+            left[name, other] = both[:, slices[name], slices[other]]
+    return left
 
 
-def _rows(window: Window, blocks: dict, gradient: Array, k) -> Float[Array, "g b p"]:
-    """Blocks of frame k of each chunk against the border; of the posture before it,
-    only frame 0 knows."""
+def _rows(window: Window, blocks: dict, gradient: Array, k) -> list[Array]:
+    """Blocks of frame k of each chunk against the border, `g l b p` for each width; of
+    the posture before it, only frame 0 knows."""
     at = lambda x: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
     dtype = gradient.dtype
     reach = window.reach if window.cross else 0
-    pose = window.pose
-    parts = [jnp.zeros((len(gradient), pose, pose), dtype)]
+    parts = []
     for name in ("root", "camera") if window.cross else ("root",):
-        total = jnp.zeros((len(gradient), 6 * (CHUNK + reach), pose), dtype)
+        total = jnp.zeros((len(gradient), 6 * (CHUNK + reach), window.pose), dtype)
         for lag in (-1, 0, 1):
             block = blocks.get(("pose", name, lag))
             if block is not None:
@@ -151,37 +199,54 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> Float[Array, "g b
         parts.append(total)
     common = blocks.get(("pose", "globals", 0))
     if common is None:
-        parts.append(jnp.zeros((len(gradient), window.own_globals, pose), dtype))
+        shape = len(gradient), window.own_globals, window.pose
+        parts.append(jnp.zeros(shape, dtype))
     else:
         parts.append(at(common).swapaxes(-1, -2))
     parts.append(-at(gradient)[:, None])
-    return jnp.concatenate(parts, axis=1)
+    rest = cut(window, jnp.concatenate(parts, axis=1), 2)
+    before = lambda x: ((0, 0), (0, 0), (x.shape[3], 0), (0, 0))
+    return [jnp.pad(x.swapaxes(1, 2), before(x)) for x in rest]
 
 
 def substitute_postures(
+    window: Window,
     postures: Postures,
     border_step: Float[Array, "g b"],
-    separator_step: Float[Array, "g p"],
-) -> Float[Array, "g B p"]:
+    separator_step: Float[Array, "g c"],
+) -> Float[Array, "g B c"]:
     """Steps of all postures of chunks from those of the border (without the right-hand
     side's row) and of their last postures."""
-    g, _, count, _ = postures.solved.shape
+    before = cut(window, border_step[:, : window.pose], 1)
+    rest = border_step[:, None, window.pose :]
+    moved = []
+    for limbs, old, last in zip(
+        postures, before, cut(window, separator_step, 1), strict=True
+    ):
+        wide = jnp.broadcast_to(rest, (*old.shape[:2], rest.shape[2]))
+        moved.append(_substitute(limbs, jnp.concatenate([old, wide], axis=-1), last))
+    return jnp.concatenate(moved, axis=-1)
+
+
+def _substitute(
+    limbs: Limbs, border_step: Float[Array, "g l b"], last: Float[Array, "g l p"]
+) -> Float[Array, "g B c"]:
+    g, l, _, count, p = limbs.solved.shape
+    half, solved, link = map(flat, (limbs.half, limbs.solved, limbs.link))
     # -1 for the right-hand side: the whole table as it is, without a copy of a part.
-    known = jnp.pad(border_step, ((0, 0), (0, 1)), constant_values=-1.0)
-    right = -(known[:, None] @ postures.solved.reshape(g, known.shape[1], -1))
-    right = right.reshape(g, count, -1)
+    known = jnp.pad(flat(border_step), ((0, 0), (0, 1)), constant_values=-1.0)
+    right = -(known[:, None] @ solved.reshape(*solved.shape[:2], -1))
+    right = right.reshape(g * l, count, p)
     at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
 
     def step(i, carry):
         following, steps = carry
         k = CHUNK - 2 - i
-        back = _link_times(at(postures.link, k).swapaxes(-1, -2), following[..., None])
-        row = at(right, k)[..., None] - at(postures.half, k) @ back
-        here = (at(postures.half, k).swapaxes(-1, -2) @ row)[..., 0]
+        back = _link_times(at(link, k).swapaxes(-1, -2), following[..., None])
+        row = at(right, k)[..., None] - at(half, k) @ back
+        here = (at(half, k).swapaxes(-1, -2) @ row)[..., 0]
         return here, jax.lax.dynamic_update_index_in_dim(steps, here, k, 1)
 
-    empty = jnp.zeros(
-        (len(separator_step), CHUNK, separator_step.shape[1]), separator_step.dtype
-    )
-    empty = empty.at[:, -1].set(separator_step)
-    return jax.lax.fori_loop(0, CHUNK - 1, step, (separator_step, empty))[1]
+    steps = jnp.zeros((g * l, CHUNK, p), last.dtype).at[:, -1].set(flat(last))
+    steps = jax.lax.fori_loop(0, CHUNK - 1, step, (flat(last), steps))[1]
+    return steps.reshape(g, l, CHUNK, p).swapaxes(1, 2).reshape(g, CHUNK, l * p)

@@ -17,7 +17,7 @@ from bodyslam_jax.compilation import (
     is_traced,
     quick_options,
 )
-from bodyslam_jax.graph import VARIABLES, Problem, State, joints_of
+from bodyslam_jax.graph import VARIABLES, Problem, State, limbs_of
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
@@ -67,9 +67,9 @@ def solve(
     started. They are NaN where their equations could not be solved.
 
     **Raises:** `ValueError` if `state` does not have the sizes the problem was made
-    for, or is not finite, if factors put in later see joints that those it was made
-    with did not, or if a baseline is to mix precisions. Failure to converge is a
-    `status`, and so is what is not finite within `jit`.
+    for, or is not finite, if factors put in later see joints together that those it
+    was made with did not, or if a baseline is to mix precisions. Failure to converge
+    is a `status`, and so is what is not finite within `jit`.
     """
     expected = problem.free.cameras.shape[0], problem.free.landmarks.shape[0]
     found = state.cameras.shape[0], state.landmarks.shape[0]
@@ -83,7 +83,7 @@ def solve(
         if mixed_precision:
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
         return _solve_baseline(problem, state, solver, schedule)
-    _check_joints(problem)
+    _check_limbs(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
@@ -101,13 +101,14 @@ def _check_finite(state: State) -> None:
             )
 
 
-def _check_joints(problem: Problem) -> None:
+def _check_limbs(problem: Problem) -> None:
     """Refuses factors that were put in later, where the layout does not hold them."""
-    more = set(joints_of(problem.factors)) - set(problem.layout.joints)
+    known = [set(limb) for limb in problem.layout.limbs]
+    more = [x for x in limbs_of(problem.factors) if not any(set(x) <= y for y in known)]
     if more and not is_traced(problem):
         raise ValueError(
-            f"problem.factors: they see joints {sorted(more)}, which those that the "
-            "problem was made with did not; make it anew with `make_problem`."
+            f"problem.factors: they see joints {list(more[0])} together, which those "
+            "that the problem was made with did not; make it anew with `make_problem`."
         )
 
 

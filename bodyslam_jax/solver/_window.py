@@ -12,6 +12,8 @@
 `inner` is eliminated with the chunk; what is left couples the rest of two chunks.
 """
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -29,13 +31,19 @@ Pairs = dict[tuple[str, str], Array]
 class Window(eqx.Module):
     """Static sizes of the groups."""
 
-    pose: int = eqx.field(static=True)
-    """Coordinates of a posture; 0 where postures are not among the variables."""
+    limbs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    """How many limbs have how many coordinates, narrow ones first; none where postures
+    are not among the variables."""
     cross: bool = eqx.field(static=True)
     """Whether postures couple with cameras, or with roots of other frames."""
     reach: int = eqx.field(static=True)
     """Frames back that terms of roots and cameras reach."""
     own_globals: int = eqx.field(static=True)
+
+    @property
+    def pose(self) -> int:
+        """Coordinates of a posture."""
+        return sum(count * width for count, width in self.limbs)
 
     @property
     def widths(self) -> dict[str, int]:
@@ -83,8 +91,9 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
             cross |= other == "camera" or lag != 0
         if first in ("pose", "root") and other in ("root", "camera"):
             reach = max(reach, abs(lag))
-    pose = 3 * len(sizes.joints) * ("pose" in lin.gradient)
-    return Window(pose, cross, reach, sizes.own_globals)
+    of_width = itertools.groupby(sizes.limbs if "pose" in lin.gradient else (), len)
+    limbs = tuple((len(list(group)), 3 * count) for count, group in of_width)
+    return Window(limbs, cross, reach, sizes.own_globals)
 
 
 def _block(pairs: Pairs, row: str, column: str) -> Array | None:
