@@ -1,4 +1,4 @@
-"""Joints that nothing ties to the rest: hands and wrists that no keypoint sees.
+"""Joints in no limb, such as hands and wrists: no keypoint ties them to the rest.
 
 What is known of such a joint is its rotation in each frame, and that errors last. So it
 is a chain in time by itself, of 3 x 3 blocks, and takes no part in the elimination of

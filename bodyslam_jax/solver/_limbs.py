@@ -47,8 +47,8 @@ def whole(window: Window, parts: list[Array]) -> Float[Array, "g c c"]:
 
 def joined(parts: list[Array]) -> Float[Array, "g r c"]:
     """Columns of all limbs, `g l r p`, side by side."""
-    flat = [x.swapaxes(1, 2).reshape(len(x), x.shape[2], -1) for x in parts]
-    return jnp.concatenate(flat, axis=-1)
+    columns = [x.swapaxes(1, 2).reshape(len(x), x.shape[2], -1) for x in parts]
+    return jnp.concatenate(columns, axis=-1)
 
 
 def to_dense(small: Float[Array, "*b j 3 3"]) -> Float[Array, "*b p p"]:
