@@ -65,8 +65,11 @@ def _settle(
     keep = jnp.zeros(len(state.landmarks), bool)
     of_tracks = jnp.zeros_like(state.scale)
     if tracks is not None:
-        old = eqx.tree_at(lambda s: s.landmarks, moved, state.landmarks)
-        here, there = (cost_by_landmark(problem, tracks, s) for s in (old, moved))
+        # One map over both: cameras are gathered once for all observations.
+        both = jnp.stack([state.landmarks, moved.landmarks])
+        at = lambda x: eqx.tree_at(lambda s: s.landmarks, moved, x)
+        found = jax.vmap(lambda x: cost_by_landmark(problem, tracks, at(x)))(both)
+        here, there = zip(*found, strict=True)
         keep = ~(there[0] + there[1] <= here[0] + here[1])
         landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
         moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
