@@ -89,7 +89,7 @@ def test_chains_of_single_joints_are_solved_exactly():
         ("apart", "apart", d): jnp.asarray(x[None]) for d, x in enumerate((own, link))
     }
     none = jnp.zeros((0, 0)), jnp.zeros(0), (), jnp.zeros(0)
-    lin = Linearisation(blocks, {"apart": jnp.asarray(gradient)}, *none)
+    lin = Linearisation(blocks, {}, {"apart": jnp.asarray(gradient)}, *none)
     step = jax.jit(lambda damping: solve_apart(lin, damping))(damping**2)
     by_joint = lambda x: x.reshape(frames, joints, 3).swapaxes(0, 1).reshape(joints, -1)
     extra = by_joint(damping**2)[:, None] * np.eye(3 * frames)

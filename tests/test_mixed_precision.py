@@ -44,7 +44,8 @@ def test_only_factors_are_in_single_precision():
     _, final = run(problem, start, method)
     single, double = np.dtype(np.float32), np.dtype(np.float64)
     assert {x.dtype for x in jax.tree.leaves(final.factor)} == {single}
-    assert {x.dtype for x in final.lin.blocks.values()} == {single}
+    blocks = final.lin.blocks, final.lin.limbs
+    assert {x.dtype for x in jax.tree.leaves(blocks)} == {single}
     assert {x.dtype for x in final.lin.gradient.values()} == {double}
     assert {t.gradient.dtype for t in final.lin.landmarks} == {double}
     assert final.lin.costs.dtype == double
@@ -63,9 +64,9 @@ def test_slopes_and_costs_are_those_of_double_precision():
     pairs = zip(*map(jax.tree.leaves, (slopes(double), slopes(single))), strict=True)
     for expected, found in pairs:
         np.testing.assert_allclose(found, expected, atol=1e-13 * abs(expected).max())
-    some = single.blocks["pose", "pose", 0]
-    assert some.dtype == np.float32
-    np.testing.assert_allclose(some, double.blocks["pose", "pose", 0], rtol=1e-4)
+    for some, exact in zip(single.limbs[0], double.limbs[0], strict=True):
+        assert some.dtype == np.float32
+        np.testing.assert_allclose(some, exact, rtol=1e-4)
 
 
 def test_products_are_of_all_bits_where_a_gpu_would_leave_some_out():

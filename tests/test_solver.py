@@ -182,7 +182,8 @@ def test_noise_free_scene_is_recovered_and_history_says_how():
 def test_a_solve_on_the_clock_is_the_same_solve():
     problem, _, start = make()
     first = Stage(("cameras", "landmarks"), max_steps=3)
-    schedule = (first, Stage(rtol=1e-13, max_steps=60))
+    # Far above rounding, which differs: the same steps are enough for both.
+    schedule = (first, Stage(rtol=1e-9, max_steps=60))
     plain = solve(problem, start, schedule=schedule)
     found, seconds = clock(problem, start, schedule=schedule)
     assert found.status == plain.status

@@ -5,6 +5,8 @@ frame k - d; `joint` is a pose whose joints do not interact, `apart` one of join
 nothing else touches, and `alone` a camera without a person.
 """
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,12 @@ class Sizes(eqx.Module):
         return sum(self.limbs, ())
 
     @property
+    def widths(self) -> tuple[tuple[int, int], ...]:
+        """How many limbs have how many coordinates, narrow ones first."""
+        of_width = itertools.groupby(self.limbs, len)
+        return tuple((len(list(same)), 3 * count) for count, same in of_width)
+
+    @property
     def own_globals(self) -> int:
         """Scale, intrinsics and the shape of one person."""
         return 1 + self.intrinsics + 10
@@ -60,6 +68,8 @@ class Linearisation(eqx.Module):
 
     blocks: dict[tuple[str, str, int], Array]
     """Per person (but for cameras alone) and frame."""
+    limbs: dict[int, list[Float[Array, "h t _l _p _p"]]]
+    """Postures with those so many frames before: limbs with themselves, by width."""
     gradient: dict[str, Array]
     globals: Float[Array, "g g"]
     globals_gradient: Float[Array, " g"]
@@ -94,6 +104,7 @@ class Sums:
     def __init__(self, sizes: Sizes, state: State):
         self.sizes = sizes
         self.blocks: dict[tuple[str, str, int], Array] = {}
+        self.limbs: dict[int, list[Array]] = {}
         self.gradient: dict[str, Array] = {}
         self.costs: list[Array] = []
         dtype = state.scale.dtype
@@ -104,6 +115,13 @@ class Sums:
         value = value.astype(self.sizes.dtype)
         known = self.blocks.get(key)
         self.blocks[key] = value if known is None else known + value
+
+    def add_limbs(self, lag: int, values: list[Array]) -> None:
+        values = cast(values, self.sizes.dtype)
+        known = self.limbs.get(lag)
+        self.limbs[lag] = (
+            values if known is None else jax.tree.map(jnp.add, known, values)
+        )
 
     def add_gradient(self, name: str, value: Array) -> None:
         known = self.gradient.get(name)

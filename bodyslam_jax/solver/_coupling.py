@@ -65,4 +65,9 @@ def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisa
         )
         for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True)
     )
-    return Linearisation(lin.blocks, gradient, lin.globals, common, tables, lin.costs)
+    names = "gradient", "globals_gradient", "landmarks"
+    return eqx.tree_at(
+        lambda lin: [getattr(lin, name) for name in names],
+        lin,
+        [gradient, common, tables],
+    )

@@ -19,6 +19,7 @@ from bodyslam_jax.graph import (
 )
 from bodyslam_jax.solver._apart import groups_of, pick, split_poses
 from bodyslam_jax.solver._blocks import Sums, shifted
+from bodyslam_jax.solver._limbs import diagonal, squares
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
 _GROUP = {
@@ -53,7 +54,8 @@ def linearise_frames(
     lead = residual.shape[: 3 if joint else 2]
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
-    local = [t for t in touches if t[0] in _LOCAL]
+    # Postures first: their limbs do not touch each other (`_add_products`).
+    local = sorted((t for t in touches if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
     columns = []
     for touch in local:
         free = _free_of(problem, *touch, joint)
@@ -124,20 +126,19 @@ def _add_products(sums, local, has_common, columns, weight, factor):
     parts = [slice(e - c.shape[-1], e) for e, c in zip(ends, columns, strict=True)]
     whole = jnp.concatenate(columns, axis=-1) * weight
     jac = whole.astype(sums.sizes.dtype)
-    if jac.shape[-2] <= 3:
-        gram = sum(
-            jac[..., r, :, None] * jac[..., r, None, :] for r in range(1, jac.shape[-2])
-        )
-        gram = gram + jac[..., 0, :, None] * jac[..., 0, None, :]
-    else:
-        gram = jnp.einsum("...ra,...rb->...ab", jac, jac)
+    # Of one posture with itself, which has most coordinates, limbs are worked on alone.
+    alone = not joint and [name for name, _ in local].count("pose") == 1
+    skip = ends[0] if alone else 0
+    gram = _products(jac[..., skip:], jac)
     if jac.dtype == whole.dtype:
-        slope = gram[..., -1]
+        slope = gram[..., -1, :]
     else:
         slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
     # A term of frame k about frame k - lag.
     shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
+    turned = lambda x: x.swapaxes(-1, -2)
+    beyond = lambda part: slice(part.start - skip, part.stop - skip)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
     for i, (name, lag) in enumerate(local):
         own = shift(slope[..., parts[i]], lag)
@@ -150,7 +151,11 @@ def _add_products(sums, local, has_common, columns, weight, factor):
             here, there = (_RANK[name], lag), (_RANK[other], other_lag)
             if here > there:
                 continue
-            block = shift(gram[..., parts[i], parts[j]], lag)
+            if alone and i == j == 0:
+                limbs = squares(sums.sizes.widths, jac[..., :skip])
+                sums.add_limbs(0, [shift(x, lag) for x in limbs])
+                continue
+            block = shift(turned(gram[..., beyond(parts[j]), parts[i]]), lag)
             if joint:
                 # Joints that do not interact here stay so: 3 x 3 each.
                 for group, joints in groups_of(sums.sizes.joints).items():
@@ -159,13 +164,16 @@ def _add_products(sums, local, has_common, columns, weight, factor):
                     sums.add((group, group, other_lag - lag), part)
                 continue
             key = (name, other) if of_people else ("alone", "alone")
-            sums.add((*key, other_lag - lag), squeeze(block))
+            if key == ("pose", "pose"):
+                sums.add_limbs(other_lag - lag, diagonal(sums.sizes.widths, block))
+            else:
+                sums.add((*key, other_lag - lag), squeeze(block))
         if has_common:
-            block = shift(gram[..., parts[i], spread], lag)
+            block = shift(turned(gram[..., beyond(spread), parts[i]]), lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if has_common:
         n = sums.sizes.own_globals if of_people else 1 + sums.sizes.intrinsics
-        total = jnp.sum(gram[..., spread, spread], axis=1).astype(whole.dtype)
+        total = jnp.sum(gram[..., beyond(spread), spread], axis=1).astype(whole.dtype)
         down = jnp.sum(slope[..., spread], axis=1)
         for person in range(total.shape[0]):
             sums.add_globals(
@@ -173,6 +181,14 @@ def _add_products(sums, local, has_common, columns, weight, factor):
                 total[person, :n, :n],
                 down[person, :n],
             )
+
+
+def _products(a: Float[Array, "*b r p"], b: Float[Array, "*b r q"]) -> Array:
+    """Of all columns of one with those of the other; few rows fused."""
+    if a.shape[-2] > 3:
+        return jnp.einsum("...ra,...rb->...ab", a, b)
+    term = lambda r: a[..., r, :, None] * b[..., r, None, :]
+    return sum((term(r) for r in range(1, a.shape[-2])), term(0))
 
 
 def shift_back(x: Float[Array, "h t *b"], lag: int) -> Float[Array, "h t *b"]:

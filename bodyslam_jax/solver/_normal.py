@@ -26,7 +26,6 @@ from bodyslam_jax.solver._landmarks import (
     substitute_landmarks,
 )
 from bodyslam_jax.solver._people import People, eliminate_people, substitute_people
-from bodyslam_jax.solver._postures import pose_diagonal
 from bodyslam_jax.solver._window import Window, window_of
 
 
@@ -61,10 +60,22 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
         ),
     }
     if "pose" in lin.gradient:
-        result["pose"] = pose_diagonal(lin)
+        result["pose"] = _pose_diagonal(lin)
     if "apart" in lin.gradient:
         result["apart"] = apart_diagonal(lin)
     return result
+
+
+def _pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
+    total = jnp.zeros_like(lin.gradient["pose"])
+    flat = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).reshape(*x.shape[:2], -1)
+    if 0 in lin.limbs:
+        found = [flat(x) for x in lin.limbs[0]]
+        total = total + jnp.concatenate(found, axis=-1).astype(total.dtype)
+    joint = lin.blocks.get(("joint", "joint", 0))
+    if joint is not None:
+        total = total + flat(joint).astype(total.dtype)
+    return total
 
 
 def damped(diagonal: dict, damping: Float[Array, ""]) -> dict:

@@ -4,7 +4,8 @@ Inside a chunk of B frames the joint coordinates of all frames but the last go, 
 after frame, the same step in all chunks and people at once. What they leave couples the
 border of the chunk (`_window.py`). Joints that no measurement sees together, such as
 those of the two legs, are limbs: each is eliminated by itself, limbs of one width at
-once. Border columns are stored as rows, one after another in memory, as products of
+once. The roots of later frames have no part in the first frames: these go with fewer
+columns. Border columns are stored as rows, one after another in memory, as products of
 these are half as fast again. Exact.
 """
 
@@ -17,7 +18,15 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver._blocks import Linearisation
-from bodyslam_jax.solver._limbs import cut, diagonal, flat, joined, to_dense, whole
+from bodyslam_jax.solver._limbs import (
+    cut,
+    flat,
+    joined,
+    link_times,
+    squares_of_rows,
+    to_dense,
+    whole,
+)
 from bodyslam_jax.solver._triangular import half_of
 from bodyslam_jax.solver._window import Pairs, Window
 
@@ -27,8 +36,8 @@ class Limbs(eqx.Module):
 
     half: Float[Array, "*n l e p p"]
     """`L^-1` of each pivot `L L^T`, `e = B - 1` eliminated frames."""
-    solved: Float[Array, "*n l b e p"]
-    """`L^-1` times border columns, transposed."""
+    solved: tuple[Float[Array, "*n l _b _e p"], ...]
+    """`L^-1` times border columns, transposed; an entry for each of the `phases_of`."""
     link: Float[Array, "*m r r"]
     """Coupling of the next frame (rows) with each eliminated one; joint by joint
     (3 x 3) where joints do not interact over time."""
@@ -44,63 +53,55 @@ def border_of(window: Window) -> tuple[str, ...]:
         between = "old_roots", "inner", "roots", "old_cameras", "cameras"
     else:
         between = "inner", "roots"
-    return "before", *between, "common"
+    return "before", "common", *between
+
+
+def phases_of(window: Window) -> tuple[tuple[int, int, int], ...]:
+    """Frames from one up to another, and how many columns at the end of the border
+    they do not touch: roots of later frames."""
+    if window.cross:
+        return ((0, CHUNK - 1, 0),)
+    middle = CHUNK // 2
+    return (0, middle, 6 * (CHUNK - middle)), (middle, CHUNK - 1, 0)
 
 
 def _pose_blocks(
-    window: Window, blocks: dict, damping: Float[Array, "g B c"]
+    window: Window, limbs: dict, blocks: dict, damping: Float[Array, "g B c"]
 ) -> tuple[list[Array], list[Array]]:
     """Limbs with themselves, `g B l p p`, and with those of the frame before, like
     `Limbs.link`."""
     dtype = damping.dtype
     own = [
         x[..., None] * jnp.eye(x.shape[-1], dtype=dtype)
-        for x in cut(window, damping, 2)
+        for x in cut(window.limbs, damping, 2)
     ]
     joint = blocks.get(("joint", "joint", 0))
     if joint is not None:
-        small = cut(window, joint, 2, 3)
+        small = cut(window.limbs, joint, 2, 3)
         own = [x + to_dense(y) for x, y in zip(own, small, strict=True)]
-    dense = blocks.get(("pose", "pose", 0))
+    dense = limbs.get(0)
     if dense is not None:
-        own = [x + y for x, y in zip(own, diagonal(window, dense), strict=True)]
+        own = [x + y for x, y in zip(own, dense, strict=True)]
     none = jnp.zeros((*damping.shape[:-1], window.pose // 3, 3, 3), dtype)
-    link = cut(window, blocks.get(("joint", "joint", 1), none), 2, 3)
-    dense = blocks.get(("pose", "pose", 1))
+    link = cut(window.limbs, blocks.get(("joint", "joint", 1), none), 2, 3)
+    dense = limbs.get(1)
     if dense is not None:
-        link = [
-            to_dense(x) + y for x, y in zip(link, diagonal(window, dense), strict=True)
-        ]
+        link = [to_dense(x) + y for x, y in zip(link, dense, strict=True)]
     return own, link
-
-
-def _link_times(link: Array, x: Float[Array, "*b p c"]) -> Float[Array, "*b p c"]:
-    if link.ndim == x.ndim:
-        return link @ x
-    rows = x.reshape(*x.shape[:-2], -1, 3, x.shape[-1])
-    # Three fused products: a matrix product for each joint would be far too small.
-    term = lambda b: link[..., b, None] * rows[..., b, None, :]
-    return (term(0) + term(1) + term(2)).reshape(x.shape)
-
-
-def pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
-    total = jnp.zeros_like(lin.gradient["pose"])
-    for kind in ("pose", "joint"):
-        block = lin.blocks.get((kind, kind, 0))
-        if block is not None:
-            found = jnp.diagonal(block, axis1=-2, axis2=-1)
-            total = total + found.reshape(total.shape).astype(total.dtype)
-    return total
 
 
 def posture_blocks(lin: Linearisation, damping: Float[Array, "h t c"]) -> tuple:
     """What `eliminate_postures` takes, of all frames; leading axes `h t`."""
     blocks = {k: v for k, v in lin.blocks.items() if k[0] in ("pose", "joint")}
-    return blocks, lin.gradient["pose"], damping
+    return lin.limbs, blocks, lin.gradient["pose"], damping
 
 
 def eliminate_postures(
-    window: Window, blocks: dict, gradient: Array, damping: Float[Array, "g B c"]
+    window: Window,
+    limbs: dict,
+    blocks: dict,
+    gradient: Array,
+    damping: Float[Array, "g B c"],
 ) -> tuple[Postures, Pairs]:
     """Eliminates all postures but the last of each of `g` chunks, at the same time.
 
@@ -109,7 +110,7 @@ def eliminate_postures(
     # Limbs of one width, of all chunks, one after another: a product with two batch
     # axes takes three times as long as with one.
     by_limb = lambda xs: [flat(x.swapaxes(1, 2)) for x in xs]
-    own, link = map(by_limb, _pose_blocks(window, blocks, damping))
+    own, link = map(by_limb, _pose_blocks(window, limbs, blocks, damping))
     at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
     put = jax.lax.dynamic_update_index_in_dim
     turned = lambda x: x.swapaxes(-1, -2)
@@ -119,33 +120,43 @@ def eliminate_postures(
         pivot, rows, halves, solved = known
         half = half_of(pivot)
         here = rows @ turned(half)
-        forward = _link_times(at(link, k + 1), turned(half))
+        forward = link_times(at(link, k + 1), turned(half))
         pivot = at(own, k + 1) - forward @ turned(forward)
-        rows = raw - here @ turned(forward)
-        return pivot, rows, put(halves, half, k, 1), put(solved, here, k, 2)
+        rows = raw[:, : rows.shape[1]] - here @ turned(forward)
+        return pivot, rows, put(halves, half, k, 1), put(solved, here, k - start, 2)
 
     def step(k, carry):
         given = own, link, raw(k + 1), carry
-        return [eliminate(k, *limbs) for limbs in zip(*given, strict=True)]
+        return [eliminate(k, *same) for same in zip(*given, strict=True)]
 
     def first(own, link, rows):
         before = at(link, 0) if link.ndim == 4 else to_dense(at(link, 0))
         rows = rows.at[:, : own.shape[-1]].set(turned(before))
         halves = jnp.zeros((len(own), CHUNK - 1, *own.shape[2:]), rows.dtype)
-        solved = jnp.zeros((*rows.shape[:2], CHUNK - 1, rows.shape[2]), rows.dtype)
-        return own[:, 0], rows, halves, solved
+        return own[:, 0], rows, halves
 
-    start = [first(*limbs) for limbs in zip(own, link, raw(0), strict=True)]
-    found = jax.lax.fori_loop(0, CHUNK - 1, step, start)
+    known = [first(*same) for same in zip(own, link, raw(0), strict=True)]
+    solved = []
+    for start, stop, late in phases_of(window):
+        carry = []
+        for (pivot, rows, halves), more in zip(known, raw(start), strict=True):
+            count = more.shape[1] - late
+            new = more[:, rows.shape[1] : count]
+            rows = jnp.concatenate([rows[:, :count], new], axis=1)
+            shape = *rows.shape[:2], stop - start, rows.shape[2]
+            carry.append((pivot, rows, halves, jnp.zeros(shape, rows.dtype)))
+        carry = jax.lax.fori_loop(start, stop, step, carry)
+        known = [(pivot, rows, halves) for pivot, rows, halves, _ in carry]
+        solved.append([found for *_, found in carry])
     by_chunk = lambda x: x.reshape(len(gradient), -1, *x.shape[1:])
+    of_limbs = list(zip(*solved, strict=True))
     postures = tuple(
-        Limbs(by_chunk(halves), by_chunk(solved), by_chunk(coupling[:, 1:]))
-        for (_, _, halves, solved), coupling in zip(found, link, strict=True)
+        Limbs(by_chunk(halves), tuple(map(by_chunk, parts)), by_chunk(coupling[:, 1:]))
+        for (*_, halves), parts, coupling in zip(known, of_limbs, link, strict=True)
     )
-    wide = [solved.reshape(*solved.shape[:2], -1) for _, _, _, solved in found]
-    updates = [by_chunk(-(x @ turned(x))) for x in wide]
-    pivots = [by_chunk(pivot) for pivot, *_ in found]
-    rows = [by_chunk(rows) for _, rows, *_ in found]
+    updates = [by_chunk(-squares_of_rows(parts)) for parts in of_limbs]
+    pivots = [by_chunk(pivot) for pivot, *_ in known]
+    rows = [by_chunk(rows) for _, rows, _ in known]
     return postures, _left(window, pivots, rows, updates)
 
 
@@ -165,9 +176,9 @@ def _left(
     )
     before, last = joined(on_mine(rest(updates))), joined(rest(rows))
     left = {
-        ("before", "before"): whole(window, on_mine(mine(updates))),
-        ("before", "sep"): whole(window, mine(rows)),
-        ("sep", "sep"): whole(window, pivots),
+        ("before", "before"): whole(window.limbs, on_mine(mine(updates))),
+        ("before", "sep"): whole(window.limbs, mine(rows)),
+        ("sep", "sep"): whole(window.limbs, pivots),
     }
     slices = window.slices(border_of(window)[1:])
     names = list(slices)
@@ -185,7 +196,12 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> list[Array]:
     at = lambda x: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
     dtype = gradient.dtype
     reach = window.reach if window.cross else 0
-    parts = []
+    common = blocks.get(("pose", "globals", 0))
+    if common is None:
+        common = jnp.zeros((len(gradient), window.own_globals, window.pose), dtype)
+    else:
+        common = at(common).swapaxes(-1, -2)
+    parts = [common, -at(gradient)[:, None]]
     for name in ("root", "camera") if window.cross else ("root",):
         total = jnp.zeros((len(gradient), 6 * (CHUNK + reach), window.pose), dtype)
         for lag in (-1, 0, 1):
@@ -197,14 +213,7 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> list[Array]:
                 wide = at(block).swapaxes(-1, -2)[:, None] * place[:, None, None]
                 total = total + wide.reshape(total.shape)
         parts.append(total)
-    common = blocks.get(("pose", "globals", 0))
-    if common is None:
-        shape = len(gradient), window.own_globals, window.pose
-        parts.append(jnp.zeros(shape, dtype))
-    else:
-        parts.append(at(common).swapaxes(-1, -2))
-    parts.append(-at(gradient)[:, None])
-    rest = cut(window, jnp.concatenate(parts, axis=1), 2)
+    rest = cut(window.limbs, jnp.concatenate(parts, axis=1), 2)
     before = lambda x: ((0, 0), (0, 0), (x.shape[3], 0), (0, 0))
     return [jnp.pad(x.swapaxes(1, 2), before(x)) for x in rest]
 
@@ -215,13 +224,13 @@ def substitute_postures(
     border_step: Float[Array, "g b"],
     separator_step: Float[Array, "g c"],
 ) -> Float[Array, "g B c"]:
-    """Steps of all postures of chunks from those of the border (without the right-hand
-    side's row) and of their last postures."""
-    before = cut(window, border_step[:, : window.pose], 1)
+    """Steps of all postures of chunks from those of the border (-1 for the right-hand
+    side) and of their last postures."""
+    before = cut(window.limbs, border_step[:, : window.pose], 1)
     rest = border_step[:, None, window.pose :]
     moved = []
     for limbs, old, last in zip(
-        postures, before, cut(window, separator_step, 1), strict=True
+        postures, before, cut(window.limbs, separator_step, 1), strict=True
     ):
         wide = jnp.broadcast_to(rest, (*old.shape[:2], rest.shape[2]))
         moved.append(_substitute(limbs, jnp.concatenate([old, wide], axis=-1), last))
@@ -231,18 +240,20 @@ def substitute_postures(
 def _substitute(
     limbs: Limbs, border_step: Float[Array, "g l b"], last: Float[Array, "g l p"]
 ) -> Float[Array, "g B c"]:
-    g, l, _, count, p = limbs.solved.shape
-    half, solved, link = map(flat, (limbs.half, limbs.solved, limbs.link))
-    # -1 for the right-hand side: the whole table as it is, without a copy of a part.
-    known = jnp.pad(flat(border_step), ((0, 0), (0, 1)), constant_values=-1.0)
-    right = -(known[:, None] @ solved.reshape(*solved.shape[:2], -1))
-    right = right.reshape(g * l, count, p)
+    g, l, _, p, _ = limbs.half.shape
+    half, link, known = map(flat, (limbs.half, limbs.link, border_step))
+    right = []
+    for solved in map(flat, limbs.solved):
+        wide = solved.reshape(*solved.shape[:2], -1)
+        here = -(known[:, None, : solved.shape[1]] @ wide)
+        right.append(here.reshape(g * l, -1, p))
+    right = jnp.concatenate(right, axis=1)
     at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
 
     def step(i, carry):
         following, steps = carry
         k = CHUNK - 2 - i
-        back = _link_times(at(link, k).swapaxes(-1, -2), following[..., None])
+        back = link_times(at(link, k).swapaxes(-1, -2), following[..., None])
         row = at(right, k)[..., None] - at(half, k) @ back
         here = (at(half, k).swapaxes(-1, -2) @ row)[..., 0]
         return here, jax.lax.dynamic_update_index_in_dim(steps, here, k, 1)

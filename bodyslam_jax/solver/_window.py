@@ -12,8 +12,6 @@
 `inner` is eliminated with the chunk; what is left couples the rest of two chunks.
 """
 
-import itertools
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -79,7 +77,8 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
     **Raises:** `ValueError` if a factor couples frames that lie too far apart.
     """
     cross, reach = False, 0
-    for first, other, lag in lin.blocks:
+    postures = [("pose", "pose", lag) for lag in lin.limbs]
+    for first, other, lag in [*lin.blocks, *postures]:
         limit = 1 if first in ("pose", "joint", "apart") else CHUNK - 1
         if abs(lag) > limit:
             raise ValueError(
@@ -91,8 +90,7 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
             cross |= other == "camera" or lag != 0
         if first in ("pose", "root") and other in ("root", "camera"):
             reach = max(reach, abs(lag))
-    of_width = itertools.groupby(sizes.limbs if "pose" in lin.gradient else (), len)
-    limbs = tuple((len(list(group)), 3 * count) for count, group in of_width)
+    limbs = sizes.widths if "pose" in lin.gradient else ()
     return Window(limbs, cross, reach, sizes.own_globals)
 
 
