@@ -164,12 +164,13 @@ def main():
     )
     parser.add_argument(
         "--tracks",
-        choices=["short", "long", "again"],
+        choices=["short", "long", "again", "far"],
         default="short",
-        help="some last long, or go on on the way back (landmarks, joint, breakdown, "
-        "peers)",
+        help="some last long, or go on on the way back, or a few all the time "
+        "(landmarks, joint, breakdown, peers)",
     )
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0, help="of the scene (peers)")
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="of `calibration`")
@@ -210,6 +211,7 @@ def main():
             args.rtol,
             args.peer_steps,
             args.tracks,
+            args.seed,
         ),
         "baselines": lambda n: solver_joint_peers.joint(
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps

@@ -34,9 +34,9 @@ def cost_of(problem, state):
     return problem.cost(state)
 
 
-def peers(frames, names, python, repeats, rtol, steps, tracks):
+def peers(frames, names, python, repeats, rtol, steps, tracks, seed):
     """Peers and this solver, in turn, on one problem."""
-    problem, _, start = make(frames, 0, tracks=tracks)
+    problem, _, start = make(frames, 0, seed, tracks=tracks)
     (factor,) = problem.factors
     count = len(np.unique(factor.landmark))
     run = lambda name, factor: run_peer(name, factor, start, python, rtol, steps)
@@ -44,8 +44,8 @@ def peers(frames, names, python, repeats, rtol, steps, tracks):
     left_out = count - len(np.unique(factor.landmark))
     problem = g.make_problem([factor], start)
     print(
-        f"{frames} frames, {count} landmarks less {left_out} that a peer sends behind "
-        f"a camera, {len(factor.frame)} observations",
+        f"{frames} frames, seed {seed}, {count} landmarks less {left_out} that a peer "
+        f"sends behind a camera, {len(factor.frame)} observations",
         flush=True,
     )
     found, curves, clocks, notes = {}, {}, {}, {}

@@ -17,6 +17,8 @@ TRACK = 16.0
 """Mean length of a track, frames."""
 AGAIN = 0.3
 """Share of the points that are seen on the way back too."""
+FAR = 40
+"""Points so far away that the camera has them before it all the way."""
 
 
 def turn(axis, angle):
@@ -65,7 +67,8 @@ def make_scene(frames, people, rng, back, scale=1.3):
 def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
     """Points seen in a run of frames each; about 10 new ones a frame. Of `long` tracks
     each is as likely to be lost in the next frame as any other, and some last long;
-    some points of `again` are seen a second time, on the way back."""
+    some points of `again` are seen a second time, on the way back; the last few of
+    `far` are distant, and found in one frame of three all the time."""
     count = int(per_frame * frames)
     start = rng.integers(-int(TRACK) // 2, frames - 2, count)
     if tracks == "long":
@@ -94,6 +97,13 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
         landmark = np.concatenate([landmark, landmark[twice]])
         # Tracks about the turning point have some of these frames already.
         frame, landmark = np.unique([frame, landmark], axis=1)
+    if tracks == "far":
+        away = rng.uniform([-0.3, -0.2, 1], [0.3, 0.2, 1], (FAR, 3))
+        away *= rng.uniform(200, 600, (FAR, 1)) / scale
+        known = np.nonzero(rng.random((frames, FAR)) < 1 / 3)
+        frame = np.concatenate([frame, known[0]])
+        landmark = np.concatenate([landmark, len(points) + known[1]])
+        points = np.concatenate([points, away])
     return points, frame, landmark
 
 

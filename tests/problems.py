@@ -30,6 +30,7 @@ def make(
     noise=1.0,
     length=8,
     again=False,
+    far=0,
     steady=False,
     **options,
 ):
@@ -37,7 +38,7 @@ def make(
     state = scenes.truth(rng, frames, people, landmarks)
     # The loss as an array: a test that differentiates by it compiles nothing anew.
     loss = jnp.asarray(1.5)
-    factors = [scenes.reprojection(rng, state, 0.5 * noise, length, loss, again)]
+    factors = [scenes.reprojection(rng, state, 0.5 * noise, length, loss, again, far)]
     if people:
         # In one program: one by one its operations take five times as long to compile.
         scenes.body_model()

@@ -60,9 +60,10 @@ def truth(rng, frames=12, people=1, landmarks=40, scale=1.7):
     )
 
 
-def observations(rng, state, length=8, again=False):
+def observations(rng, state, length=8, again=False, far=0):
     """Frame and landmark of each observation: runs of frames, with holes; with `again`
-    the camera goes back as it came, and sees every other point on its way."""
+    the camera goes back as it came, and sees every other point on its way; the last
+    `far` points are seen all the time."""
     frames, count = len(state.cameras), len(state.landmarks)
     start = rng.integers(-length // 2, frames - 1, count)
     seen = (np.arange(frames)[:, None] >= start) & (
@@ -70,12 +71,13 @@ def observations(rng, state, length=8, again=False):
     )
     if again:
         seen[:, ::2] |= seen[::-1, ::2]
+    seen[:, count - far :] = True
     seen &= rng.random(seen.shape) < 0.9
     return np.nonzero(seen)
 
 
-def reprojection(rng, state, noise=0.5, length=8, loss=1.5, again=False):
-    frame, landmark = observations(rng, state, length, again)
+def reprojection(rng, state, noise=0.5, length=8, loss=1.5, again=False, far=0):
+    frame, landmark = observations(rng, state, length, again, far)
     camera = np.asarray(state.cameras)[frame]
     offset = np.asarray(state.landmarks)[landmark] - camera[:, :3, 3]
     p_C = np.einsum("mji,mj->mi", camera[:, :3, :3], offset)

@@ -179,14 +179,17 @@ def test_gauge_holds_seven_numbers(rng):
 
 
 @pytest.mark.parametrize("again", [False, True])
-@pytest.mark.parametrize("frames, landmarks", [(3, 5), (47, 60), (230, 400)])
-def test_layout_holds_every_observation_once(rng, frames, landmarks, again):
+@pytest.mark.parametrize(
+    "frames, landmarks, far", [(3, 5, 0), (47, 60, 0), (230, 400, 0), (230, 400, 20)]
+)
+def test_layout_holds_every_observation_once(rng, frames, landmarks, far, again):
     state = scenes.truth(rng, frames=frames, people=0, landmarks=landmarks)
-    frame, landmark = scenes.observations(rng, state, 25, again)
+    frame, landmark = scenes.observations(rng, state, 25, again, far)
     layout = g.make_layout(frames, landmarks, frame, landmark)
     seen = []
     order = layout.order
     assert (order is not None) == (again and frames > 100)
+    assert layout.lasting == 24 * (far > 0)
     order = np.arange(layout.num_chunks) if order is None else np.asarray(order)
     assert sorted(order) == list(range(layout.num_chunks))
     for b in layout.buckets:
@@ -215,6 +218,13 @@ def test_a_place_that_is_seen_again_does_not_widen_the_band(rng):
         place = np.argsort(np.asarray(layout.order))
         apart = np.abs(np.diff(place[: 60 + more // 10]))
         assert apart.max() <= layout.reach <= 4
+    # Nor do points that are seen all the time: they are eliminated last.
+    seen = scenes.observations(rng, state, 25, again=True, far=30)
+    layout = g.make_layout(frames, landmarks, *seen)
+    assert layout.lasting == 48
+    assert layout.bandwidth <= 10
+    lasting = np.concatenate([b.landmark.ravel() for b in layout.buckets if b.lasting])
+    assert np.isin(np.arange(landmarks - 30, landmarks), lasting).all()
     # Without, the order of time is kept, which costs nothing.
     seen = scenes.observations(rng, state, 25)
     layout = g.make_layout(frames, landmarks, *seen)

@@ -50,6 +50,15 @@ def unpadded(step, state):
     return g.Step(**{**vars(step), **cut})
 
 
+def last(monkeypatch, count):
+    """Has so many of the longest tracks eliminated last, in two groups."""
+    if not count:
+        return
+    longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
+    monkeypatch.setattr("bodyslam_jax.graph._layout.choose_lasting", longest)
+    monkeypatch.setattr("bodyslam_jax.graph._layout._SIZE", count // 2)
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -65,6 +74,18 @@ def unpadded(step, state):
             "steady": True,
             "free_intrinsics": True,
         },
+        # Points that are seen all the time go last, with intrinsics and others that do.
+        {
+            "frames": 43,
+            "landmarks": 60,
+            "far": 8,
+            "known": True,
+            "free_intrinsics": True,
+        },
+        pytest.param(
+            {"frames": 73, "people": 1, "landmarks": 80, "far": 8, "again": True},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"frames": 73, "people": 1, "landmarks": 80, "again": True},
             marks=pytest.mark.slow,
@@ -92,10 +113,12 @@ def unpadded(step, state):
         ),
     ],
 )
-def test_step_is_that_of_the_dense_normal_equations(options):
+def test_step_is_that_of_the_dense_normal_equations(options, monkeypatch):
     options = dict(options)
+    last(monkeypatch, options.get("far", 0))
     held, without = options.pop("held", None), options.pop("without", ())
     problem, _, state = make(1, **options)
+    assert problem.layout.lasting == options.get("far", 0)
     assert (problem.layout.order is not None) == options.get("again", False)
     kept = tuple(f for f in problem.factors if not isinstance(f, without))
     problem = dataclasses.replace(problem, factors=kept)
@@ -325,6 +348,11 @@ def test_single_precision_serves_people_and_covariances_too():
     [
         {"frames": 24, "landmarks": 150, "known": True, "free_intrinsics": True},
         {"frames": 53, "landmarks": 90, "known": True, "again": True},
+        {"frames": 43, "landmarks": 90, "known": True, "far": 8},
+        pytest.param(
+            {"frames": 73, "people": 1, "landmarks": 80, "far": 8, "again": True},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
         ),
@@ -334,8 +362,10 @@ def test_single_precision_serves_people_and_covariances_too():
         ),
     ],
 )
-def test_marginal_covariances_are_blocks_of_the_inverse(options):
+def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
+    last(monkeypatch, options.get("far", 0))
     problem, state, _ = make(9, **options)
+    assert problem.layout.lasting == options.get("far", 0)
     assert (problem.layout.order is not None) == options.get("again", False)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac

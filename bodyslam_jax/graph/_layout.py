@@ -8,6 +8,7 @@ order than that of time (`_ordering.py`). Shapes are rounded up, so that videos 
 the same length compile once.
 """
 
+import dataclasses
 import itertools
 
 import equinox as eqx
@@ -16,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from bodyslam_jax.graph._abstract import JOINTS, Limbs
-from bodyslam_jax.graph._ordering import order_chunks
+from bodyslam_jax.graph._lasting import choose_lasting
+from bodyslam_jax.graph._ordering import PERSON, order_chunks
 
 CHUNK = 10
 """Frames in a chunk."""
@@ -37,6 +39,8 @@ class Bucket(eqx.Module):
     row: Int[Array, "n f g"]
     """Row in the measurements; the number of measurements where there is none."""
     width: int = eqx.field(static=True)
+    lasting: bool = eqx.field(static=True, default=False)
+    """Whether its landmarks are eliminated last, with the globals (`_lasting.py`)."""
 
 
 class Layout(eqx.Module):
@@ -59,6 +63,11 @@ class Layout(eqx.Module):
     def joints(self) -> tuple[int, ...]:
         """All joints that are in a limb, limb after limb."""
         return sum(self.limbs, ())
+
+    @property
+    def lasting(self) -> int:
+        """Room for landmarks that are eliminated last."""
+        return sum(b.landmark.size for b in self.buckets if b.lasting)
 
 
 def round_up(count: int, parts: int = 4) -> int:
@@ -83,30 +92,39 @@ def make_layout(
     num_chunks = round_up(count, parts=8)
     if len(frame) == 0:
         return Layout((), num_chunks, 2, limbs=limbs)
+    own = num_people * PERSON
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
-    order, reach = order_chunks(*divmod(pairs, count), count, num_people)
+    # In no order is a landmark's span below the number of chunks that see it.
+    least = np.bincount(pairs // count, minlength=num_landmarks)
+    lasting = choose_lasting(least, num_chunks, own, 1, _SIZE)
+    rest = pairs[~np.isin(pairs // count, lasting)]
+    order, reach = order_chunks(*divmod(rest, count), count, num_people)
     if order is not None:
         # Padding is last, and nothing couples it with the rest.
         order = np.append(order, np.arange(count, num_chunks))
         # From here on a frame is where it stands.
         frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
-        num_frames = num_chunks * CHUNK
-    first = np.full(num_landmarks, num_frames)
-    last = np.full(num_landmarks, -1)
-    np.minimum.at(first, landmark, frame)
-    np.maximum.at(last, landmark, frame)
-    seen = last >= 0
-    start = np.where(seen, first // CHUNK, 0)
-    span = np.where(seen, last // CHUNK - start + 1, 0)
-    widths = _choose_widths(span[seen], num_chunks)
+    start, span = _spans(num_landmarks, frame, landmark)
+    lasting = choose_lasting(span, num_chunks, own, reach, _SIZE)
+    soon = span > 0
+    soon[lasting] = False
+    widths = _choose_widths(span[soon], num_chunks)
     rows = np.lexsort((frame, landmark))
     begin = np.searchsorted(landmark[rows], np.arange(num_landmarks + 1))
-    members = np.flatnonzero(seen)
+    members = np.flatnonzero(soon)
     tracks = start[members], start[members] + span[members]
     buckets = [
         _fill(chunks, [members[group] for group in groups], width, frame, rows, begin)
         for width, chunks, groups in _pack(*tracks, widths, num_chunks)
     ]
+    if len(lasting):
+        lasting = lasting[np.argsort(start[lasting], kind="stable")]
+        groups = np.split(lasting, len(lasting) // _SIZE)
+        needed = max(np.ptp(np.r_[start[k], start[k] + span[k]]) for k in groups)
+        width = next(w for w in _allowed(num_chunks) if w >= needed)
+        chunks = [min(start[k].min(), num_chunks - width) for k in groups]
+        filled = _fill(chunks, groups, width, frame, rows, begin)
+        buckets.append(dataclasses.replace(filled, lasting=True))
     if order is not None:
         order = jnp.asarray(order, jnp.int32)
         reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
@@ -114,11 +132,28 @@ def make_layout(
     return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs)
 
 
+def _spans(num_landmarks, frame, landmark):
+    """The chunk in which each landmark is seen first, and how many there are to the
+    last; 0 of landmarks that are not seen."""
+    first = np.full(num_landmarks, np.iinfo(np.int32).max)
+    last = np.full(num_landmarks, -1)
+    np.minimum.at(first, landmark, frame)
+    np.maximum.at(last, landmark, frame)
+    seen = last >= 0
+    start = np.where(seen, first // CHUNK, 0)
+    return start, np.where(seen, last // CHUNK - start + 1, 0)
+
+
+def _allowed(num_chunks):
+    """Widths that tables may have."""
+    return [w for w in _WIDTHS if w < num_chunks] + [num_chunks]
+
+
 def _choose_widths(span, num_chunks):
     """At most three widths, so that tables hold few empty products; one more must save
     a tenth of them, as it costs compilation and wide groups take short tracks along.
     """
-    allowed = [w for w in _WIDTHS if w < num_chunks] + [num_chunks]
+    allowed = _allowed(num_chunks)
     top = next(w for w in allowed if w >= span.max())
     below = [w for w in allowed if w < top]
     best, best_cost = (top,), np.inf

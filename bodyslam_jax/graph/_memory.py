@@ -31,6 +31,7 @@ def memory_needed(layout: Layout, state: State) -> int:
     pose = 3 * len(layout.joints)
     person = pose + 12  # what stays of a chunk: a posture and two roots
     front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
+    front += 3 * layout.lasting
     pivot = 6 * CHUNK + people * person
     window = 2 * person + 6 * CHUNK + 24
     postures = CHUNK * 4 * pose * (2 * pose + 6 * CHUNK + 12)

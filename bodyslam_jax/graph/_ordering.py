@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-_PERSON = 81
+PERSON = 81
 """Coordinates that a person keeps of a chunk, about."""
 _CAMERAS = 60
 """Coordinates of its cameras: 6 of each of `CHUNK` frames."""
@@ -42,7 +42,7 @@ def order_chunks(
     """
     in_time = Ordering(None, 1)
     begin = np.flatnonzero(np.diff(landmark, prepend=-1))
-    own = num_people * _PERSON
+    own = num_people * PERSON
 
     def cost(place, reach):
         """Products that landmarks and the factorisation of all chunks take."""

@@ -14,8 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, shifted
-from bodyslam_jax.solver._landmarks import CAMERAS, ReducedCameras
+from bodyslam_jax.solver._blocks import (
+    CAMERAS,
+    Linearisation,
+    Sizes,
+    own_to_global,
+    shifted,
+)
+from bodyslam_jax.solver._landmarks import ReducedCameras
 from bodyslam_jax.solver._window import KEPT, Window, spread
 
 
@@ -23,14 +29,15 @@ class Chunks(eqx.Module):
     """The system `[pivot, coupling^T]` of each of `n` chunks; right-hand side included.
 
     A pivot is `[people, cameras]` of one chunk, `q` wide. Its coupling has the rows
-    `[people of the next chunks, cameras of the next chunks, globals, rhs]`: as many
-    chunks as the reach is, and as the band is wide.
+    `[people of the next chunks, cameras of the next chunks, arrow, rhs]`: as many
+    chunks as the reach is, and as the band is wide. The arrow is of globals and lasting
+    landmarks.
     """
 
     pivot: Float[Array, "n q q"]
     coupling: Float[Array, "n r q"]
     corner: Float[Array, "g1 g1"]
-    """Globals and right-hand side."""
+    """Arrow and right-hand side."""
 
 
 def assemble(
@@ -44,7 +51,7 @@ def assemble(
 ) -> Chunks:
     """Puts all blocks of the kept variables in place; all but `reduced` come in the
     order of time."""
-    n, g = sizes.chunks, sizes.globals
+    n, g = sizes.chunks, sizes.arrow
     dtype = reduced.band.dtype
     zeros = lambda *shape: jnp.zeros((n, *shape), dtype)
     own, following = _cameras(lin, sizes, damping["camera"])
@@ -176,16 +183,19 @@ def _cameras(lin, sizes, damping):
 
 def _reduced_tail(sizes, reduced):
     """What landmarks leave of it, chunks as they stand."""
-    n, g, i = sizes.chunks, sizes.globals, sizes.intrinsics
+    n, g, i = sizes.chunks, sizes.arrow, sizes.intrinsics
     tail = jnp.zeros((n, g + 1, CAMERAS), reduced.band.dtype)
     if i:
         tail = tail.at[:, 1 : 1 + i].set(_transposed(reduced.with_intrinsics))
+    if reduced.lasting is not None:
+        lasting = _transposed(reduced.lasting.cameras)
+        tail = tail.at[:, sizes.globals : g].set(lasting)
     return tail.at[:, -1].set(reduced.rhs)
 
 
 def _camera_tail(lin, sizes, dtype):
-    """Globals and right-hand side (rows) against each chunk's cameras."""
-    n, g = sizes.chunks, sizes.globals
+    """Arrow and right-hand side (rows) against each chunk's cameras."""
+    n, g = sizes.chunks, sizes.arrow
     tail = jnp.zeros((n, g + 1, CAMERAS), dtype)
     alone = lin.blocks.get(("alone", "globals", 0))
     if alone is not None:
@@ -206,11 +216,19 @@ def _camera_tail(lin, sizes, dtype):
 
 
 def _corner(lin, sizes, reduced, damping):
-    g, i = sizes.globals, sizes.intrinsics
-    corner = jnp.zeros((g + 1, g + 1), reduced.band.dtype).at[:g, :g].set(lin.globals)
+    g, i, arrow = sizes.globals, sizes.intrinsics, sizes.arrow
+    corner = jnp.zeros((arrow + 1, arrow + 1), reduced.band.dtype)
+    corner = corner.at[:g, :g].set(lin.globals)
     corner = corner.at[:g, -1].add(-lin.globals_gradient)
     corner = corner.at[jnp.arange(g), jnp.arange(g)].add(damping)
     if i:
         corner = corner.at[1 : 1 + i, 1 : 1 + i].add(reduced.intrinsics)
         corner = corner.at[1 : 1 + i, -1].add(reduced.intrinsics_rhs)
+    if reduced.lasting is not None:
+        last, lasting = slice(g, arrow), reduced.lasting
+        corner = corner.at[last, last].set(lasting.own)
+        corner = corner.at[last, -1].set(lasting.rhs)
+        if i:
+            corner = corner.at[1 : 1 + i, last].set(lasting.intrinsics)
+            corner = corner.at[last, 1 : 1 + i].set(lasting.intrinsics.T)
     return corner

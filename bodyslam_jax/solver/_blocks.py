@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph import Limbs, Problem, State, Step
+from bodyslam_jax.graph import CHUNK, Limbs, Problem, State, Step
+
+CAMERAS = 6 * CHUNK
+"""Coordinates of a chunk's cameras."""
 
 
 class Sizes(eqx.Module):
@@ -27,6 +30,8 @@ class Sizes(eqx.Module):
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
+    lasting: int = eqx.field(static=True)
+    """Landmarks that are eliminated last."""
     limbs: Limbs = eqx.field(static=True)
     """Of `Layout`: their joints' turns are the group `pose`."""
     dtype: np.dtype = eqx.field(static=True)
@@ -51,6 +56,11 @@ class Sizes(eqx.Module):
     def globals(self) -> int:
         """Scale, intrinsics and all shapes."""
         return 1 + self.intrinsics + 10 * self.people
+
+    @property
+    def arrow(self) -> int:
+        """What is eliminated last: globals, then lasting landmarks."""
+        return self.globals + 3 * self.lasting
 
 
 class LandmarkBlocks(eqx.Module):
@@ -152,6 +162,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
         reach=problem.layout.reach,
         intrinsics=0 if held else state.intrinsics.shape[0],
         variables=problem.variables,
+        lasting=problem.layout.lasting,
         limbs=problem.layout.limbs,
         dtype=state.scale.dtype if dtype is None else dtype,
     )

@@ -11,13 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.solver._assembly import Chunks
-from bodyslam_jax.solver._blocks import Sizes
-from bodyslam_jax.solver._landmarks import CAMERAS
+from bodyslam_jax.solver._blocks import CAMERAS, Sizes
 from bodyslam_jax.solver._triangular import half_of
 
 
 class Factor(eqx.Module):
-    """Each chunk, factorised, and what is left of the globals."""
+    """Each chunk, factorised, and what is left of the arrow."""
 
     half: Float[Array, "n q q"]
     """`L^-1` of each pivot."""
@@ -29,7 +28,7 @@ class Factor(eqx.Module):
 def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
     """One chunk after another, less what those before it left on it."""
     n, r, q = chunks.coupling.shape
-    tail = sizes.globals + 1
+    tail = sizes.arrow + 1
     head = q - CAMERAS
     near = sizes.reach * head
     reach = (r - near - tail) // CAMERAS
@@ -79,9 +78,9 @@ def _without(rows, first, count):
 def back_substitute(
     factor: Factor, sizes: Sizes
 ) -> tuple[Float[Array, "n q"], Float[Array, " g"]]:
-    """Steps of all chunks, as they stand, and of the globals."""
+    """Steps of all chunks, as they stand, and of the arrow."""
     n, r, q = factor.side.shape
-    g = sizes.globals
+    g = sizes.arrow
     head = q - CAMERAS
     near = sizes.reach * head
     corner = factor.corner

@@ -11,8 +11,15 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.compilation import in_full_precision, is_alone, jit_once
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, own_to_global, sizes_of
-from bodyslam_jax.solver._landmarks import CAMERAS, half_inverse
+from bodyslam_jax.solver._blocks import (
+    CAMERAS,
+    Linearisation,
+    Sizes,
+    own_to_global,
+    sizes_of,
+)
+from bodyslam_jax.solver._landmarks import half_inverse
+from bodyslam_jax.solver._lasting import lasting_spread
 from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._normal import damped, diagonals
 from bodyslam_jax.solver._padding import pad
@@ -62,16 +69,17 @@ def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     damping = damped(
         diagonals(lin, sizes), jnp.asarray(little(state.scale.dtype), state.scale.dtype)
     )
-    fronts, windows, common = selected_inverse(
+    fronts, windows, arrow = selected_inverse(
         final.factor,
         final.roots,
         window_of(lin, sizes),
         sizes,
         problem.layout.order,
     )
-    common = common * _outer(_free_globals(problem, sizes))
+    g = sizes.globals
+    common = arrow[:g, :g] * _outer(_free_globals(problem, sizes))
     cameras, people = _centres(problem, state, sizes, fronts)
-    landmarks = _landmarks(problem, state, sizes, lin, damping, windows)
+    landmarks = _landmarks(problem, state, sizes, lin, damping, windows, arrow)
     i = sizes.intrinsics
     h = sizes.people
     shapes = common[1 + i :, 1 + i :].reshape(h, 10, h, 10)
@@ -155,51 +163,56 @@ def _turned(C, r):
     return jnp.cross(r, C)
 
 
-def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows):
-    """`V^-1 + V^-1 W^T Σ W V^-1` and the share of the scale, landmark by landmark."""
-    l = state.landmarks.shape[0]
-    out = jnp.zeros((l, 3, 3), state.scale.dtype)
-    nb = sizes.bandwidth
-    free_l = problem.free.landmarks
+def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows, arrow):
+    """Of landmarks in metres: their own, and the share of the scale."""
+    out = jnp.zeros((len(state.landmarks), 3, 3), state.scale.dtype)
     free_s = problem.free.scale if "scale" in sizes.variables else 0.0
-    common = nb * CAMERAS
-    extra = common + own_to_global(sizes, None)
+    s = state.scale
     for bucket, table, damp in zip(
         problem.layout.buckets, lin.landmarks, damping["landmarks"], strict=True
     ):
-        rows = half_inverse(table, damp)
-        zero = jnp.zeros_like(rows[0][0])
-        half = jnp.stack(
-            [jnp.stack(row + [zero] * (3 - len(row)), axis=1) for row in rows], axis=1
-        )
-        inverse = jnp.einsum("nkag,nkbg->nabg", half, half)
-        width = bucket.width * CAMERAS
-        index = jnp.concatenate([jnp.arange(width), extra])
-
-        def one(group, index=index, width=width):
-            chunk, cross, side, inverse = group
-            known = windows[chunk][index[:, None], index[None, :]]
-            count = cross.shape[-1]
-            # The scale moves no landmark of the map: a row of zeros in its place.
-            still = jnp.zeros((1, 3, count), cross.dtype)
-            w = jnp.concatenate([cross.reshape(width, 3, count), still, side])
-            gain = -jnp.einsum("wag,abg->wbg", w, inverse)
-            moved = (known @ gain.reshape(len(index), -1)).reshape(gain.shape)
-            spread = inverse + jnp.einsum("wag,wbg->abg", gain, moved)
-            return spread, moved[width], known[width, width]
-
-        groups = (bucket.first_chunk, table.cross, table.cross_intrinsics, inverse)
-        spread, with_scale, of_scale = jax.lax.map(one, groups)
-        spread = jnp.moveaxis(spread, 3, 1)
-        with_scale = jnp.moveaxis(with_scale, 2, 1) * free_s
-        mask = free_l[bucket.landmark]
+        if bucket.lasting:
+            found = lasting_spread(bucket.landmark.shape, sizes, arrow)
+        else:
+            found = _from_cameras(bucket, table, damp, windows, sizes)
+        spread, with_scale, of_scale = found
+        mask = problem.free.landmarks[bucket.landmark]
         spread = spread * _outer(mask)
-        with_scale = with_scale * mask
+        with_scale = with_scale * free_s * mask
         point = state.landmarks[bucket.landmark]
-        s = state.scale
         mixed = s * (point[..., :, None] * with_scale[..., None, :])
         total = s**2 * spread + mixed + mixed.swapaxes(-1, -2)
         square = point[..., :, None] * point[..., None, :]
         total = total + free_s * of_scale[:, None, None, None] * square
         out = out.at[bucket.landmark].set(total, mode="drop")
     return out
+
+
+def _from_cameras(bucket, table, damp, windows, sizes):
+    """`V^-1 + V^-1 W^T Σ W V^-1` of each landmark that went before the cameras, and its
+    covariance with the scale; and the scale's."""
+    rows = half_inverse(table, damp)
+    zero = jnp.zeros_like(rows[0][0])
+    half = jnp.stack(
+        [jnp.stack(row + [zero] * (3 - len(row)), axis=1) for row in rows], axis=1
+    )
+    inverse = jnp.einsum("nkag,nkbg->nabg", half, half)
+    width = bucket.width * CAMERAS
+    common = sizes.bandwidth * CAMERAS + own_to_global(sizes, None)
+    index = jnp.concatenate([jnp.arange(width), common])
+
+    def one(group):
+        chunk, cross, side, inverse = group
+        known = windows[chunk][index[:, None], index[None, :]]
+        count = cross.shape[-1]
+        # The scale moves no landmark of the map: a row of zeros in its place.
+        still = jnp.zeros((1, 3, count), cross.dtype)
+        w = jnp.concatenate([cross.reshape(width, 3, count), still, side])
+        gain = -jnp.einsum("wag,abg->wbg", w, inverse)
+        moved = (known @ gain.reshape(len(index), -1)).reshape(gain.shape)
+        spread = inverse + jnp.einsum("wag,wbg->abg", gain, moved)
+        return spread, moved[width], known[width, width]
+
+    groups = (bucket.first_chunk, table.cross, table.cross_intrinsics, inverse)
+    spread, with_scale, of_scale = jax.lax.map(one, groups)
+    return jnp.moveaxis(spread, 3, 1), jnp.moveaxis(with_scale, 2, 1), of_scale

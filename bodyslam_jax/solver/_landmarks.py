@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph import CHUNK, Problem
-from bodyslam_jax.solver._blocks import LandmarkBlocks, Sizes
+from bodyslam_jax.graph import Problem
+from bodyslam_jax.solver._blocks import CAMERAS, LandmarkBlocks, Sizes
+from bodyslam_jax.solver._lasting import Lasting, lasting_blocks
 from bodyslam_jax.solver._tables import frames_of
-
-CAMERAS = 6 * CHUNK
 
 
 class ReducedCameras(eqx.Module):
@@ -27,6 +26,7 @@ class ReducedCameras(eqx.Module):
     with_intrinsics: Float[Array, "n c i"]
     intrinsics: Float[Array, "i i"]
     intrinsics_rhs: Float[Array, " i"]
+    lasting: Lasting | None
 
 
 def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list[list]:
@@ -50,7 +50,8 @@ def eliminate_landmarks(
     damping: tuple[Array, ...],
     sizes: Sizes,
 ) -> ReducedCameras:
-    """Sums what all groups take away; to be added to the cameras' own blocks."""
+    """Sums what all groups take away, to be added to the cameras' own blocks; lasting
+    landmarks stay."""
     dtype = sizes.dtype
     n, count = sizes.chunks, sizes.intrinsics
     band = jnp.zeros((n, CAMERAS, sizes.bandwidth * CAMERAS), dtype)
@@ -59,6 +60,8 @@ def eliminate_landmarks(
     for bucket, table, damp in zip(
         problem.layout.buckets, tables, damping, strict=True
     ):
+        if bucket.lasting:
+            continue
         half = half_inverse(table, damp)
         width = bucket.width
 
@@ -90,7 +93,12 @@ def eliminate_landmarks(
         groups = (bucket.first_chunk, table.cross, extra, half)
         (band, side, corner), _ = jax.lax.scan(add, (band, side, corner), groups)
     return ReducedCameras(
-        band, side[..., -1], side[..., :-1], corner[:-1, :-1], corner[:-1, -1]
+        band,
+        side[..., -1],
+        side[..., :-1],
+        corner[:-1, :-1],
+        corner[:-1, -1],
+        lasting_blocks(problem, tables, damping, sizes),
     )
 
 
@@ -103,10 +111,12 @@ def substitute_landmarks(
     out: Float[Array, "l 3"],
 ) -> Float[Array, "l 3"]:
     """Steps of the landmarks from those of cameras, as their chunks stand, and of
-    intrinsics, into `out`."""
+    intrinsics, into `out`; but for lasting ones."""
     for bucket, table, damp in zip(
         problem.layout.buckets, tables, damping, strict=True
     ):
+        if bucket.lasting:
+            continue
         step = cameras[frames_of(bucket.first_chunk, bucket.width)]
         n, g = len(step), table.own.shape[-1]
         # In the order that the tables have: `einsum` would have them in another first.

@@ -1,8 +1,9 @@
 """One damped step of the joint problem, by elimination.
 
 `(H + λ diag H) δ = -J^T r`: landmarks first, then inner postures, then the chunks of
-cameras and people from one end to the other, globals last; and back. A coordinate that
-no measurement sees has a zero row, gets 1 on its diagonal, and stays where it is.
+cameras and people from one end to the other, globals and lasting landmarks at the end;
+and back. A coordinate that no measurement sees has a zero row, gets 1 on its diagonal,
+and stays where it is.
 """
 
 import equinox as eqx
@@ -18,13 +19,16 @@ from bodyslam_jax.solver._apart import (
     split_poses,
 )
 from bodyslam_jax.solver._assembly import assemble
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, cast, own_to_global
-from bodyslam_jax.solver._chunks import Factor, back_substitute, factorise
-from bodyslam_jax.solver._landmarks import (
+from bodyslam_jax.solver._blocks import (
     CAMERAS,
-    eliminate_landmarks,
-    substitute_landmarks,
+    Linearisation,
+    Sizes,
+    cast,
+    own_to_global,
 )
+from bodyslam_jax.solver._chunks import Factor, back_substitute, factorise
+from bodyslam_jax.solver._landmarks import eliminate_landmarks, substitute_landmarks
+from bodyslam_jax.solver._lasting import move_lasting
 from bodyslam_jax.solver._people import People, eliminate_people, substitute_people
 from bodyslam_jax.solver._window import Window, window_of
 
@@ -139,14 +143,14 @@ def solve_step(
         eliminated.damping["landmarks"],
         as_they_stand,
         common[1 : 1 + i],
-        zero.landmarks,
+        move_lasting(problem, common[sizes.globals :], zero.landmarks),
     )
     step = Step(
         scale=common[0],
         cameras=cameras,
         roots=roots,
         poses=poses,
-        shapes=common[1 + i :].reshape(h, 10),
+        shapes=common[1 + i : sizes.globals].reshape(h, 10),
         landmarks=landmarks,
         intrinsics=intrinsics,
     )

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.solver._blocks import Sizes, own_to_global
+from bodyslam_jax.solver._blocks import CAMERAS, Sizes, own_to_global
 from bodyslam_jax.solver._chunks import Factor
-from bodyslam_jax.solver._landmarks import CAMERAS
 from bodyslam_jax.solver._people import Roots
 from bodyslam_jax.solver._window import Window
 
@@ -22,22 +21,24 @@ def selected_inverse(
     window: Window,
     sizes: Sizes,
     order: Int[Array, " n"] | None,
-) -> tuple[Float[Array, "n f f"], Float[Array, "n w w"], Float[Array, "g g"]]:
+) -> tuple[Float[Array, "n f f"], Float[Array, "n w w"], Float[Array, "a a"]]:
     """Covariance of each chunk's roots (all of them, person by person), cameras and the
     globals, in the order of time; of the cameras of its band with the globals, chunks
-    as they stand; of the globals."""
+    as they stand; of the whole arrow."""
     r, q = factor.side.shape[1:]
-    g = sizes.globals
+    g, arrow = sizes.globals, sizes.arrow
     head = q - CAMERAS
     near = sizes.reach * head
     dtype = factor.half.dtype
-    eye = jnp.eye(g, dtype=dtype)
-    lower = jnp.linalg.cholesky(factor.corner[:g, :g], symmetrize_input=False)
+    eye = jnp.eye(arrow, dtype=dtype)
+    corner = factor.corner[:arrow, :arrow]
+    lower = jnp.linalg.cholesky(corner, symmetrize_input=False)
     common = jax.scipy.linalg.cho_solve((lower, True), eye)
-    start = jnp.zeros((r - 1, r - 1), dtype).at[-g:, -g:].set(common)
-    split = jnp.split(jnp.arange(q + r - 1), [head, q, q + near, q + r - 1 - g])
+    start = jnp.zeros((r - 1, r - 1), dtype).at[-arrow:, -arrow:].set(common)
+    split = jnp.split(jnp.arange(q + r - 1), [head, q, q + near, q + r - 1 - arrow])
     own_people, own_cameras, people, cameras, last = split
     kept = own_people, people[: near - head], own_cameras, cameras[:-CAMERAS], last
+    last = last[:g]
     kept, band = jnp.concatenate(kept), jnp.concatenate([own_cameras, cameras, last])
 
     def pair(apart):
