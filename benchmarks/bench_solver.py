@@ -106,15 +106,16 @@ def breakdown(problem, state, mixed, repeats):
     part("back-substitution", solve_step, problem, state, lin, sizes, whole)
 
 
-def scales(frames, rtol, factors=(0.4, 0.63, 0.79, 1.26, 1.59, 2.5)):
+def scales(frames, rtol, repeats, factors=(0.4, 0.63, 0.79, 1.26, 1.59, 2.5)):
     """Starts with other scales, in one program and one after another."""
     problem, _, start = make(frames, 1)
     starts = [eqx.tree_at(lambda s: s.scale, start, start.scale * f) for f in factors]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
     one = lambda problem, s: solve(problem, s, schedule=(Stage(rtol=rtol),))
     mapped = over_devices(one, (None, 0))
-    found, _, (wall, cpu) = timed(lambda: mapped(problem, batch), 1)
-    turn, _, (turn_wall, turn_cpu) = timed(lambda: [one(problem, s) for s in starts], 1)
+    found, _, (wall, cpu) = timed(lambda: mapped(problem, batch), repeats)
+    in_turn = lambda: [one(problem, s) for s in starts]
+    turn, _, (turn_wall, turn_cpu) = timed(in_turn, repeats)
     alone = [float(s.cost) for s in turn]
     print(
         f"{frames} frames, {len(factors)} scales: on {len(jax.devices())} devices "
@@ -216,7 +217,7 @@ def main():
         "baselines": lambda n: solver_joint_peers.joint(
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps
         ),
-        "scales": lambda n: scales(n, args.rtol),
+        "scales": lambda n: scales(n, args.rtol, args.repeats),
         "one": lambda n: one(n, args.steps, args.mixed),
     }
     for frames in args.frames:

@@ -122,8 +122,10 @@ def _shared_out(function, args, axes, devices, batch):
     if len(devices) == 1:
         return eqx.combine(mapped(*arrays), form)
     # The last problem fills up what does not divide: its device would wait otherwise.
-    shares = -(-batch // len(devices)) * len(devices)
-    row = np.minimum(np.arange(shares), batch - 1)
+    each = -(-batch // len(devices))
+    # Dealt out one by one: neighbours, such as scales in order, take as many steps.
+    turn = np.arange(each * len(devices)).reshape(each, len(devices)).T.ravel()
+    row = np.minimum(turn, batch - 1)
     fill = lambda tree, axis: tree if axis is None else jax.tree.map(_rows(row), tree)
     arrays = tuple(fill(a, axis) for a, axis in zip(arrays, axes, strict=True))
     part, whole = PartitionSpec(AXIS), PartitionSpec()
@@ -136,7 +138,7 @@ def _shared_out(function, args, axes, devices, batch):
         out_specs=part,
         check_vma=False,
     )
-    found = jax.tree.map(_rows(np.arange(batch)), spread(*arrays))
+    found = jax.tree.map(_rows(np.argsort(turn)[:batch]), spread(*arrays))
     return eqx.combine(found, form)
 
 
