@@ -421,6 +421,21 @@ def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
         assert (np.abs(one - other) <= 1e-5 * size).all()
 
 
+@pytest.mark.slow
+def test_covariances_do_not_depend_on_what_is_eliminated_last(monkeypatch):
+    options = {"frames": 33, "people": 1, "landmarks": 60, "far": 8}
+    before, state, _ = make(9, **options)
+    last(monkeypatch, 8)
+    after = g.make_problem(before.factors, state)
+    assert (before.layout.lasting, after.layout.lasting) == (0, 8)
+    expected, found = (marginals(p, state) for p in (before, after))
+    for name in ("scale", "cameras", "people", "shapes", "landmarks"):
+        one, other = getattr(found, name), getattr(expected, name)
+        size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
+        # What landmarks have to do with the scale is little of their covariance.
+        assert (np.abs(one - other) <= 1e-6 * size).all(), name
+
+
 def test_marginal_covariances_are_mapped_over():
     problem, _, start = make(known=True)
     states = [start, solve(problem, start, schedule=TIGHT).state]
