@@ -106,7 +106,7 @@ def table(found, curves, clocks, notes):
         wall, cpu = clocks[name]
         print(
             f"  {name:20s} cost {cost:.8g} ({cost / best - 1:+.2%} of the least), "
-            f"{wall[-1]:.2f} s (processor {cpu[-1]:.2f}); within 0.1 %",
+            f"{wall[-1]:.3f} s (processor {cpu[-1]:.3f}); within 0.1 %",
             end="",
         )
         for label, goal in (("the least", best), ("the greatest", worst)):
@@ -115,8 +115,8 @@ def table(found, curves, clocks, notes):
                 print(f" of {label} never", end=";")
             else:
                 print(
-                    f" of {label} after {at}: {wall[at]:.2f} s (processor "
-                    f"{cpu[at]:.2f})",
+                    f" of {label} after {at}: {wall[at]:.3f} s (processor "
+                    f"{cpu[at]:.3f})",
                     end=";",
                 )
         print(f" {notes[name]}", flush=True)

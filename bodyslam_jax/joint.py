@@ -183,7 +183,7 @@ def _settle_people(
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")
     alone = dataclasses.replace(alone, free=graph.hold(alone.free, *rest))
-    solution, stage = solve_stage(alone, state, config, "people")
+    solution, stage = solve_stage(alone, state, config, "people alone")
     return solution.state, stage
 
 

@@ -35,5 +35,5 @@ def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
     monkeypatch.setattr(solver, "solve", solve)
     _, said = joint.solve_stage(problem, state, config, "joint")
     assert said["iterations"] == 7 and said["status"] == "converged"
-    joint.solve_stage(problem, state, config, "people")
+    joint.solve_stage(problem, state, config, "people alone")
     assert told == [(config.solver, steps), (config.solver, steps[-1:])]
