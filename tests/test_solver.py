@@ -436,6 +436,31 @@ def test_covariances_do_not_depend_on_what_is_eliminated_last(monkeypatch):
         assert (np.abs(one - other) <= 1e-6 * size).all(), name
 
 
+def test_what_is_eliminated_last_serves_every_kind_of_solve(monkeypatch):
+    before, _, start = make(landmarks=40, frames=23, far=8)
+    last(monkeypatch, 8)
+    after = g.make_problem(before.factors, start)
+    best = solve(before, start, schedule=TIGHT)
+    found = solve(after, start, schedule=TIGHT)
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-9)
+    mixed = solve(after, start, schedule=TIGHT, mixed_precision=True)
+    assert float(mixed.cost) == pytest.approx(float(best.cost), rel=1e-9)
+    half = lambda tree: jax.tree.map(
+        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree
+    )
+    single = solve(half(after), half(start))
+    assert float(single.cost) == pytest.approx(float(best.cost), rel=1e-4)
+
+    def place(shift, problem):
+        pixels = lambda p: p.factors[0].pixel
+        data = eqx.tree_at(pixels, problem, pixels(problem) + shift)
+        return solve(data, start, schedule=TIGHT).state.landmarks[-1, 2]
+
+    shifts = jnp.array([0.0, 0.3])
+    slope = lambda problem: jax.vmap(jax.grad(lambda x: place(x, problem)))(shifts)
+    assert np.allclose(slope(after), slope(before), rtol=1e-6)
+
+
 def test_marginal_covariances_are_mapped_over():
     problem, _, start = make(known=True)
     states = [start, solve(problem, start, schedule=TIGHT).state]

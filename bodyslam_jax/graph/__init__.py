@@ -28,10 +28,10 @@ from bodyslam_jax.graph._factors import runs as runs
 from bodyslam_jax.graph._factors import whitening_of as whitening_of
 from bodyslam_jax.graph._ground import GroundContact as GroundContact
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior as LandmarkPrior
-from bodyslam_jax.graph._layout import CHUNK as CHUNK
 from bodyslam_jax.graph._layout import Layout as Layout
 from bodyslam_jax.graph._layout import make_layout as make_layout
 from bodyslam_jax.graph._layout import round_up as round_up
+from bodyslam_jax.graph._ordering import CHUNK as CHUNK
 from bodyslam_jax.graph._problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph._problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph._problem import Problem as Problem

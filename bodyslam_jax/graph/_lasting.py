@@ -9,8 +9,8 @@ need.
 import numpy as np
 from jaxtyping import Int
 
-_CAMERAS = 60
-"""Coordinates of a chunk's cameras: 6 of each of `CHUNK` frames."""
+from bodyslam_jax.graph._ordering import CAMERAS, CHUNK
+
 _PLACE = 5000.0
 """Products that take as long as one place of a landmark's table."""
 _GAIN = 0.8
@@ -37,7 +37,7 @@ def choose_lasting(
     ranked = span[order].astype(float)
     most = _SHARE * np.sum(span > 0)
     counts = [0, *(size * n for n in _GROUPS if size * n <= most)]
-    pivot = own + _CAMERAS
+    pivot = own + CAMERAS
 
     def cost(count):
         """Products of tables, of landmarks' elimination, and of all chunks'."""
@@ -45,11 +45,11 @@ def choose_lasting(
         width = int(max(rest[0] - 1, reach))
         back = np.arange(width)
         people = own * (back < reach)
-        rows = _CAMERAS * (width - back) + people + 3 * count
-        chunk = np.sum(rows * (_CAMERAS + people)) + pivot * (rows[:1].sum() + pivot)
+        rows = CAMERAS * (width - back) + people + 3 * count
+        chunk = np.sum(rows * (CAMERAS + people)) + pivot * (rows[:1].sum() + pivot)
         chunk += (3 * count) ** 2
-        tables = _PLACE * 10 * (rest.sum() + count * num_chunks)
-        return num_chunks * pivot * chunk + 1.5 * _CAMERAS**2 * np.sum(rest**2) + tables
+        tables = _PLACE * CHUNK * (rest.sum() + count * num_chunks)
+        return num_chunks * pivot * chunk + 1.5 * CAMERAS**2 * np.sum(rest**2) + tables
 
     if len(counts) == 1:
         return order[:0]

@@ -18,10 +18,8 @@ from jaxtyping import Array, Int
 
 from bodyslam_jax.graph._abstract import JOINTS, Limbs
 from bodyslam_jax.graph._lasting import choose_lasting
-from bodyslam_jax.graph._ordering import PERSON, order_chunks
+from bodyslam_jax.graph._ordering import CHUNK, PERSON, order_chunks
 
-CHUNK = 10
-"""Frames in a chunk."""
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
 _SIZE = 24
 """Landmarks in a group. Its best value is between 16 and 32, and flat; one that follows

@@ -3,7 +3,8 @@
 import os
 from pathlib import Path
 
-from bodyslam_jax.graph._layout import CHUNK, Layout
+from bodyslam_jax.graph._layout import Layout
+from bodyslam_jax.graph._ordering import CHUNK
 from bodyslam_jax.graph._state import State
 
 _LIMITS = (

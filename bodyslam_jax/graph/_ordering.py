@@ -12,10 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+CHUNK = 10
+"""Frames in a chunk."""
+CAMERAS = 6 * CHUNK
+"""Coordinates of a chunk's cameras."""
 PERSON = 81
 """Coordinates that a person keeps of a chunk, about."""
-_CAMERAS = 60
-"""Coordinates of its cameras: 6 of each of `CHUNK` frames."""
 _GAIN = 0.7
 """An order other than time's must save this much: it is gathered to and fro."""
 _TOGETHER = 4096
@@ -48,8 +50,8 @@ def order_chunks(
         """Products that landmarks and the factorisation of all chunks take."""
         at = place[chunk]
         span = np.maximum.reduceat(at, begin) - np.minimum.reduceat(at, begin) + 1.0
-        rows = reach * own + max(span.max() - 1, reach) * _CAMERAS
-        return count * (own + _CAMERAS) * rows**2 + 3 * _CAMERAS**2 * np.sum(span**2)
+        rows = reach * own + max(span.max() - 1, reach) * CAMERAS
+        return count * (own + CAMERAS) * rows**2 + 3 * CAMERAS**2 * np.sum(span**2)
 
     if count <= 3:
         return in_time

@@ -36,7 +36,7 @@ class Chunks(eqx.Module):
 
     pivot: Float[Array, "n q q"]
     coupling: Float[Array, "n r q"]
-    corner: Float[Array, "g1 g1"]
+    corner: Float[Array, "a1 a1"]
     """Arrow and right-hand side."""
 
 

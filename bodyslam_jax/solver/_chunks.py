@@ -22,7 +22,7 @@ class Factor(eqx.Module):
     """`L^-1` of each pivot."""
     side: Float[Array, "n r q"]
     """`L^-1` times the coupling, transposed; the last row is the right-hand side's."""
-    corner: Float[Array, "g1 g1"]
+    corner: Float[Array, "a1 a1"]
 
 
 def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
@@ -77,7 +77,7 @@ def _without(rows, first, count):
 
 def back_substitute(
     factor: Factor, sizes: Sizes
-) -> tuple[Float[Array, "n q"], Float[Array, " g"]]:
+) -> tuple[Float[Array, "n q"], Float[Array, " a"]]:
     """Steps of all chunks, as they stand, and of the arrow."""
     n, r, q = factor.side.shape
     g = sizes.arrow
