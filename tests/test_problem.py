@@ -8,14 +8,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
 import scenes
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.graph import _memory
+from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._solve import method_of, run
 
 T, L, M = 3, 6, 5
 """Frames, landmarks and observations; one person."""
+FAR = 8
+"""Landmarks that are seen all the time."""
 
 
 def ones(*shape):
@@ -209,6 +214,30 @@ def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
     g.make_problem([], people_of(int(0.9 * int(fit))))
     with pytest.raises(ValueError, match="frames fit"):
         g.make_problem([], people_of(int(1.2 * int(fit))))
+
+
+def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
+    """As much more as the factorisation keeps for them, or some more."""
+
+    def bytes_of(far):
+        """What the factorisation keeps, and what is counted for those that go last."""
+        longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
+        monkeypatch.setattr("bodyslam_jax.graph._layout.choose_lasting", longest)
+        monkeypatch.setattr("bodyslam_jax.graph._layout._SIZE", FAR)
+        problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
+        assert problem.layout.lasting == far
+        problem, state = pad(problem, state)
+        method = method_of((), 0.0, state.scale.dtype, keep=True)
+        final = jax.eval_shape(lambda: run(problem, state, method, alone=False)[1])
+        kept = final.factor.side
+        layout = problem.layout
+        soon = tuple(dataclasses.replace(b, lasting=False) for b in layout.buckets)
+        without = dataclasses.replace(layout, buckets=soon)
+        counted, others = (_memory.memory_needed(x, state) for x in (layout, without))
+        return np.array([kept.size * kept.dtype.itemsize, counted - others])
+
+    kept, counted = bytes_of(FAR) - bytes_of(0)
+    assert 0 < kept <= counted <= 8 * kept
 
 
 def test_a_container_may_use_less_than_the_machine_has(monkeypatch, tmp_path):
