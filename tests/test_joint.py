@@ -105,3 +105,31 @@ def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
     both = dataclasses.replace(_sequence(given), keypoints=seen)
     factors = initialisation.people_factors(both, roots, weights, body)
     assert not any(isinstance(f, graph.RootPlace) for f in factors)
+
+
+@pytest.mark.parametrize("pixels", [None, 5.0])
+def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
+    """What a keypoint counts falls with the inflation, at which distance from the
+    others it is taken for one of something else does not."""
+    body = load_body_model(dtype=jnp.float64)
+    roots = people.roots_from_bodies(_bodies(), body)
+    seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
+
+    def factor(fps, inflation):
+        weights = GraphWeights(keypoint_sigma=pixels, keypoint_inflation=inflation)
+        sequence = dataclasses.replace(
+            _sequence(_bodies()), keypoints=seen, timestamps=np.arange(T) / fps
+        )
+        found = initialisation.people_factors(sequence, roots, weights, body)
+        (one,) = (f for f in found if isinstance(f, graph.JointReprojection))
+        return np.asarray(one.sigma[0, 0, 10]), one.loss
+
+    plain, loss = factor(30, 1.0)
+    far = 3 * plain
+    for fps, inflation in ((30, 2.5), (60, 1.0), (120, 3.0)):
+        sigma, other = factor(fps, inflation)
+        ratio = 1.0 if pixels else inflation * np.sqrt(fps / 30)
+        np.testing.assert_allclose(sigma, ratio * plain)
+        given = other.weight(jnp.asarray((far / sigma) ** 2))
+        expected = loss.weight(jnp.asarray(9.0))
+        np.testing.assert_allclose(given, expected, rtol=1e-9)

@@ -54,7 +54,7 @@ def keypoint_sigma(
     assert keypoints is not None
     focal = float(np.mean(sequence.intrinsics.params[:2]))
     sigma = np.full(keypoints.confidence.shape, np.inf)
-    inflation = weights.keypoint_inflation * np.sqrt(sequence.fps / 30.0)
+    inflation = _inflation(sequence, weights)
     for h in range(len(sigma)):
         if weights.keypoint_sigma is None:
             depth = np.maximum(roots.T_CH[h, :, 2, 3], 0.1)
@@ -67,6 +67,13 @@ def keypoint_sigma(
     return np.where(roots.present[..., None], sigma, np.inf)
 
 
+def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
+    """How much less a keypoint counts because those of frames around it err alike."""
+    if weights.keypoint_sigma is not None:
+        return 1.0
+    return weights.keypoint_inflation * float(np.sqrt(sequence.fps / 30.0))
+
+
 def people_factors(
     sequence: Sequence, roots: Roots, weights: GraphWeights, body: BodyModel
 ) -> list[graph.AbstractFactor]:
@@ -74,12 +81,14 @@ def people_factors(
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
+        # What lasts counts less, but an outlier is as far away as ever.
+        loss = weights.keypoint_loss / _inflation(sequence, weights)
         factors.append(
             graph.JointReprojection(
                 body=body,
                 pixel=jnp.asarray(sequence.keypoints.uv, float),
                 sigma=jnp.asarray(keypoint_sigma(sequence, roots, weights)),
-                loss=graph.GemanMcClure(jnp.asarray(weights.keypoint_loss)),
+                loss=graph.GemanMcClure(jnp.asarray(loss)),
             )
         )
     per_frame = 30.0 / sequence.fps
