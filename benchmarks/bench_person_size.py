@@ -1,0 +1,105 @@
+"""How well is a person's size known, over many people who were drawn at random?
+
+    python benchmarks/bench_person_size.py --people 50
+    python benchmarks/bench_person_size.py --people 50 --set posture_correlation=0.96 \
+        --set keypoint_inflation=3 --set keypoint_loss=9
+
+Simulated, noise `real`. Cameras are held where they truly were and there is no map, so
+that a person takes seconds: what is estimated is people alone, as in the first of the
+pipeline's two solves. Size is the leg's length, of which scale has its metres.
+"""
+
+import argparse
+import dataclasses
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import graph, initialisation, motion, people, solver, synthetic
+from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
+from bodyslam_jax.joint import solve_stage
+
+SEQUENCES = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
+MUTED = graph.RootSmoothness
+"""Its weight is of the person's path in the world."""
+
+
+def draw(number, frames, family):
+    """A simulated sequence: person, walk, camera and errors of its own."""
+    settings = Simulation(
+        sequence=SEQUENCES[number % len(SEQUENCES)],
+        family=family,
+        length=frames,
+        seed=zlib.crc32(f"person size {number}".encode()),
+    )
+    return synthetic.simulate(settings, body_.load_body_model())
+
+
+def errors(simulated, weights):
+    """Of the leg, as a share: the regressor's (its shrinkage undone), the estimate's,
+    and the standard deviation that the covariance says."""
+    body, config = body_.load_body_model(), Config()
+    sequence = synthetic.as_sequence(simulated)
+    bodies = people.estimate_bodies(sequence, body, PeopleFit())
+    roots = people.roots_from_bodies(bodies, body)
+    state = initialisation.first_state(
+        np.array(simulated.T_WC), np.zeros((0, 3)), roots, sequence.intrinsics.params
+    )
+    factors = initialisation.people_factors(sequence, roots, weights, body)
+    factors = [f for f in factors if not isinstance(f, MUTED)]
+    free = initialisation.free_people(state)
+    problem = graph.make_problem(factors, state, free=free)
+    held = graph.hold(problem.free, "scale", "cameras", "intrinsics")
+    problem = dataclasses.replace(problem, free=held)
+    solution, _ = solve_stage(problem, state, config, "people alone")
+    shape = solution.state.shapes[0]
+    leg = lambda shape: motion.leg_length(body, jnp.asarray(shape))
+    by_shape = np.asarray(jax.grad(lambda shape: jnp.log(leg(shape)))(shape))
+    spread = np.asarray(solver.marginals(problem, solution.state).shapes[0])
+    true = float(leg(simulated.person.shape))
+    return (
+        float(leg(roots.shape[0])) / true - 1,
+        float(leg(shape)) / true - 1,
+        float(np.sqrt(by_shape @ spread @ by_shape)),
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--people", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, help="number of the first")
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--family", choices=["room", "follow"], default="room")
+    parser.add_argument(
+        "--set", action="append", default=[], help="a weight, such as shape_sigma=0.3"
+    )
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    pairs = (pair.split("=") for pair in args.set)
+    weights = GraphWeights(**{name: float(value) for name, value in pairs})
+    found = []
+    for number in range(args.first, args.first + args.people):
+        found.append(errors(draw(number, args.frames, args.family), weights))
+        given, estimate, sigma = found[-1]
+        print(
+            f"{number}: regressor {given:+.2%}, estimate {estimate:+.2%} ± {sigma:.2%}",
+            flush=True,
+        )
+    given, estimate, sigma = np.array(found).T
+    size = lambda e: f"mean |e| {abs(e).mean():.2%}, root mean square {rms(e):.2%}"
+    print(f"{len(found)} people of {args.frames} frames, {args.family}")
+    print(f"  regressor: {size(given)}")
+    print(f"  estimate: {size(estimate)}, mean {estimate.mean():+.2%}")
+    squares = rms(estimate / sigma) ** 2
+    print(f"  as its covariances say: {rms(sigma):.2%}, mean square {squares:.2f} of 1")
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(values**2)))
+
+
+if __name__ == "__main__":
+    main()
