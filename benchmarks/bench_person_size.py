@@ -1,7 +1,8 @@
 """How well is a person's size known, over many people who were drawn at random?
 
-    python benchmarks/bench_person_size.py --people 50
-    python benchmarks/bench_person_size.py --people 50 --set posture_correlation=0.96 \
+    python benchmarks/bench_person_size.py --people 30
+    python benchmarks/bench_person_size.py --people 30 --set posture_sigma=0.18 \
+        --set posture_correlation=0.96 --set root_correlation=0.96 \
         --set keypoint_inflation=3 --set keypoint_loss=9
 
 Simulated, noise `real`. Cameras are held where they truly were and there is no map, so
@@ -22,15 +23,15 @@ from bodyslam_jax import graph, initialisation, motion, people, solver, syntheti
 from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
 from bodyslam_jax.joint import solve_stage
 
-SEQUENCES = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 MUTED = graph.RootSmoothness
 """Its weight is of the person's path in the world."""
 
 
 def draw(number, frames, family):
     """A simulated sequence: person, walk, camera and errors of its own."""
+    names = list(synthetic.LENGTH)
     settings = Simulation(
-        sequence=SEQUENCES[number % len(SEQUENCES)],
+        sequence=names[number % len(names)],
         family=family,
         length=frames,
         seed=zlib.crc32(f"person size {number}".encode()),
@@ -69,7 +70,7 @@ def errors(simulated, weights):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--people", type=int, default=50)
+    parser.add_argument("--people", type=int, default=30)
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--family", choices=["room", "follow"], default="room")

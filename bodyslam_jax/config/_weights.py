@@ -23,9 +23,8 @@ class GraphWeights:
     rate. Errors last for about 0.15 s: taken for independent, keypoints stretch the
     body by some per cent."""
     keypoint_loss: float = 4.0
-    """Geman-McClure scale, in standard deviations of one keypoint by itself, without
-    the inflation, in which a keypoint of something else would not look like one (Bogo
-    et al.: 100 px)."""
+    """Geman-McClure scale, in standard deviations of one keypoint, before the inflation
+    (Bogo et al.: 100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
     step_error: float = 0.05
@@ -44,7 +43,7 @@ class GraphWeights:
     posture_correlation: float = 0.99
     """Of their errors in successive frames at 30 fps: much of an error stays for the
     whole video, and what changes lasts for seconds. Published errors of joints, 98 mm
-    and 19.9 m/s² on one data set, go with 0.987."""
+    and 19.9 m/s² (HMR2 on EMDB), go with 0.987."""
     posture_predicted: bool = False
     """Whether postures are held to the motion model's prediction instead."""
     shape_sigma: float = 0.4
