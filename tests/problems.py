@@ -1,5 +1,7 @@
 """Small problems that tests of the solver share, and their dense equations."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,8 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.body import local_keypoints
+from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
@@ -73,6 +77,68 @@ def _dense_of(problem, state):
 
 
 _dense = kept(_dense_of, quick_options)
+
+
+def _bent_along(problem, state, way):
+    """The product of what keypoints bend with a step."""
+    mask = mask_of(problem)
+    masked = lambda step: jax.tree.map(jnp.multiply, mask, step)
+
+    def along(step, factor):
+        """How far keypoints go along the pull that they are under at the state."""
+        moved = state.retract(masked(step))
+        p_H = local_keypoints(
+            *(factor.body, moved.poses, moved.shapes[:, None]),
+            *(factor.layout, factor.bias),
+        )
+        p_C = jnp.einsum("htij,htkj->htki", moved.roots[..., :3, :3], p_H)
+        p_C = p_C + moved.roots[..., None, :3, 3]
+
+        def loss(p):
+            seen = project(state.intrinsics, p)
+            off = (seen - factor.pixel) / factor.sigma[..., None]
+            return 0.5 * jnp.sum(factor.loss.rho(jnp.sum(off**2, axis=-1)))
+
+        return jnp.vdot(jax.lax.stop_gradient(jax.grad(loss)(p_C)), p_C)
+
+    keypoints = [f for f in problem.factors if isinstance(f, g.JointReprojection)]
+    slope = jax.grad(lambda step: sum(along(step, f) for f in keypoints))
+    return jax.jvp(slope, (state.zero_step(),), (way,))[1]
+
+
+_bent = kept(_bent_along, quick_options)
+
+
+def bent(problem, state):
+    """What keypoints bend of the cost, by differentiating twice; a matrix.
+
+    No frame bends another: one product has a column of each frame and person.
+    """
+    zero = state.zero_step()
+    flat, unravel = ravel_pytree(zero)
+    place = jax.tree.map(np.asarray, unravel(jnp.arange(len(flat), dtype=float)))
+    found = np.zeros((len(flat), len(flat)))
+    if not any(isinstance(f, g.JointReprojection) for f in problem.factors):
+        return found
+    people, frames = state.roots.shape[:2]
+    of_frames = lambda s: np.concatenate(
+        [np.asarray(s.roots), np.asarray(s.poses).reshape(people, frames, 69)], axis=2
+    )
+    rows = of_frames(place).astype(int)
+    for k in range(6 + 69):
+        roots = zero.roots.at[..., k].set(1.0) if k < 6 else zero.roots
+        poses = zero.poses.reshape(people, frames, 69)
+        poses = poses.at[..., k - 6].set(1.0) if k >= 6 else poses
+        way = dataclasses.replace(
+            zero, roots=roots, poses=poses.reshape(zero.poses.shape)
+        )
+        found[rows, rows[..., [k]]] = of_frames(_bent(problem, state, way))
+    for h, k in np.ndindex(people, 10):
+        way = dataclasses.replace(zero, shapes=zero.shapes.at[h, k].set(1.0))
+        line = ravel_pytree(_bent(problem, state, way))[0]
+        at = int(place.shapes[h, k])
+        found[at], found[:, at] = line, line
+    return found
 
 
 def _structured_step(problem, state, damping):

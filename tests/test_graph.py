@@ -14,6 +14,7 @@ from jax.test_util import check_grads
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
+from bodyslam_jax.graph._keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -63,6 +64,26 @@ def test_keypoint_jacobian_is_that_of_the_keypoints(rng):
     )
     by_shape = jax.jit(jax.jacfwd(points, 1))(pose, shape)
     assert jnp.allclose(found[2], by_shape, atol=1e-12)
+
+
+def test_keypoint_curvature_is_the_second_derivative(rng):
+    body = scenes.body_model()
+    pose = jnp.asarray(0.4 * rng.standard_normal((23, 3)))
+    shape = jnp.asarray(rng.standard_normal(10))
+    pull = jnp.asarray(rng.standard_normal((25, 3)))
+
+    def along(x):
+        turn, turns = jaxlie.SO3.exp(x[:3]).as_matrix(), x[3:72].reshape(23, 3)
+        moved = g.retract_rotation(pose, turns)
+        p_H = local_keypoints(body, moved, shape + x[72:], "body25", 0.7)
+        return jnp.sum(pull * (p_H @ turn.T))
+
+    exact = jax.jit(jax.hessian(along))(jnp.zeros(82))
+    given = pose, shape, "body25", 0.7, pull
+    turns, by_shape = keypoint_curvature(body, *given)
+    assert jnp.allclose(turns, exact[:72, :72], atol=1e-12)
+    assert jnp.allclose(by_shape, exact[:72, 72:], atol=1e-12)
+    assert jnp.allclose(exact[72:, 72:], 0, atol=1e-12)
 
 
 def every_factor(rng):

@@ -20,11 +20,12 @@ from bodyslam_jax.graph._abstract import (
     Touch,
 )
 from bodyslam_jax.graph._displacement import before, displacements
+from bodyslam_jax.graph._keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph._keypoint_jacobian import (
     keypoint_jacobian,
     turning_joints,
 )
-from bodyslam_jax.graph._robust import AbstractLoss, Squared
+from bodyslam_jax.graph._robust import AbstractLoss, Squared, squared_norm
 from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
 from bodyslam_jax.motion import leg_length
 
@@ -114,6 +115,26 @@ class JointReprojection(AbstractFrameFactor):
             ("shape", 0): by_H @ by_shape,
             ("intrinsics", 0): by_intrinsics / sigma[:, None, None],
         }
+
+    def curvature(
+        self, state: State
+    ) -> tuple[Float[Array, "h t 72 72"], Float[Array, "h t 72 10"]]:
+        """What `J^T J` leaves out: `Σ w r ∂²r`, by turns of the root and of the joints,
+        and by those and shape. What perspective bends is left out as well, a share of
+        the error over the body's size in the image."""
+
+        def one(data, window, shared, _):
+            residual, parts = self.jacobian(data, window, shared)
+            (frame,) = window
+            weight = self.loss.weight(squared_norm(residual))[:, None]
+            by_C = parts["root", 0][..., 3:]
+            pull = jnp.sum((weight * residual)[..., None] * by_C, axis=1)
+            return keypoint_curvature(
+                *(self.body, frame.pose, shared.shape, self.layout, self.bias),
+                pull @ frame.root[:3, :3],
+            )
+
+        return self.map_frames(one, state)
 
 
 class HumanMotion(AbstractFrameFactor):

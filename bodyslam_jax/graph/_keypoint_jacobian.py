@@ -23,7 +23,7 @@ from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import JOINTS
 
 
-def _ancestors() -> np.ndarray:
+def ancestors() -> np.ndarray:
     """1 where joint (row) is the other (column) or above it."""
     above = np.eye(24)
     for joint in range(1, 24):
@@ -45,7 +45,7 @@ def turning_joints(
     picks, weight = np.asarray(body.picks), np.asarray(body.skin_weight)
     on = np.asarray(body.skin_joint)
     moved = np.zeros(24, bool)
-    above = _ancestors() > 0
+    above = ancestors() > 0
     for name in names if points is None else [names[i] for i in points]:
         if name in SURFACE_POINTS:
             vertex = picks[SURFACE_POINTS.index(name)]
@@ -85,12 +85,12 @@ def keypoint_jacobian(
 
     rest = rest_joints(body, shape)
     by_shape_rest = body.joint_shape_dirs.reshape(24, 3, 10)
-    G = _turns(R)
+    G = turns_of(R)
     # Places are linear in the offsets of joints from their parents, and these in shape.
     parent = jnp.array(PARENTS[1:])
     by_shape_offset = by_shape_rest[1:] - by_shape_rest[parent]
     carried = _times(G[parent], by_shape_offset).reshape(23, 30)
-    path = jnp.asarray(_ancestors()[1:], dtype)
+    path = jnp.asarray(ancestors()[1:], dtype)
     offsets = (rest[1:] - rest[parent])[..., None]
     x = path.T @ _times(G[parent], offsets)[..., 0]
     by_shape_x = path.T @ carried
@@ -142,7 +142,7 @@ def keypoint_jacobian(
     return position, jnp.stack(by_pose), by_shape
 
 
-def _turns(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
+def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
     """Rotations of the joints in H: each doubles the length of path it has covered."""
     G = jnp.concatenate([jnp.eye(3, dtype=R.dtype)[None], R])
     above = np.maximum(np.array(PARENTS), 0)

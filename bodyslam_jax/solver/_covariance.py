@@ -46,7 +46,9 @@ class Marginals(eqx.Module):
 
 
 def marginals(problem: Problem, state: State) -> Marginals:
-    """Marginal covariances at a solution: the inverse of `J^T J`.
+    """Marginal covariances at a solution: the inverse of `J^T J` and of what keypoints
+    bend (`_curvature`); of `J^T J` alone where the two have none, as away from a
+    minimum.
 
     They count for as much as the weights do: sigmas that are standard deviations, and
     correlated errors modelled as such. The equations are set up by the program that

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
 from bodyslam_jax.solver._blocks import Linearisation, sizes_of
 from bodyslam_jax.solver._coupling import with_coupling
+from bodyslam_jax.solver._curvature import with_curvature
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final, History, Loop
 from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, eliminate
@@ -85,6 +86,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             cost=jnp.asarray(jnp.inf, dtype),
             first_cost=jnp.asarray(jnp.inf, dtype),
             steps=jnp.zeros(s, int),
+            bent=jnp.array(True),
             finished=(stage == s) & ~self.keep,
             result=optx.RESULTS.successful,
             history=History(
@@ -116,6 +118,12 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             None,
         )
         problem: Problem = args.with_prediction(prediction)
+        lin = jax.lax.cond(
+            last & state.bent,
+            lambda lin: with_curvature(problem, lin, y, sizes),
+            lambda lin: lin,
+            lin,
+        )
         known = jnp.sum(lin.costs)
         trial = attempt(problem, y, lin, sizes, state.damping, state.caution, last)
         accept, before = trial.accepted, jnp.sum(trial.terms)
@@ -147,6 +155,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
         over = done | stuck | broken | spent
         following = jnp.where(over, self._after(at), state.stage)
+        # Away from a minimum the curvature may have no inverse: then without it.
+        sound = ~state.bent | jnp.isfinite(trial.predicted)
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
         history = History(
@@ -161,7 +171,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             prediction=prediction,
             observations=state.observations,
             final=final_of(lin, trial.eliminated),
-            stale=accept | found | over,
+            stale=accept | found | over | last,
             damping=jnp.where(over, self.damping, damping).astype(dtype),
             caution=trial.caution,
             searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
@@ -169,7 +179,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             cost=cost,
             first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
             steps=steps,
-            finished=last | ((following == len(self.limit)) & ~self.keep),
+            bent=state.bent & ~last,
+            finished=(last & sound) | ((following == len(self.limit)) & ~self.keep),
             result=optx.RESULTS.where(last, state.result, result),
             history=history,
         )

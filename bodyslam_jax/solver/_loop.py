@@ -55,6 +55,8 @@ class Loop(eqx.Module):
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]
     steps: Int[Array, " s"]
+    bent: Bool[Array, ""]
+    """Whether the last factorisation is to have what keypoints bend (`_curvature`)."""
     finished: Bool[Array, ""]
     result: optx.RESULTS
     history: History
