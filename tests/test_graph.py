@@ -84,6 +84,12 @@ def test_keypoint_curvature_is_the_second_derivative(rng):
     assert jnp.allclose(turns, exact[:72, :72], atol=1e-12)
     assert jnp.allclose(by_shape, exact[:72, 72:], atol=1e-12)
     assert jnp.allclose(exact[72:, 72:], 0, atol=1e-12)
+    half = lambda tree: jax.tree.map(
+        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree
+    )
+    single = keypoint_curvature(*half((body, pose, shape)), "body25", 0.7, half(pull))
+    assert single[0].dtype == single[1].dtype == jnp.float32
+    assert np.allclose(single[0], turns, atol=1e-5)
 
 
 def every_factor(rng):

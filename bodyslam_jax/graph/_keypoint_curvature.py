@@ -52,7 +52,7 @@ def keypoint_curvature(
     along, crossed = jax.lax.map(moments, shape + others)
     axes = turns_of(jaxlie.SO3.exp(pose).as_matrix()).swapaxes(1, 2).reshape(72, 3)
     product = axes @ crossed[0].T
-    above = product * _BELOW
-    same = product * _SAME
+    above = product * jnp.asarray(_BELOW, product.dtype)
+    same = product * jnp.asarray(_SAME, product.dtype)
     turns = above + above.T + 0.5 * (same + same.T)
     return turns, (along[1:] - along[0]).T
