@@ -76,9 +76,11 @@ moved = evaluation.umeyama(
     truth.T_WC[:, :3, 3], result.T_WC[:, :3, 3], with_scale=False
 )
 figure, (plan, speed) = plt.subplots(1, 2, figsize=(12, 4))
+# A person who is not found in a frame is nowhere there.
+pelvis = np.where(result.present[0, :, None], result.joints[0, :, 0], np.nan)
 for points, true, label in (
     (result.T_WC[:, :3, 3], truth.T_WC[:, :3, 3], "camera"),
-    (result.joints[0, :, 0], truth.joints[0, :, 0], "person"),
+    (pelvis, truth.joints[0, :, 0], "person"),
 ):
     found = moved.apply(points)
     (line,) = plan.plot(found[:, 0], found[:, 2], label=label)
