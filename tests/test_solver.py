@@ -368,8 +368,9 @@ def test_single_precision_serves_people_and_covariances_too():
 )
 def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
     last(monkeypatch, options.get("far", 0))
-    at = options.pop("at", "minimum" if "people" in options else "truth")
-    problem, state, start = make(9, **options)
+    at = options.get("at", "minimum" if "people" in options else "truth")
+    scene = {name: value for name, value in options.items() if name != "at"}
+    problem, state, start = make(9, **scene)
     if at == "minimum":
         state = solve(problem, start, schedule=TIGHT).state
     assert problem.layout.lasting == options.get("far", 0)

@@ -119,9 +119,12 @@ class JointReprojection(AbstractFrameFactor):
     def curvature(
         self, state: State
     ) -> tuple[Float[Array, "h t 72 72"], Float[Array, "h t 72 10"]]:
-        """What `J^T J` leaves out: `Σ w r ∂²r`, by turns of the root and of the joints,
-        and by those and shape. What perspective bends is left out as well, a share of
-        the error over the body's size in the image."""
+        """What `J^T J` leaves out of the cost's second derivatives, `Σ w r^T ∂²r`: by
+        turns of the root, then of the joints (rad), and by those and shape.
+
+        Weights of the loss are held, as the solver holds them. What perspective bends
+        is left out as well, a share of the error over the body's size in the image.
+        """
 
         def one(data, window, shared, _):
             residual, parts = self.jacobian(data, window, shared)

@@ -34,8 +34,9 @@ def keypoint_curvature(
 ) -> tuple[Float[Array, "72 72"], Float[Array, "72 10"]]:
     """Second derivatives of `Σ_k pull_k · p_k`, by turns and turns, by turns and shape.
 
-    Turns are `Exp` on the right: of the whole body about the pelvis, then of each
-    joint. Places are linear in shape. What pose blend shapes add is left out.
+    Places (m) and pulls are in H. Turns (rad) are `Exp` on the right: of the whole body
+    about the pelvis, then of each joint. Places are linear in shape. What pose blend
+    shapes add is left out.
     """
 
     def moments(shape):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from bodyslam_jax.graph import JointReprojection, Problem, State
 from bodyslam_jax.solver._apart import pick
-from bodyslam_jax.solver._blocks import Linearisation, Sizes, cast
+from bodyslam_jax.solver._blocks import Linearisation, Sizes, cast, mask_of
 from bodyslam_jax.solver._limbs import diagonal
 
 
@@ -29,14 +29,11 @@ def with_curvature(
 
 def _with_curvature_of(factor, problem, lin, state, sizes):
     turns, by_shape = factor.curvature(state)
-    free = problem.free
-    ones = lambda name, x: x if name in problem.variables else 0 * x
-    poses = ones("poses", free.poses).reshape(*free.poses.shape[:2], 69)
-    turning = jnp.concatenate([ones("roots", free.roots)[..., :3], poses], axis=-1)
+    free = mask_of(problem)
+    poses = free.poses.reshape(*free.poses.shape[:2], 69)
+    turning = jnp.concatenate([free.roots[..., :3], poses], axis=-1)
     turns = turns * turning[..., :, None] * turning[..., None, :]
-    by_shape = (
-        by_shape * turning[..., None] * ones("shapes", free.shapes)[:, None, None]
-    )
+    by_shape = by_shape * turning[..., None] * free.shapes[:, None, None]
     limbs = lambda x, axis: pick(x, sizes.joints, axis=axis, width=3)
     pose, root = limbs(turns[..., 3:, :], 2), turns[..., :3, :3]
     more = {
