@@ -36,6 +36,7 @@ def make(
     again=False,
     far=0,
     steady=False,
+    some_held=False,
     **options,
 ):
     rng = np.random.default_rng(seed)
@@ -56,7 +57,19 @@ def make(
     if extras:
         factors += scenes.extra_factors(rng, state, factors[0])
     problem = g.make_problem(factors, state, **options)
+    if some_held:
+        problem = eqx.tree_at(lambda p: p.free, problem, hold_some(problem.free))
     return problem, state, scenes.perturb(rng, problem, state)
+
+
+def hold_some(free):
+    """A turn of a root, a joint in some frames and a coordinate of shape, held too."""
+    return dataclasses.replace(
+        free,
+        roots=free.roots.at[:, 3, 1].set(0.0),
+        poses=free.poses.at[:, 5:8, 4].set(0.0),
+        shapes=free.shapes.at[:, 1].set(0.0),
+    )
 
 
 def dense(problem, state):

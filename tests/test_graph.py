@@ -1,5 +1,6 @@
 """State, losses, factors, and where their measurements lie."""
 
+import dataclasses
 import inspect
 import itertools
 
@@ -10,7 +11,9 @@ import jaxlie
 import numpy as np
 import pytest
 import scenes
+from jax.flatten_util import ravel_pytree
 from jax.test_util import check_grads
+from problems import bent, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
@@ -90,6 +93,35 @@ def test_keypoint_curvature_is_the_second_derivative(rng):
     single = keypoint_curvature(*half((body, pose, shape)), "body25", 0.7, half(pull))
     assert single[0].dtype == single[1].dtype == jnp.float32
     assert np.allclose(single[0], turns, atol=1e-5)
+
+
+def test_curvature_of_keypoints_is_what_residuals_bend(rng):
+    problem, state, _ = make(people=1, frames=3, noise=15.0)
+    normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
+    state = state.retract(
+        dataclasses.replace(
+            state.zero_step(),
+            roots=jnp.pad(1.5 * normal(1, 3, 3), ((0, 0), (0, 0), (0, 3))),
+            poses=0.3 * normal(1, 3, 23, 3),
+        )
+    )
+    (factor,) = [f for f in problem.factors if isinstance(f, g.JointReprojection)]
+    weight = factor.loss.weight(jnp.sum(factor.residual(state) ** 2, axis=-1))
+    assert weight.min() < 0.5
+    turns, by_shape = eqx.filter_jit(lambda f, s: f.curvature(s))(factor, state)
+    exact = bent(problem, state)
+    _, unravel = ravel_pytree(state.zero_step())
+    place = unravel(np.arange(len(exact), dtype=float))
+    shape = np.asarray(place.shapes[0], int)
+    for k in range(3):
+        rows = [place.roots[0, k, :3], place.poses[0, k].reshape(-1)]
+        rows = np.concatenate(rows).astype(int)
+        size = abs(exact[np.ix_(rows, rows)]).max()
+        assert size > 1
+        assert np.allclose(turns[0, k], exact[np.ix_(rows, rows)], atol=1e-10 * size)
+        assert np.allclose(
+            by_shape[0, k], exact[np.ix_(rows, shape)], atol=1e-10 * size
+        )
 
 
 def every_factor(rng):

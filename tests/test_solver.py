@@ -349,7 +349,7 @@ def test_single_precision_serves_people_and_covariances_too():
         {"frames": 24, "landmarks": 150, "known": True, "free_intrinsics": True},
         {"frames": 53, "landmarks": 90, "known": True, "again": True},
         {"frames": 43, "landmarks": 90, "known": True, "far": 8},
-        {"people": 1, "frames": 12},
+        {"people": 1, "frames": 12, "some_held": True},
         pytest.param(
             {"people": 1, "frames": 12, "at": "truth"}, marks=pytest.mark.slow
         ),
