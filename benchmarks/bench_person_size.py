@@ -68,6 +68,21 @@ def errors(simulated, weights):
     )
 
 
+def weight(text):
+    """A number of `GraphWeights` and its value, of `name=value`."""
+    name, _, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: expected name=number") from None
+    known = [k for k, v in vars(GraphWeights()).items() if not isinstance(v, bool)]
+    if name not in known:
+        raise argparse.ArgumentTypeError(
+            f"{name}: no such weight, expected one of {', '.join(known)}"
+        )
+    return name, number
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--people", type=int, default=30)
@@ -75,12 +90,15 @@ def main():
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--family", choices=["room", "follow"], default="room")
     parser.add_argument(
-        "--set", action="append", default=[], help="a weight, such as shape_sigma=0.3"
+        "--set",
+        type=weight,
+        action="append",
+        default=[],
+        help="a weight, such as shape_sigma=0.3",
     )
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    pairs = (pair.split("=") for pair in args.set)
-    weights = GraphWeights(**{name: float(value) for name, value in pairs})
+    weights = GraphWeights(**dict(args.set))
     found = []
     for number in range(args.first, args.first + args.people):
         found.append(errors(draw(number, args.frames, args.family), weights))
