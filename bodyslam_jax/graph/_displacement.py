@@ -7,12 +7,21 @@ frames at once: forward differentiation would carry forty tangents through it.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bodyslam_jax.graph._abstract import Frame
 from bodyslam_jax.graph._state import State
 
 
 def before(x: Float[Array, "h t *b"]) -> Float[Array, "h t *b"]:
     """What the frame before holds; the first frame's own in the first."""
     return jnp.concatenate([x[:, :1], x[:, :-1]], axis=1)
+
+
+def displacement(before: Frame, now: Frame, scale: Array) -> Float[Array, " 3"]:
+    """`C_WH_{k-1}^T (r_WH_k - r_WH_{k-1})`, m."""
+    moved = scale * (now.camera[:3, 3] - before.camera[:3, 3])
+    moved = moved + now.camera[:3, :3] @ now.root[:3, 3]
+    moved = moved - before.camera[:3, :3] @ before.root[:3, 3]
+    return before.root[:3, :3].T @ (before.camera[:3, :3].T @ moved)
 
 
 def displacements(

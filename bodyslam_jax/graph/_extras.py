@@ -6,8 +6,9 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
-from bodyslam_jax.graph._factors import _log, unit_length
+from bodyslam_jax.graph._human_motion import unit_length
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
+from bodyslam_jax.graph._state import log
 
 
 class CameraPrior(AbstractFrameFactor):
@@ -31,7 +32,7 @@ class CameraPrior(AbstractFrameFactor):
     def local(self, data, window, shared):
         known, sigma = data
         camera = window[0].camera
-        turn = _log(known[:3, :3].T @ camera[:3, :3])
+        turn = log(known[:3, :3].T @ camera[:3, :3])
         return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
 
 
@@ -103,8 +104,8 @@ class CameraSmoothness(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         now, before, first = (f.camera for f in window)
-        turn = _log(before[:3, :3].T @ now[:3, :3])
-        turn = turn - _log(first[:3, :3].T @ before[:3, :3])
+        turn = log(before[:3, :3].T @ now[:3, :3])
+        turn = turn - log(first[:3, :3].T @ before[:3, :3])
         shift = now[:3, 3] - 2 * before[:3, 3] + first[:3, 3]
         return jnp.concatenate([turn / data[0], shift / data[1]])
 
@@ -165,7 +166,7 @@ class RootTurning(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         now, before, first = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
-        return (_log(before.T @ now) - _log(first.T @ before)) / data
+        return (log(before.T @ now) - log(first.T @ before)) / data
 
 
 class RootOrientation(AbstractFrameFactor):
@@ -192,8 +193,8 @@ class RootOrientation(AbstractFrameFactor):
 
     def local(self, data, window, shared):
         measured, previous, sigma, correlation = data
-        error = _log(measured.T @ window[0].root[:3, :3])
-        before = _log(previous.T @ window[1].root[:3, :3])
+        error = log(measured.T @ window[0].root[:3, :3])
+        before = log(previous.T @ window[1].root[:3, :3])
         error = error - correlation * before
         return error / jnp.sqrt(1 - correlation**2) / sigma
 

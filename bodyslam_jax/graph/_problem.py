@@ -20,15 +20,12 @@ from bodyslam_jax.graph._check import (
     check_shapes,
     check_state,
 )
-from bodyslam_jax.graph._factors import (
-    HumanMotion,
-    OrientationChange,
-    Posture,
-    Reprojection,
-)
+from bodyslam_jax.graph._human_motion import HumanMotion, OrientationChange
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._layout import Layout, make_layout
 from bodyslam_jax.graph._memory import check_memory
+from bodyslam_jax.graph._posture import Posture
+from bodyslam_jax.graph._reprojection import Reprojection
 from bodyslam_jax.graph._state import State, Step, gauge
 from bodyslam_jax.motion import leg_length
 

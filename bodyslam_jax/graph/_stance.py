@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Limbs, Touch
-from bodyslam_jax.graph._factors import unit_length
+from bodyslam_jax.graph._human_motion import unit_length
 from bodyslam_jax.graph._keypoint_jacobian import turning_joints
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State

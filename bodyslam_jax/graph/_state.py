@@ -143,6 +143,11 @@ def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
     )
 
 
+def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """The rotation vector (rad) of a rotation matrix."""
+    return jaxlie.SO3.from_matrix(rotation).log()
+
+
 def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
     """T_WH in metres: `r_WH = s r'_WC + C_WC r_CH`, `C_WH = C_WC C_CH`."""
     cameras = state.cameras.at[:, :3, 3].multiply(state.scale)

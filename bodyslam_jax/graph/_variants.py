@@ -5,7 +5,8 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 
-from bodyslam_jax.graph._factors import AbstractFactor, HumanMotion
+from bodyslam_jax.graph._abstract import AbstractFactor
+from bodyslam_jax.graph._human_motion import HumanMotion
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._problem import Problem
 from bodyslam_jax.graph._state import Step

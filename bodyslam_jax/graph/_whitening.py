@@ -1,0 +1,27 @@
+"""How measurements are weighted: by covariances, and by how long errors last."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+@jax.jit
+def runs(
+    present: Bool[Array, "h t"], correlation: float | Float[Array, ""]
+) -> Float[Array, "h t"]:
+    """ρ where this frame and the one before are measured, 0 at the start of a run."""
+    before = jnp.concatenate([jnp.zeros_like(present[:, :1]), present[:, :-1]], axis=1)
+    return jnp.where(present & before, correlation, 0.0)
+
+
+def whitening_of(
+    covariance: Float[Array, "*b 3 3"], valid: Bool[Array, "*b"]
+) -> Float[Array, "*b 3 3"]:
+    """`W` with `W^T W` the inverse of the covariance; 0 where not valid."""
+    eye = jnp.eye(3, dtype=covariance.dtype)
+    safe = jnp.where(valid[..., None, None], covariance, eye)
+    lower = jnp.linalg.cholesky(safe)
+    inverse = jax.scipy.linalg.solve_triangular(
+        lower, jnp.broadcast_to(eye, safe.shape), lower=True
+    )
+    return jnp.where(valid[..., None, None], inverse, 0.0)
