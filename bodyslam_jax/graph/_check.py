@@ -16,9 +16,10 @@ from jaxtyping import AbstractArray, Bool, Float, Int
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
-from bodyslam_jax.graph._extras import CameraPrior, RootOrientation, RootPlace
+from bodyslam_jax.graph._camera_priors import CameraPrior
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._reprojection import JointReprojection, Reprojection
+from bodyslam_jax.graph._root_priors import RootOrientation, RootPlace
 from bodyslam_jax.graph._stance import StanceFoot
 from bodyslam_jax.graph._state import State
 
