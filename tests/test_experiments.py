@@ -1,6 +1,7 @@
 """Experiments on small made-up problems: variants, perturbations, weights, rows."""
 
 import csv
+import dataclasses
 import json
 import math
 import shutil
@@ -12,12 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
+from matplotlib.figure import Figure
 
 import bodyslam_jax.graph as g
 from bodyslam_jax import cli, experiments, motion, solver, synthetic
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import (
     _ablation,
+    _about,
+    _figures,
     _paper,
     _plans,
     _reports,
@@ -25,7 +29,7 @@ from bodyslam_jax.experiments import (
     _weights,
 )
 from bodyslam_jax.experiments._case import simulations
-from bodyslam_jax.experiments._journal import Journal
+from bodyslam_jax.experiments._journal import Journal, fits
 from bodyslam_jax.experiments._plans import PLANS
 from bodyslam_jax.experiments._problems import with_scale
 from bodyslam_jax.experiments._score import NAMES
@@ -221,6 +225,24 @@ def test_rows_are_computed_once(tmp_path):
     assert len(calls) == 4
 
 
+def test_forms_of_rows():
+    form = {"sequence": "E1-room", "status": str, "scale": float, "path": [[float]]}
+    row = {"sequence": "E1-room", "status": "converged", "scale": None, "more": 1}
+    row |= {"path": [[1, 0.5], [None]]}
+    assert fits(row, form)
+    for name, bad in (
+        ("sequence", "E2-room"),
+        ("status", None),
+        ("scale", "1"),
+        ("scale", True),
+        ("path", [1.0]),
+        ("path", {}),
+    ):
+        assert not fits({**row, name: bad}, form), name
+        assert not fits({k: v for k, v in row.items() if k != name}, form)
+    assert not fits(None, form) and not fits([row], form) and not fits(None, dict)
+
+
 def test_tables_as_text():
     columns = [
         _tables.Column("sequence", "sequence"),
@@ -381,20 +403,141 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
     assert code == 2 and not (tmp_path / "table1.md").exists()
 
 
+@pytest.fixture
+def made_up(monkeypatch):
+    """Two sequences of `table1`, computed at once: their settings, and which were."""
+    real, computed = PLANS["table1"], []
+
+    def plan(*given):
+        found = real(*given)
+
+        def compute(job):
+            computed.append(job.label)
+            return _made_up(job.label)
+
+        jobs = [
+            dataclasses.replace(job, compute=lambda j=job: compute(j))
+            for job in found.jobs
+        ]
+        return dataclasses.replace(found, jobs=jobs)
+
+    monkeypatch.setitem(PLANS, "table1", plan)
+    return Experiment(sequences=("E1", "M2"), family="room", frames=300), computed
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures take longer than all else."""
+    for name in ("draw_table", "draw_paths"):
+        monkeypatch.setattr(_figures, name, lambda *given: None)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    "text", ["null", "[]", "{}", '{"sequence": "E1-room"}', '{"a": ', "of M2"]
+)
+def test_files_that_are_no_rows_are_computed_again(tmp_path, made_up, caplog, text):
+    on, computed = made_up
+    experiments.run_experiment("table1", tmp_path, on)
+    (file,) = (tmp_path / "rows").glob("table1-E1*")
+    (other,) = (tmp_path / "rows").glob("table1-M2*")
+    whole = file.read_text()
+    file.write_text(other.read_text() if text == "of M2" else text)
+    computed.clear()
+    caplog.set_level("INFO")
+    experiments.run_experiment("table1", tmp_path, on)
+    assert computed == ["E1-room"] and file.read_text() == whole
+    assert "2 rows, 1 of them done" in caplog.text
+    (warning,) = (r.getMessage() for r in caplog.records if r.levelname == "WARNING")
+    assert warning == f"{file}: not a row as expected; computed again"
+
+
+def test_what_is_not_finite_stays_missing(tmp_path, made_up):
+    on, computed = made_up
+    experiments.run_experiment("table1", tmp_path, on)
+    for file in (tmp_path / "rows").glob("table1-E1*"):
+        row = json.loads(file.read_text())
+        row |= {"full/scale": None, "scale_ratio": None, "full/c_ate_se3": None}
+        file.write_text(json.dumps(row))
+    experiments.run_experiment("table1", tmp_path, on)
+    assert len(computed) == 2
+    first, second = csv.DictReader((tmp_path / "table1.csv").read_text().splitlines())
+    for name in ("|1 − s|", "C-ATE SE(3), % of it", "scale full"):
+        assert not first[name] and second[name], name
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
+    named = lambda setting: setting and Path(setting)
+    monkeypatch.setattr(_about, "body_model_file", named)
+    plain = _about.about(Experiment(), Config())
+    assert plain == "Simulated sequences, noise level `real`."
+    weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
+    config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
+    assert _about.about(Experiment(motion="walk.npz"), config) == (
+        f"{plain} Not as by default: motion of `walk.npz`; `body_model` b.npz; "
+        "`motion_model` m.npz; `weights.pixel_sigma` 2.0."
+    )
+    paper = dataclasses.replace(Config.paper(), motion_coupling="frozen")
+    told = "Not as by default: preset `paper`; `motion_coupling` frozen."
+    assert _about.deviations(Experiment(), paper) == told
+    on, _ = made_up
+    for seed in (3, 4):
+        again = dataclasses.replace(on, seed=seed)
+        experiments.run_experiment("table1", tmp_path, again)
+        text = (tmp_path / "table1.md").read_text()
+        assert f"Not as by default: seed {seed}; 300 frames each. Ours:" in text
+
+
+@pytest.mark.parametrize("frames", [0, 1, -3])
+def test_too_few_frames_are_refused(tmp_path, frames):
+    on = Experiment(sequences=("E1",), frames=frames)
+    with pytest.raises(ValueError, match=f"--frames {frames}: .* 2 frames or more"):
+        experiments.run_experiment("table1", tmp_path / "out", on)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["motion", "table1"])
+def test_file_without_motion_is_refused(tmp_path, name):
+    file = tmp_path / "tracks.npz"
+    np.savez(file, frame=np.arange(3))
+    with pytest.raises(ValueError, match="tracks.npz: no motion.*expected.*AMASS"):
+        experiments.run_experiment(name, tmp_path / "out", Experiment(motion=str(file)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_learning_weights_costs_a_compilation(tmp_path):
+    on = Experiment(sequences=("E1", "M1"), frames=40)
+    learnt, *_ = PLANS["weights"](on, Config(), tmp_path).jobs
+    assert 240 < learnt.seconds < 360
+
+
+def test_axes_of_figures(tmp_path):
+    assert _figures._log_mm([5.0, np.nan, 80.0]) == (1.0, 120.0)
+    assert _figures._log_mm([0.03, 2.0]) == pytest.approx((0.01, 10.0))
+    assert _figures._log_mm([np.nan, 0.0]) == (1.0, 10.0)
+    axis = Figure().subplots()
+    _figures._draw_ratios(axis, np.arange(3), np.array([0.98, 7.3, np.nan]))
+    assert axis.get_xlim() == pytest.approx((0.945, 1.055))
+    assert [text.get_text() for text in axis.texts] == ["7.30"]
+
+
 def test_reports_of_made_up_rows(tmp_path):
     p = [5.0, 0.1]
     curve = [[0.9, 0.1], [2.0, 0.1]]
     row = {"sequence": "M2-room", "perturbation": p, "scale": [5.1, 0.102]}
     row |= {"deviation": [0.02, 0.02], "spread": 1e-5}
     row |= {"history": [[1.0, 5.1], [1.0, 0.102]], "h_ate": curve}
-    _reports.write_scale(tmp_path, [row], noise="real")
+    _reports.write_scale(tmp_path, [row], about="Simulated.")
     text = (tmp_path / "scale.md").read_text()
     assert "| M2-room | 5.0 | 5.1000 | 2.00 | 900.0 | 100.0 | 3.673 | 26.5 |" in text
+    # Six perturbations have no mean, nor have the answers to them.
+    assert "| **mean** |  |  | 2.00 | 1450.0 | 100.0 |  |" in text
 
     row = {"sequence": "E2-room", "status": "converged", "status_no_landmarks": "-"}
     stages = ("original", "start", "perturbed", "no_landmarks", "landmarks")
     row |= {name: 0.1 for name in stages} | {f"{n}/scale": 1.0 for n in stages}
-    _reports.write_structure(tmp_path, [row], noise="real")
+    _reports.write_structure(tmp_path, [row], about="Simulated.")
     text = (tmp_path / "landmarks.md").read_text()
     both = "100.0 | 193.0 | 100.0 | 100.0 | 213.1 | 100.0 | 139.7 | 100.0 | 138.5"
     assert f"| E2-room | {both} |" in text
@@ -405,12 +548,13 @@ def test_reports_of_made_up_rows(tmp_path):
     short = {"sequence": "M2-room", "label": "no ground", "status": "no such term"}
     more = {**row, "label": "motion model short", "past": 2.0}
     rows = [row, short, more]
-    (*_, picture) = _reports.write_ablation(tmp_path, rows, noise="low")
+    (*_, picture) = _reports.write_ablation(tmp_path, rows, about="Simulated.")
     assert picture.name == "ablation_M2-room.png" and picture.stat().st_size > 0
     text = (tmp_path / "ablation.md").read_text()
     assert "| no keypoints | 20.0 | 20.0 | 20.0 | 20.0 | – | – | – |" in text
     assert "| motion model short | 20.0 | 20.0 | 20.0 | 20.0 | – | – | 2 |" in text
     assert "| no ground |" + 10 * " – |" + " no such term |" in text
+    assert "mean" not in text.split("M2-room")[1]
 
     names = ["motion", "shape"]
     row = {"names": names, "log": [0.0, 0.7], "factor": [1.0, 2.0]}
@@ -419,11 +563,11 @@ def test_reports_of_made_up_rows(tmp_path):
     for when in ("before", "after"):
         one |= {f"{when}/{k}": 0.5 for k in ("error", "scale", "j_ate_se3")}
     other = {**one, "set": "test", "sequence": "D1-room"}
-    _reports.write_weights(tmp_path, [row, one, other], noise="real")
+    _reports.write_weights(tmp_path, [row, one, other], about="Simulated.")
     text = (tmp_path / "weights.md").read_text()
     assert "| shape | 2.00 | 0.25 |" in text and "## test sequences" in text
     # Learnt, and interrupted before any sequence was judged.
-    _reports.write_weights(tmp_path, [row], noise="real")
+    _reports.write_weights(tmp_path, [row], about="Simulated.")
     assert "| shape | 2.00 | 0.25 |" in (tmp_path / "weights.md").read_text()
 
 

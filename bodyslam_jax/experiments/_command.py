@@ -37,7 +37,11 @@ def run_experiment(
         raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
     plan = PLANS[name](experiment, config, out / "stages")
     journal = Journal(out / "rows")
-    missing = [j for j in plan.jobs if not journal.path(name, j.label, *j.key).exists()]
+    missing = [
+        job
+        for job in plan.jobs
+        if journal.kept(name, job.label, job.key, job.form) is None
+    ]
     minutes = sum(job.seconds for job in missing) / 60
     log.info(
         "%s: %d rows, %d of them done; about %.0f min of processor time to go",
@@ -50,7 +54,7 @@ def run_experiment(
     written: list[Path] = []
     for job in plan.jobs:
         try:
-            rows.append(journal.row(name, job.label, job.key, job.compute))
+            rows.append(journal.row(name, job.label, job.key, job.compute, job.form))
         except (FileNotFoundError, ValueError) as error:
             log.warning("%s %s: left out: %s", name, job.label, error)
             continue

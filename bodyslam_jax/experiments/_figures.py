@@ -8,12 +8,49 @@ import numpy as np
 
 Row = Mapping[str, Any]
 _BASELINE, _OURS, _TRUTH = "#c96a3d", "#2f6f9f", "#444444"
+_THEIRS: dict[str, Any] = {
+    "ls": "",
+    "marker": "o",
+    "markeredgecolor": "k",
+    "markersize": 4,
+    "label": "the paper's, its own data",
+}
+"""How the paper's figures are drawn, in the colour of ours."""
+_FAR = 0.25
+"""From a ratio of 1: what is farther off is told as a number and sets no axis."""
 
 
 def _figure(width: float, height: float):
     from matplotlib.figure import Figure  # takes half a second to import
 
     return Figure((width, height), layout="constrained")
+
+
+def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper center"):
+    """One legend of what is drawn in `axes`, outside them: it covers nothing."""
+    known = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            known.setdefault(label, handle)
+    figure.legend(
+        known.values(),
+        known.keys(),
+        ncols=columns,
+        fontsize=8,
+        title=title,
+        title_fontsize=9,
+        loc=f"outside {where}",
+    )
+
+
+def _log_mm(values: Sequence[float]) -> tuple[float, float]:
+    """Ends of a log axis of errors: from 1 mm, or less where one of them is less."""
+    known = np.array(values, float)
+    known = known[np.isfinite(known) & (known > 0)]
+    if not known.size:
+        return 1.0, 10.0
+    low = 10.0 ** np.floor(np.log10(0.99 * known.min()))
+    return min(1.0, low), max(10.0, 1.5 * known.max())
 
 
 def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> None:
@@ -24,39 +61,36 @@ def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> 
     figure = _figure(max(7.0, 1.5 + 0.55 * len(rows)), 7.5)
     axes = figure.subplots(4, 1, sharex=True)
     at = np.arange(len(rows))
+    known = [(k, p) for k, p in enumerate(paper) if p is not None]
+    methods = (
+        (-0.2, "no_mm", _BASELINE, "no motion model"),
+        (0.2, "full", _OURS, "full"),
+    )
     names = ("c_ate_se3", "h_ate_se3", "j_ate_se3")
     labels = ("C-ATE, mm", "H-ATE, mm", "J-ATE, mm")
     for axis, name, label in zip(axes, names, labels, strict=False):
-        value = lambda method, name=name: [
-            1e3 * (row.get(f"{method}/{name}") or np.nan) for row in rows
-        ]
-        axis.bar(
-            at - 0.2, value("no_mm"), 0.4, color=_BASELINE, label="no motion model"
-        )
-        axis.bar(at + 0.2, value("full"), 0.4, color=_OURS, label="full")
-        for shift, method, color in ((-0.2, "no_mm", _BASELINE), (0.2, "full", _OURS)):
-            known = [(k, p) for k, p in enumerate(paper) if p is not None]
-            axis.plot(
-                [k + shift for k, _ in known],
-                [1e3 * p[f"{method}/{name}"] for _, p in known],
-                "o",
-                color=color,
-                markeredgecolor="k",
-                markersize=4,
-                label="the paper's, its own data" if method == "full" else None,
-            )
-        axis.set(ylabel=label, yscale="log", ylim=(1, None))
+        drawn: list[float] = []
+        for shift, method, color, meaning in methods:
+            key = f"{method}/{name}"
+            ours = [1e3 * (row.get(key) or np.nan) for row in rows]
+            theirs = [1e3 * p[key] for _, p in known]
+            axis.bar(at + shift, ours, 0.4, color=color, label=meaning)
+            axis.plot([k + shift for k, _ in known], theirs, color=color, **_THEIRS)
+            drawn += [*ours, *theirs]
+        axis.set(ylabel=label, yscale="log", ylim=_log_mm(drawn))
         axis.grid(axis="y", alpha=0.3)
-    axes[0].set_title("simulated sequences, after SE(3)", fontsize=10)
-    axes[0].legend(ncols=3, fontsize=7, loc="upper left")
     scale = axes[3]
     scale.axhline(1, color=_TRUTH, lw=1)
-    scale.plot(at, [r.get("full/scale") or np.nan for r in rows], "s", color=_OURS)
+    full = [r.get("full/scale") or np.nan for r in rows]
+    scale.plot(at, full, "s", color=_OURS, label="scale, full")
     start = [1 / r["start_ratio"] if r.get("start_ratio") else np.nan for r in rows]
-    scale.plot(at, start, "x", color=_TRUTH, label="closed form")
-    scale.set(ylabel="scale (best 1)", xlabel="sequence")
-    scale.legend(fontsize=8)
+    scale.plot(at, start, "x", color=_TRUTH, label="scale, closed form")
+    theirs = [p["full/scale"] for _, p in known]
+    scale.plot([k + 0.2 for k, _ in known], theirs, color=_OURS, **_THEIRS)
+    scale.set(ylabel="scale (best 1)", xlabel="sequence", xlim=(-0.6, len(rows) - 0.4))
+    scale.grid(axis="y", alpha=0.3)
     scale.set_xticks(at, [str(r["sequence"]) for r in rows], rotation=60, fontsize=8)
+    _legend(figure, axes, "simulated sequences, after SE(3)")
     figure.savefig(path, dpi=110)
 
 
@@ -76,7 +110,7 @@ def draw_paths(path: Path, rows: Sequence[Row]) -> None:
                 axis.plot(*points.T, color=color, lw=1.2, label=label)
             axis.set(title=f"{row['sequence']}: {what}", xlabel="x, m", ylabel="z, m")
             axis.set_aspect("equal", adjustable="datalim")
-    axes[0, 0].legend(fontsize=8)
+    _legend(figure, [axes[0, 0]], "simulated, from above, after SE(3)")
     figure.savefig(path, dpi=110)
 
 
@@ -95,25 +129,57 @@ def draw_scale(path: Path, rows: Sequence[Row]) -> None:
             axis.grid(alpha=0.3)
     for axis in axes[-1]:
         axis.set_xlabel("iteration")
-    axes[0, 0].legend(fontsize=8, title="simulated")
+    _legend(figure, [axes[0, 0]], "simulated", columns=6)
     figure.savefig(path, dpi=110)
 
 
-def draw_bars(
-    path: Path, rows: Sequence[Row], names: Sequence[tuple[str, str, float]]
-) -> None:
-    """One panel a measure, one bar a row; `names` are key, label, factor."""
-    figure = _figure(3.2 * len(names) + 2, 0.6 + 0.28 * len(rows))
-    axes = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
+def draw_variants(path: Path, rows: Sequence[Row]) -> None:
+    """C- and J-ATE under SE(3), and how far the scale is off, one line a variant."""
+    figure = _figure(11.0, max(2.4, 1.2 + 0.28 * len(rows)))
+    figure.suptitle(f"{rows[0]['sequence']}, simulated", fontsize=10)
+    *errors, scale = figure.subplots(1, 3, sharey=True)
     at = np.arange(len(rows))[::-1]
-    for axis, (key, label, factor) in zip(axes, names, strict=True):
-        found = [row.get(key) for row in rows]
-        value = [np.nan if v is None else factor * v for v in found]
+    for axis, name in zip(errors, ("c_ate_se3", "j_ate_se3"), strict=True):
+        value = [1e3 * (row.get(name) or np.nan) for row in rows]
         axis.barh(at, value, color=_OURS)
-        axis.set(xlabel=label)
+        label = f"{name[0].upper()}-ATE, SE(3), mm"
+        axis.set(xlabel=label, xscale="log", xlim=_log_mm(value))
+    ratio = np.array([row.get("scale_ratio") for row in rows], float)
+    _draw_ratios(scale, at, ratio)
+    scale.set(xlabel="estimated / true scale")
+    for axis in (*errors, scale):
         axis.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(at, [str(row["label"]) for row in rows], fontsize=8)
+    for y, row in zip(at, rows, strict=True):
+        if row.get("c_ate_se3") is None:
+            where = errors[0].get_yaxis_transform()
+            said = "none" if "c_ate_se3" in row else str(row.get("status"))
+            errors[0].text(0.02, y, said, transform=where, fontsize=7, va="center")
+    errors[0].set_yticks(at, [str(row["label"]) for row in rows], fontsize=8)
+    errors[0].set_ylim(-0.7, len(rows) - 0.3)
     figure.savefig(path, dpi=110)
+
+
+def _draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
+    """Points about 1; what is farther off than the axis goes stands at its end."""
+    off = np.abs(ratio - 1)
+    near = off <= _FAR
+    end = 1.1 * max(off[near].max(initial=0.0), 0.05)
+    axis.axvline(1, color=_TRUTH, lw=1)
+    axis.hlines(at[near], 1, ratio[near], color=_OURS, lw=1)
+    axis.plot(ratio[near], at[near], "o", color=_OURS, markersize=4)
+    for y, value in zip(at[off > _FAR], ratio[off > _FAR], strict=True):
+        side = np.sign(value - 1)
+        mark = ">" if side > 0 else "<"
+        axis.plot(1 + 0.97 * side * end, y, mark, color=_BASELINE, markersize=5)
+        axis.text(
+            1 + 0.9 * side * end,
+            y,
+            f"{value:.2f}",
+            fontsize=7,
+            va="center",
+            ha="right" if side > 0 else "left",
+        )
+    axis.set_xlim(1 - end, 1 + end)
 
 
 def draw_structure(
@@ -124,25 +190,17 @@ def draw_structure(
     axis = figure.subplots()
     stages = ("perturbed", "no_landmarks", "landmarks")
     colors = ("#999999", _BASELINE, _OURS)
+    drawn: list[float] = []
     for k, (stage, color) in enumerate(zip(stages, colors, strict=True)):
         at = np.arange(len(rows)) + 0.27 * (k - 1)
-        value = [1e3 * (row.get(stage) or np.nan) for row in rows]
-        axis.bar(at, value, 0.25, color=color, label=stage.replace("_", " "))
-        known = [(x, p[stage]) for x, p in zip(at, paper, strict=True) if p]
-        label = "the paper's, its own data" if k == 2 else None
-        axis.plot(
-            [x for x, _ in known],
-            [1e3 * v for _, v in known],
-            "o",
-            color=color,
-            markeredgecolor="k",
-            markersize=4,
-            label=label,
-        )
-    axis.set(ylabel="C-ATE, SE(3), mm", yscale="log")
+        ours = [1e3 * (row.get(stage) or np.nan) for row in rows]
+        axis.bar(at, ours, 0.25, color=color, label=stage.replace("_", " "))
+        known = [(x, 1e3 * p[stage]) for x, p in zip(at, paper, strict=True) if p]
+        axis.plot([x for x, _ in known], [v for _, v in known], color=color, **_THEIRS)
+        drawn += [*ours, *(v for _, v in known)]
+    axis.set(ylabel="C-ATE, SE(3), mm", yscale="log", ylim=_log_mm(drawn))
     axis.set_xticks(np.arange(len(rows)), [str(row["sequence"]) for row in rows])
-    where = "outside upper center"
-    figure.legend(fontsize=8, ncols=4, title="simulated", loc=where)
+    _legend(figure, [axis], "simulated", columns=4)
     figure.savefig(path, dpi=110)
 
 
@@ -150,10 +208,10 @@ def draw_learning(path: Path, row: Row) -> None:
     """The error on the training sequences by step, and the weights on the way."""
     figure = _figure(9.0, 3.0)
     left, right = figure.subplots(1, 2)
-    left.plot(row["history"], "o-", color=_OURS)
+    left.plot(np.array(row["history"], float), "o-", color=_OURS)
     left.set(xlabel="step", ylabel="training error, 1")
-    for name, values in zip(row["names"], np.array(row["path"]).T, strict=True):
+    for name, values in zip(row["names"], np.array(row["path"], float).T, strict=True):
         right.plot(values, label=name)
     right.set(xlabel="step", ylabel="log of the factor on σ")
-    right.legend(fontsize=7)
+    _legend(figure, [right], "simulated", columns=1, where="right upper")
     figure.savefig(path, dpi=110)

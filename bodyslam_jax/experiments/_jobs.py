@@ -27,6 +27,8 @@ class Job:
     seconds: float
     """Of processor time, about."""
     compute: Callable[[], Row]
+    form: Any
+    """What a kept row must have for the report, as `_journal.fits` takes it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,14 +40,18 @@ class Plan:
 
 
 def check_files(experiment: Experiment, config: Config) -> None:
-    """Reads the models that rows will need, before minutes are spent on others.
+    """Reads what rows will need, before minutes are spent on others.
 
-    **Raises:** `FileNotFoundError` or `ValueError`, naming the file.
+    **Raises:** `FileNotFoundError` or `ValueError`, naming the file or the option.
     """
-    if experiment.motion is not None and not Path(experiment.motion).exists():
-        raise FileNotFoundError(
-            f"{experiment.motion}: no such file or folder of motion data."
+    if experiment.frames is not None and experiment.frames < 2:
+        raise ValueError(
+            f"--frames {experiment.frames}: a sequence needs 2 frames or more."
         )
+    if experiment.motion is not None:
+        source = Path(experiment.motion)
+        if not source.is_dir():  # which may be large, and is read when it is needed
+            motion.read_motion(source)
     body = body_.load_body_model(config.body_model)
     for file in (config.motion_model, *experiment.motion_models):
         model = motion.load_motion_model(file)
@@ -62,7 +68,8 @@ def named(settings: Simulation) -> str:
 
 def cost(settings: Simulation, solves: float, shapes: float) -> float:
     """Processor time of so many solves, of so many kinds, on one sequence, s."""
-    frames = settings.length or LENGTH[settings.sequence]
+    own = LENGTH[settings.sequence]
+    frames = own if settings.length is None else settings.length
     return frames * (FRONT + SOLVE * solves) + COMPILE * shapes
 
 
@@ -84,13 +91,19 @@ def by_sequence(
     families: Sequence[str],
     compute: Callable[[Case], Row],
     effort: tuple[float, float],
+    form: dict[str, Any],
 ) -> list[Job]:
-    """One row a sequence; `effort` are solves and kinds of problem."""
+    """One row a sequence; `effort` are solves and kinds of problem.
+
+    `form` is what a row must have beside its sequence.
+    """
     case = cases(config, stages)
 
     def job(settings: Simulation) -> Job:
         name = named(settings)
         run = lambda: {"sequence": name, **compute(case(settings))}
-        return Job(name, (settings, config), cost(settings, *effort), run)
+        seconds = cost(settings, *effort)
+        full = {"sequence": name, **form}
+        return Job(name, (settings, config), seconds, run, full)
 
     return [job(s) for s in simulations(experiment, sequences, families)]

@@ -28,19 +28,32 @@ class Journal:
         words = re.sub(r"[^A-Za-z0-9.]+", "_", label).strip("_")
         return self.folder / f"{name}-{words}-{fingerprint(name, label, *key)}.json"
 
+    def kept(
+        self, name: str, label: str, key: Sequence[Any], form: Any = dict
+    ) -> Row | None:
+        """The row of this `key` if it is on disk and of that `form`, see `fits`."""
+        try:
+            found = json.loads(self.path(name, label, *key).read_text())
+        except (FileNotFoundError, ValueError):
+            return None
+        return found if fits(found, form) else None
+
     def row(
-        self, name: str, label: str, key: Sequence[Any], compute: Callable[[], Row]
+        self,
+        name: str,
+        label: str,
+        key: Sequence[Any],
+        compute: Callable[[], Row],
+        form: Any = dict,
     ) -> Row:
         """The row of this `key`, from disk if it is there; `label` is for people."""
+        found = self.kept(name, label, key, form)
+        if found is not None:
+            log.info("%s %s: taken from an earlier run", name, label)
+            return found
         path = self.path(name, label, *key)
         if path.exists():
-            try:
-                found = json.loads(path.read_text())
-            except ValueError:
-                log.warning("%s: not readable; computed again", path)
-            else:
-                log.info("%s %s: taken from an earlier run", name, label)
-                return found
+            log.warning("%s: not a row as expected; computed again", path)
         start = time.perf_counter()
         row = _plain(compute())
         self.computed += 1
@@ -50,6 +63,26 @@ class Journal:
         partial.write_text(json.dumps(row, indent=1))
         os.replace(partial, path)
         return row
+
+
+def fits(value: Any, form: Any) -> bool:
+    """Whether JSON is of a form: a type, a text that it must be, or parts of forms.
+
+    `{"a": float}` has at least an `a`, `[float]` any number of items. A number that was
+    not finite is `None`, and fits `float`.
+    """
+    if isinstance(form, dict):
+        return isinstance(value, dict) and all(
+            name in value and fits(value[name], one) for name, one in form.items()
+        )
+    if isinstance(form, list):
+        return isinstance(value, list) and all(fits(item, form[0]) for item in value)
+    if isinstance(form, str):
+        return value == form
+    if form is float:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        return value is None or number
+    return isinstance(value, form)
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ from bodyslam_jax import motion
 from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments import _ablation, _reports
+from bodyslam_jax.experiments._about import about
 from bodyslam_jax.experiments._case import Case, simulations
 from bodyslam_jax.experiments._comparison import compare_methods
 from bodyslam_jax.experiments._jobs import Job, Plan, by_sequence, cases, cost, named
@@ -18,21 +19,31 @@ from bodyslam_jax.experiments._learning import described, judge
 from bodyslam_jax.experiments._paper import STRUCTURE
 from bodyslam_jax.experiments._scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments._structure import landmark_ablation
-from bodyslam_jax.experiments._table1 import write_table1
+from bodyslam_jax.experiments._table1 import FORM, write_table1
 from bodyslam_jax.experiments._variants import FULL, VARIANTS
 from bodyslam_jax.experiments._weights import Learned, Trial, learn_weights, make_trial
 
 ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 NOISE_LEVELS = ("none", "low", "real")
 LEARNING_STEPS = 12
+DERIVATIVE = 240.0
+"""Processor time of compiling the solver's derivative, s: where sequences are few and
+short, most of what learning takes."""
 
 
 def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """All methods on all ten sequences, both families."""
     jobs = by_sequence(
-        experiment, config, stages, ALL, ("room", "follow"), compare_methods, (2.0, 4.0)
+        experiment,
+        config,
+        stages,
+        ALL,
+        ("room", "follow"),
+        compare_methods,
+        (2.0, 4.0),
+        FORM,
     )
-    return Plan(jobs, functools.partial(write_table1, noise=experiment.noise))
+    return Plan(jobs, functools.partial(write_table1, about=about(experiment, config)))
 
 
 def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -54,8 +65,10 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         compute,
         (len(PERTURBATIONS) * 1.5, 3.0),
+        _reports.SCALE,
     )
-    return Plan(jobs, functools.partial(_reports.write_scale, noise=experiment.noise))
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(_reports.write_scale, about=told))
 
 
 def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -68,10 +81,10 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         functools.partial(landmark_ablation, seed=experiment.seed or 0),
         (2.5, 4.0),
+        _reports.STRUCTURE,
     )
-    return Plan(
-        jobs, functools.partial(_reports.write_structure, noise=experiment.noise)
-    )
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(_reports.write_structure, about=told))
 
 
 def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -91,7 +104,7 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
     model = config.motion_model and Path(config.motion_model)
     key = (Path(source), model, body_model_file(config.body_model))
-    return Plan([Job("motion", key, 60.0, compute)], write)
+    return Plan([Job("motion", key, 60.0, compute, _reports.MOTION)], write)
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -112,7 +125,9 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         if settings in begun:
             seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are kept
         begun.add(settings)
-        jobs.append(Job(f"{name}-{label}", (settings, config, *extra), seconds, row))
+        key = (settings, config, *extra)
+        form = {"sequence": name, "label": label, "status": str}
+        jobs.append(Job(f"{name}-{label}", key, seconds, row, form))
 
     for s in simulations(experiment, ("M2", "D1"), ("room",)):
         for v in VARIANTS:
@@ -132,9 +147,8 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
             quiet = dataclasses.replace(s, noise=noise)
             one = lambda q=quiet: _ablation.ablate(case(q), prepared(q), FULL)
             add(quiet, f"noise: {noise}", one)
-    return Plan(
-        jobs, functools.partial(_reports.write_ablation, noise=experiment.noise)
-    )
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(_reports.write_ablation, about=told))
 
 
 def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -167,14 +181,17 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
         )
         return Cache(folder).stage("learned", mark, Learned, learn)
 
-    seconds = sum(cost(s, 8.0, 1.0) for s in training)
-    jobs = [Job("learnt", key, seconds, lambda: described(learned()))]
+    seconds = DERIVATIVE + sum(cost(s, 8.0, 1.0) for s in training)
+    learnt = lambda: described(learned())
+    jobs = [Job("learnt", key, seconds, learnt, _reports.LEARNT)]
     for group, settings in (("training", training), ("test", test)):
         for s in settings:
             told = {"sequence": named(s), "set": group}
             row = lambda s=s, told=told: {**told, **judge(trial(s), learned())}
-            jobs.append(Job(f"{group}-{named(s)}", (s, *key), cost(s, 2.0, 1.0), row))
-    write = functools.partial(_reports.write_weights, noise=experiment.noise)
+            form = {**told, **_reports.JUDGED}
+            label = f"{group}-{named(s)}"
+            jobs.append(Job(label, (s, *key), cost(s, 2.0, 1.0), row, form))
+    write = functools.partial(_reports.write_weights, about=about(experiment, config))
     return Plan(jobs, write)
 
 

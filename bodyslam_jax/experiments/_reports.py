@@ -1,12 +1,14 @@
 """Tables and figures of finished rows: Markdown, CSV and PNG beside one another."""
 
+import functools
 from pathlib import Path
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import motion, synthetic
-from bodyslam_jax.config import Config
+from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import _figures as figures
 from bodyslam_jax.experiments import _paper as paper
+from bodyslam_jax.experiments._about import deviations
 from bodyslam_jax.experiments._tables import (
     MM,
     Column,
@@ -19,9 +21,36 @@ from bodyslam_jax.experiments._tables import (
 
 CLIPS = Path(synthetic.__file__).parent / "assets" / "walking.npz"
 """The clips that ship."""
+SCALE = {
+    **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
+    **dict.fromkeys(("history", "h_ate"), [[float]]),
+    "spread": float,
+}
+_STAGES = ("original", "start", "perturbed", "no_landmarks", "landmarks")
+STRUCTURE = {
+    **dict.fromkeys(_STAGES, float),
+    **{f"{stage}/scale": float for stage in _STAGES},
+    **dict.fromkeys(("status", "status_no_landmarks"), str),
+}
+MOTION = {
+    "rows": [{"model": str, "drift": float, "class": str, "error_mm": float}],
+    "clips": int,
+    "held_out": bool,
+}
+LEARNT = {
+    "names": [str],
+    "path": [[float]],
+    **dict.fromkeys(("log", "factor", "history"), [float]),
+}
+JUDGED = {
+    f"{when}/{name}": float
+    for when in ("before", "after")
+    for name in ("error", "scale", "j_ate_se3")
+}
+"""What kept rows must have for the reports below, see `_journal.fits`."""
 
 
-def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
+def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Deviation by perturbation, and convergence."""
     flat = []
     for row in rows:
@@ -40,12 +69,12 @@ def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
             )
     columns = [
         Column("sequence", "sequence"),
-        Column("perturbation 1/s'", "perturbation"),
-        Column("estimated s", "scale", digits=4),
+        Column("perturbation 1/s'", "perturbation", average=False),
+        Column("estimated s", "scale", digits=4, average=False),
         Column("deviation, %", "deviation", 100.0, 2),
         Column("H-ATE before, mm", "h_before", MM),
         Column("H-ATE after, mm", "h_after", MM),
-        Column("the paper's s, its own data", "paper", digits=3),
+        Column("the paper's s, its own data", "paper", digits=3, average=False),
         Column("the paper's deviation, %", "paper_deviation"),
     ]
     spread = [
@@ -54,7 +83,7 @@ def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
     ]
     head = intro(
         "Scale recovery from perturbed cameras",
-        noise,
+        about,
         "Cameras of bundle adjustment at their true size, made 1/p as large and held; "
         "no landmarks; s starts at 1; s and people are free. The answer should not "
         "depend on the start. Deviation is signed: the motion model's bias on the "
@@ -66,7 +95,7 @@ def write_scale(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
     return [*written, out / "scale.png"]
 
 
-def write_structure(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
+def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """C-ATE of shaken cameras with and without landmarks, by the paper's."""
     names = ("original", "perturbed", "no_landmarks", "landmarks")
     theirs: list[Row | None] = []
@@ -95,7 +124,7 @@ def write_structure(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
     ]
     head = intro(
         "Structural landmarks",
-        noise,
+        about,
         "C-ATE, SE(3), mean over frames. Every camera is moved by up to 100 mm and "
         "0.01 rad in each coordinate, then everything is optimised.",
     )
@@ -108,18 +137,19 @@ def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> lis
     """The motion model's errors in the paper's form, and their histograms."""
     found = rows[0]
     error, step = paper.MOTION
-    ours = next(r for r in found["rows"] if r["class"] == "all" and r["drift"] == 0)
+    nan = float("nan")
+    table = [{k: nan if v is None else v for k, v in r.items()} for r in found["rows"]]
+    ours = next(r for r in table if r["class"] == "all" and r["drift"] == 0)
     which = "held out of training" if found["held_out"] else "of one person"
     head = (
         "# Prediction of motion\n\n"
         f"{found['clips']} clips of `{Path(source).name}`, {which}. "
         f"Mean error {ours['error_mm']:.1f} mm at a mean step of {ours['step_mm']:.1f} "
         f"mm a frame (ratio {ours['ratio']:.3f}). The paper's, on AMASS, other data: "
-        f"{error} mm at {step} mm (ratio {error / step:.3f}).\n\n"
+        f"{error} mm at {step} mm (ratio {error / step:.3f}). "
+        + deviations(Experiment(), config)
     )
-    nan = float("nan")
-    table = [{k: nan if v is None else v for k, v in r.items()} for r in found["rows"]]
-    write_text(out / "motion.md", head + motion.write_table(table))
+    write_text(out / "motion.md", f"{head.rstrip()}\n\n{motion.write_table(table)}")
     names = list(found["rows"][0])
     columns = [Column(name, name) for name in names]
     write_text(out / "motion.csv", to_csv(columns, found["rows"]))
@@ -131,20 +161,21 @@ def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> lis
     return [out / "motion.md", out / "motion.csv", picture]
 
 
-def write_ablation(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
+def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Every variant's errors, sequence by sequence."""
+    number = functools.partial(Column, average=False)  # a mean of variants says nothing
     columns = [
         Column("variant", "label"),
-        Column("C-ATE SE(3), mm", "c_ate_se3", MM),
-        Column("H-ATE SE(3), mm", "h_ate_se3", MM),
-        Column("J-ATE SE(3), mm", "j_ate_se3", MM),
-        Column("J-ATE Sim(3), mm", "j_ate_sim3", MM),
-        Column("estimated / true scale", "scale_ratio", digits=3),
-        Column("leg / true leg", "leg_ratio", digits=3),
-        Column("past frames", "past", digits=0),
-        Column("steps", "steps", digits=0),
-        Column("seconds", "seconds"),
-        Column("cost", "cost", digits=0),
+        number("C-ATE SE(3), mm", "c_ate_se3", MM),
+        number("H-ATE SE(3), mm", "h_ate_se3", MM),
+        number("J-ATE SE(3), mm", "j_ate_se3", MM),
+        number("J-ATE Sim(3), mm", "j_ate_sim3", MM),
+        number("estimated / true scale", "scale_ratio", digits=3),
+        number("leg / true leg", "leg_ratio", digits=3),
+        number("past frames", "past", digits=0),
+        number("steps", "steps", digits=0),
+        number("seconds", "seconds"),
+        number("cost", "cost", digits=0),
         Column("status", "status"),
     ]
     parts, written = [], []
@@ -152,16 +183,11 @@ def write_ablation(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         own = [row for row in rows if row["sequence"] == sequence]
         parts.append((sequence, columns, own))
         picture = out / f"ablation_{sequence}.png"
-        measures = (
-            ("c_ate_se3", "C-ATE, mm", MM),
-            ("j_ate_se3", "J-ATE, mm", MM),
-            ("scale_ratio", "estimated / true scale", 1.0),
-        )
-        figures.draw_bars(picture, own, measures)
+        figures.draw_variants(picture, own)
         written.append(picture)
     head = intro(
         "Ablations",
-        noise,
+        about,
         "`seconds` are wall time with compilation, but processor time without it for "
         "the three rows on orders. `past frames` are those that the motion model sees.",
     )
@@ -171,14 +197,14 @@ def write_ablation(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
     return [*files, *written]
 
 
-def write_weights(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
+def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Learnt factors, and errors before and after on training and test sequences.
 
     The first row is of the weights, each other one of a sequence.
     """
     found, *judged = rows
     factors = [
-        {"weight": n, "factor": f, "lambda": f**-2}
+        {"weight": n, "factor": f, "lambda": None if f is None else f**-2}
         for n, f in zip(found["names"], found["factor"], strict=True)
     ]
     columns = [
@@ -196,7 +222,7 @@ def write_weights(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
         Column("factor on σ (or robust scale)", "factor", digits=2, average=False),
         Column("factor on λ", "lambda", digits=2, average=False),
     ]
-    head = intro("Weights learnt through the solver", noise)
+    head = intro("Weights learnt through the solver", about)
     parts = [
         (f"{name} sequences", columns, [r for r in judged if r["set"] == name])
         for name in ("training", "test")

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from bodyslam_jax.experiments import _figures as figures
 from bodyslam_jax.experiments import _paper as paper
 from bodyslam_jax.experiments._comparison import METHODS
+from bodyslam_jax.experiments._score import NAMES
 from bodyslam_jax.experiments._tables import (
     MM,
     Column,
@@ -21,6 +23,19 @@ _PAIR = {"no_mm": "no MM", "full": "full"}
 """What the paper compares."""
 _PAPER = "paper:"
 """Before the keys of the paper's figures in a row of ours."""
+_NUMBERS = ("frames", "radius", "start_ratio", "start_sigma", "scale_ratio", "steps")
+_PATH = [[float]]
+FORM: dict[str, Any] = {
+    **dict.fromkeys(_NUMBERS, float),
+    **{f"{method}/{name}": float for method in METHODS for name in NAMES},
+    "status": str,
+    "paths": {
+        f"{what}/{name}": _PATH
+        for what in ("camera", "human")
+        for name in ("truth", *_PAIR)
+    },
+}
+"""What a kept row must have, beside its sequence."""
 _SEQUENCE = Column("sequence", "sequence")
 _BEHIND = [
     Column("frames", "frames", digits=0),
@@ -36,7 +51,7 @@ _BEHIND = [
 ]
 
 
-def write_table1(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
+def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Table 1, what is behind it, and the baselines; all of it in one CSV."""
     papers = [paper.table1_row(row["sequence"].split("-")[0]) for row in rows]
     rows = [_completed(*both) for both in zip(rows, papers, strict=True)]
@@ -54,7 +69,7 @@ def write_table1(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
             add(f": {meaning}", [*_errors(method), _scale(method)])
     head = intro(
         "Table 1: with and without a motion model",
-        noise,
+        about,
         "Means over frames. `scale` is that of the Sim(3) alignment of the cameras "
         "(truth per estimate, best 1); without a motion model it is the unit of the "
         "reconstruction, hence arbitrary. "
@@ -73,10 +88,11 @@ def write_table1(out: Path, rows: list[Row], *, noise: str) -> list[Path]:
 
 def _completed(row: Row, theirs: Row) -> Row:
     """A row with what follows from it, and the paper's figures."""
+    scale, error = row["full/scale"], row["full/c_ate_se3"]  # `None`: not finite
     return {
         **row,
-        "scale_error": abs(1 - row["full/scale"]),
-        "share": row["full/c_ate_se3"] / row["radius"],
+        "scale_error": None if scale is None else abs(1 - scale),
+        "share": None if error is None or not row["radius"] else error / row["radius"],
         **{_PAPER + name: value for name, value in theirs.items()},
     }
 

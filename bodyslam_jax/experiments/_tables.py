@@ -47,14 +47,14 @@ def markdown(
     lines = [[column.title for column in columns], ["---"] * len(columns)]
     lines += [[c.text(c.value(row)) for c in columns] for row in rows]
     if mean and rows:
-        last = []
+        last: list[str] = []
         for column in columns:
             values = [column.value(row) for row in rows]
             numbers = [v for v in values if isinstance(v, (int, float))]
             known = column.average and len(numbers) == len(rows)
             last.append(column.text(sum(numbers) / len(rows)) if known else "")
-        last[0] = "**mean**"
-        lines.append(last)
+        if any(last):
+            lines.append(["**mean**", *last[1:]])
     escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
     return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
 
@@ -77,10 +77,9 @@ def write_text(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def intro(title: str, noise: str, *lines: str) -> str:
+def intro(title: str, about: str, *lines: str) -> str:
     """Title, what the data are, and `lines` on what follows."""
-    about = f"Simulated sequences, noise level `{noise}`. {OTHER_DATA}"
-    return "\n".join([f"# {title}", "", about, *lines, "", ""])
+    return "\n".join([f"# {title}", "", f"{about} {OTHER_DATA}", *lines, "", ""])
 
 
 def write_tables(
