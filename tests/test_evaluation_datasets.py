@@ -130,6 +130,9 @@ def test_a_wrong_body_is_refused(tmp_path, bodies, world):
     source, out = make_emdb(tmp_path / "P0", world), tmp_path / "out"
     man, lone = bodies / "SMPL_MALE.npz", tmp_path / "lone"
     lone.mkdir()
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "SMPL_FEMALE.npz").symlink_to(bodies / "SMPL_FEMALE.npz")
     (lone / "SMPL_NEUTRAL.npz").symlink_to(bodies / "SMPL_NEUTRAL.npz")
     for model, message in (
         (None, "P0_09_walk_data.pkl: .*need SMPL, female, not the free body"),
@@ -143,11 +146,62 @@ def test_a_wrong_body_is_refused(tmp_path, bodies, world):
     root = make_rich(tmp_path / "rich", world)
     for model, message in (
         (None, "003.pkl: .*need SMPL-X, female, not the free body"),
-        (bodies, r"need SMPL-X, female, not SMPL_FEMALE \(SMPL"),
+        (other, r"need SMPL-X, female, not SMPL_FEMALE \(SMPL"),
     ):
         with pytest.raises(ValueError, match=message):
             evaluation.convert_rich(root, "val", RICH, 3, out, model)
     assert not out.exists() and not [*tmp_path.glob(".conversion-*")]
+
+
+@pytest.mark.parametrize("place", ["named", "variable", "installed"])
+def test_the_kind_needed_is_taken_out_of_a_folder_with_others(
+    tmp_path, bodies, world, monkeypatch, place, caplog
+):
+    """smplx's own layout, `smpl/SMPL_MALE.npz` beside `smplx/SMPLX_MALE.npz`."""
+    std = tmp_path / "share" / "bodyslam" / "body_models"
+    (std / "smpl").mkdir(parents=True)
+    for file in bodies.glob("*.npz"):
+        (std / "smpl" / file.name).symlink_to(file)
+    (std / "smplx").symlink_to(bodies / "smplx")
+    if place == "variable":
+        monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
+        monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(std))
+    named = std if place == "named" else None
+    smplx = bodies / "smplx" / "SMPLX_FEMALE.npz"
+    T_CW, poses, trans, betas = world
+
+    root = make_rich(tmp_path / "rich", world)
+    out = evaluation.convert_rich(root, "val", RICH, 3, tmp_path / "out", named)
+    still = poses * (np.arange(72) < 66), trans, betas
+    found = evaluation.read_groundtruth(out, load_body_model(smplx)).joints[0]
+    _expect_joints(found[:-1], smplx, (T_CW, still[0][:-1], trans[:-1], betas))
+    source = make_emdb(tmp_path / "P0", world)
+    out = evaluation.convert_emdb(source, tmp_path / "emdb", named)
+    found = evaluation.read_groundtruth(out, load_body_model(smplx)).joints[0]
+    _expect_joints(found, bodies / "SMPL_FEMALE.npz", world)
+
+    # One ground truth with the same gender in both
+    for h, width in enumerate((72, 165)):
+        wide = np.pad(poses[:, :66], ((0, 0), (0, width - 66)))
+        make_pair(tmp_path / str(h), world, gender="female", poses=wide)[1].rename(
+            tmp_path / f"body_{h}.npz"
+        )
+    truth = read_truth(tmp_path, named)
+    flat = T_CW, still[0], trans, betas
+    _expect_joints(truth.joints[0], bodies / "SMPL_FEMALE.npz", flat)
+    _expect_joints(truth.joints[1], smplx, flat)
+    assert not caplog.records
+
+
+def test_a_named_file_goes_before_a_better_name(tmp_path, bodies, world, monkeypatch):
+    """As long as it fits."""
+    home = tmp_path / "share" / "bodyslam" / "body_models"
+    home.mkdir(parents=True)
+    (home / "SMPL_FEMALE.npz").symlink_to(bodies / "SMPL_FEMALE.npz")
+    (tmp_path / "own.npz").symlink_to(bodies / "SMPL_MALE.npz")
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(tmp_path / "own.npz"))
+    make_pair(tmp_path, world)[1].rename(tmp_path / "body.npz")
+    _expect_joints(read_truth(tmp_path).joints[0], tmp_path / "own.npz", world)
 
 
 def test_the_body_is_looked_for_where_it_always_is(

@@ -164,6 +164,11 @@ def test_a_folder_without_motion(tmp_path):
     np.savez(tmp_path / "something.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="no usable motion among 1"):
         read_motion(tmp_path)
+    with pytest.raises(ValueError, match="something.npz: no motion, but a; expected"):
+        read_motion(tmp_path / "something.npz")
+    write_amass(tmp_path / "s" / "walk.npz")
+    assert len(read_motion(tmp_path)) == 1  # beside something else
+    (tmp_path / "s" / "walk.npz").unlink()
     with pytest.raises(FileNotFoundError):
         read_motion(tmp_path / "nowhere")
     write_amass(tmp_path / "broken.npz")

@@ -3,10 +3,13 @@
 import dataclasses
 import itertools
 import json
+import os
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from test_cli import _run
 
 from bodyslam_jax import synthetic
 from bodyslam_jax.body import load_body_model
@@ -104,6 +107,99 @@ def test_a_write_that_fails_leaves_nothing(simulated, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="No space left"):
         synthetic.write_sequence(tmp_path / "out", simulated)
     assert not list(tmp_path.iterdir())
+
+
+def _files(folder):
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+def test_what_no_simulation_wrote_is_kept(simulated, tmp_path):
+    """A run, notes and images; but not the longer and rendered simulation before."""
+    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    new = _files(out)
+    mark = json.loads((out / "simulation.json").read_text())
+    (out / "simulation.json").write_text(json.dumps(mark | {"render": True}))
+    old = {"video.mp4", "keypoints/D1-follow_000000000099_keypoints.json"}
+    theirs = {"run/notes.txt", "images/0.png", "keypoints/a.txt", "groundtruth/a.txt"}
+    for name in old | theirs:
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("mine")
+    synthetic.write_sequence(out, simulated)
+    assert _files(out) == new | theirs
+    assert all((out / name).read_text() == "mine" for name in theirs)
+    # Nor a video or keypoints that are somebody's, by name or behind a link
+    (out / "video.mp4").write_text("mine")
+    (out / "keypoints").rename(tmp_path / "keypoints")
+    (out / "keypoints").symlink_to(tmp_path / "keypoints")
+    before = _files(tmp_path / "keypoints")
+    synthetic.write_sequence(out, simulated)
+    assert (out / "video.mp4").read_text() == "mine"
+    assert _files(tmp_path / "keypoints") == before and len(before) == 41
+    settings = dataclasses.replace(SETTINGS, render=True)
+    with pytest.raises(ValueError, match="has video.mp4, which no simulation wrote"):
+        synthetic.check_folder(out, settings)
+
+
+@pytest.mark.parametrize("moved", [0, 1, 5, 20, 46])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left")])
+def test_interrupted_writing_is_no_sequence_and_is_finished(
+    simulated, tmp_path, monkeypatch, moved, error
+):
+    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    whole, replace, num = _files(out), os.replace, 0
+    (out / "mine.txt").write_text("x")
+
+    def interrupted(*args):
+        nonlocal num
+        num += 1
+        if num > moved + 1:  # the mark is the first
+            raise error
+        replace(*args)
+
+    monkeypatch.setattr("os.replace", interrupted)
+    with pytest.raises((KeyboardInterrupt, ValueError)):
+        synthetic.write_sequence(out, simulated)
+    monkeypatch.undo()
+    with pytest.raises((ValueError, FileNotFoundError)):
+        read_sequence(out)
+    assert "unfinished" in json.loads((out / "simulation.json").read_text())
+    assert not list(out.glob(".*"))
+    (out / ".simulation-abcd1234").mkdir()  # as `kill -9` leaves it
+    synthetic.write_sequence(out, simulated)
+    assert _files(out) == whole | {"mine.txt"} and not list(out.glob(".*"))
+
+
+def test_killed_before_the_first_file(simulated, tmp_path):
+    (tmp_path / "out" / ".simulation-abcd1234").mkdir(parents=True)
+    synthetic.write_sequence(tmp_path / "out", simulated)
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_a_link_to_a_folder_is_written_through(simulated, tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    for _ in range(2):
+        assert synthetic.write_sequence(tmp_path / "link", simulated).is_symlink()
+    assert (tmp_path / "real" / "camera.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--length", "0"], "length 0: a sequence needs 2"),
+        (["--seed", "-3"], "seed -3: expected 0 or more"),
+        (["--detector-bias", "nan"], "bias nan: expected a finite"),
+        (["--detector-bias", "inf"], "bias inf: expected a finite"),
+        (["--motion", "bad.npz"], "bad.npz: no motion, but a; expected"),
+    ],
+)
+def test_a_refused_option_is_named_and_leaves_nothing(
+    argv, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    np.savez("bad.npz", a=np.zeros(3))
+    code, _, err = _run(monkeypatch, capsys, "simulate", "new/out", *argv)
+    assert code == 1 and message in err and len(err.strip().splitlines()) == 1
+    assert list(Path().iterdir()) == [Path("bad.npz")]
 
 
 def test_video_shows_the_person_where_the_truth_is(simulated):

@@ -25,12 +25,12 @@ def simulate(
     """Writes a simulated sequence folder with ground truth.
 
     Args:
-        out: Sequence folder to write.
+        out: Sequence folder to write; an earlier simulation in it is replaced.
         config: What to simulate.
     """
     from bodyslam_jax import synthetic
 
-    out.mkdir(parents=True, exist_ok=True)  # or it is said now, not after a minute
+    synthetic.check_folder(out, config)  # said now, not after a minute
     synthetic.write_sequence(out, synthetic.simulate(config))
     print(out)
 

@@ -24,6 +24,8 @@ _CMU_ARRAYS = (
 def read_motion(path: Path | str) -> tuple[Clip, ...]:
     """Reads all motion under a file or folder; clips keep the rate they have.
 
+    In a folder, `.npz` files of other things are passed over.
+
     **Raises:** `FileNotFoundError` if there is nothing at `path`; `ValueError` if a
     file is damaged or if no file holds a usable sequence.
     """
@@ -31,7 +33,14 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder of motion data.")
     if path.is_file():
-        return _read_file(path)
+        if clips := _read_file(path):
+            return clips
+        with np.load(path, allow_pickle=False) as archive:
+            names = ", ".join(archive.files[:8]) or "nothing"
+        raise ValueError(
+            f"{path}: no motion, but {names}; expected `poses` and `trans` of AMASS, "
+            "or a CMU archive."
+        )
     files = sorted(
         file
         for suffix in ("npz", "bvh")

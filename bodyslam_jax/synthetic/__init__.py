@@ -10,6 +10,7 @@ from bodyslam_jax.synthetic._simulate import SimulatedSequence as SimulatedSeque
 from bodyslam_jax.synthetic._simulate import simulate as simulate
 from bodyslam_jax.synthetic._writing import as_sequence as as_sequence
 from bodyslam_jax.synthetic._writing import as_truth as as_truth
+from bodyslam_jax.synthetic._writing import check_folder as check_folder
 from bodyslam_jax.synthetic._writing import demo_scene as demo_scene
 from bodyslam_jax.synthetic._writing import demo_settings as demo_settings
 from bodyslam_jax.synthetic._writing import render as render

@@ -99,11 +99,19 @@ def simulate(
     - `body`: the body model, whose pose blend shapes are ignored; the default without.
 
     **Raises:** `FileNotFoundError` or `ValueError`, naming the file, if the motion
-    cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames.
+    cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames,
+    or for a negative seed or a bias that is no number.
     """
-    num_frames = settings.length or LENGTH[settings.sequence]
+    length = settings.length
+    num_frames = LENGTH[settings.sequence] if length is None else length
     if num_frames < 2:
         raise ValueError(f"length {num_frames}: a sequence needs 2 frames or more.")
+    if settings.seed is not None and settings.seed < 0:
+        raise ValueError(f"seed {settings.seed}: expected 0 or more.")
+    if not np.isfinite(settings.detector_bias):
+        raise ValueError(
+            f"detector bias {settings.detector_bias}: expected a finite number."
+        )
     name = f"{settings.sequence}-{settings.family}"
     seed = zlib.crc32(name.encode()) if settings.seed is None else settings.seed
     # One stream each, so that a noise level changes nothing that is true

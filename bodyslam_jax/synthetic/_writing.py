@@ -1,5 +1,6 @@
 """Simulated sequences as folders, films and the objects that the pipeline takes."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -7,6 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -21,6 +23,21 @@ from bodyslam_jax.synthetic._simulate import SimulatedSequence, simulate
 
 _MARK = "simulation.json"
 """Settings of the simulation; a folder with it may be written again."""
+_PARTIAL = ".simulation-"
+_FILM = "video.mp4"
+_OWN = (
+    "groundtruth/camera.txt",
+    "groundtruth/landmarks.npy",
+    "groundtruth/body.npz",
+    "camera.json",
+    "bodies.npz",
+    "bodies_weak_perspective.npz",
+    "keypoints/[EMD][1-4]-*_keypoints.json",
+    "tracks.npz",
+    _FILM,
+)
+"""What a simulation writes. It appears in this order and goes in the reverse, so that
+what is there only in part has neither tracks nor frames: no reader takes it."""
 _DEMO_FRAMES = 105
 
 
@@ -34,32 +51,26 @@ def write_sequence(
 
     **Arguments:**
 
-    - `folder`: new, empty, or an earlier simulation, which is replaced.
+    - `folder`: new, empty, or with an earlier simulation, whose files are replaced;
+        others, such as a run in a folder below, are kept.
     - `tracks`: whether `tracks.npz` is written; without it tracks come from the video.
 
     **Raises:** `ValueError` if `folder` holds something else or cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: a file; expected a folder to write.")
-    if folder.exists() and any(folder.iterdir()) and not (folder / _MARK).exists():
-        raise ValueError(f"{folder}: not empty and not a simulation; choose another.")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=".simulation-", dir=folder.parent))
-    except OSError as error:
-        raise ValueError(f"{folder}: cannot be written ({error.strerror}).") from None
-    try:
+    with _partial(folder, simulated.settings) as partial:
         _write(partial, simulated, tracks)
-        partial.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(partial, folder)
-    except OSError as error:
-        raise ValueError(f"{folder}: cannot be written ({error.strerror}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _move(partial, folder, simulated.settings)
     return folder
+
+
+def check_folder(folder: Path, settings: Simulation) -> None:
+    """Fails early, before anything is simulated; leaves `folder` as it is.
+
+    **Raises:** as `write_sequence`.
+    """
+    with _partial(Path(folder), settings):
+        pass
 
 
 def demo_settings(seed: int = 0) -> Simulation:
@@ -79,8 +90,7 @@ def demo_scene(
     there is one already.
     """
     settings = demo_settings(seed)
-    mark = Path(folder) / _MARK
-    if mark.exists() and json.loads(mark.read_text()) == dataclasses.asdict(settings):
+    if _earlier(Path(folder)) == dataclasses.asdict(settings):
         return Path(folder)
     if simulated is None:
         simulated = simulate(settings)
@@ -146,6 +156,81 @@ def _shapes_regressed(simulated: SimulatedSequence) -> bool:
     return (settings.body_noise or settings.noise) != "none"
 
 
+@contextlib.contextmanager
+def _partial(folder: Path, settings: Simulation) -> Iterator[Path]:
+    """A hidden folder in `folder`, gone afterwards, with every folder made in vain."""
+    home, made = Path(os.path.realpath(folder)), []
+    try:
+        _check(folder, settings)
+        made = [place for place in (home, *home.parents) if not place.exists()]
+        home.mkdir(parents=True, exist_ok=True)
+        for killed in home.glob(f"{_PARTIAL}????????"):
+            shutil.rmtree(killed, ignore_errors=True)
+        partial = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=home))
+        try:
+            yield partial
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"{folder}: cannot be written ({reason}).") from None
+    finally:
+        for place in made:
+            with contextlib.suppress(OSError):
+                place.rmdir()
+
+
+def _check(folder: Path, settings: Simulation) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: a file; expected a folder to write.")
+    if not folder.exists():
+        return
+    earlier = _earlier(folder)
+    if earlier is None:
+        if any(not entry.name.startswith(_PARTIAL) for entry in folder.iterdir()):
+            raise ValueError(
+                f"{folder}: not empty and not a simulation; choose another."
+            )
+    elif settings.render and not earlier.get("render") and (folder / _FILM).exists():
+        raise ValueError(
+            f"{folder}: has {_FILM}, which no simulation wrote; choose another folder."
+        )
+
+
+def _earlier(folder: Path) -> dict[str, Any] | None:
+    """Settings of the simulation in a folder; `None` if there is none."""
+    if not (folder / _MARK).exists():
+        return None
+    try:
+        found = json.loads((folder / _MARK).read_text())
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _move(partial: Path, folder: Path, settings: Simulation) -> None:
+    """Puts what is in `partial` in the place of an earlier simulation."""
+    earlier = _earlier(folder) or {}
+    was_rendered = bool(earlier.get("render"))
+    # Whoever is interrupted from here on leaves a simulation of no settings.
+    mark = {"unfinished": True, "render": was_rendered or settings.render}
+    (partial / "mark").write_text(json.dumps(mark))
+    os.replace(partial / "mark", folder / _MARK)
+    for name in ("keypoints", "groundtruth"):
+        if (folder / name).is_symlink():  # to files that are somebody's
+            (folder / name).unlink()
+    for pattern in reversed(_OWN):
+        if pattern != _FILM or was_rendered:
+            for old in folder.glob(pattern):
+                old.unlink()
+    for pattern in _OWN:
+        for new in sorted(partial.glob(pattern)):
+            place = folder / new.relative_to(partial)
+            place.parent.mkdir(exist_ok=True)
+            os.replace(new, place)
+    os.replace(partial / _MARK, folder / _MARK)
+
+
 def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
     width, height = simulated.size
     camera = {
@@ -196,7 +281,7 @@ def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
         gender=np.array("neutral"),
     )
     if simulated.settings.render:
-        write_video(folder / "video.mp4", render(simulated), FPS, simulated.size)
+        write_video(folder / _FILM, render(simulated), FPS, simulated.size)
     settings = dataclasses.asdict(simulated.settings)
     (folder / _MARK).write_text(json.dumps(settings, indent=1))
 

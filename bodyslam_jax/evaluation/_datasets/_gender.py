@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.body import BodyModel, load_body_model, search_paths
-from bodyslam_jax.body._files import DEFAULT, VARIABLE
+from bodyslam_jax.body._files import DEFAULT, VARIABLE, _candidates
 from bodyslam_jax.evaluation._readers import _load_npz, read_groundtruth
 from bodyslam_jax.result import Result
 
@@ -26,6 +26,9 @@ _NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 _NAMES["default"] = "the free body that ships with the package"
 _KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
 """Numbers in a posture, and the bodies that it and its shape fit, best first."""
+_STEMS = {"smpl": ("smpl_", "basicmodel"), "smplh": ("smplh_", "model")}
+_STEMS["smplx"] = ("smplx_",)
+"""How names of files begin, where they are usual."""
 
 
 def gender_of(value: Any) -> str | None:
@@ -40,14 +43,15 @@ def body_for(
 ) -> BodyModel:
     """The body of one kind and gender, for the parameters in `file`.
 
-    `body_model` is a file, or a folder with a file for each gender; without it one is
-    looked for where `load_body_model` does.
+    `body_model` is a file, or a folder with a file for each gender, and for other kinds
+    too; without it one is looked for where `load_body_model` does.
 
     **Raises:** `ValueError` if there is no such body.
     """
     is_found = body_model or os.environ.get(VARIABLE) or _is_installed(gender)
-    body = load_body_model(body_model, gender) if is_found else load_body_model(DEFAULT)
-    if wrong := _mismatch(body, body_model, gender, (kind,)):
+    place = body_model if is_found else DEFAULT
+    body, wrong = _load(place, gender, gender, (kind,))
+    if wrong:
         raise ValueError(
             f"{file}: its joints need {_NAMES[kind]}, {gender}, not {wrong}; name its "
             "file or folder with --body-model."
@@ -66,22 +70,22 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
         raise FileNotFoundError(f"{body_model}: no such body model.")
     files = _bodies(path)
     needs = [None if "joints" in x else _needed(x) for x in files.values()]
-    genders = sorted({need[0] for need in needs if need})
-    if not genders:
+    wanted = sorted({need for need in needs if need})
+    if not wanted:
         return read_groundtruth(path, load_body_model(DEFAULT))  # poses nobody
-    bodies = {gender: _body_at_hand(body_model, gender) for gender in genders}
+    bodies = {need: _body_at_hand(body_model, *need) for need in wanted}
     for file, need in zip(files, needs, strict=True):
-        if need and (wrong := _mismatch(bodies[need[0]], body_model, *need)):
+        if need and (wrong := bodies[need][1]):
             log.warning(
                 "%s: no joints in it; its parameters are of %s, %s, but posed with %s, "
                 "which makes another person of them; name the right body with "
                 "--body-model.",
                 *(file, _NAMES[need[1][0]], need[0], wrong),
             )
-    read = {gender: read_groundtruth(path, body) for gender, body in bodies.items()}
-    of = [need[0] if need else genders[0] for need in needs]
-    joints = np.stack([read[gender].joints[h] for h, gender in enumerate(of)])
-    return dataclasses.replace(read[genders[0]], joints=joints)
+    read = {need: read_groundtruth(path, body) for need, (body, _) in bodies.items()}
+    of = [need or wanted[0] for need in needs]
+    joints = np.stack([read[need].joints[h] for h, need in enumerate(of)])
+    return dataclasses.replace(read[wanted[0]], joints=joints)
 
 
 def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
@@ -107,21 +111,52 @@ def _is_installed(gender: str) -> bool:
     return any(file.is_file() for file in search_paths(gender))
 
 
-def _body_at_hand(body_model: Path | None, gender: str) -> BodyModel:
+def _body_at_hand(
+    body_model: Path | None, gender: str, kinds: tuple[str, ...]
+) -> tuple[BodyModel, str | None]:
     """That of the gender; if none is named and none is there, the neutral one."""
-    wanted = gender if body_model or _is_installed(gender) else "neutral"
-    return load_body_model(body_model, wanted)
+    there = gender if body_model or _is_installed(gender) else "neutral"
+    return _load(body_model, there, gender, kinds)
+
+
+def _load(
+    place: Path | None, there: str, gender: str, kinds: tuple[str, ...]
+) -> tuple[BodyModel, str | None]:
+    """The body of one of `kinds`, best first, among those called `there`.
+
+    If there is none, it is another, and what that is instead is said.
+    """
+    named = place or os.environ.get(VARIABLE) or Path()
+    files = _candidates(place, there) if place else search_paths(there)
+    order = lambda file: (not file.is_relative_to(named), _rank(file, kinds))
+    files = sorted(filter(Path.is_file, files), key=order)
+    found = []
+    for file in files:
+        body = load_body_model(file)
+        wrong = _mismatch(body, file, gender, kinds)
+        if not wrong:
+            return body, None
+        found.append((body, wrong))
+    if found:
+        return found[0]
+    body = load_body_model(place, there)  # the free one, or says where none is
+    return body, _mismatch(body, DEFAULT, gender, kinds)
+
+
+def _rank(file: Path, kinds: tuple[str, ...]) -> int:
+    """Place of a file among `kinds` by its name, which need not be true."""
+    fits = [file.stem.lower().startswith(_STEMS[kind]) for kind in kinds]
+    return [*fits, True].index(True)
 
 
 def _mismatch(
-    body: BodyModel, body_model: Path | None, gender: str, kinds: tuple[str, ...]
+    body: BodyModel, file: Path, gender: str, kinds: tuple[str, ...]
 ) -> str | None:
     """What a body is if it is not what was wanted; its gender goes by its name."""
     name = _NAMES[body.kind]
     if body.kind == "default":
         return name
-    named = Path(body_model or os.environ.get(VARIABLE) or body.name)
-    of = _named_gender(named if named.is_file() else Path(body.name))
+    of = _named_gender(file)
     if body.kind not in kinds or of not in (gender, None):
         return f"{body.name} ({name}{', ' + of if of else ''})"
     return None
