@@ -16,7 +16,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-import bodyslam_jax as bs
 from bodyslam_jax import evaluation
 from bodyslam_jax.result import Result
 
@@ -34,6 +33,12 @@ def stack_pairs(
 ) -> tuple[evaluation.Trajectories, evaluation.Trajectories]:
     """Estimates and truths on common frames and people, padded and stacked."""
     associated = [evaluation.associate(result, truth) for result, truth in pairs]
+    counts = {len(truth.present) for _, truth in associated}
+    if len(counts) > 1:
+        raise ValueError(
+            f"Pairs with {', '.join(map(str, sorted(counts)))} people: stack those "
+            "with as many."
+        )
     longest = max(len(truth.camera_valid) for _, truth in associated)
     estimates, truths = (
         [evaluation.pad_frames(trajectories, longest) for trajectories in side]
@@ -81,12 +86,12 @@ def main() -> None:
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", not arguments.single)
     if arguments.folders:
-        body = bs.load_body_model()
+        if len(arguments.folders) % 2:
+            parser.error("a run and its ground truth, in turn: one folder is left over")
+        runs, truths = arguments.folders[::2], arguments.folders[1::2]
         pairs = [
-            (evaluation.read_result(run), evaluation.read_groundtruth(truth, body))
-            for run, truth in zip(
-                arguments.folders[::2], arguments.folders[1::2], strict=True
-            )
+            (evaluation.read_result(run), evaluation.read_truth(truth))
+            for run, truth in zip(runs, truths, strict=True)
         ]
     else:
         rng = np.random.default_rng(0)
@@ -99,10 +104,13 @@ def main() -> None:
         f"{time.perf_counter() - start:.1f} s on {jax.devices()[0].device_kind}"
     )
     for name in ("c_ate_se3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe", "rte"):
-        print(
-            f"{name:>12}  mean {np.mean(found[name]):.4f}"
-            f"  max {np.max(found[name]):.4f}"
-        )
+        # NaN is where a truth lacks what the error is about.
+        known = np.asarray(found[name])[~np.isnan(found[name])]
+        if len(known):
+            print(
+                f"{name:>12}  mean {np.mean(known):.4f}  max {np.max(known):.4f}"
+                f"  of {len(known)}"
+            )
 
     estimates, truths = stack_pairs(pairs)
     longest = truths.camera_valid.shape[1]

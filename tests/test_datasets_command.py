@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import jaxlie
 import numpy as np
@@ -74,8 +75,9 @@ def test_evaluate_poses_a_truth_without_joints(
     world, out, seen = make_world(), tmp_path / "sequence", []
     command("convert-dataset", "tum-amass", *make_pair(tmp_path, world), out)
     run = _write_run(tmp_path / "run", read_truth(out, bodies))
+    found = types.SimpleNamespace(scope=None)
     monkeypatch.setattr(
-        evaluation, "evaluate", lambda _, truth, *__: seen.append(truth)
+        evaluation, "evaluate", lambda _, truth, *__: seen.append(truth) or found
     )
     monkeypatch.setattr(evaluation, "to_table", lambda _: "a table")
     evaluate = lambda model: command("evaluate", run, out, "--body-model", model)

@@ -495,3 +495,84 @@ def test_trajectories_and_results_do_not_mix():
     assert isinstance(pair[0], Trajectories)
     with pytest.raises(ValueError, match="two"):
         evaluation.evaluate(pair[0], truth)
+
+
+def test_a_piece_of_a_track_does_not_beat_the_whole():
+    truth = _truth()
+    rng = np.random.default_rng(1)
+    whole = truth.joints + rng.normal(0, 0.05, truth.joints.shape)
+    both = np.concatenate([truth.joints, whole])
+    present = np.ones((2, NUM), bool)
+    present[0, 6:] = False
+    found = _result(truth.timestamps, truth.T_WC, both, present)
+    result = evaluation.evaluate(found, truth)
+    scope = result.scope
+    assert scope is not None and scope.others == 1
+    assert scope.people == (evaluation.Pair(0, 1, NUM, NUM),)
+    assert float(result["h_ate_se3"]) > 0.01
+
+
+def test_what_is_compared_is_said():
+    truth = _truth(num_people=2)
+    present = np.ones((1, NUM), bool)
+    present[0, 25:] = False
+    found = _result(truth.timestamps, truth.T_WC, truth.joints[1:], present)
+    whole = evaluation.evaluate(found, truth)
+    scope = whole.scope
+    assert scope == evaluation.Scope(
+        NUM, NUM, (evaluation.Pair(0, None, 0, NUM), evaluation.Pair(1, 0, 25, NUM)), 0
+    )
+    first, second = evaluation.gaps(scope)
+    assert "person 0 of the ground truth is not found" in first
+    assert "person 1 is compared in 25 of 250 frames" in second
+    assert "person 1 (here 0) in 25 of 250 frames" in evaluation.to_table(whole)
+    said = json.loads(evaluation.to_json(whole))["compared"]["people"]
+    assert [person["estimate"] for person in said] == [None, 0]
+    # Half of the time, at half of the rate, of somebody without a camera.
+    half = _result(
+        truth.timestamps[:125:2], truth.T_WC[:125:2], truth.joints[:, :125:2]
+    )
+    blind = dataclasses.replace(truth, summary={"has_camera": False})
+    scope = evaluation.evaluate(half, blind).scope
+    assert (scope.cameras, scope.of_cameras) == (0, 0)
+    assert [(p.frames, p.of_frames) for p in scope.people] == [(63, 125)] * 2
+    assert len(evaluation.gaps(scope)) == 2
+
+
+def test_nothing_is_a_difference_across_missing_frames():
+    truth = _truth()
+    keep = np.r_[0:100, 140:NUM]
+    cut = _result(truth.timestamps[keep], truth.T_WC[keep], truth.joints[:, keep])
+    whole, found = evaluation.evaluate(truth, truth), evaluation.evaluate(cut, truth)
+    expected = float(whole["jitter"])
+    for name in ("jitter", "jitter_of_truth"):
+        assert float(found[name]) == pytest.approx(expected, rel=0.1), name
+    assert float(found["rpe_translation"]) < 1e-9
+    both = evaluation.evaluate(cut, cut)
+    assert float(both["jitter"]) == pytest.approx(expected, rel=0.1)
+    # A clock that jumps by years is no reason to make frames of them.
+    late = dataclasses.replace(
+        truth, timestamps=truth.timestamps + 1e8 * (np.arange(NUM) > 99)
+    )
+    assert float(evaluation.evaluate(late, late)["jitter"]) < 1.1 * expected
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.1, 0.7, 1 / 3), (9.0, -70, 3)])
+def test_an_estimate_that_does_not_move_has_no_scale(place):
+    truth, dtypes = _truth(), (jnp.float64, jnp.float32)
+    T_WC = truth.T_WC.copy()
+    T_WC[:, :3, 3] = place
+    for dtype in dtypes:
+        cast = lambda x: jax.tree.map(
+            lambda y: y.astype(dtype) if jnp.issubdtype(y.dtype, jnp.floating) else y, x
+        )
+        pair = _pair(dataclasses.replace(truth, T_WC=T_WC), truth)
+        found = evaluate(*map(cast, pair))
+        assert np.isnan(found["scale"]) and np.isnan(found["c_ate_sim3"])
+        assert float(found["c_ate_se3"]) > 0.1
+        fit = evaluation.umeyama(
+            jnp.asarray(truth.T_WC[:, :3, 3], dtype),
+            jnp.broadcast_to(jnp.asarray(place, dtype), (NUM, 3)),
+            with_scale=True,
+        )
+        assert float(fit.scale) == 1

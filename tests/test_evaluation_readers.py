@@ -112,6 +112,8 @@ BAD_BODIES = {
     "lengths": (_good | {"trans": np.zeros((4, 3))}, r"trans \(4, 3\)"),
     "nan": (_good | {"trans": np.full((5, 3), np.nan)}, "trans holds values"),
     "joints": (_good | {"joints": np.zeros((5, 22, 3))}, r"joints \(5, 22, 3\)"),
+    "two rates": (_good | {"mocap_framerate": [30.0, 60.0]}, "not one number"),
+    "text": (_good | {"trans": np.full((5, 3), "a")}, "trans is of type"),
     "objects": (_good | {"poses": np.array([{}] * 5)}, "not a readable"),
 }
 
@@ -136,6 +138,37 @@ def test_what_is_not_there_is_said(tmp_path, body):
     np.savez(tmp_path / "result.npz", T_WC=np.eye(4))
     with pytest.raises(ValueError, match="no array timestamps"):
         read_result(tmp_path)
+
+
+def test_damaged_files_are_named(tmp_path, body):
+    np.savez_compressed(tmp_path / "body.npz", **_good)
+    bytes_ = bytearray((tmp_path / "body.npz").read_bytes())
+    bytes_[80:140] = b"\x55" * 60
+    (tmp_path / "body.npz").write_bytes(bytes_)
+    with pytest.raises(ValueError, match="body.npz: not a readable"):
+        read_groundtruth(tmp_path, body)
+    np.savez(tmp_path / "body.npz", **_good)
+    for array in (np.zeros(7), np.array([{}])):
+        np.save(tmp_path / "landmarks.npy", array)
+        with pytest.raises(ValueError, match="landmarks.npy"):
+            read_groundtruth(tmp_path, body)
+    (tmp_path / "landmarks.npy").unlink()
+    export.write_run(tmp_path / "run", read_groundtruth(tmp_path, body))
+    for text in ("[]", "{"):
+        (tmp_path / "run" / "summary.json").write_text(text)
+        with pytest.raises(ValueError, match="summary.json"):
+            read_result(tmp_path / "run")
+
+
+def test_a_place_between_two_frames_needs_both(tmp_path, body):
+    _camera(tmp_path / "camera.txt", np.arange(30) / 30)
+    present = np.arange(20) < 10
+    person = _person(20) | {"present": present}
+    person["trans"][~present] = 1e3
+    np.savez(tmp_path / "body.npz", **person, mocap_framerate=20.0)
+    found = read_groundtruth(tmp_path, body)
+    assert found.present.any()
+    assert np.all(abs(found.trans[found.present]) < 1)
 
 
 @pytest.mark.skipif(not WALK.exists(), reason="the shared example is not here")

@@ -90,6 +90,7 @@ def evaluate(
     /,
     *,
     body_model: Path | None = None,
+    offset: float = 0.0,
     json: bool = False,
 ) -> None:
     """Errors of a run folder against a ground truth: cameras, people, joints, scale.
@@ -99,6 +100,8 @@ def evaluate(
         groundtruth: Folder with camera.txt (TUM) and body.npz (AMASS style).
         body_model: SMPL, or a folder with it for each gender; makes true joints where
             the ground truth holds none.
+        offset: Added to the run's timestamps, s: the ground truth's clock at the
+            video's first frame, where that does not start at 0.
         json: Print JSON instead of a table.
     """
     import bodyslam_jax as bs
@@ -107,7 +110,10 @@ def evaluate(
     truth = evaluation.read_truth(groundtruth, body_model)
     # Toes and heels slide, where the joints of both sides are this body's.
     body = bs.load_body_model(body_model)
-    found = evaluation.evaluate(evaluation.read_result(run), truth, body)
+    found = evaluation.evaluate(evaluation.read_result(run), truth, body, offset)
+    if found.scope is not None:
+        for line in evaluation.gaps(found.scope):
+            log.warning(line)
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
 
 

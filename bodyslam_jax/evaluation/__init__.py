@@ -12,15 +12,13 @@ from bodyslam_jax.evaluation._datasets import convert_emdb as convert_emdb
 from bodyslam_jax.evaluation._datasets import convert_rich as convert_rich
 from bodyslam_jax.evaluation._datasets import convert_tum_amass as convert_tum_amass
 from bodyslam_jax.evaluation._datasets import read_truth as read_truth
-from bodyslam_jax.evaluation._evaluation import ROWS as ROWS
 from bodyslam_jax.evaluation._evaluation import Evaluation as Evaluation
+from bodyslam_jax.evaluation._evaluation import Pair as Pair
+from bodyslam_jax.evaluation._evaluation import Scope as Scope
 from bodyslam_jax.evaluation._evaluation import Trajectories as Trajectories
 from bodyslam_jax.evaluation._evaluation import (
     evaluate_trajectories as evaluate_trajectories,
 )
-from bodyslam_jax.evaluation._evaluation import to_json as to_json
-from bodyslam_jax.evaluation._evaluation import to_rows as to_rows
-from bodyslam_jax.evaluation._evaluation import to_table as to_table
 from bodyslam_jax.evaluation._metrics import Errors as Errors
 from bodyslam_jax.evaluation._metrics import acceleration_error as acceleration_error
 from bodyslam_jax.evaluation._metrics import camera_frame as camera_frame
@@ -42,3 +40,9 @@ from bodyslam_jax.evaluation._metrics import world_mpjpe as world_mpjpe
 from bodyslam_jax.evaluation._readers import read_groundtruth as read_groundtruth
 from bodyslam_jax.evaluation._readers import read_result as read_result
 from bodyslam_jax.evaluation._readers import read_tum as read_tum
+from bodyslam_jax.evaluation._report import ROWS as ROWS
+from bodyslam_jax.evaluation._report import describe as describe
+from bodyslam_jax.evaluation._report import gaps as gaps
+from bodyslam_jax.evaluation._report import to_json as to_json
+from bodyslam_jax.evaluation._report import to_rows as to_rows
+from bodyslam_jax.evaluation._report import to_table as to_table

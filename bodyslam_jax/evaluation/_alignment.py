@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Alignment = Literal["A1", "A2", "A3", "A4"]
 """The appendix's alignments: A1 camera and person each on its own (the paper's tables),
@@ -104,12 +104,24 @@ def similarity_from_moments(
     rotation = nearest_rotation(covariance)
     if with_scale:
         explained = jnp.sum(rotation * covariance, (-2, -1))  # tr(D S)
-        is_point = variance <= jnp.finfo(variance.dtype).tiny  # false for NaN
-        scale = jnp.where(is_point, 1, explained / jnp.where(is_point, 1, variance))
+        one = is_point(variance, source_mean)
+        scale = jnp.where(one, 1, explained / jnp.where(one, 1, variance))
     else:
         scale = jnp.ones_like(variance)
     moved = (rotation @ source_mean[..., None])[..., 0]
     return Similarity(scale, rotation, target_mean - scale[..., None] * moved)
+
+
+def is_point(
+    variance: Float[Array, "*b"], mean: Float[Array, "*b 3"]
+) -> Bool[Array, "*b"]:
+    """Whether points that vary so little about their mean coincide: what there is may
+    be the mean's own rounding."""
+    info = jnp.finfo(variance.dtype)
+    rounding = (32 * float(info.eps)) ** 2 * jnp.sum(
+        jax.lax.stop_gradient(mean) ** 2, -1
+    )
+    return variance <= jnp.maximum(rounding, float(info.tiny))  # false for NaN
 
 
 def umeyama(

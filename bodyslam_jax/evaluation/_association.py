@@ -18,10 +18,12 @@ from bodyslam_jax.evaluation._evaluation import (
     FEET,
     PELVIS,
     Evaluation,
+    Pair,
+    Scope,
     Trajectories,
     evaluate_trajectories,
 )
-from bodyslam_jax.evaluation._metrics import trajectory_error
+from bodyslam_jax.evaluation._metrics import Errors, trajectory_error
 from bodyslam_jax.result import Result
 
 _TOES_AND_HEELS = (19, 21, 22, 24)
@@ -46,8 +48,8 @@ def evaluate(
         return evaluate_trajectories(result, truth)
     if not isinstance(result, Result) or not isinstance(truth, Result):
         raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
-    *pair, feet = _associate(result, truth, body, offset)
-    return dataclasses.replace(_evaluate(*pair), feet=feet)
+    *pair, feet, scope = _associate(result, truth, body, offset)
+    return dataclasses.replace(_evaluate(*pair), feet=feet, scope=scope)
 
 
 _evaluate = jit_once(evaluate_trajectories)
@@ -61,10 +63,13 @@ def associate(
     Time: `offset` (s) is added to the result's timestamps. The slower of the two sets
     the frames; the faster is interpolated there (positions linearly, rotations on the
     geodesic), across at most one and a half of its own frames; at its ends and gaps the
-    nearest frame within half a frame is taken. Other frames are dropped or masked.
+    nearest frame within half a frame is taken. Other frames are dropped or masked, and
+    where frames are missing there are masked ones: nothing is a difference across them.
 
-    People: the pairing with the least total H-ATE under alignment A3 (A1 without a
-    camera); people without partner are left out.
+    People: the pairing with the least total loss, `e / (e + 1 m)` of the H-ATE of a
+    frame under alignment A3 (A1 without a camera), and 1 for a frame of the truth that
+    the estimate lacks, so that a piece of a track does not beat the whole. People
+    without partner are left out (`Evaluation.scope` says who).
 
     Feet: toes and heels of `body` if both sides' joints are that body's, else the ankle
     and foot joints.
@@ -76,11 +81,11 @@ def associate(
 
 def _associate(
     result: Result, truth: Result, body: BodyModel | None, offset: float
-) -> tuple[Trajectories, Trajectories, str]:
-    """Estimate, truth, and which points the feet are."""
+) -> tuple[Trajectories, Trajectories, str, Scope]:
+    """Estimate, truth, which points the feet are, and what is compared."""
     times = result.timestamps + offset
     slower = _interval(times) >= 0.999 * _interval(truth.timestamps)
-    at = times if slower else truth.timestamps
+    at = _without_holes(times if slower else truth.timestamps)
     feet, true_feet, kind = _feet(result, truth, body)
     found = _resample(_host(result, feet), times, at)
     true = _resample(_host(truth, true_feet), truth.timestamps, at)
@@ -89,7 +94,7 @@ def _associate(
         raise ValueError(
             f"The result spans {_span(times)}, the ground truth "
             f"{_span(truth.timestamps)}: no frame of one is within half a frame of the "
-            "other; shift the result's clock with `offset`."
+            "other; `offset` (s; `--offset`) shifts the result's clock."
         )
     frames = slice(overlap[0], overlap[-1] + 1)
     fps = 1 / _interval(at)
@@ -99,11 +104,59 @@ def _associate(
         _bundle(true, frames, everybody[1], fps),
     )
     who, true_who = _match(*pair)
+    partner = dict(zip(true_who, who, strict=True))
+    rate = _interval(truth.timestamps) * fps
+    scope = _scope(truth, (found, true), partner, rate)
     found, true = (
         _bundle(found, frames, who, fps),
         _bundle(true, frames, true_who, fps),
     )
-    return found, true, kind
+    return found, true, kind, scope
+
+
+def _scope(
+    truth: Result,
+    pair: tuple["_Host", "_Host"],
+    partner: dict[int, int],
+    rate: float,
+) -> Scope:
+    """What of the truth is compared, in frames of which `rate` (1) go on one of its
+    own; also those of its frames that the result's time does not reach."""
+    found, true = pair
+
+    def counts(both: np.ndarray, own: np.ndarray) -> tuple[int, int]:
+        compared = int(both.sum())
+        return compared, max(compared, round(float(own.sum()) * rate))
+
+    camera = truth.summary.get("has_camera", True)
+    everywhere = np.full(len(truth.timestamps), bool(camera))
+    people = []
+    for i, own in enumerate(truth.present):
+        who = partner.get(i)
+        both = true.present[i] & (False if who is None else found.present[who])
+        compared, of = counts(both, own)
+        if of:
+            people.append(Pair(i, who if compared else None, compared, of))
+    matched = sum(pair.estimate is not None for pair in people)
+    return Scope(
+        *counts(found.camera_valid & true.camera_valid, everywhere),
+        tuple(people),
+        int(found.present.any(axis=1).sum()) - matched,
+    )
+
+
+def _without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:
+    """The moments, and those between where frames are missing, a hundred at most."""
+    interval = _interval(times)
+    filled = [
+        np.linspace(a, b, min(max(round((b - a) / interval), 1), _HOLE), endpoint=False)
+        for a, b in zip(times[:-1], times[1:], strict=True)
+    ]
+    return np.concatenate([*filled, times[-1:]])
+
+
+_HOLE = 101
+"""Steps across missing frames at most."""
 
 
 def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
@@ -238,22 +291,22 @@ def _match(found: Trajectories, true: Trajectories) -> tuple[list[int], list[int
     if num <= 1 and num_true <= 1:
         both = list(range(min(num, num_true)))
         return both, both
-    cost = np.asarray(_h_ate_of_all_pairs(found, true))
-    cost = np.where(np.isnan(cost), 1e6, cost)
-    who, true_who = linear_sum_assignment(cost)
+    loss = np.asarray(_loss_of_all_pairs(found, true))
+    never = np.isnan(loss)
+    who, true_who = linear_sum_assignment(np.where(never, 1e6, loss))
     pairs = sorted(
-        (int(b), int(a)) for a, b in zip(who, true_who, strict=True) if cost[a, b] < 1e6
+        (int(b), int(a)) for a, b in zip(who, true_who, strict=True) if not never[a, b]
     )
     return [a for _, a in pairs], [b for b, _ in pairs]
 
 
 @eqx.filter_jit
-def _h_ate_of_all_pairs(
+def _loss_of_all_pairs(
     found: Trajectories, true: Trajectories
 ) -> Float[Array, "h true"]:
     camera_valid = found.camera_valid & true.camera_valid
 
-    def h_ate(joints, present, true_joints, true_present):
+    def loss(joints, present, true_joints, true_present):
         valid = present & true_present
         _, human = align(
             "A3",
@@ -264,11 +317,15 @@ def _h_ate_of_all_pairs(
             joints[:, PELVIS],
             valid.astype(joints.dtype),
         )
-        return trajectory_error(
+        error = trajectory_error(
             joints[:, PELVIS], true_joints[:, PELVIS], valid, human
-        ).mean()
+        )
+        lost = error.value / (error.value + 1.0)
+        whole = Errors(jnp.where(valid, lost, 1.0), true_present)
+        # NaN where they are never known together.
+        return jnp.where(jnp.any(valid), whole.mean(), jnp.nan)
 
-    over_truth = jax.vmap(h_ate, (None, None, 0, 0))
+    over_truth = jax.vmap(loss, (None, None, 0, 0))
     return jax.vmap(over_truth, (0, 0, None, None))(
         found.joints, found.present, true.joints, true.present
     )

@@ -1,18 +1,15 @@
 """All errors of an estimate at once: a pure function of two aligned-in-time bundles."""
 
-import json
-import math
+import dataclasses
 from collections.abc import Iterator
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.evaluation import _metrics as metrics
-from bodyslam_jax.evaluation._alignment import Alignment, align
+from bodyslam_jax.evaluation._alignment import Alignment, align, is_point
 
 PELVIS = 0
 STILL = 0.01
@@ -42,6 +39,32 @@ class Trajectories(eqx.Module):
     """1/s"""
 
 
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """A person of the truth, and who of the estimate was taken for them."""
+
+    truth: int
+    estimate: int | None
+    frames: int
+    """In which both are known."""
+    of_frames: int
+    """In which the truth is known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """How much of a truth an evaluation is about."""
+
+    cameras: int
+    """Frames in which both cameras are known."""
+    of_cameras: int
+    """In which the truth's is."""
+    people: tuple[Pair, ...]
+    """One for each person of the truth."""
+    others: int
+    """People of the estimate who are none of the truth's."""
+
+
 class Evaluation(eqx.Module):
     """Errors by name in m, rad, s: `found["c_ate_se3"]` is a mean, `..._rmse` its RMSE.
 
@@ -52,9 +75,11 @@ class Evaluation(eqx.Module):
     values: dict[str, Float[Array, "*b"]]
     """Cameras, and the mean over people of theirs."""
     people: dict[str, Float[Array, "*b h"]]
-    """The same names, person by person, in the truth's order."""
+    """The same names, person by person, in the truth's order; those matched only."""
     feet: str = eqx.field(static=True, default="the points given")
     """What `foot_sliding` is of."""
+    scope: Scope | None = eqx.field(static=True, default=None)
+    """What was compared; `None` for `Trajectories`, which are all compared."""
 
     def __getitem__(self, name: str) -> Float[Array, "*b"]:
         return self.values[name]
@@ -82,7 +107,8 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
     alignment A1 (camera and person each on its own), `_a2`, `_a3`, `_a4` the other
     three in SE(3). `scale` is that of the camera's Sim(3) alignment (paper: "scale
     error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
-    `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then.
+    `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then. An
+    estimated one that does not move at all has no scale and no Sim(3) either.
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
@@ -131,6 +157,15 @@ def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array,
     return jnp.sum(apart**2) / count > STILL**2
 
 
+def _stands(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether the camera is in one place, but for rounding; of any unit."""
+    (centre,) = metrics.only(valid, T_WC[:, :3, 3])
+    count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
+    mean = jnp.sum(centre, 0) / count
+    (apart,) = metrics.only(valid, centre - mean)
+    return is_point(jnp.sum(apart**2) / count, mean)
+
+
 def _both(name: str, errors: metrics.Errors) -> dict[str, Array]:
     return {name: errors.mean(), f"{name}_rmse": errors.rmse()}
 
@@ -157,7 +192,7 @@ def _camera_errors(
         values |= _both(f"c_ate_{group}", error)
         scale = found.scale
     values["ate_s"] = values["c_ate_se3"]
-    known = _moves(truth.T_WC, valid)
+    known = _moves(truth.T_WC, valid) & ~_stands(estimate.T_WC, valid)
     for name in ("c_ate_sim3", "c_ate_sim3_rmse"):
         values[name] = jnp.where(known, values[name], jnp.nan)
     values["scale"] = jnp.where(known, scale, jnp.nan)
@@ -242,77 +277,3 @@ def _person_errors(
     values |= _both("jitter", metrics.jitter(joints, valid, estimate.fps))
     values |= _both("jitter_of_truth", metrics.jitter(true_joints, valid, truth.fps))
     return values | _both("foot_sliding", metrics.foot_sliding(feet, true_feet, valid))
-
-
-_MM, _PERCENT, _DEGREES = 1e3, 100.0, 180 / math.pi
-ROWS: tuple[tuple[str, str, str, float], ...] = (
-    ("c_ate_se3", "C-ATE, SE(3)", "mm", _MM),
-    ("c_ate_sim3", "C-ATE, Sim(3)", "mm", _MM),
-    ("h_ate_se3", "H-ATE, SE(3)", "mm", _MM),
-    ("h_ate_sim3", "H-ATE, Sim(3)", "mm", _MM),
-    ("j_ate_se3", "J-ATE, SE(3)", "mm", _MM),
-    ("j_ate_sim3", "J-ATE, Sim(3)", "mm", _MM),
-    ("scale", "scale (best 1)", "", 1.0),
-    ("scale_error", "|1 - scale|", "%", _PERCENT),
-    ("h_ate_a2", "H-ATE, A2 camera's alignment", "mm", _MM),
-    ("c_ate_a3", "C-ATE, A3 joint alignment", "mm", _MM),
-    ("h_ate_a3", "H-ATE, A3 joint alignment", "mm", _MM),
-    ("c_ate_a4", "C-ATE, A4 first camera pose", "mm", _MM),
-    ("h_ate_a4", "H-ATE, A4 first camera pose", "mm", _MM),
-    ("rpe_translation", "RPE translation, 1 frame", "mm", _MM),
-    ("rpe_rotation", "RPE rotation, 1 frame", "deg", _DEGREES),
-    ("w_mpjpe", "W-MPJPE 100", "mm", _MM),
-    ("wa_mpjpe", "WA-MPJPE 100", "mm", _MM),
-    ("w_mpjpe_tram", "W-MPJPE 100, TRAM chunks", "mm", _MM),
-    ("wa_mpjpe_tram", "WA-MPJPE 100, TRAM chunks", "mm", _MM),
-    ("rte", "RTE", "%", _PERCENT),
-    ("ate_s", "ATE-S", "mm", _MM),
-    ("mpjpe", "MPJPE", "mm", _MM),
-    ("pa_mpjpe", "PA-MPJPE", "mm", _MM),
-    ("acceleration_error", "acceleration error", "m/s²", 1.0),
-    ("jitter", "jitter", "10 m/s³", 0.1),
-    ("jitter_of_truth", "jitter of the truth", "10 m/s³", 0.1),
-    ("foot_sliding", "foot sliding per frame", "mm", _MM),
-)
-"""Name, label, unit of the report, factor from SI."""
-
-
-def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
-    """What, mean, RMSE and unit of every error that exists, ready to print."""
-
-    def cell(name: str, factor: float) -> str:
-        value = float(evaluation[name]) * factor if name in evaluation else math.nan
-        return "–" if math.isnan(value) else f"{value:.4g}"
-
-    more = {"foot_sliding": f" of {evaluation.feet}"}
-    rows = [
-        (
-            label + more.get(name, ""),
-            cell(name, factor),
-            cell(f"{name}_rmse", factor),
-            unit,
-        )
-        for name, label, unit, factor in ROWS
-    ]
-    return [row for row in rows if row[1] != "–"]
-
-
-def to_table(evaluation: Evaluation) -> str:
-    """The errors as aligned text: mean and RMSE, mm and degrees where customary."""
-    rows = [("", "mean", "RMSE", "unit"), *to_rows(evaluation)]
-    width = max(len(row[0]) for row in rows)
-    lines = [f"{a:<{width}}  {b:>9}  {c:>9}  {d}".rstrip() for a, b, c, d in rows]
-    return "\n".join([lines[0], "-" * (width + 31), *lines[1:]])
-
-
-def to_json(evaluation: Evaluation) -> str:
-    """The errors as JSON in SI units; `null` where one does not exist."""
-
-    def plain(value: Array) -> Any:
-        array = np.asarray(value, np.float64)
-        listed = [x if math.isfinite(x) else None for x in array.ravel().tolist()]
-        return listed if array.ndim else listed[0]
-
-    found: dict[str, Any] = {name: plain(x) for name, x in evaluation.items()}
-    found["people"] = {name: plain(x) for name, x in evaluation.people.items()}
-    return json.dumps(found, indent=2)

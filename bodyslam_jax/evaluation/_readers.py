@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,21 @@ def read_result(path: Path) -> Result:
             raise ValueError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
         _check_finite(file, name, arrays[name])
     summary_file = file.with_name("summary.json")
-    summary = json.loads(summary_file.read_text()) if summary_file.exists() else {}
+    summary = _read_summary(summary_file) if summary_file.exists() else {}
     fields: dict[str, Any] = {name: _float(arrays[name]) for name in _RUN_FIELDS}
     fields["scale"] = float(arrays["scale"])
     fields["present"] = arrays["present"].astype(bool)
     return Result(**fields, summary=summary)
+
+
+def _read_summary(file: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file}: not readable as JSON ({error}).") from None
+    if not isinstance(summary, dict):
+        raise ValueError(f"{file}: {type(summary).__name__}, expected an object.")
+    return summary
 
 
 def read_groundtruth(path: Path, body: BodyModel) -> Result:
@@ -178,20 +189,22 @@ def _at(
     own = times[0] + np.arange(num) / fps
     if (
         has_camera
-        and num == len(times)
+        and num == len(times) > 1
         and abs(np.median(np.diff(times)) * fps - 1) < 0.02
     ):
         own = times  # frame by frame, whatever the camera's clock does
     before, after, weight, close = brackets(own, times)
     w = weight[:, None]
     nearest = np.where(weight < 0.5, before, after)
-    trans, joint = person["trans"], person["joints"]
+    trans, joint, present = person["trans"], person["joints"], person["present"]
+    # Of a place between two frames both must be known.
+    known = (present[before] | (weight == 1)) & (present[after] | (weight == 0))
     return {
         "poses": person["poses"][nearest],
         "trans": (1 - w) * trans[before] + w * trans[after],
         "betas": person["betas"],
         "joints": (1 - w[..., None]) * joint[before] + w[..., None] * joint[after],
-        "present": close & person["present"][nearest],
+        "present": close & known,
     }
 
 
@@ -206,8 +219,15 @@ def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
     if missing or rate is None:
         missing += [] if rate else [_RATES[0]]
         raise ValueError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
+    for name in {"poses", "trans", "betas", "joints", "present", rate} & set(arrays):
+        if arrays[name].dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path}: {name} is of type {arrays[name].dtype}, no number."
+            )
+    if arrays[rate].size != 1:
+        raise ValueError(f"{path}: {rate} is {arrays[rate].tolist()}, not one number.")
     poses, trans = _float(arrays["poses"]), _float(arrays["trans"])
-    betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate])
+    betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate].item())
     num = len(poses) if poses.ndim == 2 else -1
     if num < 1 or poses.shape[1] < 66 or trans.shape != (num, 3):
         raise ValueError(
@@ -265,7 +285,14 @@ _RATES = ("mocap_framerate", "mocap_frame_rate")
 def _landmarks(path: Path | None) -> np.ndarray:
     if path is None or not path.exists():
         return np.zeros((0, 3))
-    return _float(np.load(path, allow_pickle=False)).reshape(-1, 3)
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path}: not a readable .npy file ({error}).") from None
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise ValueError(f"{path}: shape {found.shape}, expected (landmarks, 3).")
+    _check_finite(path, "landmarks", found)
+    return _float(found)
 
 
 def _load_npz(path: Path) -> dict[str, np.ndarray]:
@@ -274,9 +301,15 @@ def _load_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {n: archive[n] for n in archive.files if n not in _OBJECTS}
-    except (zipfile.BadZipFile, ValueError, EOFError, AttributeError) as error:
+    except _UNREADABLE as error:
         raise ValueError(f"{path}: not a readable .npz file ({error}).") from None
 
+
+_UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, AttributeError),
+    *(OSError, NotImplementedError),
+)
+"""What NumPy raises of damaged archives."""
 
 _OBJECTS = ("marker_data", "marker_labels")
 """Of AMASS; not needed, and at times pickled."""
