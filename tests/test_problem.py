@@ -98,7 +98,7 @@ SHORT = lambda x: x[:, :-1]
         ("shapes", zeros(2, 10), "shapes: shape (2, 10), expected (1, 10)"),
         ("cameras", zeros(4, 4), "cameras: shape (4, 4), expected (t, 4, 4)"),
         ("cameras", lambda x: 2 * x, "cameras: 3 of 3 are no rigid poses"),
-        ("cameras", NAN, "1 values are not finite"),
+        ("cameras", NAN, "1 of 48 values are not finite"),
         ("roots", lambda x: x.at[0, 1, 0, 0].set(-1.0), "1 of 3 are no rigid poses"),
         ("roots", lambda x: x.at[0, 2, 3, 0].set(1.0), "the first at (0, 2)"),
         ("intrinsics", zeros(5), "5 numbers, expected 4 or 8"),
@@ -133,7 +133,12 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("JointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
         ("JointReprojection", "sigma", ones(1, T, 24), "expected (1, 3, 25)"),
         ("JointReprojection", "layout", "coco", "layout: found 'coco'"),
-        ("JointReprojection", "bias", float("nan"), "bias: 1 values are not finite"),
+        (
+            "JointReprojection",
+            "bias",
+            float("nan"),
+            "bias: 1 of 1 values are not finite",
+        ),
         ("HumanMotion", "translation", SHORT, "(1, 2, 3), expected (1, 3, 3)"),
         ("HumanMotion", "correlation", ones(1, T), "found 1.0, expected between"),
         ("Posture", "correlation", 1.5 * ones(1, T), "found 1.5, expected between"),
@@ -280,3 +285,123 @@ def test_what_is_missing_may_be_zero_and_costs_nothing(quick_compilation):
     value, slopes = jax.jit(slope)(state.cameras, state.roots)
     assert value == 0
     assert not slopes[0].any() and not slopes[1].any()
+
+
+def test_a_video_too_long_to_order_says_how_many_frames_fit(monkeypatch):
+    """Tables over pairs of its chunks would not fit themselves."""
+
+    def reached(*_):
+        raise AssertionError("a dense table of chunks")
+
+    monkeypatch.setattr("bodyslam_jax.graph._ordering._spectral", reached)
+    monkeypatch.setattr(_memory, "memory", lambda: 2**27)
+    count = 10 * 3000
+    landmark = np.repeat(np.arange(3000), 2)
+    frame = 10 * landmark + np.tile([0, 5], 3000)
+    state = scenes.truth(np.random.default_rng(0), 1, 0, 3000)
+    state = dataclasses.replace(
+        state,
+        cameras=eye(4, count),
+        roots=eye(4, 0, count),
+        poses=zeros(0, count, 23, 3),
+    )
+    pixel = zeros(len(frame), 2)
+    index = jnp.asarray(frame), jnp.asarray(landmark)
+    track = g.Reprojection(*index, pixel, ones(len(frame)), g.Cauchy(1.5))
+    with pytest.raises(ValueError, match=r"30000 frames need about .* frames fit"):
+        g.make_problem([track], state)
+
+
+@pytest.mark.parametrize(
+    "loss, message",
+    [
+        (g.Squared, "loss: found <class"),
+        (None, "loss: found None, expected a loss such as `Squared()`"),
+        (
+            changed(g.GemanMcClure(1.0), "scale", -1),
+            "loss.scale: found -1, expected above 0",
+        ),
+        (changed(g.Cauchy(1.0), "scale", 0), "loss.scale: found 0, expected above 0"),
+        (changed(g.Cauchy(1.0), "scale", "a"), "found 'a', expected a number"),
+        (changed(g.Cauchy(1.0), "scale", float("inf")), "which is not finite"),
+    ],
+)
+def test_what_is_no_loss_is_refused(loss, message):
+    track = changed(fitting()[1]["Reprojection"], "loss", lambda _: loss)
+    with pytest.raises(ValueError) as refused:
+        make(Reprojection=track)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith("Reprojection.loss")
+
+
+def test_the_scale_of_a_loss_may_be_an_integer():
+    track = changed(
+        fitting()[1]["Reprojection"], "loss", changed(g.Cauchy(1.0), "scale", 2)
+    )
+    assert make(Reprojection=track).factors[0].loss.scale == 2
+
+
+@pytest.mark.parametrize("value", [0.5, 2.0, -1.0, np.nan])
+def test_a_coordinate_is_free_or_held(value):
+    free = changed(
+        fitting()[0].zero_step(), "roots", lambda x: x.at[0, 1, 2].set(value)
+    )
+    with pytest.raises(ValueError, match=f"free.roots: found {value}, expected 0 or 1"):
+        make(free=free)
+
+
+def test_a_mask_takes_the_precision_of_the_state():
+    free = jax.tree.map(jnp.ones_like, fitting()[0].zero_step())
+    free = jax.tree.map(lambda x: x.astype(jnp.float32), free)
+    assert make(free=free).free.cameras.dtype == jnp.float64
+
+
+EARLY = {
+    "RootSmoothness": lambda: g.RootSmoothness(ones(1, T)),
+    "RootTurning": lambda: g.RootTurning(ones(1, T)),
+    "CameraSmoothness": lambda: g.CameraSmoothness(ones(T, 2)),
+    "OrientationChange": lambda: g.OrientationChange(zeros(1, T, 3), ones(1, T)),
+}
+
+
+EARLY_FRAMES = [
+    ("HumanMotion", "whitening", 0),
+    ("HumanMotion", "correlation", 0),
+    ("HumanMotion", "correlation", 1),
+    ("Posture", "correlation", 0),
+    ("RootOrientation", "correlation", 0),
+    ("RootPlace", "correlation", 0),
+    ("OrientationChange", "sigma", 0),
+    ("RootSmoothness", "sigma", 0),
+    ("RootSmoothness", "sigma", 1),
+    ("RootTurning", "sigma", 1),
+    ("CameraSmoothness", "sigma", 1),
+]
+"""Factors, their fields, and frames that have no earlier one to look back to."""
+
+
+@pytest.mark.parametrize("name, field, at", EARLY_FRAMES)
+def test_weights_of_frames_without_an_earlier_one_are_refused(name, field, at):
+    """And let in one frame later."""
+    factor = EARLY[name]() if name in EARLY else fitting()[1][name]
+    first = max(a for n, f, a in EARLY_FRAMES if (n, f) == (name, field))
+    empty = jnp.inf if field == "sigma" else 0.0
+    frames = lambda x, k: x.at[k] if name == "CameraSmoothness" else x.at[:, k]
+    none = lambda x: jnp.full_like(x, empty)
+    one = lambda k: changed(factor, field, lambda x: frames(none(x), k).set(0.5))
+    with pytest.raises(ValueError, match=f"{name}.{field}: found 0.5 within frame"):
+        make(**{name: one(at)})
+    make(**{name: one(first + 1)})
+
+
+def test_a_state_has_one_precision():
+    state, factors = fitting()
+    mixed = changed(state, "landmarks", lambda x: x.astype(jnp.float32))
+    with pytest.raises(ValueError, match="state.landmarks: found float32, expected f"):
+        make(mixed)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
+    with pytest.raises(ValueError, match="pixel: found float64, expected float32 as"):
+        g.make_problem([factors["Reprojection"]], single)
+    half = jax.tree.map(lambda x: x.astype(jnp.float16), state)
+    with pytest.raises(ValueError, match="found float16, expected float32 or float64"):
+        make(half)

@@ -8,7 +8,8 @@ import scenes
 
 from bodyslam_jax import graph, joint, solver
 from bodyslam_jax.config import Config
-from bodyslam_jax.solver import PAPER_SCHEDULE, Solution
+from bodyslam_jax.solver import PAPER_SCHEDULE, Solution, Stage
+from bodyslam_jax.solver._schedule import check_names, check_schedule
 
 
 def test_the_papers_schedule_has_its_numbers_of_first_order_steps():
@@ -37,3 +38,32 @@ def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
     assert said["iterations"] == 7 and said["status"] == "converged"
     joint.solve_stage(problem, state, config, "people alone")
     assert told == [(config.solver, steps), (config.solver, steps[-1:])]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "message"),
+    [
+        ((), "schedule: no stage, expected one or more"),
+        ((Stage(max_steps=0),) * 2, "every stage has max_steps=0, nothing to solve"),
+        (Stage(), r"schedule: found Stage\(.*, expected a tuple of `Stage`"),
+        ((50,), "schedule: found \\(50,\\), expected a tuple of `Stage`"),
+    ],
+)
+def test_a_schedule_without_steps_is_refused(schedule, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        check_schedule("structured", schedule)
+    assert "\n" not in str(refused.value)
+
+
+def test_one_stage_may_be_idle():
+    check_schedule("adam", (Stage(max_steps=0), Stage(max_steps=1)))
+    check_schedule("structured", [Stage()])
+
+
+def test_solvers_and_stages_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="solver: 'foo', expected one of .*'adam'"):
+        check_schedule("foo", (Stage(),))
+    with pytest.raises(ValueError, match="max_steps: -1, expected 0 or more"):
+        Stage(max_steps=-1)
+    with pytest.raises(ValueError, match="free: found 'cameras', expected a tuple"):
+        check_names("cameras")

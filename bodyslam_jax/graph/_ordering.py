@@ -22,6 +22,8 @@ _GAIN = 0.7
 """An order other than time's must save this much: it is gathered to and fro."""
 _TOGETHER = 4096
 """Landmarks that are counted at once."""
+_MOST = 2000
+"""Chunks that are ordered at most: their graph is a dense table, of 32 MB then."""
 
 
 class Ordering(NamedTuple):
@@ -53,7 +55,7 @@ def order_chunks(
         rows = reach * own + max(span.max() - 1, reach) * CAMERAS
         return count * (own + CAMERAS) * rows**2 + 3 * CAMERAS**2 * np.sum(span**2)
 
-    if count <= 3:
+    if not 3 < count <= _MOST:
         return in_time
     order = _spectral(landmark, chunk, begin, count)
     place = np.argsort(order)

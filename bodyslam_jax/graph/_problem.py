@@ -16,6 +16,8 @@ from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor, Limbs
 from bodyslam_jax.graph._check import (
     check_factor,
+    check_mask,
+    check_precision,
     check_prior,
     check_shapes,
     check_state,
@@ -168,17 +170,20 @@ def make_problem(
     `free_intrinsics`, and s where no factor touches it.
 
     **Raises:** `ValueError` if shapes or kinds of arrays do not fit, a value is not
-    finite or means nothing (a pose that is not rigid, sigma 0, a correlation of 1), an
-    index is out of range, or the problem does not fit into memory.
+    finite or means nothing (a pose that is not rigid, sigma 0, a correlation of 1, a
+    weight where there is no earlier frame), an index is out of range, or the problem
+    does not fit into memory.
     """
     factors = tuple(factors)
     sizes = check_state(state)
     for factor in factors:
         check_factor(factor, sizes)
+        check_precision(factor, state)
     if motion is not None:
         check_shapes(motion, "motion", dict(sizes))
     if free is not None:
         check_shapes(free, "free", dict(sizes))
+        check_mask(free)
     tracks = [f for f in factors if isinstance(f, Reprojection)]
     if len(tracks) > 1:
         raise ValueError(
@@ -209,6 +214,9 @@ def make_problem(
             landmarks=ones.landmarks,
             intrinsics=ones.intrinsics * float(free_intrinsics),
         )
+    else:
+        # `solve` knows a problem's precision by its mask.
+        free = jax.tree.map(lambda x: x.astype(state.scale.dtype), free)
     moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
     movable = jax.tree.map(moves, free)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))

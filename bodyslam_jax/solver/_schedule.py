@@ -1,7 +1,8 @@
 """What `solve` is asked to do: by which solver, in which stages."""
 
 import dataclasses
-from typing import Literal
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, get_args
 
 from bodyslam_jax.graph import VARIABLES
 
@@ -22,9 +23,36 @@ class Stage:
 
     def __post_init__(self):
         check_names(self.free)
+        if self.max_steps < 0:
+            raise ValueError(f"max_steps: {self.max_steps}, expected 0 or more.")
 
 
-def check_names(free: tuple[str, ...]) -> None:
+def check_schedule(solver: Any, schedule: Any) -> None:
+    """Refuses a solver that is none, and stages of which none takes a step.
+
+    **Raises:** `ValueError` that says what was found and what was expected.
+    """
+    if solver not in get_args(Solver):
+        raise ValueError(
+            f"solver: {solver!r}, expected one of {list(get_args(Solver))}."
+        )
+    stages = isinstance(schedule, Sequence)
+    if not stages or not all(isinstance(stage, Stage) for stage in schedule):
+        raise ValueError(
+            f"schedule: found {schedule!r:.60}, expected a tuple of `Stage`."
+        )
+    if not schedule:
+        raise ValueError("schedule: no stage, expected one or more.")
+    if not any(stage.max_steps for stage in schedule):
+        raise ValueError(
+            "schedule: every stage has max_steps=0, nothing to solve; "
+            "`problem.cost(state)` is the cost."
+        )
+
+
+def check_names(free: Iterable[str]) -> None:
+    if isinstance(free, str):
+        raise ValueError(f"free: found {free!r}, expected a tuple of names.")
     unknown = sorted(set(free) - set(VARIABLES))
     if unknown:
         raise ValueError(f"free: {unknown}, expected names among {list(VARIABLES)}.")
