@@ -150,3 +150,34 @@ def test_a_size_no_better_known_than_before_is_reported():
     assert any("size of person 0" in x for x in observability(problem, state, unsure))
     sure = observability(problem, state, known(state))
     assert not any("person" in line for line in sure)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_a_scale_that_nothing_sees_is_unknown_in_any_unit_of_the_map(unit):
+    problem, state, _ = make(people=1)
+    (motion,) = [f for f in problem.factors if isinstance(f, g.HumanMotion)]
+    others = [f for f in problem.factors if f is not motion]
+    silent = dataclasses.replace(motion, whitening=jnp.zeros_like(motion.whitening))
+    state = dataclasses.replace(
+        state,
+        scale=state.scale / unit,
+        cameras=state.cameras.at[:, :3, 3].multiply(unit),
+        landmarks=unit * state.landmarks,
+    )
+    problem = g.make_problem([*others, silent], state)
+    spread = marginals(problem, state)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(spread))
+    report = observability(problem, state, spread)
+    assert [line for line in report if line.startswith("scale: not known")]
+
+
+def test_cameras_that_see_nothing_are_reported():
+    problem, state, _ = make()
+    factor = problem.factors[0]
+    nothing = jax.tree.map(lambda x: x, factor)
+    nothing = eqx.tree_at(
+        lambda f: f.sigma, nothing, jnp.where(factor.frame == 3, jnp.inf, factor.sigma)
+    )
+    problem = g.make_problem([nothing], state)
+    report = observability(problem, state, marginals(problem, state))
+    assert "cameras of 1 frames: no landmark is seen in them." in report

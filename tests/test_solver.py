@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from problems import bent, dense, make, structured_step
 
 import bodyslam_jax.graph as g
+from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver import (
@@ -26,6 +27,7 @@ from bodyslam_jax.solver import (
 from bodyslam_jax.solver._gmres import RESTART, gmres
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver._solve import check_start
 from bodyslam_jax.solver._triangular import invert_lower
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -611,7 +613,7 @@ def test_another_size_of_state_and_what_is_not_finite_are_refused():
     with pytest.raises(ValueError, match="state.cameras: 3 of 112 values are not fin"):
         solve(problem, lost)
     short = eqx.tree_at(lambda s: s.cameras, start, start.cameras[:-1])
-    with pytest.raises(ValueError, match="6 frames"):
+    with pytest.raises(ValueError, match=r"shape \(6, 4, 4\), expected \(7, 4, 4\)"):
         solve(problem, short)
 
 
@@ -695,3 +697,123 @@ def test_a_stage_ends_where_a_step_would_gain_less_than_its_tolerance():
     assert found.status == "converged"
     assert 0 <= found.cost - best.cost < 0.05
     assert found.num_steps[0] < best.num_steps[0]
+
+
+SINGLE = lambda x: x.astype(jnp.float32)
+
+
+@pytest.mark.parametrize(
+    "where, change, message",
+    [
+        ("landmarks", SINGLE, "landmarks: found float32, expected float64 as in the p"),
+        ("scale", lambda x: x.astype(jnp.float16), "scale: found float16, expected fl"),
+        ("landmarks", lambda x: x[:, :2], "shape (25, 2), expected (25, 3)"),
+        ("landmarks", lambda x: x[:-1], "shape (24, 3), expected (25, 3)"),
+        ("intrinsics", lambda x: jnp.zeros(8), "shape (8,), expected (4,)"),
+        ("intrinsics", lambda x: jnp.zeros(5), "shape (5,), expected (4,)"),
+        ("poses", lambda x: jnp.zeros((2, 7, 23, 3)), "(2, 7, 23, 3), expected (0, 7"),
+        ("roots", lambda x: jnp.zeros((1, 7, 4, 4)), "(1, 7, 4, 4), expected (0, 7"),
+        ("cameras", jnp.zeros_like, "cameras: 7 of 7 are no rigid poses"),
+        ("cameras", lambda x: x.at[1, 0, 3].set(jnp.nan), "1 of 112 values are not"),
+    ],
+)
+def test_a_state_that_does_not_fit_its_problem_is_refused(where, change, message):
+    problem, _, start = make()
+    other = eqx.tree_at(lambda s: getattr(s, where), start, replace_fn=change)
+    for used in (solve, marginals):
+        with pytest.raises(ValueError) as refused:
+            used(problem, other)
+        assert message in str(refused.value) and str(refused.value).startswith("state")
+        assert "\n" not in str(refused.value)
+
+
+def test_people_are_refused_by_a_problem_made_for_none():
+    problem, _, _ = make()
+    state = scenes.truth(np.random.default_rng(0), 7, 1, 25)
+    with pytest.raises(
+        ValueError, match=r"roots: shape \(1, 7, 4, 4\), expected \(0, "
+    ):
+        solve(problem, state)
+
+
+def test_a_state_is_held_against_its_problem_within_jit_by_its_shapes():
+    problem, _, start = make()
+    short = eqx.tree_at(lambda s: s.intrinsics, start, jnp.zeros(8))
+    with pytest.raises(ValueError, match=r"shape \(8,\), expected \(4,\)"):
+        jax.eval_shape(lambda s: solve(problem, s).cost, short)
+    single = jax.tree.map(SINGLE, start)
+    with pytest.raises(ValueError, match="found float32, expected float64"):
+        jax.eval_shape(lambda s: marginals(problem, s).cameras, single)
+
+
+def test_a_padded_problem_takes_its_padded_state():
+    check_start(*pad(*make()[::2]))
+
+
+def test_a_problem_without_factors_is_refused():
+    problem, _, start = make()
+    empty = dataclasses.replace(problem, factors=())
+    for used in (solve, marginals):
+        with pytest.raises(ValueError, match="problem.factors: found none, expected"):
+            used(empty, start)
+
+
+def test_a_solve_that_takes_no_step_is_refused():
+    problem, _, start = make()
+    for schedule in ((), (Stage(max_steps=0),)):
+        for solver in ("structured", "adam"):
+            with pytest.raises(ValueError, match="schedule: (no|every) stage"):
+                solve(problem, start, solver=solver, schedule=schedule)
+
+
+@pytest.mark.parametrize("damping", [-1.0, float("nan"), float("inf")])
+def test_a_damping_that_is_none_is_refused(damping):
+    problem, _, start = make()
+    with pytest.raises(ValueError, match=f"damping: {damping}, expected 0 or more"):
+        solve(problem, start, damping=damping)
+
+
+def test_derivatives_where_landmarks_or_single_coordinates_are_held():
+    """Points seen once tell where a camera is if they are held, and what pulls at a
+    coordinate that is held turns with the rest."""
+    rng = np.random.default_rng(0)
+    state = scenes.truth(rng, 3, 0, 30)
+    landmark = np.arange(30)
+    frame = landmark // 10
+    camera = np.asarray(state.cameras)[frame]
+    apart = np.asarray(state.landmarks) - camera[:, :3, 3]
+    p_C = np.einsum("mji,mj->mi", camera[:, :3, :3], apart)
+    factor = g.Reprojection(
+        frame=jnp.asarray(frame),
+        landmark=jnp.asarray(landmark),
+        pixel=project(state.intrinsics, jnp.asarray(p_C))
+        + jnp.asarray(rng.standard_normal((30, 2))),
+        sigma=jnp.ones(30),
+        loss=g.Cauchy(jnp.asarray(1.5)),
+    )
+    every = jax.tree.map(jnp.ones_like, state.zero_step())
+    every = dataclasses.replace(every, scale=jnp.zeros(()))
+    held = g.hold(every, "landmarks", "intrinsics")
+    yaw = dataclasses.replace(held, cameras=held.cameras.at[:, 1].set(0.0))
+    exact = (Stage(rtol=1e-15, max_steps=200),)
+    by_map = (Stage(free=("cameras",), rtol=1e-15, max_steps=200),)
+    toward = jnp.asarray(rng.standard_normal((30, 2)))
+    cases = (
+        (held, exact),
+        (yaw, exact),
+        (g.hold(every, "intrinsics"), by_map),
+    )
+    for free, schedule in cases:
+        problem = g.make_problem([factor], state, free=free)
+        # Of rotations of which a part is held the way there decides: a short one.
+        start = solve(problem, state, schedule=schedule).state
+
+        def value(size, problem=problem, start=start, schedule=schedule):
+            pixel = factor.pixel + size * toward
+            there = eqx.tree_at(lambda p: p.factors[0].pixel, problem, pixel)
+            found = solve(there, start, schedule=schedule).state.cameras
+            return jnp.sum(found[:, :3, 3] * jnp.arange(1.0, 10.0).reshape(3, 3))
+
+        slope = float(jax.grad(value)(0.0))
+        numeric = float(value(1e-2) - value(-1e-2)) / 2e-2
+        assert slope == pytest.approx(numeric, rel=2e-3)

@@ -21,10 +21,10 @@ from bodyslam_jax.solver._blocks import (
 from bodyslam_jax.solver._landmarks import half_inverse
 from bodyslam_jax.solver._lasting import lasting_spread
 from bodyslam_jax.solver._loop import Final
-from bodyslam_jax.solver._normal import damped, diagonals
+from bodyslam_jax.solver._normal import UNSEEN, damped, diagonals
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._selected_inverse import selected_inverse
-from bodyslam_jax.solver._solve import method_of, run
+from bodyslam_jax.solver._solve import check_start, method_of, run
 from bodyslam_jax.solver._trial import little
 from bodyslam_jax.solver._window import window_of
 
@@ -53,7 +53,10 @@ def marginals(problem: Problem, state: State) -> Marginals:
     They count for as much as the weights do: sigmas that are standard deviations, and
     correlated errors modelled as such. The equations are set up by the program that
     `solve` has compiled, in a schedule without steps.
+
+    **Raises:** `ValueError` if `state` does not fit the problem, as `solve` does.
     """
+    check_start(problem, state)
     t, l = len(state.cameras), len(state.landmarks)
     problem, state = pad(problem, state)
     method = method_of((), 0.0, state.scale.dtype, keep=True)
@@ -68,9 +71,8 @@ def marginals(problem: Problem, state: State) -> Marginals:
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)
     lin = final.lin
-    damping = damped(
-        diagonals(lin, sizes), jnp.asarray(little(state.scale.dtype), state.scale.dtype)
-    )
+    least = jnp.asarray(little(state.scale.dtype), state.scale.dtype)
+    damping = damped(diagonals(lin, sizes), least, UNSEEN)
     fronts, windows, arrow = selected_inverse(
         final.factor,
         final.roots,

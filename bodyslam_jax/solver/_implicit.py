@@ -24,7 +24,7 @@ from bodyslam_jax.compilation import (
     is_traced,
     quick_options,
 )
-from bodyslam_jax.graph import Problem, Reprojection, State, Step
+from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver._apart import join_poses
 from bodyslam_jax.solver._blocks import mask_of, sizes_of
@@ -79,11 +79,13 @@ def _cotangent_of_problem(problem, state, cotangent):
         seen = whole.predict(moved, frozen=False)
         fixed = whole.with_prediction(seen)
 
+        # About the place moved to, as the solver holds single coordinates: in the
+        # chart of another place they are others, and what pulls at them is not 0.
         def cost(d):
-            place = state.retract(d)
+            place = moved.retract(d)
             return fixed.follow(place).cost(place)
 
-        return jax.grad(cost)(step)
+        return jax.grad(cost)(zero)
 
     _, transpose = jax.vjp(gradient, zero, arrays)
     precondition = _preconditioner(problem, state)
@@ -107,14 +109,21 @@ def _cotangent_of_problem(problem, state, cotangent):
 
 def _without_single_views(problem: Problem) -> Problem:
     """Drops observations of landmarks seen once: they say nothing about the rest, and
-    leave the landmark's depth, and so the linear system, without a solution."""
+    leave the landmark's depth, and so the linear system, without a solution.
+
+    Not of landmarks that are held, or known besides: these tell where cameras are.
+    """
     factors = list(problem.factors)
+    alone = jnp.all(mask_of(problem).landmarks > 0, axis=-1)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            alone &= ~jnp.any(factor.whitening != 0, axis=(-2, -1))
     for i, factor in enumerate(factors):
         if isinstance(factor, Reprojection):
             seen = jnp.isfinite(factor.sigma)
             count = jnp.zeros(problem.free.landmarks.shape[0], jnp.int32)
             count = count.at[factor.landmark].add(seen.astype(jnp.int32))
-            once = count[factor.landmark] < 2
+            once = ((count < 2) & alone)[factor.landmark]
             sigma = jnp.where(once, jnp.inf, factor.sigma)
             factors[i] = eqx.tree_at(lambda f: f.sigma, factor, sigma)
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))

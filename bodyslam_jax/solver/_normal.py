@@ -82,10 +82,18 @@ def _pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
     return total
 
 
-def damped(diagonal: dict, damping: Float[Array, ""]) -> dict:
-    """What Marquardt's damping adds to the diagonal."""
+UNSEEN = 1e-12
+"""Weight of a coordinate that no measurement sees, for covariances: next to nothing."""
+
+
+def damped(
+    diagonal: dict,
+    damping: Float[Array, ""],
+    unseen: float | Float[Array, ""] = 1.0,
+) -> dict:
+    """What Marquardt's damping adds to the diagonal; `unseen` where that is 0."""
     tiny = jnp.finfo(damping.dtype).tiny ** 0.5
-    add = lambda d: jnp.where(d > tiny, damping * d, 1.0)
+    add = lambda d: jnp.where(d > tiny, damping * d, unseen)
     return jax.tree.map(add, diagonal)
 
 

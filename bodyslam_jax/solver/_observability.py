@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from bodyslam_jax.graph import (
     CameraPrior,
+    CameraSmoothness,
     IntrinsicsPrior,
     LandmarkPrior,
     Problem,
@@ -97,6 +98,10 @@ class _Scene:
             isinstance(x, ties) for x in self.problem.factors
         )
 
+    def is_steady(self) -> bool:
+        """Whether something ties cameras to those before."""
+        return any(isinstance(x, CameraSmoothness) for x in self.problem.factors)
+
     def stand_still(self) -> list[int]:
         """The people who do not walk, nor otherwise move their pelvis."""
         far = [
@@ -140,7 +145,8 @@ def _scale(scene: _Scene, spread: Marginals) -> Iterator[str]:
         why = "the camera hardly moves"
     else:
         why = "nothing links people's motion to the map, or nothing tells how far it is"
-    yield f"scale: known to {share:.0%} only; {why}."
+    known = f"known to {share:.0%} only" if share < 1 else "not known"
+    yield f"scale: {known}; {why}."
 
 
 def _focal_length(scene: _Scene, spread: Marginals) -> Iterator[str]:
@@ -199,7 +205,12 @@ def _landmarks(scene: _Scene, spread: Marginals) -> Iterator[str]:
 
 
 def _cameras(scene: _Scene, spread: Marginals) -> Iterator[str]:
-    if not scene.has("cameras") or (scene.moves() and not scene.has_size()):
+    if not scene.has("cameras"):
+        return
+    if scene.moves() and not scene.has_size():
+        blind = len(scene.centres) - len(np.unique(scene.frame))
+        if blind and not scene.is_steady():
+            yield f"cameras of {blind} frames: no landmark is seen in them."
         return
     reach = max(scene.reach, 1e-9)
     lost = ~(_deviation(spread.cameras) < UNKNOWN * reach)

@@ -18,6 +18,7 @@ from bodyslam_jax.compilation import (
     quick_options,
 )
 from bodyslam_jax.graph import VARIABLES, Problem, State, limbs_of
+from bodyslam_jax.graph._check import check_state
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
@@ -28,7 +29,7 @@ from bodyslam_jax.solver._levenberg_marquardt import (
 from bodyslam_jax.solver._loop import Final
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
-from bodyslam_jax.solver._schedule import Solver, Stage, check_names
+from bodyslam_jax.solver._schedule import Solver, Stage, check_names, check_schedule
 from bodyslam_jax.solver._solution import Solution, only, outcome
 
 HISTORY = 64
@@ -64,21 +65,20 @@ def solve(
 
     Derivatives, of `structured`, are those of `state` and `cost` with respect to all of
     `problem`, by the implicit function theorem; a solution does not depend on where it
-    started. They are NaN where their equations could not be solved.
+    started. What the last stage holds counts as given, also where an earlier one moved
+    it. They are NaN where their equations could not be solved.
 
-    **Raises:** `ValueError` if `state` does not have the sizes the problem was made
-    for, or is not finite, if factors put in later see joints together that those it
-    was made with did not, or if a baseline is to mix precisions. Failure to converge
-    is a `status`, and so is what is not finite within `jit`.
+    **Raises:** `ValueError` if `state` does not have the sizes and the precision the
+    problem was made for, is not finite, or has poses that are not rigid, if there is no
+    factor, or no stage that takes a step, if `damping` is negative, if factors put in
+    later see joints together that those it was made with did not, or if a baseline is
+    to mix precisions. Failure to converge is a `status`, and so is what is not finite
+    within `jit`.
     """
-    expected = problem.free.cameras.shape[0], problem.free.landmarks.shape[0]
-    found = state.cameras.shape[0], state.landmarks.shape[0]
-    if found != expected:
-        raise ValueError(
-            f"state: {found[0]} frames and {found[1]} landmarks, expected "
-            f"{expected[0]} and {expected[1]} as in the problem."
-        )
-    _check_finite(state)
+    check_schedule(solver, schedule)
+    if not is_traced(damping) and not 0 <= damping < np.inf:
+        raise ValueError(f"damping: {damping}, expected 0 or more, and finite.")
+    check_start(problem, state)
     if solver != "structured":
         if mixed_precision:
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
@@ -87,18 +87,18 @@ def solve(
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
-    return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *found))
+    sizes = len(state.cameras), len(state.landmarks)
+    return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *sizes))
 
 
-def _check_finite(state: State) -> None:
-    for name, value in vars(state).items():
-        if is_traced(value):
-            continue
-        bad = int(np.sum(~np.isfinite(np.asarray(value))))
-        if bad:
-            raise ValueError(
-                f"state.{name}: {bad} of {value.size} values are not finite."
-            )
+def check_start(problem: Problem, state: State) -> None:
+    """Refuses a problem that measures nothing, and a state that does not fit.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    if not problem.factors:
+        raise ValueError("problem.factors: found none, expected one or more.")
+    check_state(state, problem.free)
 
 
 def _check_limbs(problem: Problem) -> None:
@@ -197,6 +197,7 @@ def _backward(
     )
     now = restrict(problem, schedule[-1].free)
     given = cotangent_of_problem(now, found, full)
+    given = dataclasses.replace(given, variables=problem.variables)
     if cotangent.cost is not None:
         # At a minimum the state's own share of the cost's derivative is 0.
         arrays, static = eqx.partition(problem, eqx.is_inexact_array)

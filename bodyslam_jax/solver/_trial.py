@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._blocks import Linearisation, Sizes
 from bodyslam_jax.solver._normal import (
+    UNSEEN,
     Eliminated,
     damped,
     diagonals,
@@ -75,7 +76,9 @@ def attempt(
     """Solves for a step and tries it; with `last` only factorises, hardly damped."""
     damping = jnp.where(last, little(sizes.dtype), damping)
     diagonal = diagonals(lin, sizes)
-    extra = damped(diagonal, damping)
+    extra = damped(
+        diagonal, damping, jnp.where(last, UNSEEN, 1.0).astype(damping.dtype)
+    )
     least = jnp.where(last, 0.0, caution)
     extra["landmarks"] = tuple(
         jnp.maximum(more, least[bucket.landmark][:, None] * own)
