@@ -112,6 +112,8 @@ def draw_errors(
     for axis, name in zip(axes, ("x (left)", "y (up)", "z (forward)"), strict=True):
         axis.set(xlabel=f"error in {name}, mm")
         axis.legend(fontsize=7, title="drift: mean ± sd", title_fontsize=7)
+    axes[0].set_ylabel("density, 1/mm")
+    figure.suptitle("recorded motion, simulated drift of postures", fontsize=9)
     figure.savefig(path, dpi=120)
 
 
