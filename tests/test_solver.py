@@ -817,3 +817,34 @@ def test_derivatives_where_landmarks_or_single_coordinates_are_held():
         slope = float(jax.grad(value)(0.0))
         numeric = float(value(1e-2) - value(-1e-2)) / 2e-2
         assert slope == pytest.approx(numeric, rel=2e-3)
+
+
+@pytest.mark.parametrize("people", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_marginal_covariances_are_differentiable(people):
+    problem, _, start = make(people=people, known=True)
+    state = solve(problem, start).state
+    spread = marginals(problem, state)
+    kind = g.JointReprojection if people else g.Reprojection
+    at = next(i for i, f in enumerate(problem.factors) if isinstance(f, kind))
+    sigma = problem.factors[at].sigma
+    seen = jnp.isfinite(sigma)
+    sigma = jnp.where(seen, sigma, 1.0)
+    way = jnp.asarray(np.random.default_rng(3).standard_normal(sigma.shape))
+    move = state.zero_step()
+    move = dataclasses.replace(
+        move, cameras=move.cameras.at[3, 3].set(1.0), roots=move.roots + 0.1
+    )
+
+    def value(by):
+        size = jnp.where(seen, sigma * jnp.exp(by[0] * way), jnp.inf)
+        there = eqx.tree_at(lambda p: p.factors[at].sigma, problem, size)
+        found = marginals(there, state.retract(jax.tree.map(lambda x: by[1] * x, move)))
+        deviation = jnp.sqrt(jnp.trace(found.cameras[1:], axis1=1, axis2=2))
+        return jnp.sum(deviation) + found.scale + jnp.sum(found.shapes)
+
+    slopes = jax.grad(value)(jnp.zeros(2))
+    assert jnp.isfinite(value(jnp.zeros(2)))
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(spread))
+    for slope, step in zip(slopes, 1e-5 * jnp.eye(2), strict=True):
+        numeric = float(value(step) - value(-step)) / 2e-5
+        assert float(slope) == pytest.approx(numeric, rel=1e-4)

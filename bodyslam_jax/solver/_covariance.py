@@ -25,6 +25,7 @@ from bodyslam_jax.solver._normal import UNSEEN, damped, diagonals
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._selected_inverse import selected_inverse
 from bodyslam_jax.solver._solve import check_start, method_of, run
+from bodyslam_jax.solver._spread_gradient import equations
 from bodyslam_jax.solver._trial import little
 from bodyslam_jax.solver._window import window_of
 
@@ -52,18 +53,52 @@ def marginals(problem: Problem, state: State) -> Marginals:
 
     They count for as much as the weights do: sigmas that are standard deviations, and
     correlated errors modelled as such. The equations are set up by the program that
-    `solve` has compiled, in a schedule without steps.
+    `solve` has compiled, in a schedule without steps. Differentiable by problem and
+    state, backwards (`_spread_gradient`).
 
     **Raises:** `ValueError` if `state` does not fit the problem, as `solve` does.
     """
     check_start(problem, state)
     t, l = len(state.cameras), len(state.landmarks)
-    problem, state = pad(problem, state)
-    method = method_of((), 0.0, state.scale.dtype, keep=True)
-    _, final = run(problem, state, method, alone=is_alone())
-    spread = _marginals(problem, state, final)
+    spread = _differentiable(pad(problem, state), is_alone())
     cut = {"cameras": spread.cameras[:t], "people": spread.people[:, :t]}
     return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})
+
+
+@eqx.filter_custom_vjp
+def _differentiable(given: tuple[Problem, State], alone: bool) -> Marginals:
+    problem, state = given
+    method = method_of((), 0.0, state.scale.dtype, keep=True)
+    _, final = run(problem, state, method, alone=alone)
+    return _marginals(problem, state, final)
+
+
+@_differentiable.def_fwd
+def _forward(perturbed, given, alone):
+    return _differentiable(given, alone), None
+
+
+@_differentiable.def_bwd
+def _backward(residuals, cotangent, perturbed, given, alone):
+    return _pulled(given, cotangent)
+
+
+@eqx.filter_jit
+def _pulled(given: tuple[Problem, State], cotangent: Marginals):
+    arrays, static = eqx.partition(given, eqx.is_inexact_array)
+
+    def spread(arrays):
+        problem, state = eqx.combine(arrays, static)
+        return _marginals(problem, state, equations(problem, state))
+
+    found, pull = jax.vjp(spread, arrays)
+    full = jax.tree.map(
+        lambda c, x: jnp.zeros_like(x) if c is None else c,
+        cotangent,
+        found,
+        is_leaf=lambda x: x is None,
+    )
+    return pull(full)[0]
 
 
 @jit_once
