@@ -11,6 +11,7 @@ from bodyslam_jax.graph._camera_priors import CameraPrior as CameraPrior
 from bodyslam_jax.graph._camera_priors import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph._camera_priors import IntrinsicsPrior as IntrinsicsPrior
 from bodyslam_jax.graph._camera_priors import SquarePixels as SquarePixels
+from bodyslam_jax.graph._check import check_state as check_state
 from bodyslam_jax.graph._displacement import displacement as displacement
 from bodyslam_jax.graph._ground import GroundContact as GroundContact
 from bodyslam_jax.graph._human_motion import HumanMotion as HumanMotion

@@ -16,17 +16,13 @@ from jaxtyping import AbstractArray, Bool, Float, Int
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
-from bodyslam_jax.graph._camera_priors import CameraPrior, CameraSmoothness
-from bodyslam_jax.graph._human_motion import HumanMotion, OrientationChange
+from bodyslam_jax.graph._camera_priors import CameraPrior
+from bodyslam_jax.graph._check_weights import check_early, check_loss
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
-from bodyslam_jax.graph._posture import Posture
 from bodyslam_jax.graph._reprojection import JointReprojection, Reprojection
-from bodyslam_jax.graph._robust import AbstractLoss
 from bodyslam_jax.graph._root_priors import (
     RootOrientation,
     RootPlace,
-    RootSmoothness,
-    RootTurning,
 )
 from bodyslam_jax.graph._stance import StanceFoot
 from bodyslam_jax.graph._state import State, Step
@@ -41,20 +37,6 @@ _KINDS = {
     Int: (jnp.integer, "integers"),
     Bool: (jnp.bool_, "bool"),
 }
-_EARLY = (
-    (HumanMotion, "whitening", 1, 0.0),
-    # Of the first prediction too: the one before has none.
-    (HumanMotion, "correlation", 2, 0.0),
-    (Posture, "correlation", 1, 0.0),
-    (RootOrientation, "correlation", 1, 0.0),
-    (RootPlace, "correlation", 1, 0.0),
-    (OrientationChange, "sigma", 1, np.inf),
-    (CameraSmoothness, "sigma", 2, np.inf),
-    (RootSmoothness, "sigma", 2, np.inf),
-    (RootTurning, "sigma", 2, np.inf),
-)
-"""How many of the first frames look back to where there is none, and what a field must
-be there: windows repeat the first frame, which would be taken for a measurement."""
 
 
 def check_state(state: State, free: Step | None = None) -> Sizes:
@@ -90,7 +72,7 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
     if not of_landmarks and not isinstance(factor, AbstractFrameFactor):
         raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     sizes = dict(sizes)
-    _check_loss(factor.loss, f"{name}.loss")
+    check_loss(factor.loss, f"{name}.loss")
     if isinstance(factor, JointReprojection):
         if factor.layout not in KEYPOINT_NAMES:
             raise ValueError(
@@ -105,7 +87,7 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
     if isinstance(factor, AbstractFrameFactor):
         _check_frames(factor, name, sizes)
     _check_values(factor, name)
-    _check_early(factor, name)
+    check_early(factor, name)
     if isinstance(factor, Reprojection):
         _check_tracks(factor, sizes)
     if isinstance(factor, RootOrientation):
@@ -153,36 +135,6 @@ def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
             raise ValueError(
                 f"{where}: shape {found.shape}, expected {shape} for `{kind.dim_str}`."
             )
-
-
-def check_precision(factor: AbstractFactor, state: State) -> None:
-    """Refuses measurements of more digits than a state has, which would pass them on.
-
-    **Raises:** `ValueError` that says where, what was found and what was expected.
-    """
-    most = state.scale.dtype
-    for path, leaf in jax.tree_util.tree_leaves_with_path(factor):
-        if not eqx.is_inexact_array(leaf) or getattr(leaf, "weak_type", False):
-            continue
-        if jnp.finfo(leaf.dtype).bits > jnp.finfo(most).bits:
-            where = type(factor).__name__ + jax.tree_util.keystr(path)
-            raise ValueError(
-                f"{where}: found {leaf.dtype}, expected {most} as in state."
-            )
-
-
-def check_mask(free: Step) -> None:
-    """Refuses what is neither free nor held.
-
-    **Raises:** `ValueError` that says where, and what was found.
-    """
-    for name, value in vars(free).items():
-        if is_traced(value):
-            continue
-        values = np.asarray(value)
-        other = values[(values != 0) & (values != 1)]
-        if len(other):
-            raise ValueError(f"free.{name}: found {other[0]}, expected 0 or 1.")
 
 
 def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
@@ -242,41 +194,6 @@ def _check_precision(state, free):
         if value.dtype != expected:
             raise ValueError(
                 f"state.{name}: found {value.dtype}, expected {expected} as in {like}."
-            )
-
-
-def _check_loss(loss, where):
-    if not isinstance(loss, AbstractLoss):
-        raise ValueError(
-            f"{where}: found {loss!r:.60}, expected a loss such as `Squared()`."
-        )
-    scale = getattr(loss, "scale", 1.0)
-    if is_traced(scale):
-        return
-    values = np.asarray(scale)
-    if not np.issubdtype(values.dtype, np.number):
-        raise ValueError(f"{where}.scale: found {scale!r:.40}, expected a number.")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{where}.scale: found {scale}, which is not finite.")
-    if not (values > 0).all():
-        raise ValueError(f"{where}.scale: found {values.min()}, expected above 0.")
-
-
-def _check_early(factor, name):
-    """Weights of frames that look back to where there is none."""
-    for kind, field, count, empty in _EARLY:
-        value = getattr(factor, field, None)
-        # Not of others made from it, which may look back elsewhere.
-        if type(factor) is not kind or is_traced(value):
-            continue
-        early = np.asarray(value)
-        early = early[:, :count] if factor.of_people else early[:count]
-        other = early[early != empty]
-        if len(other):
-            frames = "frame 0" if count == 1 else f"frames 0 to {count - 1}"
-            raise ValueError(
-                f"{name}.{field}: found {other[0]} within {frames}, expected {empty}: "
-                "there is no earlier frame."
             )
 
 

@@ -16,12 +16,11 @@ from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor, Limbs
 from bodyslam_jax.graph._check import (
     check_factor,
-    check_mask,
-    check_precision,
     check_prior,
     check_shapes,
     check_state,
 )
+from bodyslam_jax.graph._check_weights import check_mask, check_precision
 from bodyslam_jax.graph._human_motion import HumanMotion, OrientationChange
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._layout import Layout, make_layout

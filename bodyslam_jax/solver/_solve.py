@@ -17,8 +17,7 @@ from bodyslam_jax.compilation import (
     is_traced,
     quick_options,
 )
-from bodyslam_jax.graph import VARIABLES, Problem, State, limbs_of
-from bodyslam_jax.graph._check import check_state
+from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import _baselines
 from bodyslam_jax.solver._implicit import cotangent_of_problem
