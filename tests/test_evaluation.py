@@ -520,11 +520,19 @@ def test_what_is_compared_is_said():
     whole = evaluation.evaluate(found, truth)
     scope = whole.scope
     assert scope == evaluation.Scope(
-        NUM, NUM, (evaluation.Pair(0, None, 0, NUM), evaluation.Pair(1, 0, 25, NUM)), 0
+        NUM,
+        NUM,
+        (evaluation.Pair(0, evaluation.NOBODY, 0, NUM), evaluation.Pair(1, 0, 25, NUM)),
+        0,
     )
     first, second = evaluation.gaps(scope)
     assert "person 0 of the ground truth is not found" in first
     assert "person 1 is compared in 25 of 250 frames" in second
+    # Evaluations of pairs with as many people stack.
+    other = dataclasses.replace(found, present=~present)
+    both = evaluation.evaluate(found, truth), evaluation.evaluate(other, truth)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *both)
+    assert stacked.scope.people[1].frames.tolist() == [25, NUM - 25]
     assert "person 1 (here 0) in 25 of 250 frames" in evaluation.to_table(whole)
     said = json.loads(evaluation.to_json(whole))["compared"]["people"]
     assert [person["estimate"] for person in said] == [None, 0]

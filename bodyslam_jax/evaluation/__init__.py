@@ -12,6 +12,7 @@ from bodyslam_jax.evaluation._datasets import convert_emdb as convert_emdb
 from bodyslam_jax.evaluation._datasets import convert_rich as convert_rich
 from bodyslam_jax.evaluation._datasets import convert_tum_amass as convert_tum_amass
 from bodyslam_jax.evaluation._datasets import read_truth as read_truth
+from bodyslam_jax.evaluation._evaluation import NOBODY as NOBODY
 from bodyslam_jax.evaluation._evaluation import Evaluation as Evaluation
 from bodyslam_jax.evaluation._evaluation import Pair as Pair
 from bodyslam_jax.evaluation._evaluation import Scope as Scope

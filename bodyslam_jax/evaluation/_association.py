@@ -16,6 +16,7 @@ from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation._alignment import align
 from bodyslam_jax.evaluation._evaluation import (
     FEET,
+    NOBODY,
     PELVIS,
     Evaluation,
     Pair,
@@ -136,8 +137,9 @@ def _scope(
         both = true.present[i] & (False if who is None else found.present[who])
         compared, of = counts(both, own)
         if of:
-            people.append(Pair(i, who if compared else None, compared, of))
-    matched = sum(pair.estimate is not None for pair in people)
+            someone = NOBODY if who is None or not compared else who
+            people.append(Pair(i, someone, compared, of))
+    matched = sum(pair.estimate != NOBODY for pair in people)
     return Scope(
         *counts(found.camera_valid & true.camera_valid, everywhere),
         tuple(people),

@@ -1,6 +1,5 @@
 """All errors of an estimate at once: a pure function of two aligned-in-time bundles."""
 
-import dataclasses
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -12,6 +11,7 @@ from bodyslam_jax.evaluation import _metrics as metrics
 from bodyslam_jax.evaluation._alignment import Alignment, align, is_point
 
 PELVIS = 0
+NOBODY = -1
 STILL = 0.01
 """m; a camera whose path has a smaller radius (root mean square) stands still."""
 FEET = (7, 10, 8, 11)
@@ -39,20 +39,19 @@ class Trajectories(eqx.Module):
     """1/s"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Pair:
+class Pair(eqx.Module):
     """A person of the truth, and who of the estimate was taken for them."""
 
     truth: int
-    estimate: int | None
+    estimate: int
+    """`NOBODY` if they are not found."""
     frames: int
     """In which both are known."""
     of_frames: int
     """In which the truth is known."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Scope:
+class Scope(eqx.Module):
     """How much of a truth an evaluation is about."""
 
     cameras: int
@@ -78,7 +77,7 @@ class Evaluation(eqx.Module):
     """The same names, person by person, in the truth's order; those matched only."""
     feet: str = eqx.field(static=True, default="the points given")
     """What `foot_sliding` is of."""
-    scope: Scope | None = eqx.field(static=True, default=None)
+    scope: Scope | None = None
     """What was compared; `None` for `Trajectories`, which are all compared."""
 
     def __getitem__(self, name: str) -> Float[Array, "*b"]:

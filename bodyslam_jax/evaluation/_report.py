@@ -1,6 +1,5 @@
 """Errors as rows, as a table, as JSON; and what they are about, in a line."""
 
-import dataclasses
 import json
 import math
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
-from bodyslam_jax.evaluation._evaluation import Evaluation, Scope
+from bodyslam_jax.evaluation._evaluation import NOBODY, Evaluation, Scope
 
 _MM, _PERCENT, _DEGREES = 1e3, 100.0, 180 / math.pi
 ROWS: tuple[tuple[str, str, str, float], ...] = (
@@ -83,7 +82,7 @@ def describe(scope: Scope) -> str:
     for pair in scope.people:
         found = (
             "not found"
-            if pair.estimate is None
+            if pair.estimate == NOBODY
             else f"(here {pair.estimate}) in {pair.frames} of {pair.of_frames} frames"
         )
         parts.append(f"person {pair.truth} {found}")
@@ -101,7 +100,7 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
             "the ground truth only."
         )
     for pair in scope.people:
-        if pair.estimate is None:
+        if pair.estimate == NOBODY:
             found.append(f"person {pair.truth} of the ground truth is not found.")
         elif pair.frames < least * pair.of_frames:
             found.append(
@@ -109,6 +108,15 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
                 f"{pair.of_frames} frames of the ground truth only."
             )
     return found
+
+
+def _compared(scope: Scope) -> dict[str, Any]:
+    """As `dict`s; who is not found has no number."""
+    people = [
+        {**vars(pair), "estimate": None if pair.estimate == NOBODY else pair.estimate}
+        for pair in scope.people
+    ]
+    return {**vars(scope), "people": people}
 
 
 def to_json(evaluation: Evaluation) -> str:
@@ -122,5 +130,5 @@ def to_json(evaluation: Evaluation) -> str:
     found: dict[str, Any] = {name: plain(x) for name, x in evaluation.items()}
     found["people"] = {name: plain(x) for name, x in evaluation.people.items()}
     if evaluation.scope is not None:
-        found["compared"] = dataclasses.asdict(evaluation.scope)
+        found["compared"] = _compared(evaluation.scope)
     return json.dumps(found, indent=2)

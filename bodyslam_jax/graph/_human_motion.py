@@ -14,6 +14,7 @@ from bodyslam_jax.graph._abstract import AbstractFrameFactor, Shared, Touch
 from bodyslam_jax.graph._displacement import before, displacement, displacements
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import log
+from bodyslam_jax.graph._whitening import innovation
 from bodyslam_jax.motion import leg_length
 
 
@@ -65,7 +66,7 @@ class HumanMotion(AbstractFrameFactor):
         error = displacement(window[1], window[0], shared.scale) / leg - translation
         if self.correlated:
             last = displacement(window[2], window[1], shared.scale) / leg - previous
-            error = (error - correlation * last) / jnp.sqrt(1 - correlation**2)
+            error = innovation(error, last, correlation)
         return whitening @ error
 
     def jacobians(self, state):

@@ -12,6 +12,7 @@ from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._displacement import before
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
+from bodyslam_jax.graph._whitening import innovation
 
 
 class Posture(AbstractFrameFactor):
@@ -50,7 +51,7 @@ class Posture(AbstractFrameFactor):
         error = rotation_between(rotation, window[0].pose)
         if self.correlated:
             last = rotation_between(previous, window[1].pose)
-            error = (error - correlation * last) / jnp.sqrt(1 - correlation**2)
+            error = innovation(error, last, correlation)
         return error / sigma[:, None]
 
     def residual(self, state: State) -> Float[Array, "h t 23 3"]:

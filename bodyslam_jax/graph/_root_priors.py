@@ -8,6 +8,7 @@ from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._human_motion import unit_length
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
 from bodyslam_jax.graph._state import log
+from bodyslam_jax.graph._whitening import innovation
 
 
 class RootSmoothness(AbstractFrameFactor):
@@ -95,8 +96,7 @@ class RootOrientation(AbstractFrameFactor):
         measured, previous, sigma, correlation = data
         error = log(measured.T @ window[0].root[:3, :3])
         before = log(previous.T @ window[1].root[:3, :3])
-        error = error - correlation * before
-        return error / jnp.sqrt(1 - correlation**2) / sigma
+        return innovation(error, before, correlation) / sigma
 
 
 class RootPlace(AbstractFrameFactor):
@@ -130,10 +130,10 @@ class RootPlace(AbstractFrameFactor):
     def local(self, data, window, shared):
         measured, previous, sigma, correlation = data
         error = _away(measured, window[0].root[:3, 3])
-        error = error - correlation * _away(previous, window[1].root[:3, 3])
+        before = _away(previous, window[1].root[:3, 3])
         across, depth = sigma
         spread = jnp.stack([across, across, depth])
-        return error / jnp.sqrt(1 - correlation**2) / spread
+        return innovation(error, before, correlation) / spread
 
 
 def _away(measured: Float[Array, " 3"], place: Float[Array, " 3"]) -> Array:

@@ -5,6 +5,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
+def innovation(
+    error: Float[Array, "*n"], last: Float[Array, "*n"], correlation: Float[Array, ""]
+) -> Float[Array, "*n"]:
+    """What is new in an error of which `correlation` lasts from frame to frame,
+    `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`: as large as the error in the long run, and
+    independent of all before. With ρ = 0, where a run begins, the error itself."""
+    return (error - correlation * last) / jnp.sqrt(1 - correlation**2)
+
+
 @jax.jit
 def runs(
     present: Bool[Array, "h t"], correlation: float | Float[Array, ""]
