@@ -187,17 +187,18 @@ def summarise(
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
         )
-    warnings += _disagreement(joint.start)
+    apart = cues_apart(joint.start)
+    warnings += _disagreement(joint.start, apart)
     ground = export.ground_scale(result) if cameras.kind == "moving" else None
-    apart = max(ground, 1 / ground) if ground else 1.0
-    if apart > _GROUND_DOUBT:
+    off = max(ground, 1 / ground) if ground else 1.0
+    if off > _GROUND_DOUBT:
         text = (
             f"the ground of the map would be under the people's feet if the map were "
             f"{ground:.2f} times as large: scale, postures or focal length are off, or "
             "they stand on something else."
         )
         warnings.append(text)
-        if status == "ok" and apart > _GROUND_DISTRUST:
+        if status == "ok" and off > _GROUND_DISTRUST:
             status = "not to be trusted: people do not stand on the ground of the map"
     way = export.camera_facts(result)
     persons = []
@@ -246,7 +247,9 @@ def summarise(
         "camera_motion": cameras.kind,
         "scale": {
             "value": result.scale,
-            "sigma": joint.scale_sigma,
+            # NaN, where covariances were not computed, stays NaN.
+            "sigma": float(np.maximum(joint.scale_sigma, apart / 2 * result.scale)),
+            "sigma_of_covariance": joint.scale_sigma,
             "start": joint.start.value,
             "start_standard_error": joint.start.standard_error,
             **_cues(joint.start),
@@ -277,18 +280,32 @@ def _cues(start: ScaleStart) -> dict[str, list[float] | None]:
     return {k: v if np.isfinite(v[1]) else None for k, v in cues.items()}
 
 
-def _disagreement(start: ScaleStart) -> list[str]:
-    """A line where motion and ground tell sizes that both cannot be right."""
-    ratio = start.motion / start.ground
+def cues_apart(start: ScaleStart) -> float:
+    """The logarithm of the ratio of the sizes that motion and ground tell; 0 where both
+    may be right.
+
+    Of two that cannot both be right half of it is what is left of certainty: the
+    standard error of two measurements with unknown errors of their own (DerSimonian and
+    Laird, 1986), in the limit of errors much larger than those stated.
+    """
     sigma = np.hypot(
         start.motion_error / start.motion, start.ground_error / start.ground
     )
-    apart = max(ratio, 1 / ratio)
-    if not np.isfinite(sigma) or apart < max(_CUES_APART, 1 + 2 * sigma):
+    apart = abs(np.log(start.motion / start.ground))
+    # Infinite errors say that a cue is not there.
+    if not np.isfinite(sigma) or np.exp(apart) < max(_CUES_APART, 1 + 2 * sigma):
+        return 0.0
+    return float(apart)
+
+
+def _disagreement(start: ScaleStart, apart: float) -> list[str]:
+    """A line where motion and ground tell sizes that both cannot be right."""
+    if not apart:
         return []
     return [
-        f"people's motion makes the map {ratio:.2f} times as large as the ground under "
-        "their feet does: postures, focal length or ground are off; look at both."
+        f"people's motion makes the map {start.motion / start.ground:.2f} times as large "
+        "as the ground under their feet does: postures, focal length or ground are off; "
+        f"look at both. The metres are known to no better than {50 * apart:.0f} % for it."
     ]
 
 

@@ -123,6 +123,19 @@ def test_a_focal_length_that_was_guessed_has_a_card(tmp_path, body):
     assert "Focal length" not in card({"guessed": False, "focal_px": 500.0})
 
 
+def test_metres_that_two_cues_dispute_say_so(tmp_path, body):
+    scale = {"value": 2.0, "sigma": 0.6, "from_motion": [1.0, 0.1]}
+    text = lambda scale: _text(
+        _write(tmp_path, dataclasses.replace(_walk(), summary={"scale": scale}), body)
+    )
+    share = lambda sigma: f"± {100 * sigma / _walk().scale:.1f} %"
+    disputed = text(scale | {"sigma_of_covariance": 0.06})
+    assert share(0.6) in disputed and share(0.06)[2:] in disputed
+    assert "half of what the two below are apart" in disputed
+    assert "half of what" not in text(scale | {"sigma_of_covariance": 0.6})
+    assert share(0.6) in text(scale)
+
+
 def test_absent_people_and_no_map(tmp_path, body):
     result = _walk(people=2)
     present = result.present.copy()

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 import scenes
 
-from bodyslam_jax import export, graph, initialisation, motion, outcome
-from bodyslam_jax.config import GraphWeights
+from bodyslam_jax import (
+    export,
+    graph,
+    initialisation,
+    motion,
+    outcome,
+    rehearsal,
+    synthetic,
+)
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.ground import find_ground
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
@@ -123,13 +132,39 @@ def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
     both = ScaleStart(motion=2.0, motion_error=0.2, ground=3.0, ground_error=0.1)
     assert both.value == pytest.approx((2 / 0.04 + 3 / 0.01) / (1 / 0.04 + 1 / 0.01))
     assert both.standard_error == pytest.approx((1 / 0.04 + 1 / 0.01) ** -0.5)
-    (line,) = outcome._disagreement(both)
-    assert "0.67 times" in line
-    assert not outcome._disagreement(dataclasses.replace(both, motion=2.8))
+    apart = outcome.cues_apart(both)
+    assert apart == pytest.approx(np.log(3 / 2))
+    (line,) = outcome._disagreement(both, apart)
+    assert "0.67 times" in line and "no better than 20 %" in line
+    assert not outcome._disagreement(both, 0.0)
     nothing = ScaleStart()
     assert nothing.value == 1.0 and np.isinf(nothing.standard_error)
-    assert not outcome._disagreement(nothing)
-    assert not outcome._disagreement(ScaleStart(motion=2.0, motion_error=0.1))
+    unsure = dataclasses.replace(both, motion_error=0.5)
+    alone = ScaleStart(motion=2.0, motion_error=0.1)
+    for start in (dataclasses.replace(both, motion=2.8), unsure, alone, nothing):
+        assert outcome.cues_apart(start) == 0.0
+
+
+def test_metres_are_no_surer_than_the_two_cues_leave_them():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    cameras = rehearsal._cameras(sequence)
+
+    def found(motion: float, sigma: float) -> tuple[dict, str]:
+        start = ScaleStart(motion, 0.1, ground=3.0, ground_error=0.1)
+        joint = dataclasses.replace(
+            rehearsal._joint(sequence), start=start, scale_sigma=sigma
+        )
+        summary = outcome.assemble(sequence, config, body, cameras, joint, {}).summary
+        return summary["scale"], " ".join(summary["warnings"])
+
+    scale, said = found(2.0, 0.03)
+    assert scale["sigma"] == pytest.approx(np.log(1.5) / 2)
+    assert scale["sigma_of_covariance"] == 0.03 and "no better than" in said
+    scale, said = found(2.9, 0.03)
+    assert scale["sigma"] == 0.03 and "no better than" not in said
+    assert found(2.0, 0.4)[0]["sigma"] == 0.4
+    assert np.isnan(found(2.0, np.nan)[0]["sigma"])
 
 
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():

@@ -56,12 +56,19 @@ def cards(
     sigma = scale.get("sigma") if isinstance(scale, dict) else None
     if sigma is not None and result.scale > 0:
         percent = 100 * sigma / result.scale
+        own = scale.get("sigma_of_covariance", sigma)
+        how = "one standard deviation of the scale, as the estimate itself sees it"
+        if own < sigma:
+            how = (
+                "half of what the two below are apart; the estimate itself has "
+                f"{100 * own / result.scale:.1f} %"
+            )
         found.append(
             _card(
                 "How sure are the metres?",
                 f"± {percent:.1f} %",
                 "",
-                "one standard deviation of the scale, as the estimate itself sees it",
+                how,
                 f"scale {result.scale:.4g} m per unit of the unscaled map",
                 *_cues(scale),
             )
