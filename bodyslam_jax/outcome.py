@@ -302,10 +302,11 @@ def _disagreement(start: ScaleStart, apart: float) -> list[str]:
     """A line where motion and ground tell sizes that both cannot be right."""
     if not apart:
         return []
+    ratio = start.motion / start.ground
     return [
-        f"people's motion makes the map {start.motion / start.ground:.2f} times as large "
-        "as the ground under their feet does: postures, focal length or ground are off; "
-        f"look at both. The metres are known to no better than {50 * apart:.0f} % for it."
+        f"people's motion makes the map {ratio:.2f} times as large as the ground under "
+        "their feet does: postures, focal length or ground are off; look at both. The "
+        f"metres are known to no better than {50 * apart:.0f} % for it."
     ]
 
 

@@ -64,6 +64,7 @@ def fitting() -> tuple[g.State, dict[str, g.AbstractFactor]]:
         g.RootPlace(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
         g.StanceFoot(body, ones(1, T, 4)),
         g.UpDirection(jnp.array([0.0, -1, 0]), ones(1, T)),
+        g.GroundContact(body, jnp.array([0.0, -1, 0, 1.5]), ones(1, T)),
     ]
     return state, {type(factor).__name__: factor for factor in factors}
 
@@ -151,6 +152,8 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("StanceFoot", "sigma", ones(1, T, 3), "(1, 3, 3), expected (1, 3, 4)"),
         ("StanceFoot", "points", (19, 21, 22, 25), "19 to 25, expected 0 to 24"),
         ("UpDirection", "up", ones(4), "(4,), expected (3,)"),
+        ("UpDirection", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
+        ("GroundContact", "plane", lambda x: x / 1.5, "length 0.6667, expected 1"),
     ],
 )
 def test_measurements_that_do_not_fit_are_refused(name, where, value, message):

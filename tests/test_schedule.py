@@ -65,5 +65,8 @@ def test_solvers_and_stages_that_are_none_are_refused():
         check_schedule("foo", (Stage(),))
     with pytest.raises(ValueError, match="max_steps: -1, expected 0 or more"):
         Stage(max_steps=-1)
+    for name, value in (("rtol", float("nan")), ("atol", -1e-3)):
+        with pytest.raises(ValueError, match=f"{name}: {value}, expected 0 or more"):
+            Stage(**{name: value})
     with pytest.raises(ValueError, match="free: found 'cameras', expected a tuple"):
         check_names("cameras")

@@ -1,6 +1,7 @@
 """The structured solver against dense algebra, stock solvers and the truth."""
 
 import dataclasses
+import functools
 import importlib
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from bodyslam_jax.solver import (
     marginals,
     restrict,
     solve,
+    trace,
 )
 from bodyslam_jax.solver._gmres import RESTART, gmres
 from bodyslam_jax.solver._mapping import in_turn
@@ -769,8 +771,20 @@ def test_a_solve_that_takes_no_step_is_refused():
 @pytest.mark.parametrize("damping", [-1.0, float("nan"), float("inf")])
 def test_a_damping_that_is_none_is_refused(damping):
     problem, _, start = make()
-    with pytest.raises(ValueError, match=f"damping: {damping}, expected 0 or more"):
-        solve(problem, start, damping=damping)
+    costs = functools.partial(trace, observe=problem.cost)
+    for used in (solve, clock, costs):
+        with pytest.raises(ValueError, match=f"damping: {damping}, expected 0 or more"):
+            used(problem, start, damping=damping)
+
+
+def test_watched_solves_refuse_what_a_solve_refuses():
+    problem, _, start = make()
+    other = dataclasses.replace(start, landmarks=start.landmarks[:-1])
+    for used in (clock, functools.partial(trace, observe=problem.cost)):
+        with pytest.raises(ValueError, match="state.landmarks: shape"):
+            used(problem, other)
+        with pytest.raises(ValueError, match="schedule: no stage"):
+            used(problem, start, schedule=())
 
 
 def test_derivatives_where_landmarks_or_single_coordinates_are_held():

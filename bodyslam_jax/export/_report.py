@@ -25,7 +25,7 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     left out. Keys, beside those that `pipeline.summarise` writes:
 
     - `stages`: a list of `name`, `cost_before`, `cost_after`, `iterations`, `seconds`;
-    - `scale`: `value`, `sigma` (of the value), `sigma_of_covariance` where that is less;
+    - `scale`: `value`, `sigma` (of the value), `sigma_of_covariance` if less;
     - `intrinsics`: `guessed`, `guess_px`, `focal_px`, `focal_sigma_px`;
     - `people`: a list, with `stature_sigma_m` if known;
     - `per_frame`: lists of one number (or `None`) per frame, `reprojection_px`,

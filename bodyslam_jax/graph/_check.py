@@ -18,11 +18,13 @@ from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
 from bodyslam_jax.graph._camera_priors import CameraPrior
 from bodyslam_jax.graph._check_weights import check_early, check_loss
+from bodyslam_jax.graph._ground import GroundContact
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._reprojection import JointReprojection, Reprojection
 from bodyslam_jax.graph._root_priors import (
     RootOrientation,
     RootPlace,
+    UpDirection,
 )
 from bodyslam_jax.graph._stance import StanceFoot
 from bodyslam_jax.graph._state import State, Step
@@ -96,6 +98,10 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
     if isinstance(factor, CameraPrior):
         known = _known(factor.sigma[:, :3])
         _check_rotations(factor.cameras, f"{name}.cameras", known)
+    if isinstance(factor, GroundContact):
+        _check_unit(factor.plane[:3], f"{name}.plane")
+    if isinstance(factor, UpDirection):
+        _check_unit(factor.up, f"{name}.up")
     if isinstance(factor, RootPlace) and not is_traced(factor.place):
         depth = np.asarray(factor.place)[..., 2][_known(factor.sigma)]
         if not (depth > 0).all():
@@ -224,6 +230,14 @@ def _check_rotations(poses, where, known=None):
             f"{where}: {int(wrong.sum())} of {wrong.size} are no rigid {what}, the "
             f"first at {at}; expected all to be."
         )
+
+
+def _check_unit(direction, where):
+    if is_traced(direction):
+        return
+    length = np.linalg.norm(np.asarray(direction, float))
+    if abs(length - 1) > _ROTATION:
+        raise ValueError(f"{where}: a direction of length {length:.4g}, expected 1.")
 
 
 def _check_range(where, index, limit):

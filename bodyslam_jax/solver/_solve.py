@@ -75,14 +75,12 @@ def solve(
     within `jit`.
     """
     check_schedule(solver, schedule)
-    if not is_traced(damping) and not 0 <= damping < np.inf:
-        raise ValueError(f"damping: {damping}, expected 0 or more, and finite.")
-    check_start(problem, state)
+    check_start(problem, state, damping)
     if solver != "structured":
         if mixed_precision:
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
         return _solve_baseline(problem, state, solver, schedule)
-    _check_limbs(problem)
+    check_limbs(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
@@ -90,17 +88,19 @@ def solve(
     return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *sizes))
 
 
-def check_start(problem: Problem, state: State) -> None:
+def check_start(problem: Problem, state: State, damping: float = 0.0) -> None:
     """Refuses a problem that measures nothing, and a state that does not fit.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
+    if not is_traced(damping) and not 0 <= damping < np.inf:
+        raise ValueError(f"damping: {damping}, expected 0 or more, and finite.")
     if not problem.factors:
         raise ValueError("problem.factors: found none, expected one or more.")
     check_state(state, problem.free)
 
 
-def _check_limbs(problem: Problem) -> None:
+def check_limbs(problem: Problem) -> None:
     """Refuses factors that were put in later, where the layout does not hold them."""
     known = [set(limb) for limb in problem.layout.limbs]
     more = [x for x in limbs_of(problem.factors) if not any(set(x) <= y for y in known)]

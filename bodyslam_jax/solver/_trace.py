@@ -15,9 +15,15 @@ from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._levenberg_marquardt import lifted
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad, unpad
-from bodyslam_jax.solver._schedule import Stage
+from bodyslam_jax.solver._schedule import Stage, check_schedule
 from bodyslam_jax.solver._solution import Solution, only, outcome
-from bodyslam_jax.solver._solve import method_of, restrict, restrict_to_all
+from bodyslam_jax.solver._solve import (
+    check_limbs,
+    check_start,
+    method_of,
+    restrict,
+    restrict_to_all,
+)
 
 
 def trace(
@@ -34,10 +40,19 @@ def trace(
     The steps are those of `solve`; after convergence the state stays. Returns the last
     state and the notes, of `1 + Σ max_steps` rows: the first state's, then one an
     iteration. Pure; costs the same whatever the states are; maps as `solve` does.
+
+    **Raises:** `ValueError` as `solve`.
     """
+    _check(problem, state, schedule, damping)
     settings = observe, schedule, damping, mixed_precision
     watched = lambda problem, state: _trace(problem, state, *settings)
     return (in_turn(watched) if is_traced(state) else watched)(problem, state)
+
+
+def _check(problem, state, schedule, damping):
+    check_schedule("structured", schedule)
+    check_start(problem, state, damping)
+    check_limbs(problem)
 
 
 def _trace(problem, state, observe, schedule, damping, mixed):
@@ -91,7 +106,10 @@ def clock(
     Python would wait for each step, and its program would neither map nor be kept from
     run to run. Here the same step is a program of its own, called from Python, compiled
     before the clock runs; only passing the loop's state in and out comes on top.
+
+    **Raises:** `ValueError` as `solve`.
     """
+    _check(problem, state, schedule, damping)
     t, l = len(state.cameras), len(state.landmarks)
     problem, start = pad(problem, state)
     problem = restrict_to_all(problem, schedule)
