@@ -5,8 +5,10 @@ import logging
 import time
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
@@ -60,6 +62,8 @@ def prepare(
 
     **Raises:** `ValueError` if there is neither a moving camera nor a person.
     """
+    within = cameras.within
+    bodies = dataclasses.replace(bodies, present=bodies.present & within)
     roots = people.roots_from_bodies(bodies, body)
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
@@ -68,9 +72,9 @@ def prepare(
     moving = cameras.kind == "moving"
     start = ScaleStart()
     contact = None
-    fitted = sequence.bodies is None
     weights = config.weights
-    shared = weights.fitted_step_error if fitted else weights.step_error
+    fitted = people.without_bodies(sequence)
+    shared = np.where(fitted, weights.fitted_step_error, weights.step_error)
     stages = []
     factors = []
     if moving:
@@ -86,9 +90,17 @@ def prepare(
         )
     anybody = len(roots.present) > 0
     free = None if moving else initialisation.free_people(state)
-    make = lambda factors, state: graph.make_problem(
-        factors, state, motion=predictor if anybody else None, free=free
-    )
+
+    def make(factors, state):
+        with_motion = predictor if anybody else None
+        problem = graph.make_problem(factors, state, motion=with_motion, free=free)
+        if within.all():
+            return problem
+        # Nothing says where cameras beyond a cut are.
+        mask = jnp.zeros_like(problem.free.cameras)
+        mask = mask.at[within].set(graph.gauge(state.cameras[within]))
+        return eqx.tree_at(lambda p: p.free.cameras, problem, mask)
+
     if anybody:
         factors += initialisation.people_factors(sequence, roots, weights, body)
         there = roots.present & cameras.registered
@@ -120,7 +132,7 @@ def prepare(
         seen = predict(predictor, state)
         if moving:
             start = initialisation.scale_start(
-                state, seen, contact, shared_error=shared
+                state, seen, contact, shared_error=float(shared.min())
             )
             log.info(
                 "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
@@ -206,6 +218,10 @@ def estimate(
     if config.uncertainty:
         spread = solver.marginals(problem, best)
         unobserved = solver.observability(problem, best, spread)
+        fitted = people.without_bodies(sequence)
+        if fitted.any() and prepared.roots.present.any():
+            sigma = np.where(fitted, config.weights.shape_sigma, 1.0)
+            spread = of_fitted_sizes(spread, best, body, sigma)
     return Joint(
         scale=float(best.scale),
         start=prepared.scale,
@@ -228,6 +244,30 @@ def estimate(
         status=solution.status,
         stages=(*prepared.stages, stage),
     )
+
+
+def of_fitted_sizes(
+    spread: solver.Marginals,
+    state: graph.State,
+    body: body_.BodyModel,
+    shape_sigma: Float[np.ndarray, " h"],
+) -> solver.Marginals:
+    """Covariances of shapes and scale where bodies were fitted to keypoints.
+
+    Nobody measured these people. A detector's errors last, so that keypoints of many
+    frames say hardly more of a shape than those of a few; the graph, which counts
+    them all, holds β by `shape_sigma` in place of 1 in return. That keeps estimates
+    where they belong, and makes variances as much too small. What is given back goes
+    to the scale by the length of legs, which is the metre of all that moves.
+    """
+    more = np.maximum(shape_sigma**-2.0 - 1, 0.0)
+    log_leg = lambda shape: jnp.log(motion.leg_length(body, shape))
+    slope = jax.vmap(jax.grad(log_leg))(state.shapes)
+    legs = more * jnp.einsum("hi,hij,hj->h", slope, spread.shapes, slope)
+    # The mean of people who differ independently of each other.
+    scale = spread.scale + state.scale**2 * jnp.sum(legs) / len(legs) ** 2
+    shapes = (1 + more)[:, None, None] * spread.shapes
+    return dataclasses.replace(spread, scale=scale, shapes=shapes)
 
 
 def solve_stage(

@@ -22,6 +22,8 @@ FEET = (10, 11)
 """SMPL's foot joints."""
 _CUES_APART = 1.25
 """Factor between the sizes that motion and ground tell, from which a line says so."""
+_MOST = 0.5
+"""Share of the frames that are used, from which a result is one of the video."""
 _GROUND_DOUBT, _GROUND_DISTRUST = 1.15, 1.4
 """Factors between the map's size and that of the people on its ground."""
 
@@ -57,6 +59,16 @@ class Cameras:
     def focal(self) -> float:
         """px"""
         return float(self.intrinsics[0])
+
+    @property
+    def within(self) -> Bool[np.ndarray, " t"]:
+        """Frames of the shot that the map is of. Nothing ties others, beyond a cut, to
+        it; a camera that does not move needs no map."""
+        frames = np.arange(len(self.registered))
+        located = np.flatnonzero(self.registered)
+        if self.kind != "moving" or not len(located):
+            return np.ones(len(frames), bool)
+        return (frames >= located[0]) & (frames <= located[-1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,6 +201,16 @@ def summarise(
         )
     apart = cues_apart(joint.start)
     warnings += _disagreement(joint.start, apart)
+    if joint.status != "converged":
+        warnings.append(f"the joint estimate may not be the best: {joint.status}.")
+    warnings += [
+        f"person {h} is left out: too few keypoints, and no body, in any frame used."
+        for h in np.flatnonzero(~joint.present.any(axis=1))
+    ]
+    within = cameras.within
+    if status == "ok" and within.mean() < _MOST:
+        used = np.flatnonzero(within)
+        status = f"only frames {used[0]} to {used[-1]} of {len(within)} are used"
     ground = export.ground_scale(result) if cameras.kind == "moving" else None
     off = max(ground, 1 / ground) if ground else 1.0
     if off > _GROUND_DOUBT:
@@ -200,7 +222,7 @@ def summarise(
         warnings.append(text)
         if status == "ok" and off > _GROUND_DISTRUST:
             status = "not to be trusted: people do not stand on the ground of the map"
-    way = export.camera_facts(result)
+    way = export.camera_facts(result, within)
     persons = []
     for h in range(len(result.poses)):
         facts = export.person_facts(result, h)
@@ -224,6 +246,8 @@ def summarise(
             if np.isnan(p["stature_sigma_m"])
             else (f" ± {100 * p['stature_sigma_m']:.0f}")
         )
+        if not p["frames"]:
+            continue
         headline.append(
             f"person {h}: {p['path_m']:.2f} m at {p['speed_m_s']:.2f} m/s, "
             f"{100 * p['stature_m']:.0f}{sure} cm tall"
@@ -256,6 +280,7 @@ def summarise(
             "ground_factor": ground,
         },
         "people": persons,
+        "frames_used": int(within.sum()),
         "counts": {
             "landmarks": len(result.landmarks),
             "observations": int(cameras.keep.sum()),

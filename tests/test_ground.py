@@ -167,6 +167,35 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
     assert np.isnan(found(2.0, np.nan)[0]["sigma"])
 
 
+def test_the_summary_says_who_and_what_is_left_out():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = rehearsal._joint(sequence)
+    moved = joint.cameras.copy()
+    moved[:, 0, 3] = np.linspace(0, 3, 15)
+    nobody = np.zeros_like(joint.present)
+    joint = dataclasses.replace(joint, cameras=moved, status="ran out of steps")
+
+    def found(joint, first, last):
+        cameras = rehearsal._cameras(sequence)
+        located = (np.arange(15) >= first) & (np.arange(15) <= last)
+        cameras = dataclasses.replace(cameras, kind="moving", registered=located)
+        return outcome.assemble(sequence, config, body, cameras, joint, {}).summary
+
+    whole = found(joint, 0, 14)
+    assert whole["status"] == "ok" and whole["frames_used"] == 15
+    assert any("may not be the best: ran out of steps" in w for w in whole["warnings"])
+    # Seven of fourteen steps are half of the way.
+    part = found(joint, 0, 7)
+    assert part["status"] == "ok" and "camera: 1.5" in part["headline"][1]
+    assert "camera: 3.0" in whole["headline"][1]
+    short = found(joint, 9, 14)
+    assert short["status"] == "only frames 9 to 14 of 15 are used"
+    empty = found(dataclasses.replace(joint, present=nobody), 0, 14)
+    assert any("person 0 is left out" in w for w in empty["warnings"])
+    assert not any("person 0" in line for line in empty["headline"])
+
+
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():
     frames, share = 200, 0.25
     step = jnp.array([0.04, 0.0, 0.001])

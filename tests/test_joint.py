@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bodyslam_jax import graph, initialisation, joint, people
+from bodyslam_jax import graph, initialisation, joint, motion, people, solver
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.initialisation import ScaleStart
@@ -54,7 +54,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     told = []
 
     def motion_factor(*_, shared_error):
-        told.append(shared_error)
+        told.append(float(shared_error[0]))
 
     def scale_start(*_, shared_error):
         told.append(shared_error)
@@ -69,9 +69,13 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
     monkeypatch.setattr(joint, "predict", lambda *_: None)
     monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
+    sequence = dataclasses.replace(
+        _sequence(None if fitted else _bodies()), keypoints=seen if fitted else None
+    )
     weights = GraphWeights(step_error=0.07, fitted_step_error=0.31)
     prepared = joint.prepare(
-        _sequence(None if fitted else _bodies()),
+        sequence,
         _cameras(),
         _bodies(),
         load_body_model(dtype=jnp.float64),
@@ -105,6 +109,109 @@ def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
     both = dataclasses.replace(_sequence(given), keypoints=seen)
     factors = initialisation.people_factors(both, roots, weights, body)
     assert not any(isinstance(f, graph.RootPlace) for f in factors)
+
+
+def test_people_whom_no_keypoint_shows_stay_where_a_regressor_has_them():
+    body, frames = load_body_model(dtype=jnp.float64), 50
+    rows = lambda x: np.tile(x, (2, frames, 1)).astype(float)
+    given = Bodies(
+        np.ones((2, frames), bool),
+        rows(np.zeros(72)),
+        rows(np.zeros(10)),
+        rows([0.0, 0.0, 4.0]),
+    )
+    confidence = np.zeros((2, frames, 25))
+    confidence[0] = 1.0
+    confidence[1, :10] = 1.0
+    seen = Keypoints(np.zeros((2, frames, 25, 2)), confidence)
+    sequence = dataclasses.replace(
+        _sequence(given), keypoints=seen, timestamps=np.arange(frames) / 20
+    )
+    roots = people.roots_from_bodies(given, body)
+    factors = initialisation.people_factors(sequence, roots, GraphWeights(), body)
+    (place,) = (f for f in factors if isinstance(f, graph.RootPlace))
+    placed = np.asarray(np.isfinite(np.asarray(place.sigma)).all(axis=-1))
+    # Person 1 from a second after the last keypoint on, and nobody else.
+    assert not placed[0].any() and not placed[1, :30].any() and placed[1, 30:].all()
+    assert not np.asarray(place.correlation)[1, :31].any()
+
+
+@pytest.mark.parametrize("shot", [slice(0, 3), slice(1, 4)])
+def test_nothing_moves_beyond_a_cut(monkeypatch, shot):
+    located = np.zeros(T, bool)
+    located[shot] = True
+    T_WC = np.tile(np.eye(4), (T, 1, 1))
+    T_WC[:, 0, 3] = np.clip(np.arange(T), shot.start, shot.stop - 1)
+    cameras = dataclasses.replace(_cameras(), registered=located, T_WC=T_WC)
+    seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
+    sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
+    monkeypatch.setattr(initialisation, "motion_factor", lambda *_, **__: _no_factor())
+    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
+    monkeypatch.setattr(
+        initialisation, "scale_start", lambda *_, **__: ScaleStart(2.0, 0.1)
+    )
+    monkeypatch.setattr(joint, "predict", lambda *_: None)
+    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    body = load_body_model(dtype=jnp.float64)
+    prepared = joint.prepare(sequence, cameras, _bodies(), body, Config())
+    free = np.asarray(prepared.problem.free.cameras)
+    assert not free[~located].any()
+    # The first and one coordinate of the farthest of those that are left.
+    kept = graph.gauge(prepared.state.cameras[shot])
+    np.testing.assert_array_equal(free[shot], kept)
+    assert free[shot].sum() == 11
+    np.testing.assert_array_equal(prepared.roots.present[0], located)
+    for factor in prepared.problem.factors:
+        if isinstance(factor, graph.JointReprojection):
+            assert np.isinf(np.asarray(factor.sigma)[0, ~located]).all()
+
+
+def _no_factor() -> graph.CameraPrior:
+    """One that says nothing."""
+    return graph.CameraPrior(jnp.tile(jnp.eye(4), (T, 1, 1)), jnp.full((T, 6), jnp.inf))
+
+
+def test_cameras_that_do_not_move_use_every_frame():
+    located = np.arange(T) < 2
+    moving = dataclasses.replace(_cameras(), registered=located)
+    assert moving.within.tolist() == [True, True, False, False]
+    gap = np.array([False, True, False, True])
+    between = dataclasses.replace(moving, registered=gap)
+    assert between.within.tolist() == [False, True, True, True]
+    for kind in ("static", "rotation", "failed"):
+        assert dataclasses.replace(moving, kind=kind).within.all()
+    lost = dataclasses.replace(moving, registered=np.zeros(T, bool))
+    assert lost.within.all()
+
+
+def test_sizes_that_nobody_measured_are_as_uncertain_as_people_differ():
+    body = load_body_model(dtype=jnp.float64)
+    given = _bodies()
+    roots = people.roots_from_bodies(given, body)
+    cameras = _cameras()
+    state = initialisation.first_state(
+        cameras.T_WC, np.zeros((0, 3)), roots, cameras.intrinsics
+    )
+    state = dataclasses.replace(state, scale=jnp.asarray(2.0))
+    zeros = functools.partial(jnp.zeros, dtype=jnp.float64)
+    spread = solver.Marginals(
+        scale=jnp.asarray(0.01),
+        cameras=zeros((T, 3, 3)),
+        people=zeros((1, T, 3, 3)),
+        intrinsics=zeros((4, 4)),
+        shapes=0.16 * jnp.eye(10)[None],
+        landmarks=zeros((0, 3, 3)),
+    )
+    found = joint.of_fitted_sizes(spread, state, body, np.array([0.4]))
+    np.testing.assert_allclose(found.shapes[0], np.eye(10), rtol=1e-12)
+    # The leg's slope by differences.
+    leg = lambda shape: float(motion.leg_length(body, jnp.asarray(shape)))
+    slope = [(leg(h) - leg(-h)) / 2e-5 / leg(0 * h) for h in 1e-5 * np.eye(10)]
+    more = 4 * (1 - 0.16) * np.square(slope).sum()
+    np.testing.assert_allclose(found.scale, 0.01 + more, rtol=1e-6)
+    measured = joint.of_fitted_sizes(spread, state, body, np.array([1.0]))
+    np.testing.assert_array_equal(measured.shapes, spread.shapes)
+    np.testing.assert_array_equal(measured.scale, spread.scale)
 
 
 @pytest.mark.parametrize("pixels", [None, 5.0])

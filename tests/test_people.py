@@ -1,5 +1,6 @@
 """Bodies from keypoints, and the cleaning of regressed ones, on made-up people."""
 
+import copy
 import dataclasses
 
 import equinox as eqx
@@ -13,8 +14,16 @@ from bodyslam_jax import people
 from bodyslam_jax.body import joints, keypoints, load_body_model, local_keypoints
 from bodyslam_jax.body import local_joints as body_joints
 from bodyslam_jax.config import Config, PeopleFit
-from bodyslam_jax.people import _chain, _fit, _prior, _skeleton, _starts, _terms
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
+from bodyslam_jax.people import (
+    _bodies,
+    _chain,
+    _fit,
+    _prior,
+    _skeleton,
+    _starts,
+    _terms,
+)
+from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
 
 FRAMES, FPS = 60, 30.0
 CAMERA = Intrinsics(np.array([600.0, 600.0, 319.5, 239.5]), 640, 480)
@@ -306,6 +315,33 @@ def test_prepared_bodies_are_whole_smooth_and_the_right_way_round(
     assert error.mean() < 0.06
     gap = poses[0, 40:43, 3:66] - found.poses[0, 40:43, 3:66]
     assert 0 < np.abs(gap).max() < 0.5  # interpolated
+
+
+def test_people_without_bodies_are_fitted_to_their_keypoints(
+    monkeypatch, truth, seen, body
+):
+    asked = []
+    given = dataclasses.replace(
+        truth, present=truth.present & [[True], [False]], poses=0 * truth.poses
+    )
+    given.poses[0] = truth.poses[0]
+    one = lambda name: getattr(truth, name)[1:]
+    fitted = Bodies(one("present"), one("poses"), one("shapes"), one("trans"))
+    monkeypatch.setattr(
+        _bodies, "fit_bodies", lambda keypoints, *_: asked.append(keypoints) or fitted
+    )
+    monkeypatch.setattr(_bodies, "prepare_bodies", lambda x, *_: copy.deepcopy(x))
+    sequence = Sequence("two", None, np.arange(FRAMES) / FPS, CAMERA, seen, given)
+    assert people.without_bodies(sequence).tolist() == [False, True]
+    found = people.estimate_bodies(sequence, body)
+    (keypoints,) = asked
+    np.testing.assert_array_equal(keypoints.uv, seen.uv[1:])
+    np.testing.assert_array_equal(found.present, truth.present)
+    np.testing.assert_array_equal(found.poses, truth.poses)
+    blind = dataclasses.replace(sequence, keypoints=None)
+    assert not people.estimate_bodies(blind, body).present[1].any()
+    alone = dataclasses.replace(sequence, bodies=None)
+    assert people.without_bodies(alone).tolist() == [True, True]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,8 @@ class GraphWeights:
     posture_predicted: bool = False
     """Whether postures are held to the motion model's prediction instead."""
     shape_sigma: float = 0.4
-    """Regressed β; one measurement a person, as the regressor errs alike in all."""
+    """Regressed β; one measurement a person, as the regressor errs alike in all. Where
+    bodies are fitted to keypoints it holds β to the fit, and errors are those of 1."""
     shape_each_frame: bool = False
     """Whether each frame counts as a measurement of β of its own."""
     orientation_sigma: float | None = None

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.ndimage import maximum_filter1d
 
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
@@ -103,9 +104,10 @@ def people_factors(
             predicted=weights.posture_predicted,
         )
     )
-    if sequence.keypoints is None:
-        rho = between(weights.root_correlation)
-        factors.append(_place_factor(roots, rho, weights))
+    placed = _placed_by_regressor(sequence, roots)
+    if placed.any():
+        rho = graph.runs(jnp.asarray(placed), weights.root_correlation**per_frame)
+        factors.append(_place_factor(roots, placed, rho, weights))
     factors.append(_shape_factor(roots, weights))
     if weights.root_sigma is not None:
         factors.append(
@@ -126,10 +128,23 @@ def people_factors(
     return factors
 
 
+def _placed_by_regressor(sequence: Sequence, roots: Roots) -> Bool[np.ndarray, "h t"]:
+    """Where nothing but a regressor tells where people are: no keypoint of theirs is
+    within a second. Keypoints tell it better, and gaps between them are short."""
+    if sequence.keypoints is None or sequence.bodies is None:
+        return roots.present & (sequence.keypoints is None)
+    seen = (sequence.keypoints.confidence > 0).any(axis=-1).astype(np.uint8)
+    near = maximum_filter1d(seen, 2 * round(sequence.fps) + 1, axis=1, mode="nearest")
+    return roots.present & sequence.bodies.present & (np.asarray(near) == 0)
+
+
 def _place_factor(
-    roots: Roots, correlation: Float[Array, "h t"], weights: GraphWeights
+    roots: Roots,
+    placed: Bool[np.ndarray, "h t"],
+    correlation: Float[Array, "h t"],
+    weights: GraphWeights,
 ) -> graph.RootPlace:
-    there = roots.present[..., None]
+    there = placed[..., None]
     sigma = np.array([weights.root_direction, weights.root_depth])
     return graph.RootPlace(
         place=jnp.asarray(np.where(there, roots.T_CH[..., :3, 3], [0.0, 0.0, 1.0])),
@@ -166,14 +181,15 @@ def motion_factor(
     body: BodyModel,
     weights: GraphWeights,
     *,
-    shared_error: float = 0.0,
+    shared_error: Float[np.ndarray, " h"] | float = 0.0,
 ) -> graph.HumanMotion:
     """The motion model's displacements, weighted by its own covariance.
 
     `shared_error` is a share by which all of a person's steps may be wrong together:
     they say no more of the scale than that allows, however many there are.
     """
-    step, whitening = _steps(seen, shapes, body, weights, shared_error)
+    shared = jnp.broadcast_to(jnp.asarray(shared_error, shapes.dtype), len(shapes))
+    step, whitening = _steps(seen, shapes, body, weights, shared[:, None, None, None])
     return graph.HumanMotion(
         translation=step,
         whitening=whitening,

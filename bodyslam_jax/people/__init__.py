@@ -2,6 +2,7 @@
 
 from bodyslam_jax.people._bodies import estimate_bodies as estimate_bodies
 from bodyslam_jax.people._bodies import nobody as nobody
+from bodyslam_jax.people._bodies import without_bodies as without_bodies
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._fit import keypoint_sigma as keypoint_sigma
