@@ -5,7 +5,6 @@ import importlib.metadata
 from typing import Any
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,6 +14,7 @@ from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
+from bodyslam_jax.rotation import log
 from bodyslam_jax.sequence import Sequence, Tracks
 from bodyslam_jax.smoothing import low_pass, low_pass_rotations
 
@@ -109,7 +109,7 @@ def assemble(
     T_WC = turn @ T_WC
     T_WH = T_WC @ joint.roots
     landmarks = joint.scale * joint.landmarks @ turn[:3, :3].T + turn[:3, 3]
-    root = np.asarray(jaxlie.SO3.from_matrix(jnp.asarray(T_WH[..., :3, :3])).log())
+    root = np.asarray(log(jnp.asarray(T_WH[..., :3, :3])))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
     poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(joint.shapes)))

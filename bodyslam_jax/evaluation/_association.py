@@ -26,6 +26,7 @@ from bodyslam_jax.evaluation._evaluation import (
 )
 from bodyslam_jax.evaluation._metrics import Errors, trajectory_error
 from bodyslam_jax.result import Result
+from bodyslam_jax.rotation import log
 
 _TOES_AND_HEELS = (19, 21, 22, 24)
 """In BODY_25; on SMPL the vertices 3216, 3387, 6617, 6787 of WHAM's foot sliding."""
@@ -243,7 +244,7 @@ def interpolate_poses(
     if np.any((weight > 0) & (weight < 1)):
         # By matrices: jaxlie's own products do not pass strict dtype promotion.
         start, end = T[before, :3, :3], T[after, :3, :3]
-        turn = jaxlie.SO3.from_matrix(jnp.asarray(np.swapaxes(start, 1, 2) @ end)).log()
+        turn = log(jnp.asarray(np.swapaxes(start, 1, 2) @ end))
         part = jaxlie.SO3.exp(jnp.asarray(weight, turn.dtype)[:, None] * turn)
         found[:, :3, :3] = start @ np.asarray(part.as_matrix())
     return found

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import log
+from bodyslam_jax.rotation import log
 
 
 class CameraPrior(AbstractFrameFactor):

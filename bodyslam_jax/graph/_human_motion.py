@@ -13,9 +13,9 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Shared, Touch
 from bodyslam_jax.graph._displacement import before, displacement, displacements
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import log
 from bodyslam_jax.graph._whitening import innovation
 from bodyslam_jax.motion import leg_length
+from bodyslam_jax.rotation import log
 
 
 class HumanMotion(AbstractFrameFactor):

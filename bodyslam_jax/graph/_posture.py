@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._displacement import before
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import State, compose, inverse_right_jacobian
+from bodyslam_jax.graph._state import State, inverse_right_jacobian
 from bodyslam_jax.graph._whitening import innovation
+from bodyslam_jax.rotation import compose, log_of
 
 
 class Posture(AbstractFrameFactor):
@@ -104,4 +105,4 @@ def rotation_between(
     first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
     """`Log(Exp(first)^T Exp(second))`, at most pi long."""
-    return compose(jaxlie.SO3.exp(-first), jaxlie.SO3.exp(second)).log()
+    return log_of(compose(jaxlie.SO3.exp(-first), jaxlie.SO3.exp(second)))

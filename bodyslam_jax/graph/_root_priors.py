@@ -7,8 +7,8 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph._abstract import AbstractFrameFactor, Touch
 from bodyslam_jax.graph._human_motion import unit_length
 from bodyslam_jax.graph._robust import AbstractLoss, Squared
-from bodyslam_jax.graph._state import log
 from bodyslam_jax.graph._whitening import innovation
+from bodyslam_jax.rotation import log
 
 
 class RootSmoothness(AbstractFrameFactor):

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from bodyslam_jax.rotation import compose, log_of
+
 
 class Step(eqx.Module):
     """A flat move of a `State`, in its tangent space."""
@@ -99,7 +101,7 @@ def retract_rotation(
     The logarithm is taken on the branch of the base point: an axis-angle vector may
     leave the ball of radius pi, but it does not jump.
     """
-    moved = compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)).log()
+    moved = log_of(compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)))
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)
     far = squared > 4.0
     angle = jnp.sqrt(jnp.where(far, squared, 1.0))
@@ -124,28 +126,6 @@ def inverse_right_jacobian(
     skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
     eye = jnp.eye(3, dtype=rotation.dtype)
     return eye + 0.5 * skew + factor * (skew @ skew)
-
-
-def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
-    """Hamilton's product; jaxlie's own mixes integers in, which strict types forbid."""
-    a, b, c, d = (first.wxyz[..., i] for i in range(4))
-    w, x, y, z = (second.wxyz[..., i] for i in range(4))
-    return jaxlie.SO3(
-        jnp.stack(
-            [
-                a * w - b * x - c * y - d * z,
-                a * x + b * w + c * z - d * y,
-                a * y - b * z + c * w + d * x,
-                a * z + b * y - c * x + d * w,
-            ],
-            axis=-1,
-        )
-    )
-
-
-def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """The rotation vector (rad) of a rotation matrix."""
-    return jaxlie.SO3.from_matrix(rotation).log()
 
 
 def world_from_root(state: State) -> Float[Array, "h t 4 4"]:

@@ -8,6 +8,8 @@ import jaxlie
 from jax import Array
 from jaxtyping import Float
 
+from bodyslam_jax.rotation import log
+
 
 def matrix(angles: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """The rotation by `|angles|` rad about `angles`."""
@@ -16,7 +18,7 @@ def matrix(angles: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
 def vector(matrices: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     """The shortest rotation vector of a rotation, rad."""
-    return jaxlie.SO3.from_matrix(matrices).log()
+    return log(matrices)
 
 
 def turned(

@@ -10,10 +10,10 @@ border of 10 columns. Levenberg's damping, steps that do not help are taken back
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
 from bodyslam_jax.people._terms import Fit, Normal, Scene, linearise
+from bodyslam_jax.rotation import log
 
 
 class Ties(eqx.Module):
@@ -100,7 +100,7 @@ def _temporal(ties: Ties, fit: Fit) -> Float[Array, "t n"]:
     before, earlier = _shifted(linear, 1), _shifted(linear, 2)
     linear = linear + ties.c1[:, 3:] * before + ties.c2[:, 3:] * earlier
     relative = fit.orientation @ jnp.swapaxes(_shifted(fit.orientation, 1), -1, -2)
-    turn = jaxlie.SO3.from_matrix(relative).log().at[0].set(0.0)
+    turn = log(relative).at[0].set(0.0)
     return jnp.concatenate([turn - ties.c2[:, :3] * _shifted(turn, 1), linear], -1)
 
 

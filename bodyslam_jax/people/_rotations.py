@@ -6,6 +6,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.rotation import log
+
 
 def matrices(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """Of axis-angle vectors, rad."""
@@ -28,4 +30,4 @@ def slerp(
 
 
 _exp = jax.jit(lambda v: jaxlie.SO3.exp(v).as_matrix())
-_log = jax.jit(lambda m: jaxlie.SO3.from_matrix(m).log())
+_log = jax.jit(log)
