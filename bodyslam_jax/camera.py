@@ -55,7 +55,8 @@ def distort(
 
     Equal to OpenCV up to the radius where the radial polynomial stops growing. Beyond
     it the polynomial's factor is held: what lies far outside the image must not fold
-    back into it, as it does in OpenCV.
+    back into it, as it does in OpenCV. Derivatives take that radius to be fixed, though
+    it follows `k1` and `k2`: beyond it those by the two are not what differences give.
     """
     if intrinsics.shape[-1] == 4:
         return xy + 0 * intrinsics[..., :2]
@@ -118,13 +119,14 @@ def triangulate(
     eye = jnp.eye(3, dtype=ray_W.dtype)
     across = eye - ray_W[..., :, None] * ray_W[..., None, :]
     across = weight[..., None, None] * across
-    total = jnp.maximum(jnp.sum(weight, axis=-1), jnp.finfo(weight.dtype).tiny)
+    total = jnp.sum(weight, axis=-1)
+    is_seen = total > 1e-30
+    total = jnp.where(is_seen, total, 1.0)
     # Relative to the mean centre, which a far origin would otherwise drown in rounding.
     middle = jnp.sum(weight[..., None] * r_WC, axis=-2) / total[..., None]
     rhs = jnp.einsum("...nij,...nj->...i", across, r_WC - middle[..., None, :])
-    tiny = 10 * jnp.finfo(weight.dtype).eps * total[..., None, None] * eye
-    tiny = tiny + jnp.where(total > 1e-30, 0.0, 1.0)[..., None, None] * eye
-    normal = jnp.sum(across, axis=-3) + tiny
+    tiny = jnp.where(is_seen, 10 * jnp.finfo(weight.dtype).eps * total, 1.0)
+    normal = jnp.sum(across, axis=-3) + tiny[..., None, None] * eye
     return middle + jnp.linalg.solve(normal, rhs[..., None])[..., 0]
 
 

@@ -11,7 +11,7 @@ _PACKAGES = (
     "bodyslam-jax jax jaxlib equinox optimistix lineax jaxlie jaxopt optax numpy scipy "
     "opencv-python-headless trimesh matplotlib tyro"
 ).split()
-_EXTRAS = {"detect": "onnxruntime", "video": "av", "viz": "viser", "rerun": "rerun"}
+_EXTRAS = {"detect": "onnxruntime"}
 _CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
 
 
@@ -64,6 +64,14 @@ def _models() -> list[tuple[str, str]]:
     rows = []
     for path in body.search_paths():
         rows.append(("body model", f"{path}: {'found' if path.exists() else 'no'}"))
-    rows.append(("default body", body.load_body_model().name))
-    rows.append(("default motion model", f"for the {motion.load_motion_model().body}"))
-    return rows
+    model = motion.load_motion_model()
+    rows.append(("default motion model", f"for the {model.body} body"))
+    try:
+        found = body.load_body_model()
+    except (OSError, ValueError) as error:
+        return [*rows, ("body in use", f"none: {error}")]
+    try:
+        motion.check_compatible(model, found, model.fps)
+    except ValueError as error:
+        return [*rows, ("body in use", f"{found.name}, but {error}")]
+    return [*rows, ("body in use", found.name)]

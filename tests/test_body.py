@@ -1,5 +1,6 @@
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from body_cases import make_raw, smpl, write
@@ -81,7 +82,31 @@ def test_long_videos_go_through_in_chunks(model):
     for n in (0, 15, 16, 31, 32, 36):
         one = body.vertices(model, pose[n], beta[n], trans[n])
         np.testing.assert_allclose(whole[n], one, atol=1e-12)
-    assert body.vertices(model, pose[:0], beta[:0], trans[:0]).shape == (0, 70, 3)
+
+
+@pytest.mark.parametrize("shape", [(10,), (1, 10), (0, 10)])
+def test_no_frames_have_no_bodies(model, default, shape):
+    pose, beta, trans = jnp.zeros((0, 72)), jnp.zeros(shape), jnp.zeros((0, 3))
+    for body_model in (model, default):  # with pose blend shapes, and without
+        size = body_model.num_vertices
+        found = body.vertices(body_model, pose, beta, trans)
+        assert found.shape == (0, size, 3)
+        assert body.joints(body_model, pose, beta, trans).shape == (0, 24, 3)
+        assert body.keypoints(body_model, pose, beta, trans).shape == (0, 25, 3)
+
+
+def test_unknown_layouts_and_whole_numbers_are_named(model):
+    pose, beta, trans = some_bodies()
+    with pytest.raises(ValueError, match="'foo', expected one of body25, coco17, hal"):
+        body.keypoints(model, pose, beta, trans, layout="foo")
+    jaxtyping.config.update("jaxtyping_disable", True)  # as without the tests' checks
+    try:
+        with pytest.raises(
+            TypeError, match="poses are of type int64, expected float32"
+        ):
+            body.joints(model, jnp.zeros(72, int), beta[0], trans[0])
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def test_leading_axes_broadcast_and_vmap_agrees(model):

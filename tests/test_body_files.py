@@ -163,9 +163,11 @@ def test_search_order_and_its_error(tmp_path, monkeypatch):
     assert body.load_body_model().kind == "default"
     with pytest.raises(ValueError) as caught:
         body.load_body_model(gender="male")
-    for path in body.search_paths("male"):
-        assert str(path) in str(caught.value)
     home = tmp_path / "data" / "bodyslam" / "body_models"
+    assert f"{home} (SMPL_MALE.npz, SMPL_MALE.pkl, ...)" in str(caught.value)
+    assert body.search_paths("male")[:2] == [
+        home / f"SMPL_MALE.{x}" for x in ("npz", "pkl")
+    ]
     home.mkdir(parents=True)
     write(make_raw(seed=1), home / "SMPL_MALE.npz")
     assert body.load_body_model(gender="male").name == "SMPL_MALE"
@@ -288,3 +290,46 @@ def test_noise_is_refused(folder, noise):
     path = folder / "noise.pkl"
     path.write_bytes(noise)
     refusal(path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SMPL_FEMALE.npz", "basicModel_f_lbs_10_207_0_v1.0.0.pkl", "female/model.npz"],
+)
+def test_a_gender_asked_for_is_not_that_of_another_file(tmp_path, monkeypatch, name):
+    monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(write(make_raw(), tmp_path / "any.npz").read_bytes())
+    assert "a female body, expected male" in refusal(path, gender="male")
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(path))
+    for gender in ("male", "neutral"):
+        with pytest.raises(ValueError, match=f"a female body, expected {gender}"):
+            body.load_body_model(gender=gender)
+    for gender in ("female", None):
+        assert body.load_body_model(gender=gender).name == path.stem
+    assert "SMPL, 70 vertices" in body.check(tmp_path, "female")
+
+
+@pytest.mark.parametrize("name", ["none/out.npz", "text/out.npz", "folder.npz"])
+def test_a_file_that_cannot_be_written_is_named(tmp_path, name):
+    model = body.load_body_model(write(make_raw(), tmp_path / "in.npz"))
+    (tmp_path / "text").write_text("no folder")
+    (tmp_path / "folder.npz").mkdir()
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(OSError) as caught:
+        body.write_npz(model, tmp_path / name)
+    assert caught.value.filename == str(tmp_path / name) and caught.value.strerror
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    model = body.load_body_model(write(make_raw(), tmp_path / "in.npz"))
+    for write_to, name in (
+        (body.write_npz, "out.pkl"),
+        (body.save_picture, "picture.foo"),
+        (body.save_picture, "picture"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: suffix .*, expected"):
+            write_to(model, tmp_path / name)
+        assert not (tmp_path / name).exists()

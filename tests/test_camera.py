@@ -116,3 +116,12 @@ def test_triangulation_stays_finite_without_parallax():
         point = lambda u: camera.triangulate(jnp.asarray(PINHOLE), T_WC, u, weight)
         assert jnp.isfinite(point(uv)).all()
         assert jnp.isfinite(jax.jacobian(point)(uv)).all()
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("weight", [(0.0, 0.0), (1.0, 0.0), (1.0, 2.0)])
+def test_derivatives_of_triangulation_are_finite_whatever_is_padding(weight, dtype):
+    T_WC, uv = _ring(2), np.array([[330.0, 250.0], [300.0, 240.0]])
+    args = [jnp.asarray(x, dtype) for x in (DISTORTED, T_WC, uv, weight)]
+    for derivative in jax.jacobian(camera.triangulate, range(4))(*args):
+        assert jnp.isfinite(derivative).all()

@@ -5,8 +5,9 @@ import sys
 
 import numpy as np
 import pytest
+from body_cases import make_raw, write
 
-from bodyslam_jax import cli
+from bodyslam_jax import cli, doctor
 from bodyslam_jax.config import Config
 
 
@@ -82,6 +83,46 @@ def test_doctor_reports(monkeypatch, capsys):
     assert code == 0
     for word in ("jax", "BRISK", "body model", "motion model", "devices"):
         assert word in out
+
+
+def _body_in_use():
+    return dict(doctor.report())["body in use"]
+
+
+def test_doctor_tells_of_a_body_that_is_not_there_or_does_not_fit(
+    monkeypatch, tmp_path, no_body_models
+):
+    assert _body_in_use() == "default_body"
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(tmp_path / "none"))
+    found = _body_in_use()
+    assert "none: No neutral body model found (BODYSLAM_BODY_MODEL is set)" in found
+    assert str(tmp_path / "none") in found and len(found) < 400 + 2 * len(str(tmp_path))
+    path = write(make_raw(), tmp_path / "SMPL_NEUTRAL.npz")
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(path))
+    assert "SMPL_NEUTRAL, but the motion model was trained on body" in _body_in_use()
+
+
+def test_body_model_takes_the_gender_that_is_asked_for(monkeypatch, capsys, tmp_path):
+    write(make_raw(), tmp_path / "SMPL_FEMALE.npz")
+    command = lambda *argv: _run(monkeypatch, capsys, "body-model", *argv)
+    code, _, err = command("check", tmp_path)
+    assert code == 1 and "No neutral body model found" in err
+    code, out, _ = command("check", tmp_path, "--gender", "female")
+    assert code == 0 and "SMPL_FEMALE.npz: SMPL" in out
+    made, drawn = tmp_path / "made.npz", tmp_path / "drawn.png"
+    assert command("convert", tmp_path, made, "--gender", "female")[0] == 0
+    assert command("show", tmp_path, "--out", drawn, "--gender", "female")[0] == 0
+    assert made.is_file() and drawn.is_file()
+
+
+@pytest.mark.parametrize("name", ["out.pkl", "none/out.npz"])
+def test_what_cannot_be_written_is_named_as_it_was_given(
+    monkeypatch, capsys, tmp_path, name
+):
+    file = write(make_raw(), tmp_path / "in.npz")
+    argv = ("body-model", "convert", file, tmp_path / name)
+    code, _, err = _run(monkeypatch, capsys, *argv)
+    assert code == 1 and f"{tmp_path / name}: " in err and ".part" not in err
 
 
 def test_preset_and_settings_are_where_options_start(tmp_path):

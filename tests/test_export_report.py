@@ -177,3 +177,36 @@ def test_paths_are_smoothed_by_a_moving_average_that_keeps_lines():
     line = np.linspace(0, 3, 60)[:, None] * [1.0, -2.0]
     np.testing.assert_allclose(facts.smoothed(line, 30.0), line, atol=1e-12)
     np.testing.assert_array_equal(facts.smoothed(path[:2], 30.0), path[:2])
+
+
+def test_is_read_aloud_as_it_is_read(tmp_path, body):
+    page = _write(tmp_path, dataclasses.replace(_walk(), summary=SUMMARY), body)
+    ids = re.findall(r'\bid="([^"]*)"', page)
+    assert len(ids) > 100 and len(set(ids)) == len(ids)
+    targets = set(re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', page))
+    assert targets and {a or b for a, b in targets} <= set(ids)
+    figures = re.findall(
+        r'<figure[^>]*><svg role="img" aria-label="([^"]+)".*?'
+        r"<figcaption>(.*?)</figcaption></figure>",
+        page,
+        re.S,
+    )
+    assert len(figures) == 6 and all(name == caption for name, caption in figures)
+    headers = re.findall(r"<th\b(.*?)>(.*?)</th>", page, re.S)
+    assert len(headers) > 20
+    for attributes, text in headers:
+        assert attributes in (' scope="col"', ' scope="row"') and text
+    levels = [int(level) for level in re.findall(r"<h([1-6])\b", page)]
+    assert levels[0] == 1 and all(b - a <= 1 for a, b in zip(levels, levels[1:]))
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e3, 2e4, 1e9])
+def test_scenes_of_any_size_have_a_grid(tmp_path, body, size):
+    result = _walk()
+    result.T_WC[:, 0, 3] *= size
+    assert "Where everybody went" in _text(_write(tmp_path, result, body))
+
+
+def test_skating_is_told_beside_that_of_a_real_walk(tmp_path, body):
+    text = _text(_write(tmp_path, _walk(), body))
+    assert "cm/s (a real walk: about 10 cm/s)" in text

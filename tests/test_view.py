@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bodyslam_jax import view
-from bodyslam_jax.body import joints, load_body_model
+from bodyslam_jax.body import joints, keypoints, load_body_model, write_npz
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Tracks
-from bodyslam_jax.view import _video
+from bodyslam_jax.view import _plan, _video
 
 WIDTH, HEIGHT = 160, 120
 
@@ -97,13 +97,41 @@ def test_absent_people_are_not_drawn(body):
 
 
 def test_coarse_body_is_nearly_the_same(body):
-    coarse, faces = view.coarse_body(body)
-    assert len(faces) < 0.35 * len(body.faces)
-    assert faces.max() < coarse.num_vertices == len(coarse.skin_weight)
+    coarse = view.coarse_body(body)
+    assert len(coarse.faces) < 0.35 * len(body.faces)
+    assert coarse.faces.max() < coarse.num_vertices == len(coarse.skin_weight)
     extent = np.ptp(np.asarray(body.template), axis=0)
     np.testing.assert_allclose(
         np.ptp(np.asarray(coarse.template), 0), extent, atol=0.03
     )
+    pose = jnp.asarray(np.random.default_rng(0).normal(0, 0.5, 72), jnp.float32)
+    args = pose, jnp.ones(10, jnp.float32), jnp.zeros(3, jnp.float32)
+    np.testing.assert_allclose(joints(coarse, *args), joints(body, *args), atol=1e-5)
+    moved = np.linalg.norm(keypoints(coarse, *args) - keypoints(body, *args), axis=-1)
+    assert moved.max() < 0.05  # m; the diagonal of a cell is 0.043
+
+
+def test_a_coarse_body_can_be_written(tmp_path, body):
+    coarse = view.coarse_body(body)
+    write_npz(coarse, tmp_path / "coarse.npz")
+    again = load_body_model(tmp_path / "coarse.npz", dtype=jnp.float32)
+    np.testing.assert_array_equal(again.picks, coarse.picks)
+    near = np.asarray(again.joint_template - body.joint_template)
+    assert np.linalg.norm(near, axis=-1).max() < 0.02
+
+
+@pytest.mark.parametrize("frame", [-1, 4, 500])
+def test_a_frame_that_is_not_there_is_named(body, frame):
+    with pytest.raises(IndexError, match=f"frame {frame}, expected 0 to 3"):
+        view.draw_frame(_black(), _scene(body), body, frame)
+
+
+@pytest.mark.parametrize("size", [3e-3, 3.0, 3e4, 3e9])
+def test_the_inset_has_a_grid_for_scenes_of_any_size(body, size):
+    result = _scene(body)
+    result.T_WC[:, 0, 3] = np.linspace(0, size, 4)
+    plan = _plan.Plan(result, (WIDTH, HEIGHT))
+    assert plan.step >= 1 and plan.side / plan.zoom / plan.step <= 10.001
 
 
 def _read(path):

@@ -6,8 +6,10 @@ eyes). At rest those follow the wrist or the head rigidly, so that their weights
 belong to it, and the body is driven by SMPL's 72 numbers.
 """
 
+import contextlib
 import json
 import os
+import re
 import zipfile
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from bodyslam_jax.body._unpickle import read_pickle
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
 VARIABLE = "BODYSLAM_BODY_MODEL"
+_GENDERS = ("neutral", "female", "male")
 
 _NAMES = (
     "SMPL_{G}.npz",
@@ -58,14 +61,11 @@ def search_paths(gender: str = "neutral") -> list[Path]:
     The file or folder in the environment variable `BODYSLAM_BODY_MODEL`, then the
     user's folder for data. After them comes the body that ships with the package.
     """
-    places = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
-    home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    places.append(Path(home) / "bodyslam" / "body_models")
-    return [path for place in places for path in _candidates(place, gender)]
+    return [path for place in _places() for path in _candidates(place, gender)]
 
 
 def load_body_model(
-    path: str | Path | None = None, gender: str = "neutral", dtype=None
+    path: str | Path | None = None, gender: str | None = None, dtype=None
 ) -> BodyModel:
     """Reads a body model; without a path the first that `search_paths` finds, or the
     free body that ships with the package.
@@ -74,11 +74,12 @@ def load_body_model(
 
     - `path`: a file (SMPL, SMPL-H, SMPL-X; `.pkl` or `.npz`) or a folder with the usual
         names.
-    - `gender`: `neutral`, `female` or `male`; which file of a folder.
+    - `gender`: `neutral`, `female` or `male`; which file of a folder, and what the name
+        of a file must not contradict. Without it a folder's neutral file, or any file.
     - `dtype`: of the arrays; by default JAX's own default.
 
-    **Raises:** `ValueError`, with all paths tried if there is no file, or saying what
-    is wrong with the one there is.
+    **Raises:** `ValueError`, saying where it was looked for if there is no file, or
+    what is wrong with the one there is.
     """
     file = _find(path, gender)
     model = _assemble(file, checked(file, read_arrays(file)))
@@ -88,12 +89,12 @@ def load_body_model(
     return BodyModel(**{**model, **arrays})
 
 
-def check(path: str | Path) -> str:
-    """What a body model file is, in one line.
+def check(path: str | Path, gender: str | None = None) -> str:
+    """What a body model file is, in one line; arguments as for `load_body_model`.
 
     **Raises:** `ValueError`, in one line, if it is not usable as a body model.
     """
-    file = _find(path, "neutral")
+    file = _find(path, gender)
     raw = checked(file, read_arrays(file))
     num_vertices, num_joints = raw["weights"].shape
     stature = np.ptp(raw["v_template"][:, 1])
@@ -110,8 +111,13 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
 
     Pose blend shapes that the model lacks are written as zeros. Nothing half-written
     stays behind: the file appears when it is complete.
+
+    **Raises:** `ValueError` if the path is not of a `.npz`; `OSError`, naming it, if it
+    cannot be written.
     """
     path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: suffix {path.suffix!r}, expected '.npz'.")
     v = model.num_vertices
     weights = np.zeros((v, 24), np.asarray(model.skin_weight).dtype)
     rows = np.arange(v)[:, None]
@@ -137,8 +143,12 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
                 header=np.array(json.dumps({"name": model.name, "keypoints": picks})),
             )
         part.replace(path)
+    except OSError as error:
+        # Of the file that was asked for, not of the one on the way to it.
+        raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
@@ -163,8 +173,14 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
     return read_pickle(file)
 
 
+def _places() -> list[Path]:
+    places = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
+    home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return [*places, Path(home) / "bodyslam" / "body_models"]
+
+
 def _candidates(place: Path, gender: str) -> list[Path]:
-    if gender not in ("neutral", "female", "male"):
+    if gender not in _GENDERS:
         raise ValueError(f"gender {gender!r}, expected neutral, female or male.")
     if place.suffix in (".npz", ".pkl") or place.is_file():
         return [place]
@@ -173,16 +189,40 @@ def _candidates(place: Path, gender: str) -> list[Path]:
     return [place / name for name in names]
 
 
-def _find(path: str | Path | None, gender: str) -> Path:
-    tried = search_paths(gender) if path is None else _candidates(Path(path), gender)
-    for candidate in tried:
+def _find(path: str | Path | None, gender: str | None) -> Path:
+    wanted = gender or "neutral"
+    places = _places() if path is None else [Path(path)]
+    is_set = path is None and bool(os.environ.get(VARIABLE))
+    note = f" ({VARIABLE} is set)" if is_set else ""
+    for candidate in (file for place in places for file in _candidates(place, wanted)):
         if candidate.is_file():
+            of = _named_gender(candidate)
+            if gender and of not in (gender, None):
+                raise ValueError(
+                    f"{candidate}{note}: by its name a {of} body, expected {gender}."
+                )
             return candidate
-    if path is None and gender == "neutral" and not os.environ.get(VARIABLE):
+    if path is None and wanted == "neutral" and not is_set:
         return DEFAULT
-    where = f" ({VARIABLE} is set)" if path is None and os.environ.get(VARIABLE) else ""
-    tried_text = ", ".join(map(str, tried))
-    raise ValueError(f"No {gender} body model found{where}; tried {tried_text}.")
+    tried = ", ".join(_tried(place, wanted) for place in places)
+    raise ValueError(f"No {wanted} body model found{note}; tried {tried}.")
+
+
+def _named_gender(file: Path) -> str | None:
+    """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
+    name = (file.parent.name if file.stem == "model" else file.stem).lower()
+    words = re.split(r"[^a-z]+", name)
+    if words[0] == "basicmodel" and words[1:2] in (["f"], ["m"]):
+        return {"f": "female", "m": "male"}[words[1]]
+    return next((gender for gender in _GENDERS if gender in words), None)
+
+
+def _tried(place: Path, gender: str) -> str:
+    files = _candidates(place, gender)
+    if files == [place]:
+        return str(place)
+    names = ", ".join(str(file.relative_to(place)) for file in files[:2])
+    return f"{place} ({names}, ...)"
 
 
 def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:

@@ -125,6 +125,8 @@ class Posed:
 
 def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
     """Matrices of axis-angle vectors."""
+    if pose.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"poses are of type {pose.dtype}, expected float32 or float64.")
     return jaxlie.SO3.exp(pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
 
 
@@ -192,6 +194,9 @@ def _placed(model, pose, shape, trans, points):
 
 def _detected(model, posed, shape, layout, bias):
     """Keypoints (k, 3, n) about the pelvis."""
+    if layout not in KEYPOINT_NAMES:
+        known = ", ".join(KEYPOINT_NAMES)
+        raise ValueError(f"keypoint layout {layout!r}, expected one of {known}.")
     names = KEYPOINT_NAMES[layout]
     surface = [n for n in names if n in SURFACE_POINTS]
     inner = [n for n in names if n not in SURFACE_POINTS]

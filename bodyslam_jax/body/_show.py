@@ -51,10 +51,17 @@ POSTURES: dict[str, dict[str, tuple[float, float, float]]] = {
 
 
 def save_picture(model: BodyModel, path: str | Path) -> None:
-    """Draws shape components at ±2σ (front) and postures (side) to an image file."""
+    """Draws shape components at ±2σ (front) and postures (side) to an image file.
+
+    **Raises:** `ValueError` if the path's suffix is none of an image.
+    """
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
+    suffix, known = Path(path).suffix, sorted(figure.canvas.get_supported_filetypes())
+    if suffix[1:].lower() not in known:
+        expected = ", ".join(f".{kind}" for kind in known)
+        raise ValueError(f"{path}: suffix {suffix!r}, expected one of {expected}.")
     rows = figure.subplots(2, 1)
     trans, zero = jnp.zeros(3, model.dtype), jnp.zeros(10, model.dtype)
     columns = [(0.0, 0)] + [(s, k) for k in range(NUM_SHAPES) for s in (-2.0, 2.0)]

@@ -67,7 +67,7 @@ def _skin_shared(model, T, shape):
         by_run = _by_run(model, T, 2)
         parts = [A.reshape(-1, len(M)) @ M for A, M in zip(by_run, runs, strict=True)]
         points = jnp.concatenate(parts, -1)
-        return points.reshape(len(T), 3, -1).transpose(0, 2, 1)
+        return points.reshape(len(T), 3, model.num_vertices).transpose(0, 2, 1)
 
     return _by_chunks(skin, _CHUNK_SHARED, T.transpose(3, 1, 0, 2))
 
@@ -91,7 +91,7 @@ def _skin_each(model, T, shape, feature):
         rest = rest.reshape(-1, 3, v)
         parts, by_run = [], _by_run(model, T, 3)
         for (start, stop, _), W, A in zip(model.blocks, weights, by_run, strict=True):
-            A = (A.reshape(-1, len(W)) @ W).reshape(-1, 3, 4, stop - start)
+            A = (A.reshape(-1, len(W)) @ W).reshape(len(T), 3, 4, stop - start)
             row = lambda c: A[:, :, c] * rest[:, c, None, start:stop]
             parts.append(row(0) + row(1) + row(2) + A[:, :, 3])
         return jnp.concatenate(parts, -1).transpose(0, 2, 1)

@@ -49,7 +49,8 @@ def cards(
                 f"person-{person % 4}",
                 "barefoot, from the estimated shape",
                 "the lower foot (its joint, median) moves at "
-                f"{100 * facts.foot_skating(result, person):.0f} cm/s (0 is perfect)",
+                f"{100 * facts.foot_skating(result, person):.0f} cm/s "
+                "(a real walk: about 10 cm/s)",
             )
         )
     scale = summary.get("scale") or {}
@@ -118,5 +119,5 @@ def _card(title: str, value: str, color: str, *notes: str) -> str:
     dot = f'<i style="background: var(--{color})"></i>' if color else ""
     lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
     return (
-        f'<div class="card"><h3>{dot}{title}</h3><strong>{value}</strong>{lines}</div>'
+        f'<div class="card"><h2>{dot}{title}</h2><strong>{value}</strong>{lines}</div>'
     )

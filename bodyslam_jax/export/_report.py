@@ -111,8 +111,8 @@ def _warnings(warnings: Sequence[str]) -> str:
 
 
 def _figure(svg: str, caption: str, kind: str = "full") -> str:
-    text = html.escape(caption)
-    return f'<figure class="{kind}">{svg}<figcaption>{text}</figcaption></figure>'
+    text, drawn = html.escape(caption), figures.labelled(svg, caption)
+    return f'<figure class="{kind}">{drawn}<figcaption>{text}</figcaption></figure>'
 
 
 def _trajectories(result: Result) -> str:

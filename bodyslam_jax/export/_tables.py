@@ -31,16 +31,16 @@ def _error_table(
     errors: Mapping[str, Mapping[str, Any]],
     chosen: Sequence[tuple[str, str, str, float]],
 ) -> str:
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in errors)
+    head = "".join(_header(name) for name in errors)
     rows = []
     for key, label, unit, factor in chosen:
         values = [found.get(key) for found in errors.values()]
         if any(isinstance(value, (int, float)) for value in values):
             cells = "".join(f"<td>{_error(v, factor)}</td>" for v in values)
             name = f"{html.escape(label)}{f', {unit}' if unit else ''}"
-            rows.append(f"<tr><th>{name}</th>{cells}</tr>")
+            rows.append(f'<tr><th scope="row">{name}</th>{cells}</tr>')
     return (
-        f'<div class="wide"><table><thead><tr><th></th>{head}</tr></thead>'
+        f'<div class="wide"><table><thead><tr>{_header("error")}{head}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
@@ -61,22 +61,26 @@ def number(value: Any, factor: float = 1.0) -> str:
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    head = "".join(f"<th>{html.escape(words(str(c)))}</th>" for c in columns)
+    head = "".join(_header(words(str(column))) for column in columns)
     body = "".join(
-        "<tr>"
-        + "".join(
-            f"<td>{number(v)}</td>"
-            if isinstance(v, (int, float)) and not isinstance(v, bool)
-            else f"<th>{html.escape(words('' if v is None else str(v)))}</th>"
-            for v in row
-        )
-        + "</tr>"
-        for row in rows
+        f'<tr><th scope="row">{html.escape(words(str(name)))}</th>'
+        f"{''.join(f'<td>{_cell(value)}</td>' for value in values)}</tr>"
+        for name, *values in rows
     )
     return (
         f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
+
+
+def _header(name: str) -> str:
+    return f'<th scope="col">{html.escape(name)}</th>'
+
+
+def _cell(value: Any) -> str:
+    if value is None or isinstance(value, (int, float)) and not isinstance(value, bool):
+        return number(value)
+    return html.escape(words(str(value)))
 
 
 def words(name: str) -> str:

@@ -27,17 +27,24 @@ _CHUNK = 16
 
 
 def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Image:
-    """One frame's bodies over its image, at the image's own size."""
-    coarse, faces = coarse_body(body)
+    """One frame's bodies over its image, at the image's own size.
+
+    **Raises:** `IndexError` if the result has no such frame.
+    """
+    num_frames = len(result.timestamps)
+    if not 0 <= frame < num_frames:
+        raise IndexError(f"frame {frame}, expected 0 to {num_frames - 1}.")
+    coarse = coarse_body(body)
     people = next(meshes(result, coarse, slice(frame, frame + 1)))
-    return draw_people(image, people, faces, np.ones(2))
+    return draw_people(image, people, np.asarray(coarse.faces), np.ones(2))
 
 
-def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
-    """The same body with about a quarter of its vertices, and the faces of those.
+def coarse_body(body: BodyModel) -> BodyModel:
+    """The same body with about a quarter of its vertices.
 
     Vertices in one cell of a grid over the rest pose are merged into the first of them:
-    a subset, so that shape and skinning stay those of the whole body.
+    a subset, so that shape, skinning and joints stay those of the whole body. Keypoints
+    on the skin move within their cells.
     """
     template = np.asarray(body.template)
     cells = np.floor(template / _CELL).astype(np.int64)
@@ -45,7 +52,8 @@ def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
     # In the body's own order, as runs of vertices are skinned together.
     order = np.argsort(kept)
     kept = kept[order]
-    faces = np.argsort(order)[cluster.reshape(-1)][np.asarray(body.faces)]
+    into = np.argsort(order)[cluster.reshape(-1)]
+    faces = into[np.asarray(body.faces)]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     arrays = lambda m: (
@@ -55,8 +63,15 @@ def coarse_body(body: BodyModel) -> tuple[BodyModel, Int[np.ndarray, "f 3"]]:
     coarse = eqx.tree_at(arrays, body, [chosen(x) for x in arrays(body)])
     place = lambda vertex: int(np.searchsorted(kept, vertex))
     runs = tuple((place(i), place(j), joints) for i, j, joints in body.blocks)
-    regressor = jnp.asarray(np.asarray(coarse.joint_regressor)[:, kept])
-    return dataclasses.replace(coarse, blocks=runs, joint_regressor=regressor), faces
+    regressor = np.zeros((len(kept), 24), body.dtype)
+    np.add.at(regressor, into, np.asarray(body.joint_regressor).T)
+    return dataclasses.replace(
+        coarse,
+        blocks=runs,
+        joint_regressor=jnp.asarray(regressor.T),
+        faces=jnp.asarray(faces, body.faces.dtype),
+        picks=jnp.asarray(into[np.asarray(body.picks)], body.picks.dtype),
+    )
 
 
 class _Mesh(eqx.Module):

@@ -49,7 +49,9 @@ class Plan:
         self.centre = (low + high) / 2
         extent = max(float((high - low).max()) * 1.2, 2.0)
         self.zoom = self.side / extent
-        self.step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 1e6) if extent / s <= 10)
+        steps = (1, 2, 5, 10, 20, 50, 100)
+        larger = 10 ** np.ceil(np.log10(extent / 10))
+        self.step = next((s for s in steps if extent / s <= 10), larger)
         self.background = self._grid(extent)
 
     def _to_inset(self, points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:

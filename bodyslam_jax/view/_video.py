@@ -124,7 +124,8 @@ def pictures(
     size: tuple[int, int],
     zoom: np.ndarray,
 ) -> Iterator[Image]:
-    coarse, faces = coarse_body(body)
+    coarse = coarse_body(body)
+    faces = np.asarray(coarse.faces)
     lines = trails(tracks, len(result.timestamps), zoom)
     plan = Plan(result, size)
     black = np.zeros((size[1], size[0], 3), np.uint8)
