@@ -241,6 +241,22 @@ INPUTS = {
         lambda f: replace_keypoints(f, [[person()[:63]]] * NUM),
         "21 keypoints a person",
     ),
+    "keypoints of two videos": (
+        lambda f: [
+            (f / "keypoints" / f"b_{k:012d}_keypoints.json").write_text(
+                '{"people": []}'
+            )
+            for k in range(NUM)
+        ],
+        "keypoints: a_0+_keypoints.json and b_0+_keypoints.json are both of frame 0",
+    ),
+    "images of a few pixels": (
+        lambda f: [
+            cv2.imwrite(str(p), np.zeros((4, 100), np.uint8))
+            for p in as_images(f).iterdir()
+        ] + [(f / "camera.json").unlink()],
+        "images: images of 100x4 px are too small; expected at least 16x16",
+    ),
     "broken JSON": (
         lambda f: next((f / "keypoints").iterdir()).write_text('{"people": ['),
         "_keypoints.json: not a JSON file",
@@ -329,6 +345,7 @@ OPTIONS = {
     "no such input": (["run", "none.mp4"], "none.mp4: no such file"),
     "no such keypoints": (["--keypoints", "none.json"], "none.json: no such file"),
     "no such bodies": (["--bodies", "none.pkl"], "none.pkl: no such file"),
+    "no such tracks": (["--tracks", "none.npz"], "none.npz: no such file"),
     "no such camera": (["--camera", "none.json"], "none.json: "),
     "no such settings": (["--settings", "none.yaml"], "none.yaml: No such file"),
     "no such body model": (["--body-model", "none.pkl"], "tried none.pkl"),

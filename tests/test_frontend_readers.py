@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,7 +20,8 @@ from bodyslam_jax.frontend import read_sequence
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
-from bodyslam_jax.frontend._keypoints import read_detections, to_body25
+from bodyslam_jax.frontend._keypoints import read_detections
+from bodyslam_jax.frontend._layouts import to_body25
 from bodyslam_jax.frontend._perspective import crop_camera, full_translation
 from bodyslam_jax.frontend._pickle import restricted_load
 from bodyslam_jax.sequence import Intrinsics, Keypoints
@@ -48,7 +50,7 @@ def openpose(folder: Path, people: list[list[np.ndarray]], key="pose_keypoints_2
 
 def video(path: Path, num: int = NUM) -> Path:
     writer = cv2.VideoWriter(
-        str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, (WIDTH, HEIGHT)
+        str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (WIDTH, HEIGHT)
     )
     rng = np.random.default_rng(0)
     for _ in range(num):
@@ -69,7 +71,7 @@ def bodies(num: int = NUM) -> dict[str, np.ndarray]:
 
 def detections(path: Path, **changes) -> list[np.ndarray]:
     size = {"num_frames": NUM, "width": WIDTH, "height": HEIGHT} | changes
-    return read_detections(path, **size)
+    return read_detections(path, **size).points
 
 
 def read(path: Path):
@@ -115,6 +117,10 @@ def test_layouts_agree_on_the_body():
     assert halpe[7, 0] == 9 and halpe[1, 0] == 18 and halpe[8, 0] == 19
     assert halpe[19:, 0].tolist() == [20, 22, 24, 21, 23, 25]
     np.testing.assert_array_equal(to_body25(Path("a"), points(25)), points(25))
+    np.testing.assert_array_equal(to_body25(Path("a"), points(136)), halpe)
+    whole = to_body25(Path("a"), points(133))
+    np.testing.assert_array_equal(whole[:19], coco17[:19])
+    assert whole[19:, 0].tolist() == [17, 18, 19, 20, 21, 22]
 
 
 def _flat(points: np.ndarray) -> list[float]:
@@ -203,7 +209,10 @@ BAD_KEYPOINTS = {
     "nan": (_other([[_nan()]] * NUM), "NaN or infinity"),
     "longer video": (_other([[person()]] * (NUM + 5)), "frames 0 to 12"),
     "larger video": (_other([[person(900.0, 700.0)]] * NUM), "outside the image"),
-    "odd layout": (_other([[person()[:21]]] * NUM), "21 keypoints"),
+    "odd layout": (
+        _other([[person()[:21]]] * NUM),
+        "21 keypoints a person, not 17, 18, 25, 26, 133 or 136",
+    ),
     "no triples": (_other([[person()[:, :2]]] * NUM), "keypoints"),
     "wrong length": (_npz(keypoints=np.ones((3, 25, 3))), "of 3 frames"),
     "wrong array": (_npz(stuff=np.ones(3)), "no array `keypoints`"),
@@ -249,14 +258,19 @@ def test_drops_who_is_seen_too_briefly_and_who_is_too_many():
     frames[5] = np.concatenate([frames[5], person(30.0, 42.0, 5.0)[None]])
     people, warnings = associate(frames, Association(max_people=2), fps=30.0)
     assert len(people.uv) == 2 and "1 less visible" in warnings[0]
+    assert "1 person seen for less than 0.4 s dropped" in warnings[1]
 
 
 def test_a_jump_makes_another_person():
     frames = [person(10.0, 20.0, 12.0)[None]] * 20 + [
         person(55.0, 30.0, 12.0)[None]
     ] * 20
-    people, _ = associate(frames, Association(), fps=30.0)
+    people, warnings = associate(frames, Association(), fps=30.0)
     assert len(people.uv) == 2
+    first, second = np.argsort(people.confidence[:, 0].max(axis=-1))[::-1]
+    assert len(warnings) == 1
+    assert f"person {second} may be person {first}" in warnings[0]
+    assert "begins in frame 20, the other was last seen in frame 19" in warnings[0]
 
 
 # Cameras
@@ -389,7 +403,7 @@ def _refocused(trans: np.ndarray, focal: float) -> np.ndarray:
     return np.stack([(u - middle[0]) * z / focal, (v - middle[1]) * z / focal, z], -1)
 
 
-def _tool_files() -> dict[str, tuple[str, object]]:
+def _tool_files() -> dict[str, tuple[str, dict]]:
     """For each tool a file name and contents that all mean `bodies()`."""
     b = bodies()
     poses, betas, trans, frame = b["poses"], b["betas"], b["trans"], b["frame"]
@@ -553,6 +567,106 @@ def test_bodies_of_other_tools(tmp_path, tool):
         np.testing.assert_array_equal(found.shapes[0], expected["betas"])
 
 
+def test_what_is_not_finite_is_refused_of_any_tool(tmp_path):
+    """Lists of bodies in dictionaries are not checked array by array."""
+    name, content = _tool_files()["4D-Humans"]
+    content["x/000003.jpg"]["smpl"][0]["betas"] = np.full(10, np.nan)
+    (tmp_path / name).write_bytes(pickle.dumps(content))
+    with pytest.raises(ValueError, match=f"{name}: `betas` has NaN or infinity"):
+        read(tmp_path / name)
+
+
+def _two_of_cliff(num: int) -> dict[str, np.ndarray]:
+    """Two people who stand apart, in changing order; a third is seen in one frame."""
+    where = [[s, 0.0, 4.0] for k in range(num) for s in ((-1, 1) if k % 2 else (1, -1))]
+    trans = np.array([*where, [0.0, 0.0, 8.0]])
+    frame = [*np.repeat(np.arange(num), 2), 5]
+    return {
+        "imgname": np.array([f"a/{k:05d}.png" for k in frame]),
+        "pose": np.zeros((2 * num + 1, 72)),
+        "shape": np.zeros((2 * num + 1, 10)),
+        "global_t": trans,
+    }
+
+
+def test_people_of_cliff_are_told_apart_by_where_they_are(tmp_path):
+    np.savez(tmp_path / "c.npz", **_two_of_cliff(20))
+    said: list[str] = []
+    found = read_bodies(
+        tmp_path / "c.npz", num_frames=20, intrinsics=CAMERA, fps=25.0, warn=said.append
+    )
+    assert found.present.all() and len(found.present) == 2
+    assert (np.ptp(found.trans[..., 0], axis=1) == 0).all()
+    assert len(said) == 1 and "2 people told apart" in said[0]
+    assert "1 bodies left out" in said[0]
+
+
+@pytest.mark.parametrize("first", [1, 2])
+def test_nobody_in_the_first_image_shifts_nobody(tmp_path, first):
+    """CLIFF names images only where it found somebody: 0 may be missing."""
+    names = [f"{k:06d}.jpg" for k in range(NUM)]
+    one = {k: v[: NUM - first] for k, v in _two_of_cliff(NUM).items()}
+    np.savez(tmp_path / "c.npz", **(one | {"imgname": np.array(names[first:])}))
+    said: list[str] = []
+    read_ = lambda **known: read_bodies(
+        tmp_path / "c.npz", num_frames=NUM, intrinsics=CAMERA, **known
+    )
+    found = read_(warn=said.append)
+    assert np.flatnonzero(found.present[0]).tolist() == list(range(first, NUM))
+    assert "taken as counted from 0" in said[0]
+    found = read_(images=tuple(names), warn=pytest.fail)
+    assert np.flatnonzero(found.present[0]).tolist() == list(range(first, NUM))
+
+
+def _walking(num: int, rate: float) -> dict[str, np.ndarray]:
+    """At 1 m/s, turning by 0.4 rad/s, in AMASS' style."""
+    poses, trans = np.zeros((num, 156)), np.tile([0.0, 0.0, 4.0], (num, 1))
+    trans[:, 0] = np.arange(num) / rate
+    poses[:, 1] = 0.4 * trans[:, 0]
+    return {
+        "poses": poses,
+        "trans": trans,
+        "betas": np.zeros(16),
+        "mocap_framerate": np.array(rate),
+    }
+
+
+@pytest.mark.parametrize(
+    ("num", "rate", "frames", "fps"),
+    [(120, 30.0, 120, 60.0), (720, 120.0, 125, 25.0), (60, 30.0, 120, 60.0)],
+)
+def test_amass_keeps_its_own_time(tmp_path, num, rate, frames, fps):
+    """More frames than the video, as many at another rate, fewer: never stretched."""
+    np.savez(tmp_path / "a.npz", **_walking(num, rate))
+    said: list[str] = []
+    found = read_bodies(
+        tmp_path / "a.npz",
+        num_frames=frames,
+        intrinsics=CAMERA,
+        fps=fps,
+        times=np.arange(frames) / fps,
+        warn=said.append,
+    )
+    assert found.present.all()
+    times = np.minimum(np.arange(frames) / fps, (num - 1) / rate)
+    np.testing.assert_allclose(found.trans[0, :, 0], times, atol=1e-9)
+    np.testing.assert_allclose(found.poses[0, :, 1], 0.4 * times, atol=1e-9)
+    assert any("as in the camera's frame" in text for text in said)
+    longer = num / rate > frames / fps + 0.1
+    assert any("begin together" in text for text in said) is longer
+
+
+def test_amass_ends_where_it_ends(tmp_path):
+    np.savez(tmp_path / "a.npz", **_walking(60, 60.0))
+    said: list[str] = []
+    known = {"fps": 30.0, "times": np.arange(50) / 30, "warn": said.append}
+    found = read_bodies(tmp_path / "a.npz", num_frames=50, intrinsics=CAMERA, **known)
+    assert np.flatnonzero(found.present[0]).tolist() == list(range(31))
+    assert any("nobody after its end" in text for text in said)
+    with pytest.raises(ValueError, match="are 1 s, but the video has 5 s"):
+        read_bodies(tmp_path / "a.npz", num_frames=150, intrinsics=CAMERA, fps=30.0)
+
+
 def test_a_folder_of_tram_uses_its_camera(tmp_path):
     b = bodies()
     matrices = Rotation.from_rotvec(b["poses"].reshape(-1, 3)).as_matrix()
@@ -601,6 +715,27 @@ BAD_BODIES = {
     "nobody": (_contract(**{k: v[:0] for k, v in bodies().items()}), "no body"),
     "no flag": (_contract(shapes_regressed=np.array(1.2)), "not true or false"),
     "flags": (_contract(shapes_regressed=np.ones(NUM, bool)), "not true or false"),
+    "no distance": (
+        _npz(
+            "b.npz",
+            imgname=np.array(["0.png"]),
+            pose=np.zeros((1, 72)),
+            shape=np.zeros((1, 10)),
+            global_t=np.zeros((1, 3)),
+            focal_l=np.array([400.0]),
+        ),
+        "a distance of 0",
+    ),
+    "frames of others": (
+        _npz(
+            "b.npz",
+            pred_rotmat=np.tile(np.eye(3), (NUM, 24, 1, 1)),
+            pred_trans=np.ones((NUM, 3)),
+            pred_shape=np.zeros((NUM, 10)),
+            frame=np.arange(NUM - 1),
+        ),
+        "`frame` has 7 entries for 8 bodies",
+    ),
     "text inside": (_contract(poses=np.full((NUM, 72), "a")), "not numbers"),
 }
 
@@ -783,6 +918,24 @@ def test_tracks_need_no_video(tmp_path):
         read_sequence(path)
 
 
+def test_without_a_video_the_longest_part_says_how_many_frames(tmp_path):
+    """And without a frame rate one is assumed, which is said."""
+    path = folder(tmp_path / "walk")
+    (path / "video.mp4").unlink()
+    shutil.rmtree(path / "masks")
+    (path / "camera.json").write_text(json.dumps(GOOD_CAMERA))
+    shutil.rmtree(path / "keypoints")
+    np.savez(path / "keypoints.npz", keypoints=np.stack([person()] * (NUM + 5)))
+    found = read_sequence(path)
+    assert found.num_frames == NUM + 5 and found.fps == pytest.approx(30)
+    assert found.warnings == ("camera.json has no fps: 30 frames/s assumed.",)
+    (path / "keypoints.npz").unlink()
+    np.savez(path / "bodies.npz", **bodies(NUM + 2))
+    assert read_sequence(path).num_frames == NUM + 2
+    openpose(path / "keypoints", [[person()]] * (NUM + 3))
+    assert read_sequence(path).num_frames == NUM + 3
+
+
 def test_pairs_keypoints_and_bodies_of_the_same_person(tmp_path):
     """Bodies are listed in the other order than the people that fill the image."""
     path = folder(tmp_path / "walk")
@@ -886,7 +1039,7 @@ def test_real_files():
     found = read_detections(
         third / "badminton_openpose", num_frames=60, width=1920, height=1080
     )
-    people, _ = associate(found, Association(), fps=30.0)
+    people, _ = associate(found.points, Association(), fps=30.0)
     assert (people.confidence.max(axis=-1) > 0).mean(axis=1).max() == 1
     camera = Intrinsics(np.array([1000.0, 1000, 1920, 1080]), 3840, 2160)
     one, two = (

@@ -12,7 +12,7 @@ from test_frontend_motion import CAMERA, SIZE, plane_images, scene
 
 from bodyslam_jax.frontend import _video, frames, read_sequence, reconstruct, track
 from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.sequence import Tracks
+from bodyslam_jax.sequence import Keypoints, Sequence, Tracks
 
 
 def write(path: Path, images, fps: float = 25.0) -> Path:
@@ -81,6 +81,40 @@ def test_a_variable_rate_is_thinned_to_its_clock():
     assert "58 of 65 frames used" in warnings[0]
     np.testing.assert_allclose(found, times[picks])
     np.testing.assert_allclose(found, np.delete(steady, [40, 41]), atol=1e-9)
+
+
+def test_a_variable_rate_without_a_burst_is_not_said_to_be_resampled():
+    times = np.delete(np.arange(60) / 30, [30])
+    found, picks, warnings = _video.resampled(Path("a.mp4"), times, 30.0)
+    np.testing.assert_array_equal(found, times)
+    assert picks is None and len(warnings) == 1
+    assert "all frames used" in warnings[0] and "resampled" not in warnings[0]
+
+
+@pytest.mark.parametrize("size", [(100, 4), (2, 2)])
+def test_images_too_small_for_anything_are_refused(tmp_path, size):
+    for k in range(4):
+        image = np.full(size[::-1], 50 * k, np.uint8)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    with pytest.raises(ValueError, match=f"{size[0]}x{size[1]} px are too small"):
+        read_sequence(tmp_path)
+
+
+def test_nobody_is_masked_before_they_come(tmp_path):
+    """Someone who enters a clip of less than a second, and leaves on the other side."""
+    uv, confidence = np.zeros((1, 20, 25, 2)), np.zeros((1, 20, 25))
+    uv[0, 8:] = np.array([20.0, 20.0]) + 3.0 * np.arange(12)[:, None, None]
+    uv[0, 8:] += np.random.default_rng(0).uniform(0, 10, (25, 2))
+    confidence[0, 8:17] = 1.0
+    sequence = Sequence(
+        "a",
+        None,
+        np.arange(20) / 30,
+        CAMERA,
+        keypoints=Keypoints(uv, confidence),
+    )
+    masked = [bool(m.any()) for m in person_masks(sequence, 0.05) if m is not None]
+    assert masked == [False] * 8 + [True] * 12  # who was there is still there
 
 
 def test_times_that_do_not_increase_are_made_up():

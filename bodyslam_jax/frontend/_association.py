@@ -19,70 +19,131 @@ _SEEN = 0.05
 
 @dataclasses.dataclass
 class _Person:
-    frames: list[int]
-    points: list[np.ndarray]
+    number: int
+    frame: int
+    """When they were last seen."""
+    points: np.ndarray
     velocity: np.ndarray
 
     def predict(self, frame: int) -> np.ndarray:
         """Keypoints (25, 3) expected in `frame`; motion fades while unseen."""
-        gap = min(frame - self.frames[-1], 5)
-        last = self.points[-1].copy()
+        gap = min(frame - self.frame, 5)
+        last = self.points.copy()
         last[:, :2] += gap * self.velocity
         return last
 
     def extend(self, frame: int, points: np.ndarray) -> None:
-        gap = frame - self.frames[-1]
-        both = (points[:, 2] > _SEEN) & (self.points[-1][:, 2] > _SEEN)
+        gap = frame - self.frame
+        both = (points[:, 2] > _SEEN) & (self.points[:, 2] > _SEEN)
         if both.any():
-            moved = np.median((points - self.points[-1])[both, :2], axis=0) / gap
+            moved = np.median((points - self.points)[both, :2], axis=0) / gap
             self.velocity = 0.7 * self.velocity + 0.3 * moved
-        self.frames.append(frame)
-        self.points.append(points)
+        self.frame, self.points = frame, points
+
+
+@dataclasses.dataclass(frozen=True)
+class _Track:
+    """All that was seen of one person."""
+
+    frames: list[int]
+    points: list[np.ndarray]
+
+    def presence(self) -> float:
+        """How much there is to see: confidence times size, over time."""
+        return sum(float(p[:, 2].sum()) * _size(p) for p in self.points)
 
 
 def associate(
-    detections: Detections, config: Association, fps: float
+    detections: Detections,
+    config: Association,
+    fps: float,
+    given: list[np.ndarray] | None = None,
 ) -> tuple[Keypoints, tuple[str, ...]]:
     """People found in the detections of `t` frames, the best seen first.
 
     Whoever is seen for less than `config.min_duration` is dropped, unless that is
     everybody, and so is who is beyond `config.max_people`.
+
+    Args:
+        given: for each frame who each detection is, where that is known: the same
+            number is the same person, and people keep the order of their numbers.
     """
-    people = _follow(detections, max(1, round(config.max_gap * fps)))
+    found = given
+    if found is None:
+        found = identify(detections, max(1, round(config.max_gap * fps)))
+    people = _collect(detections, found)
     least = min(max(1, round(config.min_duration * fps)), len(detections))
     kept = [p for p in people if len(p.frames) >= least] or people
-    kept = sorted(kept, key=_presence, reverse=True)
-    warnings: tuple[str, ...] = ()
-    if len(kept) > config.max_people:
-        dropped = len(kept) - config.max_people
-        warnings = (f"{dropped} less visible people dropped (max_people).",)
-        kept = kept[: config.max_people]
-    uvc = np.zeros((len(kept), len(detections), 25, 3))
-    for row, person in zip(uvc, kept, strict=True):
+    brief = len(people) - len(kept)
+    best = sorted(kept, key=_Track.presence, reverse=True)[: config.max_people]
+    warnings: list[str] = []
+    if len(kept) > len(best):
+        dropped = len(kept) - len(best)
+        warnings.append(f"{dropped} less visible people dropped (max_people).")
+    if brief:
+        who = "1 person" if brief == 1 else f"{brief} people"
+        warnings.append(
+            f"{who} seen for less than {config.min_duration:g} s dropped "
+            "(min_duration)."
+        )
+    if given is None:
+        warnings += _returns(best)
+    else:
+        best = [p for p in kept if any(p is b for b in best)]
+    uvc = np.zeros((len(best), len(detections), 25, 3))
+    for row, person in zip(uvc, best, strict=True):
         row[person.frames] = np.stack(person.points)
-    return Keypoints(uvc[..., :2], uvc[..., 2]), warnings
+    return Keypoints(uvc[..., :2], uvc[..., 2]), tuple(warnings)
 
 
-def _presence(person: _Person) -> float:
-    """How much there is to see of a person: confidence times size, over time."""
-    return sum(float(p[:, 2].sum()) * _size(p) for p in person.points)
+def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
+    """For each frame who its `n` detections are, (n,): people numbered from 0.
 
-
-def _follow(detections: Detections, max_gap: int) -> list[_Person]:
+    Args:
+        max_gap: frames that a person may be unseen and still be recognised.
+    """
     people: list[_Person] = []
-    for frame, found in enumerate(detections):
-        alive = [p for p in people if frame - p.frames[-1] <= max_gap]
-        free = set(range(len(found)))
-        if alive and len(found):
-            cost = np.array([[_cost(p, frame, d) for d in found] for p in alive])
+    found = []
+    for frame, seen in enumerate(detections):
+        alive = [p for p in people if frame - p.frame <= max_gap]
+        who = np.full(len(seen), -1)
+        if alive and len(seen):
+            cost = np.array([[_cost(p, frame, d) for d in seen] for p in alive])
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:
-                    alive[i].extend(frame, found[j])
-                    free.discard(j)
-        for j in sorted(free):
-            people.append(_Person([frame], [found[j]], np.zeros(2)))
-    return people
+                    alive[i].extend(frame, seen[j])
+                    who[j] = alive[i].number
+        for j in np.flatnonzero(who < 0):
+            who[j] = len(people)
+            people.append(_Person(len(people), frame, seen[j], np.zeros(2)))
+        found.append(who)
+    return found
+
+
+def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
+    people: dict[int, _Track] = {}
+    for frame, (seen, who) in enumerate(zip(detections, found, strict=True)):
+        for points, number in zip(seen, who.tolist(), strict=True):
+            person = people.setdefault(number, _Track([], []))
+            person.frames.append(frame)
+            person.points.append(points)
+    return [people[number] for number in sorted(people)]
+
+
+def _returns(people: list[_Track]) -> list[str]:
+    """Whoever appears after another has left may be that other, and is said to be."""
+    warnings = []
+    for j, person in enumerate(people):
+        begin = person.frames[0]
+        gone = [i for i, p in enumerate(people) if p.frames[-1] < begin]
+        if gone:
+            i = max(gone, key=lambda i: people[i].frames[-1])
+            warnings.append(
+                f"person {j} may be person {i}: the one begins in frame {begin}, the "
+                f"other was last seen in frame {people[i].frames[-1]}."
+            )
+    return warnings
 
 
 def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
@@ -94,7 +155,7 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
     size = max(_size(points), _size(expected), 1.0)
     # The median forgives a swapped or lost limb, which a mean would not.
     distance = np.median(np.linalg.norm((points - expected)[both, :2], axis=-1)) / size
-    gap = frame - person.frames[-1]
+    gap = frame - person.frame
     reach = 0.2 + 0.02 * (gap - 1)
     ratio = _size(points) / max(_size(expected), 1.0)
     if not 0.4 < ratio < 2.5:

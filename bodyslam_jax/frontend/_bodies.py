@@ -4,23 +4,39 @@ The contract's `bodies.npz` is read here; `_body_tools.py` reads the files of ot
 """
 
 import dataclasses
+import logging
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from bodyslam_jax.frontend._body_parts import Unfit, join
+from bodyslam_jax.config import Association
+from bodyslam_jax.frontend._body_parts import join
 from bodyslam_jax.frontend._body_tools import READERS, from_spin
+from bodyslam_jax.frontend._numbering import Unfit, Warn
 from bodyslam_jax.frontend._pickle import restricted_load
-from bodyslam_jax.frontend._rows import Rows
+from bodyslam_jax.frontend._rows import Rows, Video
 from bodyslam_jax.sequence import Bodies, Intrinsics
+
+_log = logging.getLogger(__name__)
 
 _MAX_DISTANCE = 200.0
 """A person further away than this is not a person, m."""
 
 
-def read_bodies(path: Path, *, num_frames: int, intrinsics: Intrinsics) -> Bodies:
+def read_bodies(
+    path: Path,
+    *,
+    num_frames: int | None,
+    intrinsics: Intrinsics,
+    fps: float | None = None,
+    times: Float[np.ndarray, " t"] | None = None,
+    images: tuple[str, ...] = (),
+    config: Association = Association(),
+    warn: Warn = _log.warning,
+) -> Bodies:
     """Reads regressed bodies, recognised by content; a folder of TRAM's tracks too.
 
     `bodies.npz` does not name its source: its shapes count as regressed, unless an
@@ -29,29 +45,36 @@ def read_bodies(path: Path, *, num_frames: int, intrinsics: Intrinsics) -> Bodie
 
     Nothing in the file is run: see `_pickle.py`.
 
+    Args:
+        num_frames: of the video; None for as many as the file has.
+        fps, times: of the video, 1/s, and of each of its frames, s; without them a
+            motion of another rate is refused.
+        images: names of the video's frames, if it is a folder of images.
+
     **Raises:** `ValueError`, naming the file, if it is none of the known kinds, has NaN
     or infinity in it, or belongs to another video.
     """
     if not path.exists():
         raise ValueError(f"{path}: no such file.")
+    video = Video(intrinsics, num_frames, fps, times, images, config, warn)
     if path.is_dir():
-        rows = _read_tram_folder(path, num_frames, intrinsics)
+        rows = _read_tram_folder(path, video)
     else:
-        rows = _read(path, restricted_load(path), num_frames, intrinsics)
+        rows = _read(path, restricted_load(path), video)
     return _gather(path, rows, num_frames)
 
 
-def _read(path: Path, data: Any, num_frames: int, intrinsics: Intrinsics) -> Rows:
+def _read(path: Path, data: Any, video: Video) -> Rows:
     if isinstance(data, dict) and set(data) == {"results"}:
         data = data["results"]
     if not isinstance(data, dict) or not data:
         raise ValueError(f"{path}: no named arrays in it, so not bodies.")
     try:
         if {"frame", "poses", "betas"} <= set(data):
-            return _from_contract(data, intrinsics, num_frames)
+            return _from_contract(data, video)
         for _, recognise, read in READERS:
             if recognise(data):
-                return read(data, intrinsics, num_frames)
+                return read(data, video)
     except Unfit as error:
         raise ValueError(f"{path}: {error}.") from None
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
@@ -62,12 +85,12 @@ def _read(path: Path, data: Any, num_frames: int, intrinsics: Intrinsics) -> Row
     raise ValueError(f"{path}: not bodies of {known} or bodies.npz; it holds {keys}.")
 
 
-def _from_contract(data: dict, intrinsics: Intrinsics, num_frames: int) -> Rows:
+def _from_contract(data: dict, video: Video) -> Rows:
     regressed = _flag(data, "shapes_regressed", default=True)
     if "trans" not in data:
         if "camera" not in data:
             raise Unfit("neither `trans` nor `camera` and `bbox`")
-        rows = from_spin({**data, "pose": data["poses"]}, intrinsics, num_frames)
+        rows = from_spin({**data, "pose": data["poses"]}, video)
         return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
     n = len(np.atleast_1d(np.asarray(data["frame"])))
@@ -99,7 +122,7 @@ def _flag(data: dict, key: str, default: bool) -> bool:
     return bool(value.item())
 
 
-def _read_tram_folder(folder: Path, num_frames: int, intrinsics: Intrinsics) -> Rows:
+def _read_tram_folder(folder: Path, video: Video) -> Rows:
     """TRAM's `hps/` (one file per person), with `camera.npy` beside or above it."""
     tracks = sorted(folder.glob("**/hps_track_*.npy"))
     if not tracks:
@@ -113,18 +136,28 @@ def _read_tram_folder(folder: Path, num_frames: int, intrinsics: Intrinsics) -> 
         data = restricted_load(track)
         if not isinstance(data, dict):
             raise ValueError(f"{track}: not a dictionary of arrays.")
-        one = _read(track, {**data, **shared}, num_frames, intrinsics)
+        one = _read(track, {**data, **shared}, video)
         number = int(re.findall(r"\d+", track.stem)[-1])
         person = np.full(len(one.frame), number)
         rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
     return join(rows)
 
 
-def _gather(path: Path, rows: Rows, num_frames: int) -> Bodies:
+def _gather(path: Path, rows: Rows, num_frames: int | None) -> Bodies:
     """Sorts rows by person and frame, after a last look at all of them."""
     if not len(rows.frame):
         raise ValueError(f"{path}: no body in any frame.")
+    for name in ("person", "poses", "betas", "trans"):
+        array = getattr(rows, name)
+        if len(array) != len(rows.frame):
+            raise ValueError(
+                f"{path}: {len(rows.frame)} frames for {len(array)} of `{name}`."
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path}: `{name}` has NaN or infinity in it.")
     low, high = int(rows.frame.min()), int(rows.frame.max())
+    if num_frames is None:
+        num_frames = high + 1
     if low < 0 or high >= num_frames:
         raise ValueError(
             f"{path}: bodies of frames {low} to {high}, but the video has {num_frames}."

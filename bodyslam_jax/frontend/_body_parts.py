@@ -3,18 +3,17 @@
 An `Unfit` says what is wrong with the content; the caller adds the file's name.
 """
 
-import re
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.frontend._association import identify
+from bodyslam_jax.frontend._numbering import Unfit, frames_of_names
 from bodyslam_jax.frontend._perspective import full_translation, turn_to_camera
-from bodyslam_jax.frontend._rows import Rows
+from bodyslam_jax.frontend._rows import Rows, Video
 from bodyslam_jax.sequence import Intrinsics
 
-
-class Unfit(ValueError):
-    """A file of a known tool that lacks something; the reader adds the file's name."""
+_BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
+"""Points in front view of a body's size, about its middle, m."""
 
 
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -51,35 +50,48 @@ def people_of(data: dict, n: int) -> np.ndarray:
     return numbers_of(data, "person", (n,)).astype(np.int64)
 
 
-def frames_of(data: dict, key: str, n: int, num_frames: int) -> np.ndarray:
+def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarray:
     if key in data:
-        return np.ravel(numbers_of(data, key, None)).astype(np.int64)
-    if n != num_frames:
+        found = np.ravel(numbers_of(data, key, None)).astype(np.int64)
+        if len(found) != n:
+            raise Unfit(f"`{key}` has {len(found)} entries for {n} bodies")
+        return found
+    if num_frames is not None and n != num_frames:
         raise Unfit(
             f"{n} bodies without `{key}`, but the video has {num_frames} frames"
         )
     return np.arange(n)
 
 
-def frames_of_names(names: list[str]) -> np.ndarray:
-    """Frame numbers from image names; as many as there are names if they have none."""
-    numbers = [
-        re.findall(r"\d+", name.rsplit("/", 1)[-1].rsplit(".", 1)[0]) for name in names
-    ]
-    if not all(numbers):
-        raise Unfit("image names without a number")
-    found = np.array([int(n[-1]) for n in numbers])
-    # Tools that cut a video into images count from 1.
-    return found - 1 if len(found) and found.min() == 1 else found
+def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
+    """Frames of bodies found in images of these names."""
+    frames = frames_of_names(
+        names,
+        what="bodies",
+        num_frames=video.num_frames,
+        images=video.images,
+        complete=complete,
+        warn=video.warn,
+    )
+    return np.array([frames[name] for name in names], dtype=np.int64)
 
 
-def tell_apart(frame: np.ndarray) -> np.ndarray:
-    """Numbers people within a frame, where a tool does not say who is who."""
-    person = np.zeros(len(frame), dtype=np.int64)
-    count: dict[int, int] = {}
-    for i, k in enumerate(frame):
-        person[i] = count.get(int(k), 0)
-        count[int(k)] = person[i] + 1
+def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray:
+    """Numbers people where a tool does not say who is who: by where they are in the
+    image, and how large, from frame to frame. One body a frame is one person."""
+    if len(np.unique(frame)) == len(frame):
+        return np.zeros(len(frame), dtype=np.int64)
+    fx, fy, cx, cy = video.camera.params[:4]
+    order = np.argsort(frame, kind="stable")
+    x, y, z = trans[order].T[:, :, None]
+    z = np.maximum(z, 0.1)
+    u = fx * (x + _BOX[0].ravel()) / z + cx
+    v = fy * (y + _BOX[1].ravel()) / z + cy
+    points = np.stack([u, v, np.ones_like(u)], axis=-1)
+    first = np.searchsorted(frame[order], np.arange(1, frame.max(initial=0) + 1))
+    found = identify(np.split(points, first), video.frames_in(video.config.max_gap))
+    person = np.empty(len(frame), dtype=np.int64)
+    person[order] = np.concatenate(found)
     return person
 
 
@@ -122,6 +134,8 @@ def refocused(
         focal: of the tool's camera, px: one number a body, or two (x, y).
         center: its principal point, px: one for all, or one a body.
     """
+    if (trans[:, 2] == 0).any():
+        raise Unfit("a body at a distance of 0 from the camera (z = 0)")
     fx, fy, cx, cy = camera.params[:4]
     focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
     center = np.broadcast_to(center, (len(trans), 2))

@@ -14,13 +14,14 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.frontend._amass import from_amass
 from bodyslam_jax.frontend._body_parts import (
     Unfit,
     as_rotvec,
     betas_of,
     focals,
     frames_of,
-    frames_of_names,
+    frames_of_images,
     from_crops,
     join,
     middle,
@@ -31,8 +32,7 @@ from bodyslam_jax.frontend._body_parts import (
     tell_apart,
 )
 from bodyslam_jax.frontend._perspective import turn_to_camera
-from bodyslam_jax.frontend._rows import Rows
-from bodyslam_jax.sequence import Intrinsics
+from bodyslam_jax.frontend._rows import Rows, Video
 
 _PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 """J_0 of SMPL's neutral template, m."""
@@ -40,10 +40,10 @@ _PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
 
 
-def from_spin(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_spin(data: dict, video: Video) -> Rows:
     """SPIN: a row per frame; weak perspective in boxes that SPIN itself leaves out."""
     poses = numbers_of(data, "pose", (-1, 72))
-    frame = frames_of(data, "frame", len(poses), num_frames)
+    frame = frames_of(data, "frame", len(poses), video.num_frames)
     if "bbox" not in data:
         raise Unfit("`camera` needs `bbox` (m, 3: cx, cy, side px)")
     box, crop = (
@@ -57,11 +57,11 @@ def from_spin(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         betas_of(data, "betas", len(poses)),
         crop,
         box,
-        camera,
+        video.camera,
     )
 
 
-def from_vibe(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_vibe(data: dict, video: Video) -> Rows:
     """VIBE: `{person: {...}}`, crops as boxes (cx, cy, w, h) with w = h."""
     rows = []
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
@@ -70,19 +70,19 @@ def from_vibe(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         boxes = numbers_of(one, "bboxes", (n, 4))
         rows.append(
             from_crops(
-                frames_of(one, "frame_ids", n, num_frames),
+                frames_of(one, "frame_ids", n, video.num_frames),
                 np.full(n, number),
                 poses,
                 betas_of(one, "betas", n),
                 numbers_of(one, "pred_cam", (n, 3)),
                 boxes[:, :3],
-                camera,
+                video.camera,
             )
         )
     return join(rows)
 
 
-def from_wham(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_wham(data: dict, video: Video) -> Rows:
     """WHAM: `{person: {...}}`; `pose`, `trans` are in the camera (`_world` is not)."""
     rows = []
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
@@ -90,7 +90,7 @@ def from_wham(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         n = len(poses)
         rows.append(
             Rows(
-                frames_of(one, "frame_ids", n, num_frames),
+                frames_of(one, "frame_ids", n, video.num_frames),
                 np.full(n, number),
                 poses,
                 betas_of(one, "betas", n),
@@ -100,31 +100,45 @@ def from_wham(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     return join(rows)
 
 
-def from_cliff(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
-    """CLIFF: full-image translation for its own focal length, image names."""
+def from_cliff(data: dict, video: Video) -> Rows:
+    """CLIFF: full-image translation for its own focal length, image names.
+
+    Its bodies are in no order; who is seen in a few frames only is left out.
+    """
     poses = rotations_of(data, "pose", 24)
     n = len(poses)
     if "imgname" in data:
-        frame = frames_of_names([str(name) for name in np.ravel(data["imgname"])])
+        names = [str(name) for name in np.ravel(data["imgname"])]
+        if len(names) != n:
+            raise Unfit(f"{len(names)} image names for {n} bodies")
+        frame = frames_of_images(names, video, complete=False)
     else:
-        frame = frames_of(data, "frame", n, num_frames)
-    if len(frame) != n:
-        raise Unfit(f"{len(frame)} image names for {n} bodies")
+        frame = frames_of(data, "frame", n, video.num_frames)
     trans = numbers_of(data, "global_t", (n, 3))
     if "focal_l" in data:
         focal = np.broadcast_to(np.ravel(numbers_of(data, "focal_l", None)), (n,))
-        trans = refocused(trans, focal, middle(camera), camera)
-    return Rows(frame, tell_apart(frame), poses, betas_of(data, "shape", n), trans)
+        trans = refocused(trans, focal, middle(video.camera), video.camera)
+    person = tell_apart(frame, trans, video)
+    _, which, count = np.unique(person, return_inverse=True, return_counts=True)
+    least = video.frames_in(video.config.min_duration)
+    keep = count[which] >= min(least, count.max(initial=0))
+    if len(count) > 1:
+        video.warn(
+            f"bodies do not say who is who: {len(np.unique(person[keep]))} people told "
+            f"apart by where they are, {int((~keep).sum())} bodies left out."
+        )
+    betas = betas_of(data, "shape", n)
+    return Rows(frame[keep], person[keep], poses[keep], betas[keep], trans[keep])
 
 
-def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_phalp(data: dict, video: Video) -> Rows:
     """4D-Humans / PHALP: `{image: {...}}`, lists over the people in it.
 
     Its camera has a focal length of 5000/256 of the longer side, and its rotations are
     relative to the crop's ray.
     """
     names = sorted(data)
-    numbered = frames_of_names([str(name) for name in names])
+    numbered = frames_of_images([str(n) for n in names], video, complete=True)
     frame, person, poses, betas, trans, box = [], [], [], [], [], []
     for number, name in zip(numbered, names, strict=True):
         found = data[name]
@@ -147,24 +161,28 @@ def from_phalp(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         raise Unfit("no body in any frame")
     stacked = [np.asarray(a, dtype=np.float64) for a in (poses, betas, trans, box)]
     poses, betas, trans, box = stacked
-    focal = np.full(len(frame), 5000 / 256 * max(camera.width, camera.height))
-    trans = refocused(trans, focal, middle(camera), camera)
-    root = turn_to_camera(poses[:, :3], box, camera)
+    focal = np.full(
+        len(frame), 5000 / 256 * max(video.camera.width, video.camera.height)
+    )
+    trans = refocused(trans, focal, middle(video.camera), video.camera)
+    root = turn_to_camera(poses[:, :3], box, video.camera)
     poses = np.concatenate([root, poses[:, 3:]], axis=-1)
     return Rows(np.asarray(frame), np.asarray(person), poses, betas, trans)
 
 
-def from_tram(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_tram(data: dict, video: Video) -> Rows:
     """TRAM: one `hps_track_k.npy` is one person, with full-image translation."""
     poses = as_rotvec(numbers_of(data, "pred_rotmat", (-1, 24, 3, 3)), 24)
     n = len(poses)
     trans = numbers_of(data, "pred_trans", None).reshape(n, 3)
     if "img_focal" in data:
         focal = np.full(n, float(np.ravel(data["img_focal"])[0]))
-        center = np.asarray(data.get("img_center", middle(camera)), dtype=np.float64)
-        trans = refocused(trans, focal, center, camera)
+        center = np.asarray(
+            data.get("img_center", middle(video.camera)), dtype=np.float64
+        )
+        trans = refocused(trans, focal, center, video.camera)
     return Rows(
-        frames_of(data, "frame", n, num_frames),
+        frames_of(data, "frame", n, video.num_frames),
         np.zeros(n, dtype=np.int64),
         poses.reshape(n, 72),
         betas_of(data, "pred_shape", n),
@@ -172,7 +190,7 @@ def from_tram(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     )
 
 
-def from_gvhmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_gvhmr(data: dict, video: Video) -> Rows:
     """GVHMR: SMPL-X in the camera of `K_fullimg`, a row per frame."""
     body = data["smpl_params_incam"]
     root = numbers_of(body, "global_orient", (-1, 3))
@@ -180,15 +198,15 @@ def from_gvhmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     trans = numbers_of(body, "transl", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
     if "K_fullimg" in data:
         K = np.broadcast_to(numbers_of(data, "K_fullimg", None), (n, 3, 3))
-        trans = refocused(trans, focals(K), K[:, :2, 2], camera)
+        trans = refocused(trans, focals(K), K[:, :2, 2], video.camera)
     poses = np.concatenate(
         [root, numbers_of(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
     )
-    frame = frames_of(data, "frame", n, num_frames)
+    frame = frames_of(data, "frame", n, video.num_frames)
     return Rows(frame, np.zeros(n, np.int64), poses, np.zeros((n, 10)), trans)
 
 
-def from_prompthmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_prompthmr(data: dict, video: Video) -> Rows:
     """PromptHMR: SMPL-X per person, in the camera of `img_focal`, `img_center`."""
     world = data.get("camera_world", data.get("camera", {}))
     rows = []
@@ -207,11 +225,13 @@ def from_prompthmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         trans = numbers_of(body, "trans", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
         if "img_focal" in world:
             focal = np.full(n, float(np.ravel(world["img_focal"])[0]))
-            center = np.asarray(world.get("img_center", middle(camera)), np.float64)
-            trans = refocused(trans, focal, center, camera)
+            center = np.asarray(
+                world.get("img_center", middle(video.camera)), np.float64
+            )
+            trans = refocused(trans, focal, center, video.camera)
         rows.append(
             Rows(
-                frames_of(one, "frames", n, num_frames),
+                frames_of(one, "frames", n, video.num_frames),
                 np.full(n, number),
                 np.concatenate([pose, np.zeros((n, 6))], axis=-1),
                 np.zeros((n, 10)),
@@ -221,12 +241,12 @@ def from_prompthmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     return join(rows)
 
 
-def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_slahmr(data: dict, video: Video) -> Rows:
     """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
     trans = numbers_of(data, "trans", (-1, -1, 3))
     p, t = trans.shape[:2]
-    if t != num_frames:
-        raise Unfit(f"{t} frames, but the video has {num_frames}")
+    if video.num_frames not in (None, t):
+        raise Unfit(f"{t} frames, but the video has {video.num_frames}")
     scale = float(np.ravel(data.get("world_scale", 1.0))[0])
     R = np.broadcast_to(numbers_of(data, "cam_R", None), (p, t, 3, 3))
     shift = scale * np.broadcast_to(numbers_of(data, "cam_t", None), (p, t, 3))
@@ -244,7 +264,7 @@ def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     if "intrins" in data:
         fx, _, cx, cy = np.ravel(numbers_of(data, "intrins", None))[:4]
         focal = np.full(p * t, fx)
-        moved = refocused(moved.reshape(-1, 3), focal, np.array([cx, cy]), camera)
+        moved = refocused(moved.reshape(-1, 3), focal, np.array([cx, cy]), video.camera)
     seen = np.ones((p, t), dtype=bool)
     if "track_mask" in data:
         seen = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
@@ -257,7 +277,7 @@ def from_slahmr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
     return Rows(frame, person, *parts, shapes_regressed=False)
 
 
-def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
+def from_glamr(data: dict, video: Video) -> Rows:
     """GLAMR: `root_trans_cam` is the pelvis itself, in the camera of `cam_K`."""
     people = data["person_data"] if "person_data" in data else {0: data}
     rows = []
@@ -269,11 +289,13 @@ def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
         trans = numbers_of(one, "root_trans_cam", (n, 3)) - _PELVIS_SMPL
         if "cam_K" in one:
             K = np.broadcast_to(numbers_of(one, "cam_K", None), (n, 3, 3))
-            pelvis = refocused(trans + _PELVIS_SMPL, focals(K), K[:, :2, 2], camera)
+            pelvis = refocused(
+                trans + _PELVIS_SMPL, focals(K), K[:, :2, 2], video.camera
+            )
             trans = pelvis - _PELVIS_SMPL
         poses = np.concatenate([root, numbers_of(one, "smpl_pose", (n, 69))], axis=-1)
         seen = np.asarray(one.get("visible", np.ones(n))).astype(bool)
-        frame = frames_of(one, "frames", n, num_frames)
+        frame = frames_of(one, "frames", n, video.num_frames)
         rows.append(
             Rows(
                 frame[seen],
@@ -284,38 +306,6 @@ def from_glamr(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
             )
         )
     return join(rows)
-
-
-def from_amass(data: dict, camera: Intrinsics, num_frames: int) -> Rows:
-    """AMASS style, one body for the whole video, taken to be in the camera frame.
-
-    A different rate is resampled to the video's number of frames.
-    """
-    poses = numbers_of(data, "poses", None)
-    n = len(poses)
-    if poses.ndim != 2 or poses.shape[1] < 66:
-        raise Unfit(f"`poses` is {poses.shape}, not (t, 72) or (t, 156)")
-    width = 72 if poses.shape[1] == 72 else 66
-    poses = np.pad(poses[:, :width], [(0, 0), (0, 72 - width)])
-    trans = numbers_of(data, "trans", (n, 3))
-    at = np.arange(num_frames)
-    if n != num_frames:
-        at = np.round(np.linspace(0, n - 1, num_frames)).astype(np.int64)
-        rate = float(np.ravel(data["mocap_framerate"])[0])
-        if not 0.5 < (n / rate) / (num_frames / 30.0) < 2:
-            raise Unfit(
-                f"{n} frames at {rate:g}/s, but the video has {num_frames} frames"
-            )
-    betas = np.ravel(numbers_of(data, "betas", None))[:10]
-    betas = np.pad(betas, (0, 10 - len(betas)))
-    return Rows(
-        np.arange(num_frames),
-        np.zeros(num_frames, np.int64),
-        poses[at],
-        np.tile(betas, (num_frames, 1)),
-        trans[at],
-        shapes_regressed=False,
-    )
 
 
 def _has(*keys: str) -> Callable[[dict], bool]:
@@ -331,7 +321,7 @@ def _each(*keys: str) -> Callable[[dict], bool]:
     return test
 
 
-Reader = Callable[[dict, Intrinsics, int], Rows]
+Reader = Callable[[dict, Video], Rows]
 
 READERS: list[tuple[str, Callable[[dict], bool], Reader]] = [
     ("SPIN", _has("pose", "betas", "camera"), from_spin),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyslam_jax.frontend._keypoints import numbers, open_npz
+from bodyslam_jax.frontend._archive import numbers, open_npz
 from bodyslam_jax.sequence import Tracks
 
 

@@ -139,7 +139,8 @@ def _fill_gaps(keypoints: Keypoints, max_gap: int) -> Float[np.ndarray, "h t 25 
             after = at[
                 np.minimum(np.searchsorted(at, np.arange(num_frames)), len(at) - 1)
             ]
-            for k in np.setdiff1d(np.arange(num_frames), at):
+            # Who has not been seen yet has not come yet.
+            for k in np.setdiff1d(np.arange(at[0], num_frames), at):
                 if abs(k - before[k]) <= max_gap and abs(k - after[k]) <= max_gap:
                     part = (k - before[k]) / max(after[k] - before[k], 1)
                     part = min(max(part, 0.0), 1.0)

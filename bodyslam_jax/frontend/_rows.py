@@ -1,9 +1,17 @@
-"""Bodies as the readers give them: one row each, in no order."""
+"""Bodies as the readers give them, one row each, in no order; and what they know of
+the video that the bodies are in."""
 
 import dataclasses
+import logging
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from bodyslam_jax.config import Association
+from bodyslam_jax.frontend._numbering import Warn
+from bodyslam_jax.sequence import Intrinsics
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,3 +28,24 @@ class Rows:
     """m: the pelvis is at `J_0(β) + trans`."""
     shapes_regressed: bool = True
     """As in `Bodies`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """What readers of bodies are told of the video."""
+
+    camera: Intrinsics
+    num_frames: int | None = None
+    """None if only the file can say."""
+    fps: float | None = None
+    """1/s; None if not known"""
+    times: Float[np.ndarray, " t"] | None = None
+    """s, of every frame; None if not known"""
+    images: tuple[str, ...] = ()
+    """Names of the frames, if it is a folder of images."""
+    config: Association = Association()
+    warn: Warn = _log.warning
+
+    def frames_in(self, seconds: float) -> int:
+        """At least 1; by the common rate of 30/s if the video's is not known."""
+        return max(1, round(seconds * (self.fps or 30.0)))

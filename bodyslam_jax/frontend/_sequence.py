@@ -127,16 +127,19 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
     known = read_camera(parts.camera) if parts.camera else None
     fps = known[1] if known else None
     footage = look_at(parts.footage, fps) if parts.footage else None
-    warnings = footage.warnings if footage else ()
+    warnings = list(footage.warnings) if footage else []
+    images: tuple[str, ...] = ()
+    if footage and footage.path.is_dir():
+        images = tuple(p.name for p in list_images(footage.path))
     if known:
         intrinsics = known[0]
         if footage:
             warnings += _check_camera(parts, intrinsics, fps, footage)
     elif footage:
-        first = list_images(footage.path)[0] if footage.path.is_dir() else None
+        first = footage.path / images[0] if images else None
         intrinsics = guess_camera(footage.width, footage.height, first)
-        warnings += (
-            f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px.",
+        warnings.append(
+            f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px."
         )
     else:
         raise ValueError(f"{path}: tracks without a video need a camera.json.")
@@ -146,21 +149,39 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
     if parts.tracks:
         count = footage.num_read if footage else None
         found_tracks = read_tracks(parts.tracks, num_frames=count, size=size)
-    stamps = footage.timestamps if footage else _made_up_times(parts, found_tracks, fps)
-    num_frames = footage.num_read if footage else len(stamps)
+    if footage:
+        stamps, num_frames, picks = footage.timestamps, footage.num_read, footage.picks
+    else:
+        if fps is None:
+            fps = 30.0
+            warnings.append("camera.json has no fps: 30 frames/s assumed.")
+        num_frames, picks = _count_frames(parts, found_tracks, intrinsics, fps), None
+        stamps = np.arange(num_frames) / fps
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 30.0
 
     people = None
-    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 30.0
     if parts.keypoints:
-        detections = read_detections(
-            parts.keypoints, num_frames=num_frames, width=size[0], height=size[1]
+        detected = read_detections(
+            parts.keypoints,
+            num_frames=num_frames,
+            width=size[0],
+            height=size[1],
+            images=images,
+            warn=warnings.append,
         )
-        people, more = associate(detections, config, rate)
+        people, more = associate(detected.points, config, rate, detected.person)
         warnings += more
     regressed = None
     if parts.bodies:
         regressed = read_bodies(
-            parts.bodies, num_frames=num_frames, intrinsics=intrinsics
+            parts.bodies,
+            num_frames=num_frames,
+            intrinsics=intrinsics,
+            fps=rate,
+            times=stamps if picks is None else _times_of_all(stamps, picks, num_frames),
+            images=images,
+            config=config,
+            warn=warnings.append,
         )
         if people is not None:
             people, regressed = pair(people, regressed, intrinsics)
@@ -178,10 +199,37 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         tracks=found_tracks,
         masks=parts.masks,
         groundtruth=parts.groundtruth,
-        warnings=warnings,
+        warnings=tuple(warnings),
     )
-    picks = footage.picks if footage else None
     return sequence if picks is None else _thinned(sequence, picks)
+
+
+def _count_frames(
+    parts: _Parts, tracks: Tracks | None, intrinsics: Intrinsics, fps: float
+) -> int:
+    """Frames of a sequence without images: as many as any of its parts has."""
+    found = [int(tracks.frame.max()) + 1] if tracks else []
+    quiet = _log.debug  # it is all read again, and said then
+    if parts.keypoints:
+        detected = read_detections(
+            parts.keypoints,
+            num_frames=None,
+            width=intrinsics.width,
+            height=intrinsics.height,
+            warn=quiet,
+        )
+        found.append(len(detected.points))
+    if parts.bodies:
+        bodies = read_bodies(
+            parts.bodies, num_frames=None, intrinsics=intrinsics, fps=fps, warn=quiet
+        )
+        found.append(bodies.present.shape[1])
+    return max(found)
+
+
+def _times_of_all(stamps: np.ndarray, picks: np.ndarray, num_frames: int) -> np.ndarray:
+    """Times also of frames that are left out, where they hardly matter."""
+    return np.interp(np.arange(num_frames), picks, stamps)
 
 
 def _thinned(sequence: Sequence, picks: np.ndarray) -> Sequence:
@@ -227,16 +275,6 @@ def _check_camera(
             f"camera.json says {fps:g} frames/s, the video {rate:.4g}: video used.",
         )
     return ()
-
-
-def _made_up_times(
-    parts: _Parts, tracks: Tracks | None, fps: float | None
-) -> np.ndarray:
-    """Times of a sequence without images: as many as it has keypoints or tracks for."""
-    num = int(tracks.frame.max()) + 1 if tracks else 0
-    if parts.keypoints and parts.keypoints.is_dir():
-        num = max(num, len(list(parts.keypoints.glob("*_keypoints.json"))))
-    return np.arange(num) / (fps or 30.0)
 
 
 def _check_masks(folder: Path, num_frames: int) -> None:

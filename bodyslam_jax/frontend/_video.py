@@ -17,6 +17,8 @@ _log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+_LEAST_SIDE = 16
+"""px; BRISK's pyramid fails below 6; so small images have nothing to follow."""
 _MAX_JITTER = 0.25
 """Spread of frame intervals, relative to their median, that is still a fixed rate."""
 
@@ -48,9 +50,13 @@ def look_at(path: Path, fps: float | None = None) -> Footage:
 
     **Raises:** `ValueError`, naming the file, if it is not a readable video.
     """
-    if path.is_dir():
-        return _look_at_images(path, fps)
-    return _look_at_video(path)
+    footage = _look_at_images(path, fps) if path.is_dir() else _look_at_video(path)
+    if min(footage.width, footage.height) < _LEAST_SIDE:
+        raise ValueError(
+            f"{path}: images of {footage.width}x{footage.height} px are too small; "
+            f"expected at least {_LEAST_SIDE}x{_LEAST_SIDE}."
+        )
+    return footage
 
 
 def frames(
@@ -160,11 +166,11 @@ def resampled(
     nearest = after - (ticks - times[after - 1] < times[after] - ticks)
     picks = np.unique(nearest)
     slow, fast = 1 / step.max(), 1 / step.min()
-    text = (
-        f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s; "
-        f"resampled to {1 / median:.3g}, {len(picks)} of {len(times)} frames used."
-    )
-    return times[picks], picks if len(picks) < len(times) else None, (text,)
+    text = f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s; "
+    if len(picks) == len(times):
+        return times, None, (text + "all frames used, each at its own time.",)
+    text += f"resampled to {1 / median:.3g}, {len(picks)} of {len(times)} frames used."
+    return times[picks], picks, (text,)
 
 
 def _look_at_images(folder: Path, fps: float | None) -> Footage:

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Detect
+from bodyslam_jax.frontend import BODY25_FROM
 
 log = logging.getLogger(__name__)
 
@@ -58,16 +59,6 @@ _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _STD = np.array([58.395, 57.12, 57.375], np.float32)
 _SIMCC_SPLIT = 2.0
 """Bins of SimCC per pixel of the crop."""
-
-# BODY_25 from COCO's first 17, without neck, middle of the hips and feet.
-_COCO_TO_BODY25 = {
-    **{0: 0, 2: 6, 3: 8, 4: 10, 5: 5, 6: 7, 7: 9, 9: 12, 10: 14, 11: 16},
-    **{12: 11, 13: 13, 14: 15, 15: 2, 16: 1, 17: 4, 18: 3},
-}
-_FEET = {
-    26: {19: 20, 20: 22, 21: 24, 22: 21, 23: 23, 24: 25},  # Halpe
-    133: {19: 17, 20: 18, 21: 19, 22: 20, 23: 21, 24: 22},  # COCO-WholeBody
-}
 
 
 def detect_people(
@@ -231,11 +222,10 @@ def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
     Neck and middle of the hips are the middles of shoulders and hips.
     """
     count = len(points)
-    if count != 17 and count not in _FEET:
+    if count not in (17, 26, 133):
         raise ValueError(f"pose: {count} keypoints, expected 17, 26 or 133.")
-    found = np.zeros((25, 3))
-    for target, source in (_COCO_TO_BODY25 | _FEET.get(count, {})).items():
-        found[target] = points[source]
+    index = np.asarray(BODY25_FROM[count])
+    found = np.where((index >= 0)[:, None], points[index], 0.0)
     for target, pair in ((1, (2, 5)), (8, (9, 12))):
         found[target, :2] = found[pair, :2].mean(0)
         found[target, 2] = found[pair, 2].min()

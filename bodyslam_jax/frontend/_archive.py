@@ -1,0 +1,38 @@
+"""`.npz` files of other people: opened without unpickling, checked array by array."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def open_npz(path: Path) -> "np.lib.npyio.NpzFile":
+    """Opens an `.npz` without ever unpickling; `ValueError` if it is not one."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file.")
+    try:
+        archive = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not a NumPy archive ({error}).") from None
+    except Exception as error:  # zipfile's own errors are not of one family
+        raise ValueError(f"{path}: damaged NumPy archive ({error}).") from None
+    if not isinstance(archive, np.lib.npyio.NpzFile):
+        raise ValueError(f"{path}: one array, not a NumPy archive (.npz).")
+    return archive
+
+
+def numbers(path: Path, archive: Any, key: str) -> np.ndarray:
+    """A float64 array of an archive; `ValueError` if not all finite numbers."""
+    try:
+        array = archive[key]
+    except Exception as error:
+        raise ValueError(f"{path}: cannot read array `{key}` ({error}).") from None
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{path}: array `{key}` holds {array.dtype}, not numbers.")
+    array = np.asarray(array, dtype=np.float64)
+    if not np.isfinite(array).all():
+        bad = int((~np.isfinite(array)).sum())
+        raise ValueError(
+            f"{path}: {bad} of {array.size} numbers of `{key}` not finite."
+        )
+    return array
