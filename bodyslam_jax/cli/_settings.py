@@ -64,7 +64,10 @@ def _merged(found: Any, base: Any, where: str) -> Any:
                 )
             value = float(value)
         changes[name] = value
-    return dataclasses.replace(base, **changes)
+    try:
+        return dataclasses.replace(base, **changes)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def starting_from(

@@ -1,6 +1,9 @@
 """From images to cameras up to scale: people found, points followed, structure."""
 
 import dataclasses
+import math
+
+from bodyslam_jax.config._check import NOT_NEGATIVE, SHARE, check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,6 +21,9 @@ class Detect:
     max_people: int = 4
     """The largest ones in an image that are looked at."""
 
+    def __post_init__(self):
+        check(self, {"min_score": SHARE, "max_overlap": SHARE})
+
 
 @dataclasses.dataclass(frozen=True)
 class Association:
@@ -29,6 +35,9 @@ class Association:
     """Time that a person must be seen for, s."""
     max_gap: float = 0.7
     """Time that a person may be unseen and still be recognised, s."""
+
+    def __post_init__(self):
+        check(self, {"min_duration": NOT_NEGATIVE, "max_gap": NOT_NEGATIVE})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +60,10 @@ class Tracking:
     """Frames over which a point must fit one rigid motion."""
     person_margin: float = 0.06
     """Width added around people's keypoints, of the person's height."""
+
+    def __post_init__(self):
+        least = {"octaves": 0, "person_margin": 0, "threshold": 0, "window": 3}
+        check(self, {name: (value, math.inf) for name, value in least.items()})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,3 +98,10 @@ class Structure:
     """Standard deviation, of the focal length, above which the guess is kept."""
     focal_runs: float = 30.0
     """Observations of a track that count for one, as its errors last."""
+
+    def __post_init__(self):
+        free = (
+            "keyframe_motion static_motion rotation_error min_baseline focal_accuracy"
+        )
+        ranges = dict.fromkeys(free.split(), NOT_NEGATIVE)
+        check(self, ranges | {"landmark_span": (2, math.inf)})

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+from bodyslam_jax.config._check import NOT_NEGATIVE, SHARE, check
+
 
 @dataclasses.dataclass(frozen=True)
 class PeopleFit:
@@ -42,3 +44,7 @@ class PeopleFit:
     """Factor on the β of given bodies, whatever their source. Without it 1.2 for a
     regressor's, which are drawn to the mean, and 1 where β was measured or optimised
     (AMASS, SLAHMR, or `bodies.npz` that says so by `shapes_regressed`)."""
+
+    def __post_init__(self):
+        free = dict.fromkeys(("max_gap", "correlation_time"), NOT_NEGATIVE)
+        check(self, free | {"detector_bias": SHARE})

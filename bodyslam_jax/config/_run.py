@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Literal
 
+from bodyslam_jax.config._check import check
 from bodyslam_jax.config._front_end import Association, Detect, Structure, Tracking
 from bodyslam_jax.config._people import PeopleFit
 from bodyslam_jax.config._weights import GraphWeights
@@ -42,6 +43,9 @@ class Config:
     smoothing_hz: float | None = 6.0
     """People's motion faster than this is taken for noise in the result, Hz; nothing
     is smoothed without it."""
+
+    def __post_init__(self):
+        check(self)
 
     @classmethod
     def paper(cls) -> "Config":

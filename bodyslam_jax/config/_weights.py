@@ -2,6 +2,11 @@
 
 import dataclasses
 
+from bodyslam_jax.config._check import NOT_NEGATIVE, check
+
+_CORRELATED = 0.999999
+"""Errors that last for ever would not be told from what is measured."""
+
 
 @dataclasses.dataclass(frozen=True)
 class GraphWeights:
@@ -82,6 +87,13 @@ class GraphWeights:
     ground_sigma: float | None = 0.04
     """How far the map's ground may be from what people stand on, m: one error for the
     whole sequence. Without it, people need not stand on anything."""
+
+    def __post_init__(self):
+        ranges = {
+            name: (0, _CORRELATED) for name in vars(self) if "correlation" in name
+        }
+        free = ("step_error", "fitted_step_error")
+        check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE))
 
     @classmethod
     def paper(cls) -> "GraphWeights":

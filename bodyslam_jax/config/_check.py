@@ -1,0 +1,71 @@
+"""What settings may be: of their kind, finite, and within their range."""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+Range = tuple[int | float, int | float]
+SHARE: Range = (0, 1)
+NOT_NEGATIVE: Range = (0, math.inf)
+
+
+def check(settings: Any, ranges: Mapping[str, Range] = types.MappingProxyType({})):
+    """Refuses settings that mean nothing, before minutes are spent.
+
+    Whole numbers are 1 or more, others more than 0, unless `ranges` has the least and
+    the largest value. Arrays are let through: they may not be known yet.
+
+    **Raises:** `ValueError` that names the setting, what was found and what was
+    expected.
+    """
+    hints = typing.get_type_hints(type(settings))
+    for field in dataclasses.fields(settings):
+        found = getattr(settings, field.name)
+        if dataclasses.is_dataclass(found) or hasattr(found, "dtype"):
+            continue
+        expected = _refused(found, hints[field.name], ranges.get(field.name))
+        if expected:
+            raise ValueError(f"{field.name}: found {found!r}, expected {expected}.")
+
+
+def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
+    """What was expected, where it is something else."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if found is None and types.NoneType in arguments:
+            return None
+        (kind,) = (one for one in arguments if one is not types.NoneType)
+        expected = _refused(found, kind, within)
+        return expected and f"{expected}, or nothing"
+    if origin is typing.Literal:
+        return None if found in arguments else f"one of {list(arguments)}"
+    if origin is tuple:
+        if not isinstance(found, tuple):
+            return "several values"
+        if kind == tuple[int, ...] and not found:
+            return "one number or more"
+        return next(
+            (e for x in found if (e := _refused(x, arguments[0], within))), None
+        )
+    if kind is float or kind is int:
+        return _out_of_range(found, kind, within)
+    names = {bool: "true or false", str: "a text"}
+    return None if isinstance(found, kind) else names.get(kind, kind.__name__)
+
+
+def _out_of_range(found: Any, kind: type, within: Range | None) -> str | None:
+    whole = isinstance(found, int) and not isinstance(found, bool)
+    if not (whole or (kind is float and isinstance(found, float))):
+        return "a whole number" if kind is int else "a number"
+    if within is None:
+        if kind is int:
+            return None if found >= 1 else "1 or more"
+        return None if 0 < found < math.inf else "more than 0, and finite"
+    least, most = within
+    # Not a NaN either, which no bound is above or below.
+    if least <= found <= most and math.isfinite(found):
+        return None
+    return f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"

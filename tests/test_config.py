@@ -1,0 +1,82 @@
+"""Settings that mean nothing are refused where they are made."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import pytest
+
+from bodyslam_jax.cli._settings import read_settings
+from bodyslam_jax.config import (
+    Association,
+    Config,
+    Detect,
+    GraphWeights,
+    PeopleFit,
+    Structure,
+    Tracking,
+)
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "expected"),
+    [
+        (Config, "solver", "foo", "one of ['structured', 'adam']"),
+        (Config, "smoothing_hz", 0.0, "more than 0, and finite, or nothing"),
+        (Config, "smoothing_hz", -3.0, "more than 0, and finite, or nothing"),
+        (Config, "overlay", 1, "true or false"),
+        (Config, "body_model", 3, "a text, or nothing"),
+        (Tracking, "cells", 0, "1 or more"),
+        (Tracking, "cells", 8.0, "a whole number"),
+        (Tracking, "window", 2, "3 or more"),
+        (Tracking, "octaves", -1, "0 or more"),
+        (Tracking, "keyframe_gap", True, "a whole number"),
+        (Structure, "landmark_span", 1, "2 or more"),
+        (Structure, "max_error", NAN, "more than 0, and finite"),
+        (Structure, "static_motion", -0.1, "0 or more"),
+        (Detect, "min_score", 1.5, "0 to 1"),
+        (Association, "max_gap", INF, "0 or more"),
+        (PeopleFit, "detector_bias", 2.0, "0 to 1"),
+        (PeopleFit, "regressor_shape_gain", 0.0, "more than 0, and finite, or nothing"),
+        (GraphWeights, "keypoint_sigma", "abc", "a number, or nothing"),
+        (GraphWeights, "pixel_sigma", None, "a number"),
+        (GraphWeights, "posture_correlation", 1.0, "0 to 0.999999"),
+        (GraphWeights, "step_error", -0.1, "0 or more"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(kind, name, value, expected):
+    # As made without the types that tests check everywhere.
+    settings = kind()
+    object.__setattr__(settings, name, value)
+    with pytest.raises(ValueError) as refused:
+        settings.__post_init__()
+    assert str(refused.value) == f"{name}: found {value!r}, expected {expected}."
+
+
+def test_settings_that_mean_something_are_let_in():
+    Config()
+    Config.paper()
+    Tracking(octaves=0, person_margin=0.0)
+    GraphWeights(step_error=0.0, motion_correlation=0.0)
+    weights = GraphWeights()
+    for value in (1, jnp.ones(3)):  # what is mapped over may not be known yet
+        object.__setattr__(weights, "posture_sigma", value)
+        weights.__post_init__()
+    dataclasses.replace(Config(), smoothing_hz=None)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("smoothing_hz: 0.0", "smoothing_hz: found 0.0, expected more than 0"),
+        ("tracking: {cells: 0}", "tracking: cells: found 0, expected 1 or more"),
+    ],
+)
+def test_a_file_of_settings_is_named_with_what_is_wrong_in_it(tmp_path, text, expected):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError) as refused:
+        read_settings(path, Config())
+    assert str(refused.value).startswith(f"{path}: {expected}")
+    assert str(refused.value).count(str(path)) == 1
