@@ -206,6 +206,58 @@ def test_bad_names_are_one_line_and_exit_code_1(monkeypatch, capsys, tmp_path, d
         assert code == 1 and words in error and len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--epochs 0", "epochs: found 0, expected 1 or more."),
+        ("--epochs -1", "epochs: found -1, expected 1 or more."),
+        ("--segments 0", "segments: found 0, expected 1 or more."),
+        ("--past 0", "past: found 0, expected 1 or more."),
+        ("--members 0", "members: found 0, expected 1 or more."),
+        ("--future 2", "future: found 2, expected 0 to 1."),
+        ("--clean-share nan", "clean_share: found nan, expected 0 to 1."),
+        ("--run-weight inf", "run_weight: found inf, expected 0 or more."),
+        (
+            "--learning-rate 0",
+            "learning_rate: found 0.0, expected more than 0, and finite.",
+        ),
+        ("--width", "width: found (), expected one number or more."),
+        ("--strides", "strides: found (), expected one number or more."),
+        ("--strides 4 0", "strides: found (4, 0), expected each 1 or more."),
+    ],
+)
+def test_settings_that_train_nothing_are_one_line_and_exit_code_1(
+    monkeypatch, capsys, tmp_path, data, option, message
+):
+    out = tmp_path / "m.npz"
+    code, _, error = command(monkeypatch, capsys, data, "--out", out, *option.split())
+    assert (code, error) == (1, f"bodyslam: {message}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_where_weights_go_is_checked_before_training(
+    monkeypatch, capsys, tmp_path, data
+):
+    file, folder = tmp_path / "file", tmp_path / "folder.npz"
+    file.touch()
+    folder.mkdir()
+
+    def read(path):
+        raise ValueError("read")
+
+    monkeypatch.setattr("bodyslam_jax.motion._command.read_motion", read)
+    new = tmp_path / "new" / "m.npz"  # a folder that can be made is no fault
+    for out, message in (
+        (file / "m.npz", f"{file / 'm.npz'}: {file} cannot be written (Not a dir"),
+        (file / "a" / "m.npz", f"{file / 'a' / 'm.npz'}: {file} cannot be written"),
+        (folder, f"{folder}: is a folder; expected a file"),
+        (new, "read"),
+    ):
+        code, _, error = command(monkeypatch, capsys, data, "--out", out)
+        assert code == 1 and error.startswith(f"bodyslam: {message}")
+    assert sorted(tmp_path.iterdir()) == [file, folder]
+
+
 def test_training_learns(trained):
     _, history = trained
     assert history[-1, 0] < history[0, 0]

@@ -47,9 +47,8 @@ def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
             return "several values"
         if kind == tuple[int, ...] and not found:
             return "one number or more"
-        return next(
-            (e for x in found if (e := _refused(x, arguments[0], within))), None
-        )
+        parts = (_refused(one, arguments[0], within) for one in found)
+        return next((f"each {part}" for part in parts if part), None)
     if kind is float or kind is int:
         return _out_of_range(found, kind, within)
     names = {bool: "true or false", str: "a text"}

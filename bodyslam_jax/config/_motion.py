@@ -3,6 +3,14 @@
 import dataclasses
 from typing import Literal
 
+from bodyslam_jax.config._check import NOT_NEGATIVE, SHARE, check
+
+_SHARES = "future averaging clean_share"
+_MAY_BE_0 = (
+    "weight_decay slope_weight segment_weight drift_deg white_deg root_drift "
+    "shape_sigma run_weight other_weight"
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class MotionTraining:
@@ -62,6 +70,12 @@ class MotionTraining:
     """Whether half of the segments are mirrored."""
     sliding: bool = True
     """Whether windows may overlap; the paper's do not."""
+
+    def __post_init__(self):
+        ranges = dict.fromkeys(_SHARES.split(), SHARE)
+        ranges |= dict.fromkeys(_MAY_BE_0.split(), NOT_NEGATIVE)
+        # What a random key is made of.
+        check(self, ranges | {"seed": (-(2**63), 2**63 - 1)})
 
     @staticmethod
     def paper() -> "MotionTraining":

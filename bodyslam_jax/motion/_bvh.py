@@ -41,6 +41,10 @@ _REST_BONES = {
 }
 """SMPL's rest bones: joint -> (child, direction); the spine is left as it is."""
 
+_PLACES = ("xposition", "yposition", "zposition")
+_TURNS = ("xrotation", "yrotation", "zrotation")
+"""Channels, in lower case: writers of BVH do not agree on capitals."""
+
 _UNITS = (1.0, 0.01, 0.0254, 0.056444, 0.001)
 """Metres in a unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
 
@@ -51,6 +55,7 @@ class _Joint:
     parent: int
     offset: np.ndarray
     channels: list[str]
+    """In lower case."""
 
 
 def read_bvh(path: Path) -> Clip:
@@ -58,8 +63,8 @@ def read_bvh(path: Path) -> Clip:
 
     The unit of length is the one that makes the legs 0.55 to 1.15 m long.
 
-    **Raises:** `ValueError` if the file is no BVH, is cut short, holds NaN, or lacks
-    a joint of the legs.
+    **Raises:** `ValueError` if the file is no BVH, is cut short, holds NaN, channels
+    or a frame time that cannot be, or lacks a joint of the legs.
     """
     path = Path(path)
     joints, values, fps = _parse(path)
@@ -77,8 +82,9 @@ def read_bvh(path: Path) -> Clip:
                 f"{', '.join(list(index)[:8])}, ..."
             )
     turns = padded(lambda rows: _forward(joints, jnp.asarray(rows)), values)
-    moved = [i for i, c in enumerate(joints[0].channels) if c.endswith("position")]
-    where = values[:, moved] if len(moved) == 3 else np.zeros((len(values), 3))
+    channels, where = joints[0].channels, np.zeros((len(values), 3))
+    if set(_PLACES) <= set(channels):
+        where = values[:, [channels.index(place) for place in _PLACES]]
     rest = np.zeros((len(joints), 3))
     for i, joint in enumerate(joints):
         rest[i] = joint.offset + (rest[joint.parent] if joint.parent >= 0 else 0)
@@ -144,13 +150,12 @@ def _forward(
     joints: list[_Joint], rows: Float[Array, "t c"]
 ) -> Float[Array, "t j 3 3"]:
     """Global rotations of all joints: in each, the channels in the file's order."""
-    about = {"Xrotation": 0, "Yrotation": 1, "Zrotation": 2}
     turns, column = [], 0
     for joint in joints:
         turn = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (len(rows), 3, 3))
         for channel in joint.channels:
-            if channel in about:
-                axis = jnp.asarray(np.eye(3)[about[channel]], rows.dtype)
+            if channel in _TURNS:
+                axis = jnp.asarray(np.eye(3)[_TURNS.index(channel)], rows.dtype)
                 turn = turn @ matrix(jnp.deg2rad(rows[:, column, None]) * axis)
             column += 1
         turns.append(turns[joint.parent] @ turn if joint.parent >= 0 else turn)
@@ -178,7 +183,8 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
                 joints[-1].offset = np.array(words[i + 1 : i + 4], float)
             elif word == "CHANNELS":
                 count = int(words[i + 1])
-                joints[-1].channels = words[i + 2 : i + 2 + count]
+                named = words[i + 2 : i + 2 + count]
+                joints[-1].channels = [name.lower() for name in named]
             i += 1
         frames = int(words[words.index("Frames:", start) + 1])
         time = words.index("Time:", start)
@@ -186,8 +192,26 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
         values = np.array(words[time + 2 :], float)
     except (ValueError, IndexError):
         raise ValueError(f"{path}: not a BVH file (HIERARCHY and MOTION).") from None
+    for joint in joints:
+        if not np.isfinite(joint.offset).all():
+            raise ValueError(
+                f"{path}: OFFSET {joint.offset.tolist()} of {joint.name}; expected "
+                "numbers."
+            )
+        for channel in joint.channels:
+            if channel not in (*_PLACES, *_TURNS):
+                raise ValueError(
+                    f"{path}: channel {channel!r} of {joint.name}; expected Xposition, "
+                    "Xrotation and the like."
+                )
+    if not 0.001 <= step <= 1:
+        raise ValueError(
+            f"{path}: Frame Time {step:g}; expected 0.001 to 1 s from one to the next."
+        )
     width = sum(len(joint.channels) for joint in joints)
-    if frames < 1 or values.size != frames * width or not step > 0:
+    if frames < 1:
+        raise ValueError(f"{path}: {frames} frames; expected one or more.")
+    if values.size != frames * width:
         raise ValueError(
             f"{path}: {values.size} numbers; expected {frames} frames of {width}."
         )

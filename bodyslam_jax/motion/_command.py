@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,10 +30,10 @@ def train_from_data(
     `body_model`, by default the one that `load_body_model` finds, and no other.
 
     **Raises:** `FileNotFoundError`; `ValueError` if there is no usable motion in
-    `data`, no usable body model, or if `out` does not end in `.npz`.
+    `data`, no usable body model, or if `out` does not end in `.npz` or cannot be
+    written.
     """
-    if out.suffix != ".npz":
-        raise ValueError(f"{out}: weights are an .npz file; name it so.")
+    _check_writable(out)
     known, validation = split(read_motion(data))
     checkpoint = out.with_suffix(".ckpt.npz")
     model, history = train(
@@ -52,4 +53,22 @@ def train_from_data(
     }
     save_motion_model(out, dataclasses.replace(model, about=json.dumps(about)))
     draw_history(history, out.with_suffix(".png"))
-    checkpoint.unlink()  # only now is nothing lost without it
+    checkpoint.unlink(missing_ok=True)  # only now is nothing lost without it
+
+
+def _check_writable(out: Path) -> None:
+    """Fails before hours of training, not after them; leaves nothing behind."""
+    if out.suffix != ".npz":
+        raise ValueError(f"{out}: weights are an .npz file; name it so.")
+    if out.is_dir():
+        raise ValueError(f"{out}: is a folder; expected a file to write weights to.")
+    # Folders that are missing will be made: what counts is where.
+    folder = next(p for p in out.parents if p.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"{out}: {folder} cannot be written ({error.strerror}); expected a "
+            "writable folder."
+        ) from None

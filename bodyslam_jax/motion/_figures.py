@@ -124,7 +124,7 @@ def draw_rollout(
     path: Path,
     every: int = 15,
 ) -> None:
-    """Stick figures of a motion, seen from its left and from above."""
+    """Stick figures of a motion, seen from its right and from above."""
     dtype = motion.body_pose.dtype
     local = local_joints(body, motion.body_pose, jnp.asarray(shape, dtype))
     world = jnp.einsum("tab,tjb->tja", motion.orientation, local)

@@ -4,27 +4,33 @@
 finite numbers, right widths, a rate; errors are one line that names the file.
 """
 
-import itertools
+import dataclasses
+import logging
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Float
 
 from bodyslam_jax.motion._bvh import read_bvh
 from bodyslam_jax.motion._clips import Clip, leg_length, rest_from_offsets
+from bodyslam_jax.motion._legs import NoLegs, leg_from_height, leg_from_joints
+
+logger = logging.getLogger(__name__)
 
 _CMU_ARRAYS = (
     "poses trans fps parents seq_start seq_length seq_name seq_motion seq_subject "
     "seq_split seq_phase subjects subject_offsets"
 ).split()
+_RATES = ("mocap_framerate", "mocap_frame_rate")
 
 
 def read_motion(path: Path | str) -> tuple[Clip, ...]:
     """Reads all motion under a file or folder; clips keep the rate they have.
 
-    In a folder, `.npz` files of other things are passed over.
+    In a folder, `.npz` files of other things are passed over, and so, with a warning,
+    are sequences without bone lengths in which nobody stands.
 
     **Raises:** `FileNotFoundError` if there is nothing at `path`; `ValueError` if a
     file is damaged or if no file holds a usable sequence.
@@ -43,17 +49,32 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
         )
     files = sorted(
         file
-        for suffix in ("npz", "bvh")
-        for file in itertools.chain(path.rglob(f"*.{suffix}"))
-        if file.name not in ("shape.npz", "neutral_stagei.npz")
+        for file in path.rglob("*")
+        if file.suffix.lower() in (".npz", ".bvh")
+        and file.name not in ("shape.npz", "neutral_stagei.npz")
+        and file.is_file()
     )
-    clips = tuple(itertools.chain.from_iterable(map(_read_file, files)))
+    clips, legless = [], []
+    for file in files:
+        try:
+            clips += _read_file(file)
+        except NoLegs as error:
+            legless.append(error)
+    if legless and not clips:
+        raise legless[0]
+    if legless:
+        logger.warning(
+            "passed over %d of %d files; the first: %s",
+            len(legless),
+            len(files),
+            legless[0],
+        )
     if not clips:
         raise ValueError(
             f"{path}: no usable motion among {len(files)} .npz and .bvh files; "
             "expected AMASS sequences, a CMU archive or BVH."
         )
-    return clips
+    return tuple(clips)
 
 
 def _read_file(path: Path) -> tuple[Clip, ...]:
@@ -80,7 +101,7 @@ def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
             raise ValueError(f"{path}: no array `{name}`, only {archive.files}.")
         try:
             return archive[name]
-        except BadZipFile:
+        except (BadZipFile, zlib.error, EOFError):
             raise ValueError(f"{path}: `{name}` is damaged; copy it again.") from None
         except ValueError:
             raise ValueError(
@@ -88,6 +109,22 @@ def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
             ) from None
 
     return take
+
+
+def _numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "fiub":
+        raise ValueError(
+            f"{path}: `{name}` is of type {array.dtype}; expected real numbers."
+        )
+    return array
+
+
+def _rate(path: Path, fps: np.ndarray) -> float:
+    if fps.size != 1 or not 1 <= fps.item() <= 1000:
+        raise ValueError(
+            f"{path}: frame rate {fps.tolist()}; expected one number of 1 to 1000."
+        )
+    return float(fps.item())
 
 
 def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
@@ -107,12 +144,15 @@ def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
 def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]:
     """The archive of CMU trials as SMPL rotations, one clip per trial and phase."""
     data = {name: take(name) for name in _CMU_ARRAYS}
+    for name in ("poses", "trans", "fps", "subject_offsets"):
+        _numbers(path, name, data[name])
     poses, trans = data["poses"], data["trans"]
     if poses.ndim != 3 or poses.shape[1:] != (24, 3) or trans.shape[1:] != (3,):
         raise ValueError(
             f"{path}: poses {poses.shape}, trans {trans.shape}; expected (n, 24, 3) "
             "and (n, 3)."
         )
+    fps = _rate(path, data["fps"])
     parents = [int(p) for p in data["parents"]]
     subjects = {str(name): i for i, name in enumerate(data["subjects"])}
     phase, names = data["seq_phase"], data["seq_name"]
@@ -132,7 +172,7 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
                 subject=subject,
                 motion=str(data["seq_motion"][i]),
                 split=str(data["seq_split"][i]),
-                fps=float(data["fps"]),
+                fps=fps,
                 poses=poses[rows],
                 trans=trans[rows],
                 offsets=offsets,
@@ -147,23 +187,26 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
 
 
 def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
-    """One AMASS sequence, SMPL-H or SMPL-X release; the world's z is up.
+    """One AMASS sequence, SMPL-H or SMPL-X release, or a body that this project wrote.
 
     `reference.md` of nghorbani/amass: `poses` (t, 156) of SMPL-H, of which SMPL has
-    the first 66; `mocap_framerate` or `mocap_frame_rate`.
+    the first 66; `mocap_framerate` or `mocap_frame_rate`. The project's own files have
+    `joints` (t, 24, 3) besides, in the world, m.
     """
-    rates = names & {"mocap_framerate", "mocap_frame_rate"}
-    if not rates:
+    number = lambda name: _numbers(path, name, take(name))
+    rate = next((name for name in _RATES if name in names), None)
+    if rate is None:
         raise ValueError(f"{path}: no `mocap_framerate`; expected frames per second.")
-    fps = float(take(rates.pop()))
-    if not fps > 0:
-        raise ValueError(f"{path}: frame rate {fps}; expected a positive number.")
-    if "poses" in names:
-        poses = take("poses")
-    else:
-        poses = np.concatenate([take("root_orient"), take("pose_body")], -1)
-    trans = take("trans")
-    if poses.ndim != 2 or poses.shape[1] < 66 or trans.shape[1:] != (3,):
+    fps = _rate(path, number(rate))
+    parts = ("poses",) if "poses" in names else ("root_orient", "pose_body")
+    angles = [_rows(number(name)) for name in parts]
+    trans = number("trans")
+    if any(a.ndim != 2 for a in angles) or len({len(a) for a in angles}) > 1:
+        shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(parts, angles, strict=True))
+        wanted = "(t, 3) and (t, 63)" if len(parts) > 1 else "(t, 66 or more)"
+        raise ValueError(f"{path}: {shapes}; expected {wanted}.")
+    poses = np.concatenate(angles, -1)
+    if poses.shape[1] < 66 or trans.shape[1:] != (3,):
         raise ValueError(
             f"{path}: poses {poses.shape}, trans {trans.shape}; expected (t, 66 or "
             "more) and (t, 3)."
@@ -173,7 +216,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
     _check(path, "the sequence", poses, trans)
     hands = np.zeros((len(poses), 6))
     poses = np.concatenate([poses[:, :66], hands], -1).reshape(-1, 24, 3)
-    return Clip(
+    clip = Clip(
         name=path.stem,
         subject=path.parent.name,
         motion=_motion_class(path.stem),
@@ -182,8 +225,20 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         poses=poses.astype(np.float32),
         trans=trans.astype(np.float32),
         offsets=None,
-        leg_length=_leg_from_height(trans),
+        leg_length=np.nan,
     )
+    if "joints" in names:
+        leg = leg_from_joints(path, number("joints"), len(poses))
+    else:
+        leg = leg_from_height(path, clip)
+    return dataclasses.replace(clip, leg_length=leg)
+
+
+def _rows(angles: np.ndarray) -> np.ndarray:
+    """A row per frame, also of angles that are stored joint by joint."""
+    if angles.ndim == 3:
+        return angles.reshape(len(angles), angles.shape[1] * angles.shape[2])
+    return angles
 
 
 def gender(path: Path) -> str:
@@ -193,16 +248,6 @@ def gender(path: Path) -> str:
     text = value.decode() if isinstance(value, bytes) else str(value)
     text = text.strip("b'\" ").lower()
     return text if text in ("female", "male", "neutral") else "neutral"
-
-
-def _leg_from_height(trans: Float[np.ndarray, "t 3"]) -> float:
-    """Leg length (m) from the usual height of SMPL's origin above AMASS's floor.
-
-    AMASS holds no bone length without a licensed body model. Its floor is z = 0, and
-    the pelvis stands 0.92 to 0.94 m high in people with legs of 0.80 m (CMU).
-    """
-    height = float(np.percentile(trans[:, 2], 75))
-    return float(np.clip(0.86 * height, 0.6, 1.1))
 
 
 def _motion_class(text: str) -> str:
