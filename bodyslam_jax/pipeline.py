@@ -23,6 +23,7 @@ from bodyslam_jax import (
 )
 from bodyslam_jax import body as body_
 from bodyslam_jax import joint as joint_
+from bodyslam_jax.body import DEFAULT
 from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config
 from bodyslam_jax.outcome import Cameras, Joint, assemble, describe
@@ -72,7 +73,29 @@ def run(
 
     **Raises:** `ValueError` if there is nothing to be estimated from, in one line.
     """
-    return _run(sequence, config, cache)[0]
+    config, warnings = _with_body(config)
+    return _run(_warned(sequence, warnings), config, cache)[0]
+
+
+def _with_body(config: Config) -> tuple[Config, tuple[str, ...]]:
+    """The settings with the body that ships, and a line that says so, where a body
+    model that nobody named was found for which the motion model is none."""
+    file = body_model_file(config.body_model)
+    if config.body_model is not None or file is None or not config.people:
+        return config, ()
+    model = motion.load_motion_model(config.motion_model)
+    found = body_.load_body_model(file)
+    if found.kind == model.body or model.body != body_.load_body_model(DEFAULT).kind:
+        return config, ()
+    text = (
+        f"{file} is not used: the motion model was trained on the body that ships; "
+        "name both, --body-model and a --motion-model of `bodyslam train-motion`."
+    )
+    return dataclasses.replace(config, body_model=str(DEFAULT)), (text,)
+
+
+def _warned(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
+    return dataclasses.replace(sequence, warnings=(*sequence.warnings, *warnings))
 
 
 def _run(
@@ -212,6 +235,8 @@ def run_to_folder(
 
     **Raises:** `ValueError` if `out` cannot be written or holds something else.
     """
+    config, warnings = _with_body(config)
+    sequence = _warned(sequence, warnings)
     cache = Cache(out / ".cache", describe(sequence))
     export.check_folder(out, cache.source, cache.owner())
     rehearsal = Rehearsal()
@@ -272,6 +297,7 @@ def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result
     """
     folder, rehearsal, watch = out / "scene", Rehearsal(), Stopwatch()
     scene = None
+    config, warnings = _with_body(config)
     cache = Cache(out / ".cache", {"name": folder.name})
     export.check_folder(out, cache.source, cache.owner())
     if first:
@@ -282,7 +308,7 @@ def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result
     try:
         with watch("rendering"):
             synthetic.demo_scene(folder, simulated=scene)
-            sequence = frontend.read_sequence(folder)
+            sequence = _warned(frontend.read_sequence(folder), warnings)
         cache = Cache(out / ".cache", describe(sequence))
         export.check_folder(out, cache.source, cache.owner())
         return _to_folder(sequence, out, config, cache, rehearsal)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax import accuracy, evaluation, export, outcome, pipeline, synthetic
+from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 
 CONTRACT = {
@@ -104,3 +105,20 @@ def test_upright_puts_the_trunk_up_and_keeps_distances():
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)
     np.testing.assert_allclose((turn @ T_WC[0])[:3, 3], 0, atol=1e-12)
+
+
+def test_a_body_that_was_found_does_not_stop_who_did_not_ask_for_it(
+    tmp_path, monkeypatch
+):
+    found = tmp_path / "SMPL_NEUTRAL.npz"
+    write_npz(load_body_model(DEFAULT), found)
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(found))
+    config, warnings = pipeline._with_body(Config())
+    assert config.body_model == str(DEFAULT)
+    (line,) = warnings
+    assert line.startswith(f"{found} is not used") and "--motion-model" in line
+    # Whoever names it is told that the two do not fit, and cameras need no body.
+    for asked in (Config(body_model=str(found)), Config(people=False)):
+        assert pipeline._with_body(asked) == (asked, ())
+    monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(DEFAULT))
+    assert pipeline._with_body(Config()) == (Config(), ())

@@ -1,5 +1,6 @@
 """The person: model file -> shaped body -> posed joints -> keypoints -> vertices."""
 
+from bodyslam_jax.body._files import DEFAULT as DEFAULT
 from bodyslam_jax.body._files import check as check
 from bodyslam_jax.body._files import load_body_model as load_body_model
 from bodyslam_jax.body._files import search_paths as search_paths

@@ -196,7 +196,7 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
     note = f" ({VARIABLE} is set)" if is_set else ""
     for candidate in (file for place in places for file in _candidates(place, wanted)):
         if candidate.is_file():
-            of = _named_gender(candidate)
+            of = named_gender(candidate)
             if gender and of not in (gender, None):
                 raise ValueError(
                     f"{candidate}{note}: by its name a {of} body, expected {gender}."
@@ -208,7 +208,7 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
     raise ValueError(f"No {wanted} body model found{note}; tried {tried}.")
 
 
-def _named_gender(file: Path) -> str | None:
+def named_gender(file: Path) -> str | None:
     """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
     name = (file.parent.name if file.stem == "model" else file.stem).lower()
     words = re.split(r"[^a-z]+", name)

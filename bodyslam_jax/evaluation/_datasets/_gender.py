@@ -7,14 +7,13 @@ gendered SMPL that they were made with, as their own evaluations do (EMDB, WHAM,
 import dataclasses
 import logging
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bodyslam_jax.body import BodyModel, load_body_model, search_paths
-from bodyslam_jax.body._files import DEFAULT, VARIABLE, _candidates
+from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
+from bodyslam_jax.body._files import VARIABLE, _candidates, named_gender
 from bodyslam_jax.evaluation._readers import _load_npz, read_groundtruth
 from bodyslam_jax.result import Result
 
@@ -156,15 +155,7 @@ def _mismatch(
     name = _NAMES[body.kind]
     if body.kind == "default":
         return name
-    of = _named_gender(file)
+    of = named_gender(file)
     if body.kind not in kinds or of not in (gender, None):
         return f"{body.name} ({name}{', ' + of if of else ''})"
     return None
-
-
-def _named_gender(file: Path) -> str | None:
-    """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
-    text = file.parent.name if file.stem == "model" else file.stem
-    words = re.split(r"[^a-z]+", text.lower())
-    found = {_GENDERS[word] for word in words if word in _GENDERS}
-    return found.pop() if len(found) == 1 else None

@@ -3,8 +3,7 @@
 import shutil
 from pathlib import Path
 
-from bodyslam_jax.body import load_body_model
-from bodyslam_jax.body._files import DEFAULT
+from bodyslam_jax.body import DEFAULT, load_body_model
 from bodyslam_jax.evaluation._datasets import _checks as checks
 from bodyslam_jax.evaluation._datasets import _folder as folder
 from bodyslam_jax.evaluation._readers import _read_body, read_tum
