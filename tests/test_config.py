@@ -60,7 +60,8 @@ def test_settings_that_mean_something_are_let_in():
     Tracking(octaves=0, person_margin=0.0)
     GraphWeights(step_error=0.0, motion_correlation=0.0)
     weights = GraphWeights()
-    for value in (1, jnp.ones(3)):  # what is mapped over may not be known yet
+    # What says nothing; what is mapped over may not be known yet.
+    for value in (1, INF, jnp.ones(3)):
         object.__setattr__(weights, "posture_sigma", value)
         weights.__post_init__()
     dataclasses.replace(Config(), smoothing_hz=None)

@@ -237,10 +237,12 @@ def test_motion_of_ones_own_and_bad_motion(tmp_path):
     own = dataclasses.replace(Simulation(length=20), motion=str(tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match="none"):
         synthetic.simulate(own)
-    still = tmp_path / "sit.npz"
+    still = tmp_path / "stand.npz"
+    upright = np.zeros((90, 156))
+    upright[:, 0] = np.pi / 2
     np.savez(
         still,
-        poses=np.zeros((90, 156)),
+        poses=upright,
         trans=np.tile([0.0, 0.0, 0.9], (90, 1)),
         mocap_framerate=30.0,
     )

@@ -12,11 +12,17 @@ SHARE: Range = (0, 1)
 NOT_NEGATIVE: Range = (0, math.inf)
 
 
-def check(settings: Any, ranges: Mapping[str, Range] = types.MappingProxyType({})):
+def check(
+    settings: Any,
+    ranges: Mapping[str, Range] = types.MappingProxyType({}),
+    *,
+    infinite: bool = False,
+) -> None:
     """Refuses settings that mean nothing, before minutes are spent.
 
     Whole numbers are 1 or more, others more than 0, unless `ranges` has the least and
-    the largest value. Arrays are let through: they may not be known yet.
+    the largest value; nothing is infinite unless it may be, as a standard deviation of
+    what is to say nothing. Arrays are let through: they may not be known yet.
 
     **Raises:** `ValueError` that names the setting, what was found and what was
     expected.
@@ -25,6 +31,8 @@ def check(settings: Any, ranges: Mapping[str, Range] = types.MappingProxyType({}
     for field in dataclasses.fields(settings):
         found = getattr(settings, field.name)
         if dataclasses.is_dataclass(found) or hasattr(found, "dtype"):
+            continue
+        if infinite and found == math.inf:
             continue
         expected = _refused(found, hints[field.name], ranges.get(field.name))
         if expected:

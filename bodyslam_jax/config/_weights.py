@@ -93,7 +93,7 @@ class GraphWeights:
             name: (0, _CORRELATED) for name in vars(self) if "correlation" in name
         }
         free = ("step_error", "fitted_step_error")
-        check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE))
+        check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE), infinite=True)
 
     @classmethod
     def paper(cls) -> "GraphWeights":
