@@ -19,7 +19,13 @@ from bodyslam_jax.config import Association
 from bodyslam_jax.frontend import read_sequence
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
-from bodyslam_jax.frontend._calibration import guess_camera, read_camera
+from bodyslam_jax.frontend._calibration import (
+    as_opencv,
+    guess_camera,
+    project_points,
+    rays,
+    read_camera,
+)
 from bodyslam_jax.frontend._keypoints import read_detections
 from bodyslam_jax.frontend._layouts import to_body25
 from bodyslam_jax.frontend._perspective import crop_camera, full_translation
@@ -1058,3 +1064,13 @@ def test_real_files():
     assert walk.bodies is not None
     np.testing.assert_allclose(weak.trans, walk.bodies.trans, atol=1e-9)
     np.testing.assert_allclose(weak.poses, walk.bodies.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [[], [-0.28, 0.07, 1e-3, -5e-4], [-0.35, 0.12, 0, 0]])
+def test_rays_are_those_of_their_pixels_with_strong_distortion_too(lens):
+    params = np.array([400.0, 410.0, 319.5, 239.5, *lens])
+    points = np.random.default_rng(0).uniform([-0.75, -0.55], [0.75, 0.55], (500, 2))
+    p_C = np.column_stack([points, np.ones(500)])
+    uv = project_points(Intrinsics(params, 640, 480), p_C)
+    np.testing.assert_allclose(rays(uv, *as_opencv(params)), points, atol=1e-8)
+    assert rays(uv[:0], *as_opencv(params)).shape == (0, 2)

@@ -3,14 +3,13 @@
 import dataclasses
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.frontend._bundle import Scene, Views, errors
-from bodyslam_jax.frontend._calibration import as_opencv
+from bodyslam_jax.frontend._calibration import as_opencv, rays
 from bodyslam_jax.frontend._camera_motion import (
     choose_keyframes,
     find_cuts,
@@ -72,9 +71,7 @@ def reconstruct(
     """
     K, distortion = as_opencv(intrinsics.params)
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    xy = np.zeros((0, 2))
-    if len(tracks.uv):
-        xy = cv2.undistortPoints(tracks.uv[:, None], K, distortion)[:, 0]
+    xy = rays(tracks.uv, K, distortion)
     views = Views(tracks.frame, tracks.landmark, xy)
     num_landmarks = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
     problem = _Problem(

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from bodyslam_jax.config import Tracking
-from bodyslam_jax.frontend._calibration import as_opencv
+from bodyslam_jax.frontend._calibration import as_opencv, rays
 from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, match, spread
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.frontend._video import frames
@@ -190,9 +190,7 @@ class _Tracker:
         self.live = live.keep(keep)
 
     def _normalise(self, uv: np.ndarray) -> np.ndarray:
-        if not len(uv):
-            return np.zeros((0, 2))
-        return cv2.undistortPoints(uv[:, None], self.K, self.distortion)[:, 0]
+        return rays(uv, self.K, self.distortion)
 
     def _is_sparse(self, k: int) -> bool:
         wanted, found = self.config.num_points, len(self.live.ids)
