@@ -286,7 +286,8 @@ def summarise(
             "observations": int(cameras.keep.sum()),
             "people": len(persons),
         },
-        "pixel_sigma": cameras.pixel_sigma,
+        # Of what was not adjusted it is a setting, not a measurement.
+        "pixel_sigma": cameras.pixel_sigma if cameras.kind == "moving" else None,
         "per_frame": per_frame(sequence, body, cameras, joint),
         "stages": list(joint.stages),
         "solver": joint.status,

@@ -43,12 +43,12 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     for text in cameras.warnings:
         log.warning("%s", text)
     log.info(
-        "cameras: %s, %d of %d frames located, %d landmarks, noise %.2f px",
+        "cameras: %s, %d of %d frames located, %d landmarks%s",
         cameras.kind,
         cameras.registered.sum(),
         len(cameras.registered),
         len(cameras.landmarks),
-        cameras.pixel_sigma,
+        f", noise {cameras.pixel_sigma:.2f} px" if cameras.kind == "moving" else "",
     )
     if np.isfinite(cameras.focal_sigma):
         log.info(

@@ -167,6 +167,17 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
     assert np.isnan(found(2.0, np.nan)[0]["sigma"])
 
 
+def test_noise_of_pixels_that_nobody_measured_is_not_told():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = rehearsal._joint(sequence)
+    for kind, told in (("static", None), ("rotation", None), ("moving", 0.7)):
+        cameras = rehearsal._cameras(sequence)
+        cameras = dataclasses.replace(cameras, kind=kind, pixel_sigma=0.7)
+        summary = outcome.assemble(sequence, config, body, cameras, joint, {}).summary
+        assert summary["pixel_sigma"] == told
+
+
 def test_the_summary_says_who_and_what_is_left_out():
     made = synthetic.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
