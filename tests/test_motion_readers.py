@@ -96,6 +96,23 @@ def test_joints_that_are_none_are_one_line(tmp_path, tall, factor, frames, messa
         read_motion(tmp_path)
 
 
+def test_only_frames_with_somebody_in_them_are_motion(tmp_path, tall):
+    arrays = {name: np.array(value) for name, value in tall[0].items()}
+    there = np.ones(50, bool)
+    there[[3, 40, 41]] = False
+    for name in ("poses", "trans", "joints"):
+        arrays[name][~there] = 0.0
+    path = tmp_path / "s" / "a.npz"
+    write_amass(path, **arrays, present=there)
+    (clip,) = read_motion(path)
+    np.testing.assert_allclose(clip.trans, tall[0]["trans"][4:40], atol=1e-6)
+    assert clip.leg_length == pytest.approx(tall[1], abs=1e-4)
+    for wrong in (np.zeros(50, bool), np.ones(49, bool), np.ones(50)):
+        write_amass(path, **arrays, present=wrong)
+        with pytest.raises(ValueError, match="a.npz: present is .*; expected bool"):
+            read_motion(path)
+
+
 def test_a_rate_may_be_an_array_of_one(tmp_path):
     write_amass(tmp_path / "s" / "a.npz", mocap_framerate=np.array([30.0]))
     write_cmu(tmp_path / "cmu.npz", [make_clip(40)], fps=np.array([30]))

@@ -213,6 +213,10 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         )
     if len(poses) == 0:
         raise ValueError(f"{path}: the sequence has no frame.")
+    there = slice(None)
+    if "present" in names:
+        there = _longest(path, take("present"), len(poses))
+    poses, trans = poses[there], trans[there]
     _check(path, "the sequence", poses, trans)
     hands = np.zeros((len(poses), 6))
     poses = np.concatenate([poses[:, :66], hands], -1).reshape(-1, 24, 3)
@@ -228,10 +232,22 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         leg_length=np.nan,
     )
     if "joints" in names:
-        leg = leg_from_joints(path, number("joints"), len(poses))
+        leg = leg_from_joints(path, number("joints")[there], len(poses))
     else:
         leg = leg_from_height(path, clip)
     return dataclasses.replace(clip, leg_length=leg)
+
+
+def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
+    """The longest run of frames that the person is there in."""
+    if present.shape != (num_frames,) or present.dtype != bool or not present.any():
+        raise ValueError(
+            f"{path}: present is {present.dtype} {present.shape}; expected bool "
+            f"{(num_frames,)}, true somewhere."
+        )
+    edges = np.flatnonzero(np.diff(np.r_[False, present, False]))
+    best = np.argmax(edges[1::2] - edges[::2])
+    return slice(edges[::2][best], edges[1::2][best])
 
 
 def _rows(angles: np.ndarray) -> np.ndarray:
