@@ -942,6 +942,18 @@ def test_without_a_video_the_longest_part_says_how_many_frames(tmp_path):
     assert read_sequence(path).num_frames == NUM + 3
 
 
+@pytest.mark.parametrize(("fps", "few"), [(30, False), (10, False), (2, True)])
+def test_few_frames_a_second_are_warned_of(tmp_path, fps, few):
+    path = folder(tmp_path / "walk")
+    (path / "video.mp4").unlink()
+    shutil.rmtree(path / "masks")
+    (path / "camera.json").write_text(json.dumps(GOOD_CAMERA | {"fps": fps}))
+    warned = [
+        w for w in read_sequence(path).warnings if w.startswith(f"{fps} frames/s")
+    ]
+    assert len(warned) == few
+
+
 def test_pairs_keypoints_and_bodies_of_the_same_person(tmp_path):
     """Bodies are listed in the other order than the people that fill the image."""
     path = folder(tmp_path / "walk")

@@ -18,6 +18,8 @@ from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
 
 _log = logging.getLogger(__name__)
 
+_FEWEST_A_SECOND = 8.0
+"""Frames in which a step is still seen: it takes half a second."""
 _FPS_TOLERANCE = 0.02
 
 
@@ -158,6 +160,11 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         num_frames, picks = _count_frames(parts, found_tracks, intrinsics, fps), None
         stamps = np.arange(num_frames) / fps
     rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 30.0
+    if rate < _FEWEST_A_SECOND:
+        warnings.append(
+            f"{rate:.3g} frames/s: people do not move as straight between frames as "
+            "the motion model, of 30, has to take them to."
+        )
 
     people = None
     if parts.keypoints:
