@@ -280,7 +280,8 @@ def summarise(
             "ground_factor": ground,
         },
         "people": persons,
-        "frames_used": int(within.sum()),
+        # The first and the last.
+        "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),
         "counts": {
             "landmarks": len(result.landmarks),
             "observations": int(cameras.keep.sum()),

@@ -34,3 +34,13 @@ class Result:
     """Whether the person is there; rows where not are finite fill, not estimates."""
     summary: dict = dataclasses.field(default_factory=dict)
     """What goes to `summary.json`."""
+
+    @property
+    def located(self) -> Bool[np.ndarray, " t"]:
+        """Frames whose camera is an estimate: `frames_used` of the summary, first and
+        last, if it says so. Beyond a cut poses are finite fill."""
+        frames = np.arange(len(self.timestamps))
+        used = self.summary.get("frames_used")
+        if not (isinstance(used, list) and len(used) == 2):
+            return np.ones(len(frames), bool)
+        return (frames >= used[0]) & (frames <= used[1])

@@ -547,6 +547,21 @@ def test_what_is_compared_is_said():
     assert len(evaluation.gaps(scope)) == 2
 
 
+def test_poses_beyond_a_cut_are_not_compared():
+    truth = _truth()
+    T_WC = truth.T_WC.copy()
+    T_WC[200:] = T_WC[199]
+    filled = dataclasses.replace(truth, T_WC=T_WC)
+    cut = dataclasses.replace(filled, summary={"frames_used": [0, 199]})
+    assert float(evaluation.evaluate(filled, truth)["c_ate_se3"]) > 0.01
+    found = evaluation.evaluate(cut, truth)
+    assert float(found["c_ate_se3"]) < 1e-9
+    assert found.scope.cameras == 200 and found.scope.of_cameras == NUM
+    for other in (None, 3, [1], "0-9"):
+        odd = dataclasses.replace(truth, summary={"frames_used": other})
+        assert odd.located.all()
+
+
 def test_nothing_is_a_difference_across_missing_frames():
     truth = _truth()
     keep = np.r_[0:100, 140:NUM]

@@ -83,6 +83,19 @@ def test_others_can_read_it(tmp_path, result):
     assert str(person["gender"]) == "neutral"
 
 
+def test_only_located_cameras_are_in_the_trajectory(tmp_path, result):
+    cut = dataclasses.replace(result, summary={"frames_used": [2, 8]})
+    export.write_run(tmp_path, cut)
+    evo = file_interface.read_tum_trajectory_file(tmp_path / "camera.tum")
+    np.testing.assert_allclose(evo.timestamps, result.timestamps[2:9], atol=1e-9)
+    np.testing.assert_allclose(evo.poses_se3, result.T_WC[2:9], atol=1e-8)
+    found = evaluation.read_result(tmp_path)
+    np.testing.assert_array_equal(found.T_WC, result.T_WC)
+    assert found.located.tolist() == [2 <= k <= 8 for k in range(12)]
+    whole = export.camera_facts(result)
+    assert export.camera_facts(cut).seconds < whole.seconds
+
+
 def test_run_folder_is_a_ground_truth_for_another(tmp_path, result, body):
     """Its camera.tum and body_<h>.npz alone give the same world, joints included."""
     export.write_run(tmp_path, result)

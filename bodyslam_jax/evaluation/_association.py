@@ -194,9 +194,8 @@ class _Host:
 def _host(result: Result, feet: np.ndarray) -> _Host:
     has_camera = bool(result.summary.get("has_camera", True))
     every = np.ones(len(result.timestamps), bool)
-    return _Host(
-        result.T_WC, every & has_camera, result.joints, result.present, feet, every
-    )
+    camera = result.located & has_camera
+    return _Host(result.T_WC, camera, result.joints, result.present, feet, every)
 
 
 def _interval(times: Float[np.ndarray, " t"]) -> float:

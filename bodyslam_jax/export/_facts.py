@@ -39,9 +39,9 @@ class PathFacts:
 def camera_facts(
     result: Result, used: Bool[np.ndarray, " t"] | None = None
 ) -> PathFacts:
-    """The camera's way; of the frames `used`, if not all."""
+    """The camera's way in the frames `used`, by default those that are located."""
     if used is None:
-        used = np.ones(len(result.timestamps), bool)
+        used = result.located
     return _path_facts(result, result.T_WC[:, :3, 3], used)
 
 

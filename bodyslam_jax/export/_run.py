@@ -145,7 +145,8 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
         if field.name != "summary"
     }
     _savez(folder / "result.npz", arrays)
-    write_tum(folder / "camera.tum", result.timestamps, result.T_WC)
+    located = result.located
+    write_tum(folder / "camera.tum", result.timestamps[located], result.T_WC[located])
     for h in range(len(result.poses)):
         write_body(
             folder / f"body_{h}.npz",
