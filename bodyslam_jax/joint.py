@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
@@ -75,6 +75,7 @@ def prepare(
     weights = config.weights
     fitted = people.without_bodies(sequence)
     shared = np.where(fitted, weights.fitted_step_error, weights.step_error)
+    told = shared[roots.present.any(axis=1)] if roots.present.any() else shared
     stages = []
     factors = []
     if moving:
@@ -94,7 +95,7 @@ def prepare(
     def make(factors, state):
         with_motion = predictor if anybody else None
         problem = graph.make_problem(factors, state, motion=with_motion, free=free)
-        if within.all():
+        if within.all() or not moving:
             return problem
         # Nothing says where cameras beyond a cut are.
         mask = jnp.zeros_like(problem.free.cameras)
@@ -132,7 +133,7 @@ def prepare(
         seen = predict(predictor, state)
         if moving:
             start = initialisation.scale_start(
-                state, seen, contact, shared_error=float(shared.min())
+                state, seen, contact, shared_error=float(told.min())
             )
             log.info(
                 "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
@@ -219,9 +220,10 @@ def estimate(
         spread = solver.marginals(problem, best)
         unobserved = solver.observability(problem, best, spread)
         fitted = people.without_bodies(sequence)
-        if fitted.any() and prepared.roots.present.any():
+        there = prepared.roots.present.any(axis=1)
+        if len(there) and (fitted & there).any():
             sigma = np.where(fitted, config.weights.shape_sigma, 1.0)
-            spread = of_fitted_sizes(spread, best, body, sigma)
+            spread = of_fitted_sizes(spread, best, body, sigma, there)
     return Joint(
         scale=float(best.scale),
         start=prepared.scale,
@@ -251,6 +253,7 @@ def of_fitted_sizes(
     state: graph.State,
     body: body_.BodyModel,
     shape_sigma: Float[np.ndarray, " h"],
+    there: Bool[np.ndarray, " h"],
 ) -> solver.Marginals:
     """Covariances of shapes and scale where bodies were fitted to keypoints.
 
@@ -264,8 +267,10 @@ def of_fitted_sizes(
     log_leg = lambda shape: jnp.log(motion.leg_length(body, shape))
     slope = jax.vmap(jax.grad(log_leg))(state.shapes)
     legs = more * jnp.einsum("hi,hij,hj->h", slope, spread.shapes, slope)
-    # The mean of people who differ independently of each other.
-    scale = spread.scale + state.scale**2 * jnp.sum(legs) / len(legs) ** 2
+    # The mean of the people there are, who differ independently of each other.
+    scale = (
+        spread.scale + state.scale**2 * jnp.sum(legs[there]) / float(there.sum()) ** 2
+    )
     shapes = (1 + more)[:, None, None] * spread.shapes
     return dataclasses.replace(spread, scale=scale, shapes=shapes)
 

@@ -62,11 +62,11 @@ class Cameras:
 
     @property
     def within(self) -> Bool[np.ndarray, " t"]:
-        """Frames of the shot that the map is of. Nothing ties others, beyond a cut, to
-        it; a camera that does not move needs no map."""
+        """Frames of the shot that was looked at, from the first that is located to the
+        last. Nothing ties others, as beyond a cut, to it."""
         frames = np.arange(len(self.registered))
         located = np.flatnonzero(self.registered)
-        if self.kind != "moving" or not len(located):
+        if self.kind == "failed" or not len(located):
             return np.ones(len(frames), bool)
         return (frames >= located[0]) & (frames <= located[-1])
 
@@ -208,6 +208,12 @@ def summarise(
         for h in np.flatnonzero(~joint.present.any(axis=1))
     ]
     within = cameras.within
+    if not within.all():
+        used = np.flatnonzero(within)
+        warnings.append(
+            f"frames {used[0]} to {used[-1]} of {len(within)} are used: nothing tells "
+            "where the camera was in the others."
+        )
     if status == "ok" and within.mean() < _MOST:
         used = np.flatnonzero(within)
         status = f"only frames {used[0]} to {used[-1]} of {len(within)} are used"
@@ -226,7 +232,9 @@ def summarise(
     persons = []
     for h in range(len(result.poses)):
         facts = export.person_facts(result, h)
-        tall, sigma = stature(body, result.betas[h], joint.shape_covariance[h])
+        tall, sigma = None, None
+        if result.present[h].any():
+            tall, sigma = stature(body, result.betas[h], joint.shape_covariance[h])
         persons.append(
             {
                 "frames": int(result.present[h].sum()),
@@ -241,13 +249,13 @@ def summarise(
         f"camera: {way.distance:.2f} m in {way.seconds:.1f} s ({cameras.kind})",
     ]
     for h, p in enumerate(persons):
+        if not p["frames"]:
+            continue
         sure = (
             ""
             if np.isnan(p["stature_sigma_m"])
             else (f" ± {100 * p['stature_sigma_m']:.0f}")
         )
-        if not p["frames"]:
-            continue
         headline.append(
             f"person {h}: {p['path_m']:.2f} m at {p['speed_m_s']:.2f} m/s, "
             f"{100 * p['stature_m']:.0f}{sure} cm tall"

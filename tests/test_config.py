@@ -36,13 +36,16 @@ NAN, INF = float("nan"), float("inf")
         (Structure, "max_error", NAN, "more than 0, and finite"),
         (Structure, "static_motion", -0.1, "0 or more"),
         (Detect, "min_score", 1.5, "0 to 1"),
-        (Association, "max_gap", INF, "0 or more"),
+        (Association, "max_gap", INF, "0 or more, and finite"),
         (PeopleFit, "detector_bias", 2.0, "0 to 1"),
         (PeopleFit, "regressor_shape_gain", 0.0, "more than 0, and finite, or nothing"),
         (GraphWeights, "keypoint_sigma", "abc", "a number, or nothing"),
         (GraphWeights, "pixel_sigma", None, "a number"),
         (GraphWeights, "posture_correlation", 1.0, "0 to 0.999999"),
         (GraphWeights, "step_error", -0.1, "0 or more"),
+        (GraphWeights, "posture_correlation", INF, "0 to 0.999999"),
+        (GraphWeights, "keypoint_loss", INF, "more than 0, and finite"),
+        (GraphWeights, "shape_each_frame", INF, "true or false"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(kind, name, value, expected):
@@ -65,6 +68,8 @@ def test_settings_that_mean_something_are_let_in():
         object.__setattr__(weights, "posture_sigma", value)
         weights.__post_init__()
     dataclasses.replace(Config(), smoothing_hz=None)
+    PeopleFit(upright_sigma=INF, limit_sigma=INF)
+    Structure(focal_accuracy=INF)
 
 
 @pytest.mark.parametrize(

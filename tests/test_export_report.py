@@ -146,6 +146,7 @@ def test_absent_people_and_no_map(tmp_path, body):
     )
     page = _write(tmp_path, result, body)
     assert "there for 1.9 s" in page and "nan" not in _text(page)
+    assert "Stature of person 0" in page and "Stature of person 1" not in page
     # The gap is no distance: 19 + 39 frames at 1.2 m/s.
     way = facts.person_facts(result, 0)
     np.testing.assert_allclose(way.distance, 1.2 * (19 + 39) / 30, rtol=1e-6)

@@ -206,6 +206,10 @@ def test_the_summary_says_who_and_what_is_left_out():
     empty = found(dataclasses.replace(joint, present=nobody), 0, 14)
     assert any("person 0 is left out" in w for w in empty["warnings"])
     assert not any("person 0" in line for line in empty["headline"])
+    assert empty["people"][0]["stature_m"] is None
+    assert whole["people"][0]["stature_m"] > 1
+    assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
+    assert not any("are used" in w for w in whole["warnings"])
 
 
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():

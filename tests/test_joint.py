@@ -171,15 +171,17 @@ def _no_factor() -> graph.CameraPrior:
     return graph.CameraPrior(jnp.tile(jnp.eye(4), (T, 1, 1)), jnp.full((T, 6), jnp.inf))
 
 
-def test_cameras_that_do_not_move_use_every_frame():
+def test_frames_that_are_used_are_those_of_the_shot():
     located = np.arange(T) < 2
     moving = dataclasses.replace(_cameras(), registered=located)
     assert moving.within.tolist() == [True, True, False, False]
     gap = np.array([False, True, False, True])
     between = dataclasses.replace(moving, registered=gap)
     assert between.within.tolist() == [False, True, True, True]
-    for kind in ("static", "rotation", "failed"):
-        assert dataclasses.replace(moving, kind=kind).within.all()
+    for kind in ("static", "rotation"):
+        turning = dataclasses.replace(moving, kind=kind)
+        assert turning.within.tolist() == [True, True, False, False]
+    assert dataclasses.replace(moving, kind="failed").within.all()
     lost = dataclasses.replace(moving, registered=np.zeros(T, bool))
     assert lost.within.all()
 
@@ -202,14 +204,26 @@ def test_sizes_that_nobody_measured_are_as_uncertain_as_people_differ():
         shapes=0.16 * jnp.eye(10)[None],
         landmarks=zeros((0, 3, 3)),
     )
-    found = joint.of_fitted_sizes(spread, state, body, np.array([0.4]))
+    there = np.array([True])
+    found = joint.of_fitted_sizes(spread, state, body, np.array([0.4]), there)
     np.testing.assert_allclose(found.shapes[0], np.eye(10), rtol=1e-12)
     # The leg's slope by differences.
     leg = lambda shape: float(motion.leg_length(body, jnp.asarray(shape)))
     slope = [(leg(h) - leg(-h)) / 2e-5 / leg(0 * h) for h in 1e-5 * np.eye(10)]
     more = 4 * (1 - 0.16) * np.square(slope).sum()
     np.testing.assert_allclose(found.scale, 0.01 + more, rtol=1e-6)
-    measured = joint.of_fitted_sizes(spread, state, body, np.array([1.0]))
+    twice = lambda x: jnp.concatenate([x, x])
+    two = dataclasses.replace(
+        spread, shapes=twice(spread.shapes), people=twice(spread.people)
+    )
+    both = dataclasses.replace(
+        state,
+        **{name: twice(getattr(state, name)) for name in ("shapes", "roots", "poses")},
+    )
+    absent = np.array([True, False])
+    alone = joint.of_fitted_sizes(two, both, body, np.array([0.4, 0.4]), absent)
+    np.testing.assert_allclose(alone.scale, found.scale)
+    measured = joint.of_fitted_sizes(spread, state, body, np.array([1.0]), there)
     np.testing.assert_array_equal(measured.shapes, spread.shapes)
     np.testing.assert_array_equal(measured.scale, spread.scale)
 

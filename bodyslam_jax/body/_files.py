@@ -212,9 +212,8 @@ def named_gender(file: Path) -> str | None:
     """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
     name = (file.parent.name if file.stem == "model" else file.stem).lower()
     words = re.split(r"[^a-z]+", name)
-    if words[0] == "basicmodel" and words[1:2] in (["f"], ["m"]):
-        return {"f": "female", "m": "male"}[words[1]]
-    return next((gender for gender in _GENDERS if gender in words), None)
+    found = {g for g in _GENDERS if g in words or g[0] in words}
+    return found.pop() if len(found) == 1 else None
 
 
 def _tried(place: Path, gender: str) -> str:

@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
+import os
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 Range = tuple[int | float, int | float]
@@ -16,12 +17,12 @@ def check(
     settings: Any,
     ranges: Mapping[str, Range] = types.MappingProxyType({}),
     *,
-    infinite: bool = False,
+    infinite: Collection[str] = (),
 ) -> None:
     """Refuses settings that mean nothing, before minutes are spent.
 
     Whole numbers are 1 or more, others more than 0, unless `ranges` has the least and
-    the largest value; nothing is infinite unless it may be, as a standard deviation of
+    the largest value; those named in `infinite` may be that, as standard deviations of
     what is to say nothing. Arrays are let through: they may not be known yet.
 
     **Raises:** `ValueError` that names the setting, what was found and what was
@@ -32,7 +33,7 @@ def check(
         found = getattr(settings, field.name)
         if dataclasses.is_dataclass(found) or hasattr(found, "dtype"):
             continue
-        if infinite and found == math.inf:
+        if field.name in infinite and found == math.inf:
             continue
         expected = _refused(found, hints[field.name], ranges.get(field.name))
         if expected:
@@ -59,6 +60,8 @@ def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
         return next((f"each {part}" for part in parts if part), None)
     if kind is float or kind is int:
         return _out_of_range(found, kind, within)
+    if kind is str and isinstance(found, os.PathLike):
+        return None
     names = {bool: "true or false", str: "a text"}
     return None if isinstance(found, kind) else names.get(kind, kind.__name__)
 
@@ -75,4 +78,6 @@ def _out_of_range(found: Any, kind: type, within: Range | None) -> str | None:
     # Not a NaN either, which no bound is above or below.
     if least <= found <= most and math.isfinite(found):
         return None
+    if found == most == math.inf:
+        return f"{least:g} or more, and finite"
     return f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"

@@ -104,4 +104,5 @@ class Structure:
             "keyframe_motion static_motion rotation_error min_baseline focal_accuracy"
         )
         ranges = dict.fromkeys(free.split(), NOT_NEGATIVE)
-        check(self, ranges | {"landmark_span": (2, math.inf)})
+        ranges |= {"landmark_span": (2, math.inf)}
+        check(self, ranges, infinite=("focal_accuracy",))

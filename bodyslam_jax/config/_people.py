@@ -47,4 +47,5 @@ class PeopleFit:
 
     def __post_init__(self):
         free = dict.fromkeys(("max_gap", "correlation_time"), NOT_NEGATIVE)
-        check(self, free | {"detector_bias": SHARE})
+        silent = ("limit_sigma", "upright_sigma", "depth_error")
+        check(self, free | {"detector_bias": SHARE}, infinite=silent)

@@ -93,7 +93,10 @@ class GraphWeights:
             name: (0, _CORRELATED) for name in vars(self) if "correlation" in name
         }
         free = ("step_error", "fitted_step_error")
-        check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE), infinite=True)
+        # Deviations say nothing then; losses, factors and shares would be no numbers.
+        never = ("correlation", "inflation", "loss", "error", "each", "predicted")
+        silent = [x for x in vars(self) if not any(word in x for word in never)]
+        check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE), infinite=silent)
 
     @classmethod
     def paper(cls) -> "GraphWeights":

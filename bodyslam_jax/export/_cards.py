@@ -28,6 +28,8 @@ def cards(
     ]
     known = summary.get("people") or []
     for person, way in enumerate(people):
+        if not result.present[person].any():
+            continue
         near, far = facts.distance_to_camera(result, person)
         here = f"there for {way.seconds:.1f} s, {near:.1f} to {far:.1f} m away"
         found.append(
