@@ -58,6 +58,15 @@ def test_the_number_of_a_frame_is_found_in_its_name(tmp_path, pattern):
     assert frames_with(found) == {k: k for k in range(NUM)} and said == []
 
 
+def test_times_are_no_frame_numbers(tmp_path):
+    names = [f"{1305031102175304 + 33333 * k}_keypoints.json" for k in range(NUM)]
+    folder = write(tmp_path / "k", names)
+    read = lambda n: read_detections(folder, num_frames=n, width=640, height=480)
+    for num_frames in (None, NUM):
+        with pytest.raises(ValueError, match="of frame"):
+            read(num_frames)
+
+
 def test_two_files_of_one_frame_are_refused(tmp_path):
     names = [f"{v}_{k:03d}_keypoints.json" for v in "ab" for k in range(NUM)]
     folder = write(tmp_path / "k", names)
@@ -74,6 +83,7 @@ def test_two_files_of_one_frame_are_refused(tmp_path):
         (range(5, 21), 20, False, 1, False),  # 20 is beyond, if counted from 0
         (range(15), 20, True, 0, False),
         (range(1, 20), 20, True, 1, True),  # or number 0 has been deleted
+        ([k for k in range(1, 20) if k % 7], 30, True, 0, True),  # some are deleted
         (range(1, 20), 20, False, 0, True),  # or the last image has nobody
         (range(5, 15), 20, True, 0, True),
         (range(3, 9), None, False, 0, True),

@@ -662,6 +662,19 @@ def test_amass_keeps_its_own_time(tmp_path, num, rate, frames, fps):
     assert any("begin together" in text for text in said) is longer
 
 
+def test_amass_of_a_video_whose_rate_varies_has_a_pose_a_frame(tmp_path):
+    """The rate of the frames that are used is not that of all."""
+    steps = np.where(np.arange(149) % 3, 1 / 60, 1 / 20)
+    times = np.r_[0.0, np.cumsum(steps)]
+    rate = 149 / times[-1]
+    np.savez(tmp_path / "a.npz", **_walking(150, rate))
+    said: list[str] = []
+    known = {"fps": 25.0, "times": times, "warn": said.append}
+    found = read_bodies(tmp_path / "a.npz", num_frames=150, intrinsics=CAMERA, **known)
+    np.testing.assert_allclose(found.trans[0, :, 0], np.arange(150) / rate, atol=1e-9)
+    assert not any("begin together" in text for text in said)
+
+
 def test_amass_ends_where_it_ends(tmp_path):
     np.savez(tmp_path / "a.npz", **_walking(60, 60.0))
     said: list[str] = []

@@ -96,6 +96,11 @@ def test_joints_that_are_none_are_one_line(tmp_path, tall, factor, frames, messa
         read_motion(tmp_path)
 
 
+def test_joints_of_another_skeleton_are_left_aside(tmp_path):
+    write_amass(tmp_path / "s" / "a.npz", joints=np.zeros((50, 22, 3)))
+    assert read_motion(tmp_path)[0].leg_length == pytest.approx(0.8, abs=0.03)
+
+
 def test_only_frames_with_somebody_in_them_are_motion(tmp_path, tall):
     arrays = {name: np.array(value) for name, value in tall[0].items()}
     there = np.ones(50, bool)
@@ -107,7 +112,9 @@ def test_only_frames_with_somebody_in_them_are_motion(tmp_path, tall):
     (clip,) = read_motion(path)
     np.testing.assert_allclose(clip.trans, tall[0]["trans"][4:40], atol=1e-6)
     assert clip.leg_length == pytest.approx(tall[1], abs=1e-4)
-    for wrong in (np.zeros(50, bool), np.ones(49, bool), np.ones(50)):
+    write_amass(path, **arrays, present=there.astype(np.int8))
+    np.testing.assert_array_equal(read_motion(path)[0].trans, clip.trans)
+    for wrong in (np.zeros(50, bool), np.ones(49, bool), np.full(50, 2), np.ones(50)):
         write_amass(path, **arrays, present=wrong)
         with pytest.raises(ValueError, match="a.npz: present is .*; expected bool"):
             read_motion(path)

@@ -52,12 +52,16 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
     if t is None:
         t = n if fps is None else round((n - 1) / rate * fps) + 1
         return np.arange(t) * (1.0 if fps is None else rate / fps), 0.5
-    same = fps is None or abs(rate / fps - 1) < _SAME_RATE
-    if n == t and same:
+    if n == t and fps is None:
         return np.arange(float(n)), 0.5
     if fps is None:
         raise Unfit(f"{n} frames at {rate:g}/s, but the video has {t} frames")
-    moved, filmed = n / rate, t / fps
+    # Its rate may vary, and that of the frames that are used is another one.
+    times = np.arange(t) / fps if video.times is None else video.times - video.times[0]
+    filmed = float(times[-1]) * t / (t - 1) if t > 1 else 1 / fps
+    moved = n / rate
+    if n == t and abs(moved / filmed - 1) < _SAME_RATE:
+        return np.arange(float(n)), 0.5
     if not 1 / _MAX_RATIO < moved / filmed < _MAX_RATIO:
         raise Unfit(
             f"{n} frames at {rate:g}/s are {moved:.3g} s, but the video has "
@@ -70,8 +74,7 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
             f"motion of {moved:.3g} s for a video of {filmed:.3g} s: both taken to "
             f"begin together, {what}."
         )
-    times = np.arange(t) / fps if video.times is None else video.times
-    return (times - times[0]) * rate, slack
+    return times * rate, slack
 
 
 def _between(

@@ -212,4 +212,4 @@ def _who(path: Path, entry: dict, *keys: str) -> int:
     try:
         return int(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{path}: `{keys[0]}` is {value!r}, not a number.") from None
+        return -1  # a name, say; people are then told apart by where they are

@@ -17,6 +17,10 @@ _SUFFIX = re.compile(
 )
 
 
+_SPARSEST = 100
+"""Times as many frames as are named, above which the numbers are others: times, say."""
+
+
 class Unfit(ValueError):
     """What is wrong with a file's content; the caller adds the file's name."""
 
@@ -116,6 +120,8 @@ def _first(
     first, last = min(numbers), max(numbers)
     unbroken = len(set(numbers)) == last - first + 1
     if num_frames is None:
+        if last > _SPARSEST * (len(numbers) + 10):
+            raise Unfit(f"{what} of frame {last}, but {len(numbers)} names: no numbers")
         num_frames = len(numbers) if complete and unbroken else last + 1
     if unbroken and len(numbers) == num_frames:
         return first  # also a cut-out of a longer video
@@ -127,8 +133,9 @@ def _first(
         )
     if first == 0:
         return 0
-    # Whoever lists every image would have listed number 0.
-    zero = 1 if complete and first == 1 else 0
+    # Whoever lists every image would have listed number 0, but some have been deleted
+    # where there are gaps.
+    zero = 1 if complete and unbroken and first == 1 else 0
     warn(
         f"{what} numbered {first} to {last} for {num_frames} frames: taken as counted "
         f"from {zero}."

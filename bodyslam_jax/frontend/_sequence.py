@@ -157,7 +157,10 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         if fps is None:
             fps = 30.0
             warnings.append("camera.json has no fps: 30 frames/s assumed.")
-        num_frames, picks = _count_frames(parts, found_tracks, intrinsics, fps), None
+        num_frames, picks = (
+            _count_frames(parts, found_tracks, intrinsics, fps, config),
+            None,
+        )
         stamps = np.arange(num_frames) / fps
     rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 30.0
     if rate < _FEWEST_A_SECOND:
@@ -212,7 +215,11 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
 
 
 def _count_frames(
-    parts: _Parts, tracks: Tracks | None, intrinsics: Intrinsics, fps: float
+    parts: _Parts,
+    tracks: Tracks | None,
+    intrinsics: Intrinsics,
+    fps: float,
+    config: Association,
 ) -> int:
     """Frames of a sequence without images: as many as any of its parts has."""
     found = [int(tracks.frame.max()) + 1] if tracks else []
@@ -228,7 +235,12 @@ def _count_frames(
         found.append(len(detected.points))
     if parts.bodies:
         bodies = read_bodies(
-            parts.bodies, num_frames=None, intrinsics=intrinsics, fps=fps, warn=quiet
+            parts.bodies,
+            num_frames=None,
+            intrinsics=intrinsics,
+            fps=fps,
+            config=config,
+            warn=quiet,
         )
         found.append(bodies.present.shape[1])
     return max(found)

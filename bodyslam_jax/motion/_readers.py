@@ -231,8 +231,9 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         offsets=None,
         leg_length=np.nan,
     )
-    if "joints" in names:
-        leg = leg_from_joints(path, number("joints")[there], len(poses))
+    joints = number("joints")[there] if "joints" in names else np.zeros(0)
+    if joints.shape[1:] == (24, 3):
+        leg = leg_from_joints(path, joints, len(poses))
     else:
         leg = leg_from_height(path, clip)
     return dataclasses.replace(clip, leg_length=leg)
@@ -240,12 +241,13 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
 
 def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
     """The longest run of frames that the person is there in."""
-    if present.shape != (num_frames,) or present.dtype != bool or not present.any():
+    flags = present.dtype.kind in "biu" and np.isin(present, (0, 1)).all()
+    if present.shape != (num_frames,) or not flags or not present.any():
         raise ValueError(
             f"{path}: present is {present.dtype} {present.shape}; expected bool "
             f"{(num_frames,)}, true somewhere."
         )
-    edges = np.flatnonzero(np.diff(np.r_[False, present, False]))
+    edges = np.flatnonzero(np.diff(np.r_[False, present.astype(bool), False]))
     best = np.argmax(edges[1::2] - edges[::2])
     return slice(edges[::2][best], edges[1::2][best])
 
