@@ -607,6 +607,26 @@ def test_people_of_cliff_are_told_apart_by_where_they_are(tmp_path):
     assert "1 bodies left out" in said[0]
 
 
+def test_cliff_may_name_each_image_once(tmp_path):
+    """Detections then begin with the number of their image."""
+    data = _two_of_cliff(20)
+    image = [*np.repeat(np.arange(20), 2), 5]
+    once = data | {"imgname": np.array([f"a/{k:05d}.png" for k in range(1, 21)])}
+    boxes = np.zeros((41, 7))
+    boxes[:, 0] = image
+    read_ = lambda: read_bodies(
+        tmp_path / "c.npz", num_frames=20, intrinsics=CAMERA, fps=25.0
+    )
+    np.savez(tmp_path / "c.npz", **once, detection_all=boxes)
+    found = read_()
+    assert found.present.all() and len(found.present) == 2
+    assert (np.ptp(found.trans[..., 0], axis=1) == 0).all()
+    for other in ({}, {"detection_all": boxes + 0.5}, {"detection_all": boxes[1:]}):
+        np.savez(tmp_path / "c.npz", **once, **other)
+        with pytest.raises(ValueError, match="20 image names for 41 bodies"):
+            read_()
+
+
 @pytest.mark.parametrize("first", [1, 2])
 def test_nobody_in_the_first_image_shifts_nobody(tmp_path, first):
     """CLIFF names images only where it found somebody: 0 may be missing."""

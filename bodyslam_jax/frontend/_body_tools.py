@@ -28,9 +28,8 @@ from bodyslam_jax.frontend._body_parts import (
     numbers_of,
     people_of,
     refocused,
-    rotations_of,
-    tell_apart,
 )
+from bodyslam_jax.frontend._cliff import from_cliff
 from bodyslam_jax.frontend._perspective import turn_to_camera
 from bodyslam_jax.frontend._rows import Rows, Video
 
@@ -98,37 +97,6 @@ def from_wham(data: dict, video: Video) -> Rows:
             )
         )
     return join(rows)
-
-
-def from_cliff(data: dict, video: Video) -> Rows:
-    """CLIFF: full-image translation for its own focal length, image names.
-
-    Its bodies are in no order; who is seen in a few frames only is left out.
-    """
-    poses = rotations_of(data, "pose", 24)
-    n = len(poses)
-    if "imgname" in data:
-        names = [str(name) for name in np.ravel(data["imgname"])]
-        if len(names) != n:
-            raise Unfit(f"{len(names)} image names for {n} bodies")
-        frame = frames_of_images(names, video, complete=False)
-    else:
-        frame = frames_of(data, "frame", n, video.num_frames)
-    trans = numbers_of(data, "global_t", (n, 3))
-    if "focal_l" in data:
-        focal = np.broadcast_to(np.ravel(numbers_of(data, "focal_l", None)), (n,))
-        trans = refocused(trans, focal, middle(video.camera), video.camera)
-    person = tell_apart(frame, trans, video)
-    _, which, count = np.unique(person, return_inverse=True, return_counts=True)
-    least = video.frames_in(video.config.min_duration)
-    keep = count[which] >= min(least, count.max(initial=0))
-    if len(count) > 1:
-        video.warn(
-            f"bodies do not say who is who: {len(np.unique(person[keep]))} people told "
-            f"apart by where they are, {int((~keep).sum())} bodies left out."
-        )
-    betas = betas_of(data, "shape", n)
-    return Rows(frame[keep], person[keep], poses[keep], betas[keep], trans[keep])
 
 
 def from_phalp(data: dict, video: Video) -> Rows:
