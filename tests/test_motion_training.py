@@ -216,7 +216,7 @@ def test_bad_names_are_one_line_and_exit_code_1(monkeypatch, capsys, tmp_path, d
         ("--members 0", "members: found 0, expected 1 or more."),
         ("--future 2", "future: found 2, expected 0 to 1."),
         ("--clean-share nan", "clean_share: found nan, expected 0 to 1."),
-        ("--run-weight inf", "run_weight: found inf, expected 0 or more."),
+        ("--run-weight inf", "run_weight: found inf, expected 0 or more, and finite."),
         (
             "--learning-rate 0",
             "learning_rate: found 0.0, expected more than 0, and finite.",
