@@ -23,13 +23,15 @@ from bodyslam_jax import (
 )
 from bodyslam_jax import body as body_
 from bodyslam_jax import joint as joint_
+from bodyslam_jax.assembly import assemble
 from bodyslam_jax.body import DEFAULT
 from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config
-from bodyslam_jax.outcome import Cameras, Joint, assemble, describe
+from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.rehearsal import Rehearsal, rehearse
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Bodies, Sequence, Tracks
+from bodyslam_jax.summary import describe
 
 log = logging.getLogger(__name__)
 

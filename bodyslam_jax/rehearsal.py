@@ -15,9 +15,10 @@ import numpy as np
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, export, initialisation, joint, people, view
+from bodyslam_jax.assembly import assemble
 from bodyslam_jax.config import Config
 from bodyslam_jax.initialisation import ScaleStart
-from bodyslam_jax.outcome import Cameras, Joint, assemble
+from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.result import Result
 from bodyslam_jax.sequence import Sequence, Tracks
 

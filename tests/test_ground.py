@@ -13,12 +13,9 @@ from bodyslam_jax import (
     graph,
     initialisation,
     motion,
-    outcome,
-    rehearsal,
-    synthetic,
+    summary,
 )
-from bodyslam_jax.body import load_body_model
-from bodyslam_jax.config import Config, GraphWeights, Simulation
+from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.ground import find_ground
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.result import Result
@@ -132,84 +129,17 @@ def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
     both = ScaleStart(motion=2.0, motion_error=0.2, ground=3.0, ground_error=0.1)
     assert both.value == pytest.approx((2 / 0.04 + 3 / 0.01) / (1 / 0.04 + 1 / 0.01))
     assert both.standard_error == pytest.approx((1 / 0.04 + 1 / 0.01) ** -0.5)
-    apart = outcome.cues_apart(both)
+    apart = summary.cues_apart(both)
     assert apart == pytest.approx(np.log(3 / 2))
-    (line,) = outcome._disagreement(both, apart)
+    (line,) = summary._disagreement(both, apart)
     assert "0.67 times" in line and "no better than 20 %" in line
-    assert not outcome._disagreement(both, 0.0)
+    assert not summary._disagreement(both, 0.0)
     nothing = ScaleStart()
     assert nothing.value == 1.0 and np.isinf(nothing.standard_error)
     unsure = dataclasses.replace(both, motion_error=0.5)
     alone = ScaleStart(motion=2.0, motion_error=0.1)
     for start in (dataclasses.replace(both, motion=2.8), unsure, alone, nothing):
-        assert outcome.cues_apart(start) == 0.0
-
-
-def test_metres_are_no_surer_than_the_two_cues_leave_them():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
-    cameras = rehearsal._cameras(sequence)
-
-    def found(motion: float, sigma: float) -> tuple[dict, str]:
-        start = ScaleStart(motion, 0.1, ground=3.0, ground_error=0.1)
-        joint = dataclasses.replace(
-            rehearsal._joint(sequence), start=start, scale_sigma=sigma
-        )
-        summary = outcome.assemble(sequence, config, body, cameras, joint, {}).summary
-        return summary["scale"], " ".join(summary["warnings"])
-
-    scale, said = found(2.0, 0.03)
-    assert scale["sigma"] == pytest.approx(np.log(1.5) / 2)
-    assert scale["sigma_of_covariance"] == 0.03 and "no better than" in said
-    scale, said = found(2.9, 0.03)
-    assert scale["sigma"] == 0.03 and "no better than" not in said
-    assert found(2.0, 0.4)[0]["sigma"] == 0.4
-    assert np.isnan(found(2.0, np.nan)[0]["sigma"])
-
-
-def test_noise_of_pixels_that_nobody_measured_is_not_told():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
-    joint = rehearsal._joint(sequence)
-    for kind, told in (("static", None), ("rotation", None), ("moving", 0.7)):
-        cameras = rehearsal._cameras(sequence)
-        cameras = dataclasses.replace(cameras, kind=kind, pixel_sigma=0.7)
-        summary = outcome.assemble(sequence, config, body, cameras, joint, {}).summary
-        assert summary["pixel_sigma"] == told
-
-
-def test_the_summary_says_who_and_what_is_left_out():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
-    joint = rehearsal._joint(sequence)
-    moved = joint.cameras.copy()
-    moved[:, 0, 3] = np.linspace(0, 3, 15)
-    nobody = np.zeros_like(joint.present)
-    joint = dataclasses.replace(joint, cameras=moved, status="ran out of steps")
-
-    def found(joint, first, last):
-        cameras = rehearsal._cameras(sequence)
-        located = (np.arange(15) >= first) & (np.arange(15) <= last)
-        cameras = dataclasses.replace(cameras, kind="moving", registered=located)
-        return outcome.assemble(sequence, config, body, cameras, joint, {}).summary
-
-    whole = found(joint, 0, 14)
-    assert whole["status"] == "ok" and whole["frames_used"] == [0, 14]
-    assert any("may not be the best: ran out of steps" in w for w in whole["warnings"])
-    # Seven of fourteen steps are half of the way.
-    part = found(joint, 0, 7)
-    assert part["status"] == "ok" and "camera: 1.5" in part["headline"][1]
-    assert "camera: 3.0" in whole["headline"][1]
-    assert part["frames_used"] == [0, 7]
-    short = found(joint, 9, 14)
-    assert short["status"] == "only frames 9 to 14 of 15 are used"
-    empty = found(dataclasses.replace(joint, present=nobody), 0, 14)
-    assert any("person 0 is left out" in w for w in empty["warnings"])
-    assert not any("person 0" in line for line in empty["headline"])
-    assert empty["people"][0]["stature_m"] is None
-    assert whole["people"][0]["stature_m"] > 1
-    assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
-    assert not any("are used" in w for w in whole["warnings"])
+        assert summary.cues_apart(start) == 0.0
 
 
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():

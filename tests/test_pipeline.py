@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from bodyslam_jax import accuracy, evaluation, export, outcome, pipeline, synthetic
+from bodyslam_jax import accuracy, assembly, evaluation, export, pipeline, synthetic
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 
@@ -100,7 +100,7 @@ def test_upright_puts_the_trunk_up_and_keeps_distances():
     T_WC[:, :3, 3] = rng.normal(size=(5, 3))
     T_WH = np.tile(np.eye(4), (1, 5, 1, 1))
     T_WH[..., :3, 1] = np.array([0.6, 0.0, 0.8])
-    turn = outcome.upright(T_WC, T_WH, np.ones((1, 5), bool))
+    turn = assembly.upright(T_WC, T_WH, np.ones((1, 5), bool))
     np.testing.assert_allclose(turn[:3, :3] @ [0.6, 0.0, 0.8], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bodyslam_jax import evaluation, joint, people, rehearsal, synthetic, view
+from bodyslam_jax.assembly import assemble
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.initialisation import first_state
-from bodyslam_jax.outcome import assemble
 from bodyslam_jax.rehearsal import Rehearsal
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"

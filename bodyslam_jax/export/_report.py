@@ -22,7 +22,7 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     """Writes the report of a result: no other file, no network, light or dark.
 
     All but numbers about the paths comes from `result.summary`; a part that it lacks is
-    left out. Keys, beside those that `pipeline.summarise` writes:
+    left out. Keys, beside those that `summary.summarise` writes:
 
     - `stages`: a list of `name`, `cost_before`, `cost_after`, `iterations`, `seconds`;
     - `scale`: `value`, `sigma` (of the value), `sigma_of_covariance` if less;

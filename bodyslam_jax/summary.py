@@ -1,0 +1,276 @@
+"""`summary.json`: what a person wants to know of a result, and what to doubt."""
+
+import dataclasses
+import importlib.metadata
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import camera, export
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.config import Config
+from bodyslam_jax.initialisation import ScaleStart
+from bodyslam_jax.outcome import Cameras, Joint
+from bodyslam_jax.result import Result
+from bodyslam_jax.sequence import Sequence
+
+_CUES_APART = 1.25
+"""Factor between the sizes that motion and ground tell, from which a line says so."""
+_MOST = 0.5
+"""Share of the frames that are used, from which a result is one of the video."""
+_GROUND_DOUBT, _GROUND_DISTRUST = 1.15, 1.4
+"""Factors between the map's size and that of the people on its ground."""
+
+
+def summarise(
+    sequence: Sequence,
+    config: Config,
+    body: body_.BodyModel,
+    cameras: Cameras,
+    joint: Joint,
+    result: Result,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """`summary.json`: what a person wants to know first, then everything else."""
+    warnings = [*sequence.warnings, *cameras.warnings, *joint.unobserved]
+    status = "ok"
+    if not joint.present.any():
+        status = "no people: cameras and map have no unit"
+    elif not np.isfinite(result.T_WC).all():
+        status = "failed"
+    elif cameras.kind == "failed":
+        status = "camera motion not found: people are placed as if it stood still"
+    if cameras.kind != "moving":
+        warnings.append(
+            "metric size comes from the body alone: the camera's path gives none."
+        )
+    apart = cues_apart(joint.start)
+    warnings += _disagreement(joint.start, apart)
+    if joint.status != "converged":
+        warnings.append(f"the joint estimate may not be the best: {joint.status}.")
+    warnings += [
+        f"person {h} is left out: too few keypoints, and no body, in any frame used."
+        for h in np.flatnonzero(~joint.present.any(axis=1))
+    ]
+    within = cameras.within
+    if not within.all():
+        used = np.flatnonzero(within)
+        warnings.append(
+            f"frames {used[0]} to {used[-1]} of {len(within)} are used: nothing tells "
+            "where the camera was in the others."
+        )
+    if status == "ok" and within.mean() < _MOST:
+        used = np.flatnonzero(within)
+        status = f"only frames {used[0]} to {used[-1]} of {len(within)} are used"
+    ground = export.ground_scale(result) if cameras.kind == "moving" else None
+    off = max(ground, 1 / ground) if ground else 1.0
+    if off > _GROUND_DOUBT:
+        text = (
+            f"the ground of the map would be under the people's feet if the map were "
+            f"{ground:.2f} times as large: scale, postures or focal length are off, or "
+            "they stand on something else."
+        )
+        warnings.append(text)
+        if status == "ok" and off > _GROUND_DISTRUST:
+            status = "not to be trusted: people do not stand on the ground of the map"
+    way = export.camera_facts(result, within)
+    persons = []
+    for h in range(len(result.poses)):
+        facts = export.person_facts(result, h)
+        tall, sigma = None, None
+        if result.present[h].any():
+            tall, sigma = stature(body, result.betas[h], joint.shape_covariance[h])
+        persons.append(
+            {
+                "frames": int(result.present[h].sum()),
+                "path_m": facts.distance,
+                "speed_m_s": facts.distance / max(facts.seconds, 1e-9),
+                "stature_m": tall,
+                "stature_sigma_m": sigma,
+            }
+        )
+    headline = [
+        f"{sequence.name}: {status}",
+        f"camera: {way.distance:.2f} m in {way.seconds:.1f} s ({cameras.kind})",
+    ]
+    for h, p in enumerate(persons):
+        if not p["frames"]:
+            continue
+        sure = (
+            ""
+            if np.isnan(p["stature_sigma_m"])
+            else (f" ± {100 * p['stature_sigma_m']:.0f}")
+        )
+        headline.append(
+            f"person {h}: {p['path_m']:.2f} m at {p['speed_m_s']:.2f} m/s, "
+            f"{100 * p['stature_m']:.0f}{sure} cm tall"
+        )
+    lens = focal_length(sequence, cameras)
+    if lens["guessed"]:
+        text = f"focal length: guess {lens['guess_px']:.0f} px"
+        if (sigma := lens["focal_sigma_px"]) is not None:
+            text += f", from the camera's path {lens['focal_px']:.0f} ± {sigma:.0f} px"
+        headline.append(text)
+    return {
+        "status": status,
+        "headline": headline,
+        "warnings": warnings,
+        "input": {
+            **describe(sequence),
+            "fps": sequence.fps,
+            "intrinsics_guessed": sequence.intrinsics.is_guess,
+        },
+        "intrinsics": lens,
+        "camera_motion": cameras.kind,
+        "scale": {
+            "value": result.scale,
+            # NaN, where covariances were not computed, stays NaN.
+            "sigma": float(np.maximum(joint.scale_sigma, apart / 2 * result.scale)),
+            "sigma_of_covariance": joint.scale_sigma,
+            "start": joint.start.value,
+            "start_standard_error": joint.start.standard_error,
+            **_cues(joint.start),
+            "ground_factor": ground,
+        },
+        "people": persons,
+        # The first and the last.
+        "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),
+        "counts": {
+            "landmarks": len(result.landmarks),
+            "observations": int(cameras.keep.sum()),
+            "people": len(persons),
+        },
+        # Of what was not adjusted it is a setting, not a measurement.
+        "pixel_sigma": cameras.pixel_sigma if cameras.kind == "moving" else None,
+        "per_frame": per_frame(sequence, body, cameras, joint),
+        "stages": list(joint.stages),
+        "solver": joint.status,
+        "durations_s": seconds,
+        "settings": dataclasses.asdict(config),
+        "versions": versions(),
+    }
+
+
+def _cues(start: ScaleStart) -> dict[str, list[float] | None]:
+    """Scale and standard error as each cue alone has them; `None` where it has none."""
+    cues = {
+        "from_motion": [start.motion, start.motion_error],
+        "from_ground": [start.ground, start.ground_error],
+    }
+    return {k: v if np.isfinite(v[1]) else None for k, v in cues.items()}
+
+
+def cues_apart(start: ScaleStart) -> float:
+    """The logarithm of the ratio of the sizes that motion and ground tell; 0 where both
+    may be right.
+
+    Of two that cannot both be right half of it is what is left of certainty: the
+    standard error of two measurements with unknown errors of their own (DerSimonian and
+    Laird, 1986), in the limit of errors much larger than those stated.
+    """
+    sigma = np.hypot(
+        start.motion_error / start.motion, start.ground_error / start.ground
+    )
+    apart = abs(np.log(start.motion / start.ground))
+    # Infinite errors say that a cue is not there.
+    if not np.isfinite(sigma) or np.exp(apart) < max(_CUES_APART, 1 + 2 * sigma):
+        return 0.0
+    return float(apart)
+
+
+def _disagreement(start: ScaleStart, apart: float) -> list[str]:
+    """A line where motion and ground tell sizes that both cannot be right."""
+    if not apart:
+        return []
+    ratio = start.motion / start.ground
+    return [
+        f"people's motion makes the map {ratio:.2f} times as large as the ground under "
+        "their feet does: postures, focal length or ground are off; look at both. The "
+        f"metres are known to no better than {50 * apart:.0f} % for it."
+    ]
+
+
+def describe(sequence: Sequence) -> dict[str, Any]:
+    """By what an input is told from another."""
+    return {
+        "name": sequence.name,
+        "frames": sequence.num_frames,
+        "width": sequence.intrinsics.width,
+        "height": sequence.intrinsics.height,
+    }
+
+
+def focal_length(sequence: Sequence, cameras: Cameras) -> dict[str, Any]:
+    """The focal length used, and how it was come by; px.
+
+    `focal_sigma_px` is `None` unless a guess could be refined.
+    """
+    guessed = sequence.intrinsics.is_guess
+    refined = np.isfinite(cameras.focal_sigma)
+    return {
+        "guessed": guessed,
+        "guess_px": float(sequence.intrinsics.params[0]) if guessed else None,
+        "focal_px": cameras.focal,
+        "focal_sigma_px": cameras.focal_sigma if refined else None,
+    }
+
+
+def stature(
+    body: body_.BodyModel,
+    shape: Float[np.ndarray, " 10"],
+    covariance: Float[np.ndarray, "10 10"],
+) -> tuple[float, float]:
+    """Height of the mesh in its rest pose and its standard deviation, m."""
+    tall = export.stature(body, shape)
+    slope = np.array([export.stature(body, shape + e) - tall for e in np.eye(10)])
+    return tall, float(np.sqrt(slope @ covariance @ slope))
+
+
+def versions() -> dict[str, str]:
+    """What ran: a result can be repeated only with the same."""
+    names = ("bodyslam-jax", "jax", "optimistix", "numpy", "opencv-python-headless")
+    return {name: importlib.metadata.version(name) for name in names}
+
+
+def per_frame(
+    sequence: Sequence, body: body_.BodyModel, cameras: Cameras, joint: Joint
+) -> dict[str, list[float | None]]:
+    """How well each frame is explained: mean pixel errors, tracks and inliers."""
+    t = sequence.num_frames
+    tracks, keep = cameras.tracks, cameras.keep
+    count = np.bincount(tracks.frame, minlength=t)
+    found: dict[str, list[float | None]] = {"tracks": count.astype(float).tolist()}
+    intrinsics = jnp.asarray(joint.intrinsics)
+    if cameras.kind == "moving":
+        T = joint.cameras[tracks.frame]
+        offset = joint.landmarks[tracks.landmark] - T[:, :3, 3]
+        p_C = np.einsum("mji,mj->mi", T[:, :3, :3], offset)
+        error = np.asarray(camera.project(intrinsics, jnp.asarray(p_C))) - tracks.uv
+        length = np.linalg.norm(error, axis=-1)
+        inliers = np.bincount(tracks.frame[keep], minlength=t)
+        found["inliers"] = inliers.astype(float).tolist()
+        found["reprojection_px"] = _means(tracks.frame[keep], length[keep], t)
+    if sequence.keypoints is not None and joint.present.any():
+        shapes = jnp.asarray(joint.shapes)[:, None]
+        p_H = _keypoints(body, jnp.asarray(joint.poses), shapes)
+        turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
+        p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
+        error = np.asarray(camera.project(intrinsics, p_C)) - sequence.keypoints.uv
+        length = np.linalg.norm(error, axis=-1)
+        seen = (sequence.keypoints.confidence > 0) & joint.present[..., None]
+        frame = np.broadcast_to(np.arange(t)[:, None], length.shape)
+        found["keypoint_px"] = _means(frame[seen], length[seen], t)
+    return found
+
+
+def _means(frame: np.ndarray, value: np.ndarray, num_frames: int) -> list[float | None]:
+    """Mean of `value` in each frame; `None` where there is none."""
+    total = np.bincount(frame, value, num_frames)
+    count = np.bincount(frame, minlength=num_frames)
+    return [float(x / n) if n else None for x, n in zip(total, count, strict=True)]
+
+
+_keypoints = jit_once(body_.local_keypoints)

@@ -1,0 +1,79 @@
+"""What the summary says of a result, and what it doubts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bodyslam_jax import rehearsal, synthetic
+from bodyslam_jax.assembly import assemble
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.initialisation import ScaleStart
+
+
+def test_metres_are_no_surer_than_the_two_cues_leave_them():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    cameras = rehearsal._cameras(sequence)
+
+    def found(motion: float, sigma: float) -> tuple[dict, str]:
+        start = ScaleStart(motion, 0.1, ground=3.0, ground_error=0.1)
+        joint = dataclasses.replace(
+            rehearsal._joint(sequence), start=start, scale_sigma=sigma
+        )
+        told = assemble(sequence, config, body, cameras, joint, {}).summary
+        return told["scale"], " ".join(told["warnings"])
+
+    scale, said = found(2.0, 0.03)
+    assert scale["sigma"] == pytest.approx(np.log(1.5) / 2)
+    assert scale["sigma_of_covariance"] == 0.03 and "no better than" in said
+    scale, said = found(2.9, 0.03)
+    assert scale["sigma"] == 0.03 and "no better than" not in said
+    assert found(2.0, 0.4)[0]["sigma"] == 0.4
+    assert np.isnan(found(2.0, np.nan)[0]["sigma"])
+
+
+def test_noise_of_pixels_that_nobody_measured_is_not_told():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = rehearsal._joint(sequence)
+    for kind, expected in (("static", None), ("rotation", None), ("moving", 0.7)):
+        cameras = rehearsal._cameras(sequence)
+        cameras = dataclasses.replace(cameras, kind=kind, pixel_sigma=0.7)
+        found = assemble(sequence, config, body, cameras, joint, {}).summary
+        assert found["pixel_sigma"] == expected
+
+
+def test_the_summary_says_who_and_what_is_left_out():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = rehearsal._joint(sequence)
+    moved = joint.cameras.copy()
+    moved[:, 0, 3] = np.linspace(0, 3, 15)
+    nobody = np.zeros_like(joint.present)
+    joint = dataclasses.replace(joint, cameras=moved, status="ran out of steps")
+
+    def found(joint, first, last):
+        cameras = rehearsal._cameras(sequence)
+        located = (np.arange(15) >= first) & (np.arange(15) <= last)
+        cameras = dataclasses.replace(cameras, kind="moving", registered=located)
+        return assemble(sequence, config, body, cameras, joint, {}).summary
+
+    whole = found(joint, 0, 14)
+    assert whole["status"] == "ok" and whole["frames_used"] == [0, 14]
+    assert any("may not be the best: ran out of steps" in w for w in whole["warnings"])
+    # Seven of fourteen steps are half of the way.
+    part = found(joint, 0, 7)
+    assert part["status"] == "ok" and "camera: 1.5" in part["headline"][1]
+    assert "camera: 3.0" in whole["headline"][1]
+    assert part["frames_used"] == [0, 7]
+    short = found(joint, 9, 14)
+    assert short["status"] == "only frames 9 to 14 of 15 are used"
+    empty = found(dataclasses.replace(joint, present=nobody), 0, 14)
+    assert any("person 0 is left out" in w for w in empty["warnings"])
+    assert not any("person 0" in line for line in empty["headline"])
+    assert empty["people"][0]["stature_m"] is None
+    assert whole["people"][0]["stature_m"] > 1
+    assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
+    assert not any("are used" in w for w in whole["warnings"])
