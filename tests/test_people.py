@@ -194,14 +194,20 @@ def test_the_linearisation_is_the_gradient_of_the_cost(body):
     uv = jnp.asarray(rng.normal([320, 240], 60.0, size=(25, 2)))
     sigma = jnp.full(25, 20.0).at[3].set(jnp.inf)
     fit = dataclasses.replace(fit, latent=3 * fit.latent)  # beyond the limits
+    other = jaxlie.SO3.exp(jnp.asarray([-0.4, 0.6, 0.3])).as_matrix() @ fit.orientation
+    size = len(fit.latent)
+    latent_sigma = jnp.asarray(rng.uniform(0.5, 2.0, size)).at[7].set(jnp.inf)
+    lifted = _terms.Lifted(
+        other, jnp.asarray(rng.normal(size=size)), latent_sigma, jnp.asarray(0.3)
+    )
 
     def moved(step):
         split = 6 + len(fit.latent)
         return _terms.cost(
-            scene, fit.moved(step[:split]), shape + step[split:], uv, sigma
+            scene, fit.moved(step[:split]), shape + step[split:], uv, sigma, lifted
         )
 
-    normal = jax.jit(_terms.linearise)(scene, fit, shape, uv, sigma)
+    normal = jax.jit(_terms.linearise)(scene, fit, shape, uv, sigma, lifted)
     value, wanted = jax.jit(jax.value_and_grad(moved))(
         jnp.zeros(6 + len(fit.latent) + len(shape))
     )

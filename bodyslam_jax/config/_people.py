@@ -23,11 +23,16 @@ class PeopleFit:
     """Keypoint errors stay the same for about this long, s."""
     detector_bias: float = 0.0
     """0: keypoints are SMPL's joints; 1: hips, neck and shoulders as COCO has them."""
+    lift_scale: float = 1.0
+    """Scale of the robust loss on guessed postures, in their standard deviations; 0:
+    they are places to start from, and say nothing else."""
+    lift_correlation: float = 0.2
+    """Errors of guessed postures stay the same for about this long, s."""
     limit_sigma: float = 0.05
     """Softness of the joints' limits, rad."""
     upright_sigma: float = 0.4
     """How far bodies lean towards or from the camera, sine of the angle."""
-    shape_frames: float = 3.0
+    shape_frames: float = 1.0
     """Frames' worth of evidence on shape in a whole clip: keypoint bias is the same in
     all frames, so they do not add up."""
     motion_scale: float = 2.0
@@ -46,6 +51,9 @@ class PeopleFit:
     (AMASS, SLAHMR, or `bodies.npz` that says so by `shapes_regressed`)."""
 
     def __post_init__(self):
-        free = dict.fromkeys(("max_gap", "correlation_time"), NOT_NEGATIVE)
-        silent = ("limit_sigma", "upright_sigma", "depth_error")
+        free = dict.fromkeys(
+            ("max_gap", "correlation_time", "lift_scale", "lift_correlation"),
+            NOT_NEGATIVE,
+        )
+        silent = ("limit_sigma", "upright_sigma", "depth_error", "lift_scale")
         check(self, free | {"detector_bias": SHARE}, infinite=silent)

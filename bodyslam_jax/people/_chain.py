@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.people._terms import Fit, Normal, Scene, linearise
+from bodyslam_jax.people._terms import Fit, Lifted, Normal, Scene, linearise
 from bodyslam_jax.rotation import log
 
 
@@ -31,6 +31,7 @@ class ChainProblem(eqx.Module):
     scene: Scene
     uv: Float[Array, "t 25 2"]
     sigma: Float[Array, "t 25"]
+    lifted: Lifted
     ties: Ties
     shape_weight: Float[Array, ""]
     """Precision of the prior on β."""
@@ -77,8 +78,13 @@ def solve_chain(
 
 def _evaluate(problem: ChainProblem, chain: Chain) -> tuple[Normal, Float[Array, ""]]:
     """Each frame's normal equations, and the negative log-posterior of all."""
-    normal: Normal = jax.vmap(linearise, in_axes=(None, 0, None, 0, 0))(
-        problem.scene, chain.fit, chain.shape, problem.uv, problem.sigma
+    normal: Normal = jax.vmap(linearise, in_axes=(None, 0, None, 0, 0, 0))(
+        problem.scene,
+        chain.fit,
+        chain.shape,
+        problem.uv,
+        problem.sigma,
+        problem.lifted,
     )
     residual = _temporal(problem.ties, chain.fit)
     value = (

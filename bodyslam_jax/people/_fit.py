@@ -18,12 +18,13 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
+from bodyslam_jax.people._lift import lift, load_lifter
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._roots import Roots, bodies_from_roots
 from bodyslam_jax.people._rotations import slerp
 from bodyslam_jax.people._skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people._starts import best_path, fit_frames
-from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Scene
+from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Lifted, Scene
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
@@ -92,6 +93,7 @@ def make_scene(
         number(settings.robust_scale),
         number(settings.limit_sigma),
         number(settings.upright_sigma**-2),
+        number(settings.lift_scale or 1.0),
     )
 
 
@@ -151,8 +153,9 @@ def _fit_person(
     where = np.flatnonzero(present)
     fitted = slice(where[0], where[-1] + 1)
     uv, sigma = uv[fitted], sigma[fitted]
+    lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
     sigma_px = _in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
-    start, cuts = _start(scene, uv, sigma_px, fps, settings)
+    start, cuts = _start(scene, uv, sigma_px, lifted, fps, settings)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
@@ -161,15 +164,20 @@ def _fit_person(
     dtype = scene.intrinsics.dtype
     length = -len(uv) % _BUCKET
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
+    last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
+    # Guesses err for many frames alike, too; padding has none.
+    alike = max(1.0, settings.lift_correlation * fps) ** 0.5
+    wider = np.where(np.arange(len(uv) + length) < len(uv), alike, np.inf)
+    lifted = jax.tree.map(lambda a: last(jnp.asarray(a, dtype)), lifted)
     evidence = np.sum(np.isfinite(sigma).any(1)) / frames_alike
     problem = ChainProblem(
         scene,
         jnp.asarray(pad(uv, 0.0), dtype),
         jnp.asarray(pad(sigma_px * np.sqrt(frames_alike), np.inf), dtype),
+        lifted.widened(jnp.asarray(wider, dtype)),
         make_ties(scene.prior, cuts, len(uv) + length, fps, settings),
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
-    last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
     chain, value = solve_chain(problem, chain, settings.max_steps)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
@@ -180,8 +188,32 @@ def _in_pixels(sigma: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
 
 
+def guess_postures(
+    scene: Scene,
+    uv: Float[np.ndarray, "t 25 2"],
+    sigma: Float[np.ndarray, "t 25"],
+    fps: float,
+    trusted: bool = True,
+) -> Lifted:
+    """What the network makes of one person's keypoints, in C. Where it sees too few,
+    and everywhere if not `trusted`, deviations are infinite."""
+    dtype = scene.intrinsics.dtype
+    length = -len(uv) % _BUCKET
+    # Beyond the end the last frame stands still, as for frames beyond the first.
+    last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
+    numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
+    lifted, known = lift(load_lifter(), scene.intrinsics, *numbers)
+    lifted = lifted.widened(jnp.where(known & trusted, 1.0, jnp.inf).astype(dtype))
+    return jax.tree.map(lambda a: np.asarray(a[: len(uv)]), lifted)
+
+
 def _start(
-    scene: Scene, uv: np.ndarray, sigma_px: np.ndarray, fps: float, settings: PeopleFit
+    scene: Scene,
+    uv: np.ndarray,
+    sigma_px: np.ndarray,
+    lifted: Lifted,
+    fps: float,
+    settings: PeopleFit,
 ) -> tuple[Fit, np.ndarray]:
     """The best path through the fits of every few frames, for all frames.
 
@@ -193,7 +225,12 @@ def _start(
     chosen = np.unique(
         [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
     )
-    fits, costs, joints = fit_frames(scene, uv[chosen], sigma_px[chosen])
+    fits, costs, joints = fit_frames(
+        scene,
+        uv[chosen],
+        sigma_px[chosen],
+        jax.tree.map(lambda a: a[chosen], lifted),
+    )
     path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps)
     fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps

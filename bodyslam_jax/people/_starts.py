@@ -22,6 +22,7 @@ from bodyslam_jax.people._skeleton import NUM_SHAPE, place_points
 from bodyslam_jax.people._terms import (
     DEPTH_FLOOR,
     Fit,
+    Lifted,
     Scene,
     cost,
     joints_about_pelvis,
@@ -44,7 +45,10 @@ _TURN_SPEED = 2.0
 
 
 def fit_frames(
-    scene: Scene, uv: Float[np.ndarray, "f 25 2"], sigma: Float[np.ndarray, "f 25"]
+    scene: Scene,
+    uv: Float[np.ndarray, "f 25 2"],
+    sigma: Float[np.ndarray, "f 25"],
+    lifted: Lifted,
 ) -> tuple[Fit, Float[np.ndarray, "f s"], Float[np.ndarray, "f s 24 3"]]:
     """Fits each frame by itself, β = 0, from all starts; the best few ends of each.
 
@@ -52,16 +56,19 @@ def fit_frames(
     joints relative to the pelvis, in C; NumPy.
     """
     frames = len(uv)
-    starts, value = _batched(_all_starts, _FRAME_BATCH, scene, uv, sigma)
-    # The best postures of every heading: diversity where it matters.
-    by_heading = value.reshape(frames, NUM_HEADINGS, -1)
+    starts, value = _batched(_all_starts, _FRAME_BATCH, scene, uv, sigma, lifted)
+    # The best postures of every heading: diversity where it matters; and the guess.
+    by_heading = value[:, :-1].reshape(frames, NUM_HEADINGS, -1)
     best = np.argsort(by_heading, axis=2)[..., :_POSTURES_PER_HEADING]
     best = best + by_heading.shape[2] * np.arange(NUM_HEADINGS)[:, None]
-    fits = _take(starts, best.reshape(frames, -1))
+    guess = np.full((frames, 1), value.shape[1] - 1)
+    fits = _take(starts, np.concatenate([best.reshape(frames, -1), guess], axis=1))
     for steps in (_FIRST_STEPS, _LAST_STEPS):
         count = fits.latent.shape[1]
         flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), fits)
-        repeated = np.repeat(uv, count, axis=0), np.repeat(sigma, count, axis=0)
+        repeated = jax.tree.map(
+            lambda a: np.repeat(a, count, axis=0), (uv, sigma, lifted)
+        )
         limit = jnp.asarray(steps)
         flat, value, joints = _batched(
             _descend, _DESCENT_BATCH, (scene, limit), flat, *repeated
@@ -99,44 +106,51 @@ def _take(tree: Any, index: Int[np.ndarray, "f s"]) -> Any:
 
 @eqx.filter_jit
 def _all_starts(
-    scene: Scene, uv: Float[Array, "f 25 2"], sigma: Float[Array, "f 25"]
+    scene: Scene,
+    uv: Float[Array, "f 25 2"],
+    sigma: Float[Array, "f 25"],
+    lifted: Lifted,
 ) -> tuple[Fit, Float[Array, "f s"]]:
     """All starts of each frame and their costs."""
 
-    def one(uv: Array, sigma: Array) -> tuple[Fit, Array]:
-        starts = _frame_starts(scene, uv, sigma)
+    def one(uv: Array, sigma: Array, lifted: Lifted) -> tuple[Fit, Array]:
+        starts = _frame_starts(scene, uv, sigma, lifted)
         shape = jnp.zeros(NUM_SHAPE, uv.dtype)
-        value = jax.vmap(lambda fit: cost(scene, fit, shape, uv, sigma))(starts)
+        value = jax.vmap(lambda fit: cost(scene, fit, shape, uv, sigma, lifted))(starts)
         return starts, value + 0.5 * jnp.sum(starts.latent**2, -1)
 
-    return jax.vmap(one)(uv, sigma)
+    return jax.vmap(one)(uv, sigma, lifted)
 
 
 def _frame_starts(
-    scene: Scene, uv: Float[Array, "25 2"], sigma: Float[Array, " 25"]
+    scene: Scene,
+    uv: Float[Array, "25 2"],
+    sigma: Float[Array, " 25"],
+    lifted: Lifted,
 ) -> Fit:
-    """Every heading with every typical posture, put where the keypoints are."""
+    """Every heading with every typical posture, put where the keypoints are; the last
+    is the one guessed."""
     dtype = uv.dtype
     angles = jnp.arange(NUM_HEADINGS, dtype=dtype) * (2 * jnp.pi / NUM_HEADINGS)
     # Upright before the camera, facing it: H's y up is C's y down.
     facing = jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
     turned = jax.vmap(lambda a: jaxlie.SO3.from_y_radians(a).as_matrix())(angles)
-    orientation = _roll(uv, sigma) @ facing @ turned
-    latent = scene.prior.typical
+    orientation = jnp.concatenate(
+        [_roll(uv, sigma) @ facing @ turned, lifted.orientation[None]]
+    )
+    latent = jnp.concatenate([scene.prior.typical, lifted.latent[None]])
     shape = jnp.zeros(NUM_SHAPE, dtype)
     local = jax.vmap(
         lambda z: place_points(scene.skeleton, scene.prior.angles(z), shape)[1]
     )(latent)
-    seen = jnp.einsum("hij,skj->hski", orientation, local)
+    count = len(scene.prior.typical)
+    heading = np.append(np.repeat(np.arange(NUM_HEADINGS), count), NUM_HEADINGS)
+    posture = np.append(np.tile(np.arange(count), NUM_HEADINGS), count)
+    orientation, latent = orientation[heading], latent[posture]
+    seen = jnp.einsum("sij,skj->ski", orientation, local[posture])
     rays = unproject(scene.intrinsics, uv)
-    position = jax.vmap(jax.vmap(lambda x: _place(x, rays, sigma)))(seen)
-    headings, postures = position.shape[:2]
-    flat = lambda a: a.reshape(headings * postures, *a.shape[2:])
-    return Fit(
-        flat(jnp.broadcast_to(orientation[:, None], (headings, postures, 3, 3))),
-        flat(position),
-        flat(jnp.broadcast_to(latent, (headings, *latent.shape))),
-    )
+    position = jax.vmap(lambda x: _place(x, rays, sigma))(seen)
+    return Fit(orientation, position, latent)
 
 
 def _roll(uv: Array, sigma: Array) -> Float[Array, "3 3"]:
@@ -178,6 +192,7 @@ def _descend(
     fits: Fit,
     uv: Float[Array, "m 25 2"],
     sigma: Float[Array, "m 25"],
+    lifted: Lifted,
 ) -> tuple[Fit, Float[Array, " m"], Float[Array, "m 24 3"]]:
     """Levenberg--Marquardt on each of `m` fits, all the same number of steps.
 
@@ -188,8 +203,8 @@ def _descend(
     size = 6 + fits.latent.shape[-1]
     prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
 
-    def evaluate(fit: Fit, uv: Array, sigma: Array) -> tuple[Array, Array, Array]:
-        normal = linearise(scene, fit, shape, uv, sigma)
+    def evaluate(fit: Fit, *seen: Any) -> tuple[Array, Array, Array]:
+        normal = linearise(scene, fit, shape, *seen)
         return (
             normal.hessian + jnp.diag(prior),
             normal.gradient.at[6:].add(fit.latent),
@@ -205,7 +220,7 @@ def _descend(
     def step(_: Array, carry: tuple) -> tuple:
         fits, normal, damping = carry
         proposal = jax.vmap(propose)(fits, normal, damping)
-        found = jax.vmap(evaluate)(proposal, uv, sigma)
+        found = jax.vmap(evaluate)(proposal, uv, sigma, lifted)
         better = found[2] < normal[2]
         choose = lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
         fits, normal = jax.tree.map(choose, (proposal, found), (fits, normal))

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.camera import project
 from bodyslam_jax.people._prior import PosturePrior
 from bodyslam_jax.people._skeleton import Skeleton, place_points, pose_points
+from bodyslam_jax.rotation import log
 
 KEYPOINT_SIGMA = np.array(
     # Nose, neck, then shoulder, elbow, wrist of the right and of the left.
@@ -54,6 +55,27 @@ class Fit(eqx.Module):
         )
 
 
+class Lifted(eqx.Module):
+    """What keypoints before and after a frame make likely there (`_lift`)."""
+
+    orientation: Float[Array, "*b 3 3"]
+    """R_CH."""
+    latent: Float[Array, "*b k"]
+    latent_sigma: Float[Array, "*b k"]
+    """Standard deviation of each component, in the prior's."""
+    turn_sigma: Float[Array, "*b"]
+    """Of the orientation, rad per axis."""
+
+    def widened(self, factor: Float[Array, "*b"]) -> "Lifted":
+        """With deviations that are this many times as large."""
+        return Lifted(
+            self.orientation,
+            self.latent,
+            self.latent_sigma * factor[..., None],
+            self.turn_sigma * factor,
+        )
+
+
 class Scene(eqx.Module):
     """What all frames and all starts share."""
 
@@ -66,6 +88,8 @@ class Scene(eqx.Module):
     """How softly the angles' limits are held, rad."""
     upright_weight: Float[Array, ""]
     """1/σ² of the body axis' lean out of the image plane (sine)."""
+    lift_scale: Float[Array, ""]
+    """c of a guessed posture, in standard deviations of one component."""
 
 
 class Normal(eqx.Module):
@@ -94,16 +118,19 @@ def cost(
     shape: Float[Array, " s"],
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],
+    lifted: Lifted,
 ) -> Float[Array, ""]:
-    """Robust keypoints, soft limits and upright prior of one frame; not the posture's
-    own prior, which is temporal in a chain and static in a single frame."""
+    """Robust keypoints, soft limits, upright prior and guess of one frame; not the
+    posture's own prior, which is temporal in a chain and static in a single frame."""
     angles = scene.prior.angles(fit.latent)
     _, local = place_points(scene.skeleton, angles, shape)
     p_C = local @ fit.orientation.T + fit.position
     residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
     beyond = _beyond_limits(scene, angles) / scene.limit_sigma
+    unlike = jnp.sum(_unlike(fit.orientation, fit.latent, lifted) ** 2)
     return 0.5 * (
         jnp.sum(robust(jnp.sum(residual**2, -1), scene.robust_scale)[0])
+        + robust(unlike, _lift_scale(scene, lifted))[0]
         + jnp.sum(beyond**2)
         + scene.upright_weight * fit.orientation[2, 1] ** 2
     )
@@ -115,6 +142,7 @@ def linearise(
     shape: Float[Array, " s"],
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],
+    lifted: Lifted,
 ) -> Normal:
     """The same as `cost`, with its derivatives."""
     size = 6 + fit.latent.shape[-1]
@@ -146,12 +174,20 @@ def linearise(
     hessian = hessian.at[6:, 6:].add(limits.T @ limits)
     gradient_own = gradient_own.at[6:].add(limits.T @ beyond)
 
+    unlike = _unlike(fit.orientation, fit.latent, lifted)
+    by_own = _unlike_by_own(lifted)
+    unlikely, trust = robust(jnp.sum(unlike**2), _lift_scale(scene, lifted))
+    hessian = hessian + trust * by_own.T @ by_own
+    gradient_own = gradient_own + trust * by_own.T @ unlike
+
     lean = fit.orientation[2, 1]
     # d(Exp(δ) R)[2, 1] = δ x (R e_y), third component.
     axis = jnp.stack([fit.orientation[1, 1], -fit.orientation[0, 1], 0 * lean])
     hessian = hessian.at[:3, :3].add(scene.upright_weight * jnp.outer(axis, axis))
     gradient_own = gradient_own.at[:3].add(scene.upright_weight * lean * axis)
-    total = 0.5 * (jnp.sum(value) + jnp.sum(beyond**2) + scene.upright_weight * lean**2)
+    total = 0.5 * (
+        jnp.sum(value) + unlikely + jnp.sum(beyond**2) + scene.upright_weight * lean**2
+    )
     return Normal(
         hessian,
         full[:size, size:],
@@ -168,6 +204,34 @@ def robust(
     """Geman and McClure's ρ of squared whitened distances, and its derivative."""
     ratio = 1 + squared / scale**2
     return squared / ratio, 1 / ratio**2
+
+
+def _lift_scale(scene: Scene, lifted: Lifted) -> Float[Array, ""]:
+    return scene.lift_scale * (3 + lifted.latent.shape[-1]) ** 0.5
+
+
+def _unlike(
+    orientation: Float[Array, "3 3"], latent: Float[Array, " k"], lifted: Lifted
+) -> Float[Array, " d"]:
+    """How far a body is from the one guessed, in standard deviations; 0 where these are
+    infinite."""
+    turn = log(orientation @ lifted.orientation.T) / lifted.turn_sigma
+    return jnp.concatenate([turn, (latent - lifted.latent) / lifted.latent_sigma])
+
+
+def _unlike_by_own(lifted: Lifted) -> Float[Array, "d n"]:
+    """Its derivatives by the frame's unknowns.
+
+    That of a turn's logarithm by a further turn is taken for the identity: the exact
+    one leaves the logarithm as it is, so the gradient of its square is exact.
+    """
+    count = lifted.latent.shape[-1]
+    by_turn = jnp.eye(3, dtype=lifted.latent.dtype) / lifted.turn_sigma
+    rows = [
+        jnp.pad(by_turn, ((0, 0), (0, 3 + count))),
+        jnp.pad(jnp.diag(1 / lifted.latent_sigma), ((0, 0), (6, 0))),
+    ]
+    return jnp.concatenate(rows)
 
 
 def _beyond_limits(scene: Scene, angles: Float[Array, " 63"]) -> Float[Array, " 63"]:

@@ -1,0 +1,183 @@
+"""Postures guessed from keypoints: what they depend on, and what they are good for."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax import people
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.motion import read_motion
+from bodyslam_jax.people import _fit, _lift, _skeleton
+from bodyslam_jax.people._prior import load_posture_prior
+from bodyslam_jax.sequence import Intrinsics, Keypoints
+from bodyslam_jax.synthetic import _measuring, _simulate
+
+FPS = 30.0
+CAMERA = Intrinsics(np.array([900.0, 900.0, 640.0, 360.0]), 1280, 720)
+SIGMA = np.tile(_lift.KEYPOINT_SIGMA, (60, 1))
+ANKLES = [7, 8]
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body_model()
+
+
+@pytest.fixture(scope="module")
+def walk(body):
+    """Someone of whom nothing was learnt walks away: joints and keypoints in C, m."""
+    clip = read_motion(str(_simulate.ASSETS / "walking.npz"))[6]
+    poses, trans = clip.poses[:60].astype(float), clip.trans[:60].astype(float)
+    skeleton = _skeleton.make_skeleton(body, 0.0)
+    place = jax.jit(jax.vmap(_skeleton.place_points, in_axes=(None, 0, None)))
+    angles = jnp.asarray(poses[:, 1:22].reshape(-1, 63))
+    local = place(skeleton, angles, jnp.zeros(_skeleton.NUM_SHAPE))
+    ahead = trans[-1] - trans[0]
+    # C looks along the walk, y down, from 3 m behind.
+    z = ahead * [1, 0, 1] / np.linalg.norm(ahead * [1, 0, 1])
+    R_CW = np.stack([np.cross(z, [0.0, 1.0, 0.0]), [0.0, -1.0, 0.0], z])
+    camera = trans[0] - 3 * z + [0.0, 0.5, 0.0]
+    R_CH = R_CW @ Rotation.from_rotvec(poses[:, 0]).as_matrix()
+    p_C = (trans - camera) @ R_CW.T
+    joints, points = (
+        np.einsum("tij,tkj->tki", R_CH, np.asarray(a)) + p_C[:, None] for a in local
+    )
+    return R_CH, joints, points
+
+
+def pixels(points, intrinsics):
+    return points[..., :2] / points[..., 2:] * intrinsics[:2] + intrinsics[2:]
+
+
+def lift(uv, sigma, intrinsics=CAMERA.params, fps=FPS):
+    arrays = (jnp.asarray(a) for a in (intrinsics, uv, sigma, fps))
+    return _lift.lift(_lift.load_lifter(), *arrays)
+
+
+def test_a_guess_does_not_depend_on_the_lens_nor_on_where_the_camera_points(walk):
+    _, _, points = walk
+    plain, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    other = np.array([1500.0, 1400.0, 200.0, 500.0])
+    zoomed, _ = lift(pixels(points, other), SIGMA, intrinsics=other)
+    np.testing.assert_allclose(zoomed.latent, plain.latent, atol=1e-4)
+
+    # From straight ahead, nodding does not roll what is seen along the ray.
+    centred = points - points.mean(axis=1, keepdims=True) * [1.0, 0.0, 0.0]
+    nod = Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    level, _ = lift(pixels(centred, CAMERA.params), SIGMA)
+    nodded, _ = lift(pixels(centred @ nod.T, CAMERA.params), SIGMA)
+    turn = np.asarray(nodded.orientation) @ np.swapaxes(level.orientation, -1, -2)
+    np.testing.assert_allclose(nodded.latent, level.latent, atol=0.05)
+    assert np.abs(turn - nod).max() < 0.02
+
+
+def test_a_guess_does_not_depend_on_the_size_of_the_world(walk):
+    _, _, points = walk
+    larger, known = lift(pixels(1.7 * points, CAMERA.params), SIGMA)
+    plain, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    assert np.asarray(known).all()
+    np.testing.assert_allclose(larger.latent, plain.latent, atol=1e-4)
+
+
+def test_a_guess_is_the_same_at_twice_the_rate(walk):
+    _, _, points = walk
+    uv = pixels(points, CAMERA.params)
+    doubled = np.repeat(uv, 2, axis=0)
+    found, _ = lift(doubled, np.repeat(SIGMA, 2, axis=0), fps=2 * FPS)
+    plain, _ = lift(uv, SIGMA)
+    middle = slice(15, 45)  # frames that do not reach beyond the ends
+    np.testing.assert_allclose(
+        found.latent[::2][middle], plain.latent[middle], atol=1e-4
+    )
+
+
+def test_a_guess_is_close_to_who_was_not_learnt_from(walk, body):
+    R_CH, joints, points = walk
+    found, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    turn = Rotation.from_matrix(np.asarray(found.orientation) @ np.swapaxes(R_CH, 1, 2))
+    assert np.degrees(turn.magnitude()).mean() < 12
+    skeleton = _skeleton.make_skeleton(body, 0.0)
+    angles = load_posture_prior(FPS).angles(found.latent)
+    place = jax.vmap(_skeleton.place_points, in_axes=(None, 0, None))
+    guess, _ = eqx.filter_jit(place)(skeleton, angles, jnp.zeros(_skeleton.NUM_SHAPE))
+    guess = np.einsum("tij,tkj->tki", found.orientation, guess)
+    error = np.linalg.norm(guess - (joints - joints[:, :1]), axis=-1)
+    assert error[:, :22].mean() < 0.05
+    # Neither sure beyond reason nor of nothing.
+    assert 0.1 < np.median(found.latent_sigma[:, :5]) < 1.0
+
+
+def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
+    _, _, points = walk
+    uv, sigma = pixels(points, CAMERA.params), SIGMA.copy()
+    uv[20:30], sigma[20:30] = 0.0, np.inf
+    sigma[40, 5:] = np.inf
+    found, known = lift(uv, sigma)
+    missing = [*range(20, 30), 40]
+    assert np.flatnonzero(~np.asarray(known)).tolist() == missing
+    assert all(np.isfinite(a).all() for a in jax.tree.leaves(found))
+    plain, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    # Half a second after the last of them they are out of sight.
+    np.testing.assert_allclose(found.latent[56:], plain.latent[56:], atol=1e-5)
+
+    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    guess = _fit.guess_postures(scene, uv, sigma, FPS)
+    assert np.isinf(guess.latent_sigma[missing]).all()
+    assert np.isinf(guess.turn_sigma[missing]).all()
+    assert np.isfinite(guess.latent_sigma[56:]).all()
+    # One who is never seen.
+    guess = _fit.guess_postures(scene, 0 * uv, np.full_like(sigma, np.inf), FPS)
+    assert np.isinf(guess.turn_sigma).all() and np.isfinite(guess.latent).all()
+
+
+def test_legs_of_who_walks_away_swing(walk, body):
+    """Along the line of sight, where a single image says nothing."""
+    _, joints, points = walk
+    size = (CAMERA.width, CAMERA.height)
+    rng = np.random.default_rng(0)
+    noise = _measuring.NOISE["real"]
+    uv, confidence = _measuring.detect_keypoints(
+        points, joints, CAMERA.params, size, noise, rng
+    )
+    seen = Keypoints(uv[None], confidence[None])
+
+    def fit(settings):
+        bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
+        roots = people.roots_from_bodies(bodies, body)
+        place = jax.vmap(_skeleton.place_points, in_axes=(None, 0, None))
+        found, _ = eqx.filter_jit(place)(
+            _skeleton.make_skeleton(body, 0.0),
+            jnp.asarray(roots.body_pose[0, :, :21].reshape(-1, 63)),
+            jnp.zeros(_skeleton.NUM_SHAPE).at[:10].set(roots.shape[0]),
+        )
+        return np.einsum("tij,tkj->tki", roots.T_CH[0, :, :3, :3], found)
+
+    def swing(joints):
+        left, right = (joints[:, j, 2] for j in ANKLES)
+        return left - right
+
+    def error(found):
+        away = found - (joints - joints[:, :1])
+        return np.linalg.norm(away, axis=-1)[:, [4, 5, 7, 8]].mean()  # m
+
+    found = fit(PeopleFit())
+    share = swing(found) @ swing(joints) / (swing(joints) @ swing(joints))
+    assert 0.9 < share < 1.1
+    assert error(found) < 0.055
+    assert error(fit(PeopleFit(lift_scale=0.0))) > 1.2 * error(found)
+
+
+def test_in_single_precision(walk):
+    _, _, points = walk
+    found, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    single = [
+        jnp.asarray(a, jnp.float32)
+        for a in (CAMERA.params, pixels(points, CAMERA.params), SIGMA, FPS)
+    ]
+    other, _ = _lift.lift(_lift.load_lifter(), *single)
+    assert other.latent.dtype == other.orientation.dtype == jnp.float32
+    np.testing.assert_allclose(other.latent, found.latent, atol=1e-3)
