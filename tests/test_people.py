@@ -18,9 +18,9 @@ from bodyslam_jax.people import (
     _bodies,
     _chain,
     _fit,
+    _path,
     _prior,
     _skeleton,
-    _starts,
     _terms,
 )
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
@@ -245,10 +245,10 @@ def test_the_path_prefers_continuity_to_the_cheaper_jump():
     costs = np.tile([0.0, 4.0], (5, 1))
     costs[2] = [2.0, 0.0]
     upright = np.tile(np.eye(3), (5, 2, 1, 1))
-    path = _starts.best_path(costs, places, upright, np.arange(5) / 10)
+    path = _path.best_path(costs, places, upright, np.arange(5) / 10)
     assert path.tolist() == [0, 0, 0, 0, 0]
     costs[:2], costs[2:] = [0.0, 5e3], [5e3, 0.0]
-    path = _starts.best_path(costs, places, upright, np.arange(5) / 10)
+    path = _path.best_path(costs, places, upright, np.arange(5) / 10)
     assert path.tolist() == [0, 0, 1, 1, 1]
 
 
@@ -266,7 +266,7 @@ def test_legs_go_on_where_they_cross():
     costs = np.zeros((30, 2))
     costs[np.arange(30), 1 - forward] = 1.0  # the left leg in front is a little cheaper
     upright = np.tile(np.eye(3), (30, 2, 1, 1))
-    path = _starts.best_path(costs, joints, upright, time)
+    path = _path.best_path(costs, joints, upright, time)
     left = joints[np.arange(30), path, 7, 2]
     # Either all of it or none is mirrored, but for where both are the same anyway.
     away = [np.abs(left - sign * swing).max() for sign in (1, -1)]
@@ -276,9 +276,9 @@ def test_legs_go_on_where_they_cross():
 def test_a_path_of_one_or_two_frames():
     joints, costs = np.zeros((2, 3, 24, 3)), np.array([[2.0, 1, 3], [0, 1, 2]])
     upright = np.tile(np.eye(3), (2, 3, 1, 1))
-    one = _starts.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
+    one = _path.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
     assert one.tolist() == [1]
-    two = _starts.best_path(costs, joints, upright, np.arange(2) / 10)
+    two = _path.best_path(costs, joints, upright, np.arange(2) / 10)
     assert two.tolist() == [1, 0]
 
 

@@ -5,7 +5,7 @@ from bodyslam_jax.people._bodies import nobody as nobody
 from bodyslam_jax.people._bodies import without_bodies as without_bodies
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
-from bodyslam_jax.people._fit import keypoint_sigma as keypoint_sigma
+from bodyslam_jax.people._keypoint_errors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people._prepare import BodyNoise as BodyNoise
 from bodyslam_jax.people._prepare import body_noise as body_noise
 from bodyslam_jax.people._prepare import prepare_bodies as prepare_bodies

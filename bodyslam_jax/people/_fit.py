@@ -13,28 +13,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import median_filter
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
+from bodyslam_jax.people._keypoint_errors import (
+    find_present,
+    in_pixels,
+    keypoint_sigma,
+    pixels_per_metre,
+)
 from bodyslam_jax.people._lift import lift, load_lifter
+from bodyslam_jax.people._path import best_path
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._roots import Roots, bodies_from_roots
 from bodyslam_jax.people._rotations import slerp
 from bodyslam_jax.people._skeleton import NUM_SHAPE, make_skeleton
-from bodyslam_jax.people._starts import best_path, fit_frames
-from bodyslam_jax.people._terms import KEYPOINT_SIGMA, Fit, Lifted, Scene
+from bodyslam_jax.people._starts import fit_frames
+from bodyslam_jax.people._terms import Fit, Lifted, Scene
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
 
 _BUCKET = 64
 """Frames are padded to a multiple of this, so that few shapes are compiled."""
-_BOX_DIAGONAL = 1.75
-"""m: what the keypoints of a standing adult span, nose to toe and arms."""
-_DETECTOR_FLOOR = 1.0
-"""px: no detector is better, however small the person."""
 _FASTEST = 8.0
 """m/s across the line of sight, above which it is not the same person."""
 
@@ -97,50 +100,6 @@ def make_scene(
     )
 
 
-def keypoint_sigma(
-    keypoints: Keypoints, intrinsics: Intrinsics, person: int
-) -> Float[np.ndarray, "t 25"]:
-    """Standard deviation of one person's keypoints relative to the body, m; `inf` where
-    there is none."""
-    uv, confidence = keypoints.uv[person], keypoints.confidence[person]
-    size = np.array([intrinsics.width, intrinsics.height])
-    inside = np.all((uv > -0.5) & (uv < size - 0.5), axis=-1)
-    seen = (confidence > 0) & inside
-    if not seen.any():
-        return np.full(confidence.shape, np.inf)
-    sure = np.quantile(confidence[seen], 0.9)
-    relative = np.clip(confidence / sure, 0.1, 1.0)
-    return np.where(
-        seen & (confidence > 0.02 * sure), KEYPOINT_SIGMA / relative, np.inf
-    )
-
-
-def find_present(
-    sigma: Float[np.ndarray, "t 25"], fps: float, settings: PeopleFit
-) -> np.ndarray:
-    """Frames with keypoints enough, and short gaps between them."""
-    enough = np.sum(np.isfinite(sigma), axis=1) >= settings.min_keypoints
-    present = enough.copy()
-    known = np.flatnonzero(enough)
-    for a, b in zip(known[:-1], known[1:]):
-        if b - a - 1 <= settings.max_gap * fps:
-            present[a:b] = True
-    return present
-
-
-def pixels_per_metre(
-    uv: Float[np.ndarray, "t 25 2"], sigma: Float[np.ndarray, "t 25"], fps: float
-) -> Float[np.ndarray, " t"]:
-    """How large the person appears: largest keypoint box within half a second."""
-    seen = np.isfinite(sigma)[..., None]
-    low = np.min(np.where(seen, uv, np.inf), axis=1)
-    high = np.max(np.where(seen, uv, -np.inf), axis=1)
-    diagonal = np.where(seen.any(axis=(1, 2)), np.linalg.norm(high - low, axis=-1), 0.0)
-    largest = maximum_filter1d(diagonal, 2 * round(fps / 2) + 1)
-    overall = np.median(diagonal[diagonal > 0])
-    return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
-
-
 def _fit_person(
     scene: Scene,
     uv: Float[np.ndarray, "t 25 2"],
@@ -154,12 +113,12 @@ def _fit_person(
     fitted = slice(where[0], where[-1] + 1)
     uv, sigma = uv[fitted], sigma[fitted]
     lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
-    sigma_px = _in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
+    sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
     start, cuts = _start(scene, uv, sigma_px, lifted, fps, settings)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
-    sigma_px = _in_pixels(sigma, focal / depth)
+    sigma_px = in_pixels(sigma, focal / depth)
     frames_alike = max(1.0, settings.correlation_time * fps)
     dtype = scene.intrinsics.dtype
     length = -len(uv) % _BUCKET
@@ -182,10 +141,6 @@ def _fit_person(
     chain, value = solve_chain(problem, chain, settings.max_steps)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
-
-
-def _in_pixels(sigma: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    return np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
 
 
 def guess_postures(

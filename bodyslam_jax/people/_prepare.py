@@ -17,7 +17,12 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PeopleFit
-from bodyslam_jax.people._fit import keypoint_sigma, pixels_per_metre
+from bodyslam_jax.people._keypoint_errors import (
+    in_pixels,
+    keypoint_sigma,
+    pixels_per_metre,
+)
+from bodyslam_jax.people._path import best_path
 from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
 from bodyslam_jax.people._rotations import matrices, slerp, vectors
 from bodyslam_jax.people._skeleton import (
@@ -26,14 +31,11 @@ from bodyslam_jax.people._skeleton import (
     make_skeleton,
     place_points,
 )
-from bodyslam_jax.people._starts import best_path
 from bodyslam_jax.people._terms import DEPTH_FLOOR, robust
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints
 
 _BUCKET = 64
 _PLACING_STEPS = 10
-_DETECTOR_FLOOR = 1.0
-"""px"""
 _REGRESSOR_SHAPE_GAIN = 1.2
 """Regressors draw shapes to the mean, by 0.5 to 0.8 with an error of 0.3, of which this
 is about the best linear estimate."""
@@ -97,8 +99,7 @@ def prepare_bodies(
             uv = keypoints.uv[h, where]
             sigma = keypoint_sigma(keypoints, intrinsics, h)[where]
         if np.isfinite(sigma).any():
-            scale = pixels_per_metre(uv, sigma, fps)
-            sigma = np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
+            sigma = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
         orientation, position = _place_person(
             skeleton, intrinsics, prepared, h, where, uv, sigma, fps, settings
         )

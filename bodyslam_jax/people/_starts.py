@@ -1,10 +1,9 @@
-"""Where the fit of a person starts: many guesses a frame, the best path through them.
+"""Where the fit of a person starts: many guesses a frame.
 
 One view does not say which way round a body is, nor which leg is in front; a single
 descent ends in the nearest of several minima. So every few frames the body is fitted
-from each of eight headings and a few typical postures, and a path through the frames
-(Viterbi) weighs how well each end explains its keypoints against how far the joints
-would have to jump between frames.
+from each of eight headings and a few typical postures, and from the posture that
+keypoints before and after make likely (`_lift`); `_path` finds the motion among them.
 """
 
 from collections.abc import Callable
@@ -34,14 +33,6 @@ _POSTURES_PER_HEADING = 2
 _KEPT = 6
 _FIRST_STEPS, _LAST_STEPS = 5, 10
 _FRAME_BATCH, _DESCENT_BATCH = 32, 256
-_JOINT_SPEED = 1.2
-"""m/s: how fast joints move about the pelvis, roughly."""
-_JOINT_ACCELERATION = 6.0
-"""m/s^2: how fast that changes, roughly."""
-_INDEPENDENT_JOINTS = 8
-"""Joints of a body move together: 24 of them say as much as about this many."""
-_TURN_SPEED = 2.0
-"""rad/s: how fast people turn round."""
 
 
 def fit_frames(
@@ -236,56 +227,3 @@ def _descend(
     fits, normal, _ = jax.lax.fori_loop(0, steps + 1, step, carry)
     joints = jax.vmap(joints_about_pelvis, in_axes=(None, 0, None))(scene, fits, shape)
     return fits, normal[2], joints
-
-
-def best_path(
-    costs: Float[np.ndarray, "f s"],
-    joints: Float[np.ndarray, "f s 24 3"],
-    orientation: Float[np.ndarray, "f s 3 3"],
-    time: Float[np.ndarray, " f"],
-) -> Int[np.ndarray, " f"]:
-    """The end of each frame that lies on the cheapest path (Viterbi, second order).
-
-    When legs cross, a leg that goes on and one that turns back move equally far; only
-    the change of velocity tells them apart.
-
-    Args:
-        joints: relative to the pelvis, in C, m.
-        time: of each frame, s, increasing.
-    """
-    frames, starts = costs.shape
-    if frames == 1:
-        return np.array([np.argmin(costs[0])])
-    gap = np.maximum(np.diff(time), 1e-3)
-    # A state is the ends of two frames, [before, now]: their difference is a velocity.
-    total = costs[0][:, None] + costs[1] + _jump(joints, orientation, gap, 1)
-    came_from = np.zeros((frames, starts, starts), int)
-    for k in range(2, frames):
-        velocity, before = (
-            (joints[j][None] - joints[j - 1][:, None]) / gap[j - 1] for j in (k, k - 1)
-        )
-        change = velocity[None] - before[:, :, None]  # [two before, before, now]
-        step = _JOINT_ACCELERATION * (gap[k - 1] + gap[k - 2]) / 2
-        squared = np.mean(np.sum(change**2, -1), -1) / step**2
-        through = total[..., None] + 0.5 * _INDEPENDENT_JOINTS * squared
-        came_from[k] = np.argmin(through, axis=0)
-        total = np.min(through, axis=0) + _jump(joints, orientation, gap, k) + costs[k]
-    path = np.empty(frames, int)
-    path[-2:] = np.unravel_index(np.argmin(total), total.shape)
-    for k in range(frames - 1, 1, -1):
-        path[k - 2] = came_from[k, path[k - 1], path[k]]
-    return path
-
-
-def _jump(
-    joints: Float[np.ndarray, "f s 24 3"],
-    orientation: Float[np.ndarray, "f s 3 3"],
-    gap: Float[np.ndarray, " g"],
-    k: int,
-) -> Float[np.ndarray, "s s"]:
-    """Cost of moving from each end of frame k - 1 to each of frame k."""
-    moved = joints[k][None] - joints[k - 1][:, None]
-    squared = np.mean(np.sum(moved**2, -1), -1) / (_JOINT_SPEED * gap[k - 1]) ** 2
-    cosine = np.einsum("aij,bij->ab", orientation[k - 1], orientation[k])
-    turn = np.arccos(np.clip((cosine - 1) / 2, -1, 1)) / (_TURN_SPEED * gap[k - 1])
-    return 0.5 * (_INDEPENDENT_JOINTS * squared + turn**2)
