@@ -77,6 +77,8 @@ def summarise(
         if status == "ok" and off > _GROUND_DISTRUST:
             status = "not to be trusted: people do not stand on the ground of the map"
     way = export.camera_facts(result, within)
+    # NaN, where covariances were not computed, stays NaN.
+    scale_sigma = float(np.maximum(joint.scale_sigma, apart / 2 * result.scale))
     persons = []
     for h in range(len(result.poses)):
         facts = export.person_facts(result, h)
@@ -94,7 +96,8 @@ def summarise(
         )
     headline = [
         f"{sequence.name}: {status}",
-        f"camera: {way.distance:.2f} m in {way.seconds:.1f} s ({cameras.kind})",
+        f"camera: {way.distance:.2f} m{_known_to(scale_sigma / result.scale, cameras)} "
+        f"in {way.seconds:.1f} s ({cameras.kind})",
     ]
     for h, p in enumerate(persons):
         if not p["frames"]:
@@ -127,8 +130,7 @@ def summarise(
         "camera_motion": cameras.kind,
         "scale": {
             "value": result.scale,
-            # NaN, where covariances were not computed, stays NaN.
-            "sigma": float(np.maximum(joint.scale_sigma, apart / 2 * result.scale)),
+            "sigma": scale_sigma,
             "sigma_of_covariance": joint.scale_sigma,
             "start": joint.start.value,
             "start_standard_error": joint.start.standard_error,
@@ -152,6 +154,13 @@ def summarise(
         "settings": dataclasses.asdict(config),
         "versions": versions(),
     }
+
+
+def _known_to(share: float, cameras: Cameras) -> str:
+    """How well the camera's metres are known, to stand behind them."""
+    if cameras.kind != "moving" or np.isnan(share):
+        return ""
+    return f" ± {100 * share:.0f} %" if share < 1 else ", of no known size,"
 
 
 def _cues(start: ScaleStart) -> dict[str, list[float] | None]:

@@ -28,6 +28,7 @@ from bodyslam_jax.frontend._calibration import (
 )
 from bodyslam_jax.frontend._keypoints import read_detections
 from bodyslam_jax.frontend._layouts import to_body25
+from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._perspective import crop_camera, full_translation
 from bodyslam_jax.frontend._pickle import restricted_load
 from bodyslam_jax.sequence import Intrinsics, Keypoints
@@ -945,6 +946,30 @@ def test_images_alone_are_enough_in_the_order_of_their_numbers(tmp_path):
     means = [int(image.mean()) for image in frames(found, gray=True)]
     assert means == [20 * k for k in range(11)]
     assert any("30 frames/s assumed" in w for w in found.warnings)
+    assert not any("none between" in w for w in found.warnings)
+
+    for k in (4, 5, 8):
+        (tmp_path / f"frame{k}.png").unlink()
+    found = read_sequence(tmp_path)
+    (gap,) = [w for w in found.warnings if "none between" in w]
+    assert "frame3.png and frame6.png, and 1 more such gap" in gap
+    assert found.num_frames == 8
+
+
+@pytest.mark.parametrize(
+    ("names", "where"),
+    [
+        (["5.png", "10.png", "15.png"], None),  # every fifth
+        (["a.png", "b.png"], None),
+        (["one.png"], None),
+        ([], None),
+        (["5.png", "10.png", "15.png", "30.png"], "15.png and 30.png"),
+        (["v2_1.png", "v2_2.png", "v2_4.png"], "v2_2.png and v2_4.png"),
+    ],
+)
+def test_gaps_among_images(names, where):
+    found = gap_among(names)
+    assert found is None if where is None else where in found
 
 
 def test_tracks_need_no_video(tmp_path):

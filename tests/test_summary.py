@@ -22,9 +22,12 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
         joint = dataclasses.replace(
             rehearsal._joint(sequence), start=start, scale_sigma=sigma
         )
-        told = assemble(sequence, config, body, cameras, joint, {}).summary
+        moving = dataclasses.replace(cameras, kind="moving")
+        told = assemble(sequence, config, body, moving, joint, {}).summary
+        lines.append(told["headline"][1])
         return told["scale"], " ".join(told["warnings"])
 
+    lines = []
     scale, said = found(2.0, 0.03)
     assert scale["sigma"] == pytest.approx(np.log(1.5) / 2)
     assert scale["sigma_of_covariance"] == 0.03 and "no better than" in said
@@ -32,6 +35,11 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
     assert scale["sigma"] == 0.03 and "no better than" not in said
     assert found(2.0, 0.4)[0]["sigma"] == 0.4
     assert np.isnan(found(2.0, np.nan)[0]["sigma"])
+    found(2.9, 4.0)
+    value = scale["value"]
+    shares = [f" m ± {100 * s / value:.0f} % in" for s in (np.log(1.5) / 2, 0.03, 0.4)]
+    for line, part in zip(lines, [*shares, " m in", " m, of no known size, in"]):
+        assert part in line
 
 
 def test_noise_of_pixels_that_nobody_measured_is_not_told():

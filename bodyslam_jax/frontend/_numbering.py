@@ -67,6 +67,24 @@ def frames_of_names(
     return dict(zip(names, frames, strict=True))
 
 
+def gap_among(images: Sequence[str]) -> str | None:
+    """What to warn of where numbers in the names of a video's images leave some out."""
+    numbers = _numbers([_stem(name) for name in images]) or []
+    steps = [b - a for a, b in zip(numbers, numbers[1:])]
+    if not steps or min(steps) < 1 or min(steps) == max(steps):
+        return None
+    usual = sorted(steps)[(len(steps) - 1) // 2]
+    at = next((k for k, step in enumerate(steps) if step > usual), None)
+    if at is None:
+        return None
+    count = sum(step > usual for step in steps)
+    return (
+        f"images: none between {images[at]} and {images[at + 1]}"
+        + (f", and {count - 1} more such gaps" if count > 1 else "")
+        + "; taken as if each followed the last by one frame."
+    )
+
+
 def _stem(name: str) -> str:
     """The name without folders and known suffixes; other dots belong to it."""
     return _SUFFIX.sub("", re.split(r"[/\\]", name)[-1])

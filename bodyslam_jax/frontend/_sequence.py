@@ -12,6 +12,7 @@ from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
 from bodyslam_jax.frontend._given_tracks import read_tracks
 from bodyslam_jax.frontend._keypoints import Detections, read_detections
+from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
 from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
 from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
@@ -133,6 +134,8 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
     images: tuple[str, ...] = ()
     if footage and footage.path.is_dir():
         images = tuple(p.name for p in list_images(footage.path))
+        gap = gap_among(images)
+        warnings += [gap] if gap else []
     if known:
         intrinsics = known[0]
         if footage:
