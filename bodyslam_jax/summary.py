@@ -160,7 +160,7 @@ def _known_to(share: float, cameras: Cameras) -> str:
     """How well the camera's metres are known, to stand behind them."""
     if cameras.kind != "moving" or np.isnan(share):
         return ""
-    return f" ± {100 * share:.0f} %" if share < 1 else ", of no known size,"
+    return f" ± {max(1, 100 * share):.0f} %" if share < 1 else ", of no known size,"
 
 
 def _cues(start: ScaleStart) -> dict[str, list[float] | None]:

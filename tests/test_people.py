@@ -149,6 +149,12 @@ def test_fit_without_any_keypoint(body):
     assert np.isfinite(found.poses).all() and np.isfinite(found.trans).all()
 
 
+def test_fit_of_keypoints_that_are_all_in_one_place(body):
+    here = np.full((1, 8, 25, 2), 200.0)
+    found = people.fit_bodies(Keypoints(here, np.ones((1, 8, 25))), CAMERA, body, FPS)
+    assert np.isfinite(found.poses).all() and np.isfinite(found.trans).all()
+
+
 def test_the_prior_at_another_rate_is_the_same_process():
     """Correlation over 1/30 s: one step at 30 fps, two steps at 60."""
     at = {

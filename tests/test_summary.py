@@ -36,9 +36,12 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
     assert found(2.0, 0.4)[0]["sigma"] == 0.4
     assert np.isnan(found(2.0, np.nan)[0]["sigma"])
     found(2.9, 4.0)
+    found(2.9, 1e-5)
     value = scale["value"]
     shares = [f" m ± {100 * s / value:.0f} % in" for s in (np.log(1.5) / 2, 0.03, 0.4)]
-    for line, part in zip(lines, [*shares, " m in", " m, of no known size, in"]):
+    for line, part in zip(
+        lines, [*shares, " m in", " m, of no known size, in", " m ± 1 % in"]
+    ):
         assert part in line
 
 

@@ -21,6 +21,8 @@ from bodyslam_jax.synthetic._measuring import NOISE, detect_keypoints
 FRAMES = 320
 """Of a clip, at most."""
 CAMERA, SIZE = np.array([1200.0, 1200.0, 640.0, 360.0]), (1280, 720)
+STEEP = 0.3
+"""Share of cameras that look up by as much as 30 degrees, or down by 70."""
 _SHAPE_SPREAD = np.where(np.arange(NUM_SHAPE) < 10, 0.7, 1.0)
 # Keypoints that an edge of the image or a piece of furniture hides together.
 _GROUPS = (
@@ -142,8 +144,11 @@ def _camera(
     target = gaussian_filter1d(trans, 30, axis=0, mode="nearest")
     target = target if follows else np.repeat(trans.mean(0)[None], len(trans), 0)
     yaw, distance = rng.uniform(0, 2 * np.pi), rng.uniform(2.5, 9.0)
-    camera = target - distance * np.array([np.sin(yaw), 0.0, np.cos(yaw)])
-    camera[:, 1] = rng.uniform(0.5, 2.3)
+    # Most cameras are held in hands, some hang above people or lie below them.
+    rise = rng.uniform(-0.5, 1.2) if rng.random() < STEEP else 0.0
+    away = np.array([np.sin(yaw) * np.cos(rise), 0.0, np.cos(yaw) * np.cos(rise)])
+    camera = target - distance * away
+    camera[:, 1] = rng.uniform(0.5, 2.3) + distance * np.sin(rise)
     camera += np.cumsum(0.0015 * rng.standard_normal(camera.shape), axis=0)
     aim = gaussian_filter1d(trans, 20, axis=0, mode="nearest") + rng.normal(0, 0.15, 3)
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)

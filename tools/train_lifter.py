@@ -38,7 +38,7 @@ from make_posture_prior import HELD_OUT
 from bodyslam_jax import people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import PeopleFit
-from bodyslam_jax.people import _lift
+from bodyslam_jax.people import _fit, _lift
 from bodyslam_jax.people._lift import NUM_FEATURES, Lifter, features
 from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people._skeleton import (
@@ -238,7 +238,7 @@ def learn(folder: Path, out: Path, steps: int) -> None:
 
 def judge(folder: Path, network: Path) -> None:
     """Fits to keypoints of the held-out people, with guesses and without."""
-    _lift.ASSET = network
+    _fit.load_lifter = lambda: _lift.load_lifter(network)
     body = load_body_model()
     skeleton = make_skeleton(body, 0.0)
     motions = [
@@ -272,7 +272,8 @@ def judge(folder: Path, network: Path) -> None:
     rows = np.array(rows, float)
     for name, kind in (("walking", 1.0), ("other", 0.0)):
         mean = rows[rows[:, 0] == kind, 1:].mean(0)
-        print(f"{name}, {np.sum(rows[:, 0] == kind)} sequences, joints and legs, mm:")
+        count = np.sum(rows[:, 0] == kind)
+        print(f"{name}, {count} sequences, joints and legs of the best size, mm:")
         for i, which in enumerate(settings):
             print(f"  {which} guesses {mean[2 * i]:.1f} {mean[2 * i + 1]:.1f}")
 

@@ -24,8 +24,8 @@ class PeopleFit:
     detector_bias: float = 0.0
     """0: keypoints are SMPL's joints; 1: hips, neck and shoulders as COCO has them."""
     lift_scale: float = 1.0
-    """Scale of the robust loss on guessed postures, in their standard deviations; 0:
-    they are places to start from, and say nothing else."""
+    """Scale of the robust loss on guessed postures, in standard deviations of each
+    component; 0: they are places to start from, and say nothing else."""
     lift_correlation: float = 0.2
     """Errors of guessed postures stay the same for about this long, s."""
     limit_sigma: float = 0.05

@@ -68,19 +68,22 @@ def frames_of_names(
 
 
 def gap_among(images: Sequence[str]) -> str | None:
-    """What to warn of where numbers in the names of a video's images leave some out."""
+    """What to warn of where numbers in the names of a video's images leave some out.
+
+    One in ten may: where more are wide, images were thinned to another rate.
+    """
     numbers = _numbers([_stem(name) for name in images]) or []
     steps = [b - a for a, b in zip(numbers, numbers[1:])]
-    if not steps or min(steps) < 1 or min(steps) == max(steps):
+    if not steps or min(steps) < 1:
         return None
+    # Numbers that are times are never quite even.
     usual = sorted(steps)[(len(steps) - 1) // 2]
-    at = next((k for k, step in enumerate(steps) if step > usual), None)
-    if at is None:
+    wide = [k for k, step in enumerate(steps) if step >= 2 * usual]
+    if not 0 < len(wide) <= max(1, len(steps) // 10):
         return None
-    count = sum(step > usual for step in steps)
     return (
-        f"images: none between {images[at]} and {images[at + 1]}"
-        + (f", and {count - 1} more such gaps" if count > 1 else "")
+        f"images: none between {images[wide[0]]} and {images[wide[0] + 1]}"
+        + (f", and {len(wide) - 1} more such gaps" if len(wide) > 1 else "")
         + "; taken as if each followed the last by one frame."
     )
 

@@ -54,7 +54,9 @@ def pixels_per_metre(
     high = np.max(np.where(seen, uv, -np.inf), axis=1)
     diagonal = np.where(seen.any(axis=(1, 2)), np.linalg.norm(high - low, axis=-1), 0.0)
     largest = maximum_filter1d(diagonal, 2 * round(fps / 2) + 1)
-    overall = np.median(diagonal[diagonal > 0])
+    known = diagonal[diagonal > 0]
+    # All in one place is nobody, but no reason to fail.
+    overall = np.median(known) if len(known) else _DETECTOR_FLOOR
     return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
 
 

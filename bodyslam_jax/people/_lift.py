@@ -31,6 +31,9 @@ REACH = 5
 NUM_FEATURES = (2 * REACH + 1) * 25 * 3
 _KEPT = 0.8
 """Share of hidden units, while training."""
+_NECK, _HIPS = 1, 8
+_SIZE = 0.5
+"""Root mean square of what the network sees of a person, where they are largest."""
 _FEWEST = 6
 """Keypoints that a frame needs to be seen at all."""
 
@@ -81,9 +84,9 @@ def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
 
 
 @functools.cache
-def load_lifter() -> Lifter:
-    """The network that ships with the package, in float32."""
-    with np.load(ASSET, allow_pickle=False) as archive:
+def load_lifter(path: Path = ASSET) -> Lifter:
+    """The network that ships with the package, or another, in float32."""
+    with np.load(path, allow_pickle=False) as archive:
         names = ("first", "hidden", "last", "bias", "last_bias")
         return Lifter(*(jnp.asarray(archive[n], jnp.float32) for n in names))
 
@@ -115,17 +118,19 @@ def features(
     sigma: Float[Array, "t 25"],
     fps: Float[Array, ""],
 ) -> tuple[Float[Array, "t f"], Float[Array, "t 3 3"], Bool[Array, " t"]]:
-    """What the network sees, the turn from C to the frame whose z is the ray to the
-    person, and where that is known.
+    """What the network sees, the turn from C to the frame in which it sees that, and
+    where that is known.
 
-    Seen along that ray, centred and in units of the person's size, so that neither
-    place nor focal length matter.
+    That frame's z is the ray to the person; in it their trunk is upright, on average
+    over the window, and their size is 1. So neither place nor focal length matter, nor
+    how the camera is turned.
     """
     relative = jnp.where(
         sigma < jnp.inf, jnp.asarray(KEYPOINT_SIGMA, uv.dtype) / sigma, 0
     )
     enough = jnp.sum(relative > 0, axis=1) >= _FEWEST
-    there = (relative > 0) & enough[:, None]
+    mark = jnp.where(enough[:, None], relative, 0)
+    there = mark > 0
     rays = jnp.where(there[..., None], unproject(intrinsics, uv), 0)
     length = jnp.sqrt(jnp.sum(rays**2, -1, keepdims=True))
     middle = jnp.sum(rays / jnp.maximum(length, 1), axis=1)
@@ -133,19 +138,31 @@ def features(
     view = _turn_to_axis(jnp.where(enough[:, None], middle, ahead))
     turned = jnp.einsum("tij,tkj->tki", view, rays)
     flat = turned[..., :2] / jnp.maximum(turned[..., 2:], 0.1)
-    low = jnp.min(jnp.where(there[..., None], flat, jnp.inf), axis=1)
-    high = jnp.max(jnp.where(there[..., None], flat, -jnp.inf), axis=1)
-    size = jnp.where(enough, jnp.sqrt(jnp.sum((high - low) ** 2, -1)), 0)
+    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(uv.dtype)
+    size = jnp.sqrt(jnp.sum(flat**2, (1, 2)) / count)
+    trunk = flat[:, _NECK] - flat[:, _HIPS]
+    trunk = jnp.where((there[:, _NECK] & there[:, _HIPS])[:, None], trunk, 0)
 
     step = jnp.arange(-REACH, REACH + 1, dtype=uv.dtype) * SPACING * fps
     index = jnp.arange(len(uv))[:, None] + jnp.round(step).astype(int)
     index = jnp.clip(index, 0, len(uv) - 1)
+    upright = _turn_upright(jnp.sum(trunk[index], axis=1))
     largest = jnp.maximum(jnp.max(size[index], axis=1), 1e-6)
-    shape = flat[index] * (2 / largest)[:, None, None, None]
-    mark = jnp.where(there, relative, 0)[index][..., None]
-    shape = jnp.where(mark > 0, shape, 0)
-    x = jnp.concatenate([shape, mark], -1).reshape(len(uv), NUM_FEATURES)
-    return x.astype(jnp.float32), view, enough
+    shape = jnp.einsum("tij,twkj->twki", upright[:, :2, :2], flat[index])
+    shape = shape * (_SIZE / largest)[:, None, None, None]
+    x = jnp.concatenate([shape, mark[index][..., None]], -1)
+    x = x.reshape(len(uv), NUM_FEATURES).astype(jnp.float32)
+    return x, upright @ view, enough
+
+
+def _turn_upright(trunk: Float[Array, "t 2"]) -> Float[Array, "t 3 3"]:
+    """About z, so that the trunk points to -y; none where it is not seen."""
+    length = jnp.sqrt(jnp.sum(trunk**2, -1, keepdims=True))
+    up = jnp.array([0.0, -1.0], trunk.dtype)
+    x, y = jnp.where(length > 1e-6, trunk / jnp.maximum(length, 1e-6), up).T
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rows = [[-y, x, zero], [-x, -y, zero], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
 def _turn_to_axis(ray: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
