@@ -21,6 +21,7 @@ from bodyslam_jax.people import (
     _path,
     _prior,
     _skeleton,
+    _starts,
     _terms,
 )
 from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
@@ -221,6 +222,41 @@ def test_the_linearisation_is_the_gradient_of_the_cost(body):
     np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(normal.cost, value, rtol=1e-12)
     assert jnp.linalg.eigvalsh(normal.hessian).min() > -1e-6
+
+
+def test_a_guess_weighs_as_much_as_it_is_sure(body):
+    fit, shape = random_fit()
+    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    uv, sigma = jnp.zeros((25, 2)), jnp.full(25, 20.0)
+    size = len(fit.latent)
+    sure = jnp.linspace(0.5, 2.0, size)
+    guess = _terms.Lifted(fit.orientation, fit.latent, sure, jnp.asarray(0.3))
+    none = guess.widened(jnp.asarray(jnp.inf))
+    linearise = jax.jit(_terms.linearise)
+    found, plain = (linearise(scene, fit, shape, uv, sigma, g) for g in (guess, none))
+    wanted = np.concatenate([np.full(3, 0.3**-2), np.zeros(3), np.asarray(sure) ** -2])
+    np.testing.assert_allclose(
+        found.hessian - plain.hessian, np.diag(wanted), rtol=1e-9, atol=1e-5
+    )
+
+
+def test_a_guess_is_a_start(body, monkeypatch):
+    """With no steps at all the one that is right is the best end."""
+    monkeypatch.setattr(_starts, "_FIRST_STEPS", 0)
+    monkeypatch.setattr(_starts, "_LAST_STEPS", 0)
+    fit, _ = random_fit()
+    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    _, local = jax.jit(_skeleton.place_points)(
+        scene.skeleton, scene.prior.angles(fit.latent), jnp.zeros(_skeleton.NUM_SHAPE)
+    )
+    p_C = np.asarray(local @ fit.orientation.T + fit.position)
+    uv = p_C[:, :2] / p_C[:, 2:] * CAMERA.params[:2] + CAMERA.params[2:]
+    sure = (jnp.full_like(fit.latent, 0.5), jnp.asarray(0.3))
+    guess = _terms.Lifted(fit.orientation, fit.latent, *sure)
+    guess = jax.tree.map(lambda a: a[None], guess)
+    fits, _, _ = _starts.fit_frames(scene, uv[None], np.full((1, 25), 5.0), guess)
+    np.testing.assert_allclose(fits.latent[0, 0], fit.latent)
+    np.testing.assert_allclose(fits.position[0, 0], fit.position, atol=1e-3)
 
 
 def test_the_banded_solver_is_a_dense_one():

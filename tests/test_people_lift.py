@@ -135,16 +135,40 @@ def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
     assert np.isinf(guess.turn_sigma).all() and np.isfinite(guess.latent).all()
 
 
-def test_legs_of_who_walks_away_swing(walk, body):
-    """Along the line of sight, where a single image says nothing."""
+@pytest.fixture(scope="module")
+def seen(walk):
+    """With a detector's errors."""
     _, joints, points = walk
-    size = (CAMERA.width, CAMERA.height)
-    rng = np.random.default_rng(0)
-    noise = _measuring.NOISE["real"]
     uv, confidence = _measuring.detect_keypoints(
-        points, joints, CAMERA.params, size, noise, rng
+        points,
+        joints,
+        CAMERA.params,
+        (CAMERA.width, CAMERA.height),
+        _measuring.NOISE["real"],
+        np.random.default_rng(0),
     )
-    seen = Keypoints(uv[None], confidence[None])
+    return Keypoints(uv[None], confidence[None])
+
+
+def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
+    sigma = people.keypoint_sigma(seen, CAMERA, 0)
+    guess = lift(seen.uv[0], sigma)[0].latent[:, :5]
+    prior = load_posture_prior(FPS)
+    decode = np.linalg.pinv(prior.basis)[:5]
+
+    def away(seconds):
+        settings = PeopleFit(lift_correlation=seconds)
+        bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
+        angles = people.roots_from_bodies(bodies, body).body_pose[0, :, :21]
+        latent = (angles.reshape(-1, 63) - np.asarray(prior.mean)) @ decode.T
+        return np.abs(latent - guess).mean()
+
+    assert away(0.0) < 0.8 * away(5.0)
+
+
+def test_legs_of_who_walks_away_swing(walk, seen, body):
+    """Along the line of sight, where a single image says nothing."""
+    _, joints, _ = walk
 
     def fit(settings):
         bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
