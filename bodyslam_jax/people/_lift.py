@@ -39,7 +39,8 @@ _FEWEST = 6
 
 
 class Lifter(eqx.Module):
-    """Dense layers with one skip; `k` components of posture (`PosturePrior`)."""
+    """Dense layers with two skips; `f` features of `h` hidden units; `k` components of
+    posture (`PosturePrior`)."""
 
     first: Float[Array, "f h"]
     hidden: Float[Array, "3 h h"]
@@ -122,8 +123,8 @@ def features(
     where that is known.
 
     That frame's z is the ray to the person; in it their trunk is upright, on average
-    over the window, and their size is 1. So neither place nor focal length matter, nor
-    how the camera is turned.
+    over the window, and their size, where largest in it, is 1/2. So neither place nor
+    focal length matter, nor how the camera is turned.
     """
     relative = jnp.where(
         sigma < jnp.inf, jnp.asarray(KEYPOINT_SIGMA, uv.dtype) / sigma, 0
