@@ -40,7 +40,10 @@ def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
     check_grads(retract, (step,), order=1)
 
 
-@pytest.mark.parametrize("loss", [g.Squared(), g.Cauchy(1.5), g.GemanMcClure(2.0)])
+@pytest.mark.parametrize(
+    "loss",
+    [g.Squared(), g.Cauchy(1.5), g.GemanMcClure(2.0), g.BlakeZisserman(3.5)],
+)
 def test_lifted_residual_has_the_loss_as_norm_and_its_gradient(loss, rng):
     residual = jnp.asarray(3 * rng.standard_normal((7, 2)))
     rho = lambda r: jnp.sum(loss.rho(jnp.sum(r**2, axis=-1)))
@@ -49,6 +52,24 @@ def test_lifted_residual_has_the_loss_as_norm_and_its_gradient(loss, rng):
     assert jnp.allclose(jax.grad(lifted)(residual), jax.grad(rho)(residual))
     zero = jnp.zeros((1, 2))
     assert jnp.isfinite(jax.grad(lifted)(zero)).all()
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_what_is_an_outlier_by_its_likelihood_pulls_no_more(dtype):
+    share, area, sigma = 0.03, 160.0**2, 0.7
+    c2 = 2 * np.log((1 - share) * area / (2 * np.pi * sigma**2 * share))
+    loss = g.BlakeZisserman(jnp.asarray(c2**0.5, dtype))
+    s = np.array([0.0, 1e-6, 1.0, 9.0, c2, 400.0, 1e12])
+    likely = lambda s: (
+        (1 - share) * np.exp(-s / 2) / (2 * np.pi * sigma**2) + share / area
+    )
+    rho, weight = loss.rho(jnp.asarray(s, dtype)), loss.weight(jnp.asarray(s, dtype))
+    assert rho.dtype == weight.dtype == dtype
+    rest = 2e-6 if dtype == jnp.float32 else 1e-12
+    assert np.allclose(rho, 2 * np.log(likely(0.0) / likely(s)), atol=rest, rtol=rest)
+    inlier = 1 - share / area / likely(s)
+    assert np.allclose(weight, inlier, atol=rest)
+    assert weight[4] == pytest.approx(0.5, abs=1e-5)
 
 
 def test_keypoint_jacobian_is_that_of_the_keypoints(rng):

@@ -252,6 +252,25 @@ def test_order_of_landmarks_does_not_matter():
     assert jnp.abs(moved).max() < 1e-6
 
 
+def test_inliers_count_as_if_there_were_no_outliers():
+    problem, _, start = make(noise=0.5)
+    factor = problem.factors[0]
+    wrong = jnp.arange(len(factor.frame)) % 29 == 3
+    pixel = factor.pixel + jnp.where(wrong[:, None], jnp.array([30.0, -45.0]), 0.0)
+    problem = eqx.tree_at(lambda p: p.factors[0].pixel, problem, pixel)
+    with_loss = lambda loss: eqx.tree_at(lambda p: p.factors[0].loss, problem, loss)
+    left_out = eqx.tree_at(
+        lambda p: p.factors[0].sigma,
+        with_loss(g.Squared()),
+        jnp.where(wrong, jnp.inf, factor.sigma),
+    )
+    first = solve(problem, start, schedule=TIGHT).state
+    best = solve(left_out, first, schedule=TIGHT).state
+    found = solve(with_loss(g.BlakeZisserman(5.0)), first, schedule=TIGHT).state
+    away = lambda state: jnp.abs(state.cameras - best.cameras).max()
+    assert away(found) < 1e-5 < 1e-3 < away(first)
+
+
 def test_the_world_and_unit_of_the_map_do_not_matter():
     problem, _, start = make()
     size, turn = 3.0, np.asarray(g.retract_pose(jnp.eye(4), 0.1 * jnp.arange(6.0)))
@@ -624,14 +643,27 @@ def test_covariances_are_as_large_as_errors_on_simulated_noise(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
     bench = importlib.import_module("solver_calibration")
     # A tenth of the noise that videos have: covariances are those of the linear part.
-    found = bench.calibration(20, draws=100, noise=0.1)
-    for name in ("cameras", "people", "landmarks"):
+    found = bench.calibration(20, draws=100, noise=0.1)["squared"]
+    for name in ("cameras, m", "people, m", "landmarks, m"):
         square, inside = found[name]
         assert abs(square - 1) < 0.15, name
         assert abs(inside - 0.95) < 0.03, name
     # Ten shapes, one scale a draw: the mean of so few is known to a tenth or so.
     assert abs(found["scale"][0] - 1) < 0.6
     assert abs(found["shape"][0] - 1) < 0.2
+
+
+@pytest.mark.slow
+def test_covariances_are_as_large_as_errors_among_outliers(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    bench = importlib.import_module("solver_calibration")
+    found = bench.calibration(20, draws=60, noise=0.1, robust=True)
+    for name in ("cameras, m", "people, m", "landmarks, m"):
+        square, inside = found["inliers"][name]
+        assert abs(square - 1) < 0.2, name
+        assert abs(inside - 0.95) < 0.03, name
+    # The Cauchy loss, for which inliers say less, takes errors to be larger.
+    assert found["default"]["cameras, m"][0] < found["inliers"]["cameras, m"][0] - 0.05
 
 
 def test_a_cost_that_is_not_finite_is_a_status():

@@ -32,6 +32,7 @@ from bodyslam_jax.graph._problem import make_problem as make_problem
 from bodyslam_jax.graph._reprojection import JointReprojection as JointReprojection
 from bodyslam_jax.graph._reprojection import Reprojection as Reprojection
 from bodyslam_jax.graph._robust import AbstractLoss as AbstractLoss
+from bodyslam_jax.graph._robust import BlakeZisserman as BlakeZisserman
 from bodyslam_jax.graph._robust import Cauchy as Cauchy
 from bodyslam_jax.graph._robust import GemanMcClure as GemanMcClure
 from bodyslam_jax.graph._robust import Squared as Squared

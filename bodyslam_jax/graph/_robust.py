@@ -26,7 +26,7 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
-        """The derivative of `rho`: 1 at 0, never negative."""
+        """The derivative of `rho`: 1 at 0, or nearly, and never negative."""
 
 
 class Squared(AbstractLoss):
@@ -70,6 +70,35 @@ class GemanMcClure(AbstractLoss):
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         c2 = self.scale**2
         return (c2 / (c2 + s)) ** 2
+
+
+class BlakeZisserman(AbstractLoss):
+    """`rho(s) = 2 log((1 + ε) / (exp(-s / 2) + ε))`, `ε = exp(-c^2 / 2)`: saturates
+    near `c^2`.
+
+    Minus twice the log-likelihood of Gaussian errors among outliers that may be
+    anywhere (Blake and Zisserman 1987; Hartley and Zisserman 2004, A6.8). What is no
+    outlier keeps its weight, where `Cauchy(1.5)` takes a third of it at one standard
+    deviation: estimates are closer, and covariances as large as their errors. But what
+    is further away than c pulls no more, so start where another loss has converged:
+
+        solution = solve(problem, state)
+        where = lambda p: p.factors[0].loss
+        problem = eqx.tree_at(where, problem, BlakeZisserman(4.5))
+        solution = solve(problem, solution.state)
+    """
+
+    scale: float | Float[Array, ""]
+    """c, standard deviations: where a measurement is as likely to be an outlier as not.
+    If a share `p` are outliers, anywhere in `A` px^2, and the others have a standard
+    deviation of `b` px, `c^2 = 2 log((1 - p) A / (2 π b^2 p))`."""
+
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        never = -(self.scale**2) / 2
+        return 2 * (jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never))
+
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        return jax.nn.sigmoid((self.scale**2 - s) / 2)
 
 
 def squared_norm(residual: Float[Array, "*m d"]) -> Float[Array, "*m"]:
