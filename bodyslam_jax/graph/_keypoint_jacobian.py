@@ -6,10 +6,12 @@ turn `R_j Exp(δ_j)` of joint j carries what hangs below it:
 add to a vertex. Forward differentiation of the chain takes twenty times as long.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import (
     DETECTOR_BIAS,
@@ -57,17 +59,30 @@ def turning_joints(
     return tuple(np.flatnonzero(moved[1:]).tolist())
 
 
-def keypoint_jacobian(
+class Carried(NamedTuple):
+    """What each joint carries of each keypoint, in H, m:
+    `p_k = Σ_i share_ik x_i + G_i lever_ik`."""
+
+    G: Float[Array, "24 3 3"]
+    x: Float[Array, "24 3"]
+    share: Float[Array, "24 k"]
+    lever: Float[Array, "24 k 3"]
+    x_by_shape: Float[Array, "24 3 10"]
+    lever_by_shape: Float[Array, "24 3 k 10"]
+    vertex: Int[Array, " k"]
+    """Of the skin, for those keypoints that are on it."""
+    on_skin: Bool[np.ndarray, " k"]
+
+
+def carried_by_joints(
     body: BodyModel,
-    pose: Float[Array, "23 3"],
+    R: Float[Array, "23 3 3"],
     shape: Float[Array, " 10"],
     layout: str,
     bias: float | Float[Array, ""],
-) -> tuple[Float[Array, "k 3"], Float[Array, "3 k 69"], Float[Array, "k 3 10"]]:
-    """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
-    by shape."""
-    dtype = pose.dtype
-    R = jaxlie.SO3.exp(pose).as_matrix()
+) -> Carried:
+    """Joints with their rotations, and where keypoints are on them."""
+    dtype = R.dtype
     names = KEYPOINT_NAMES[layout]
     skinned = np.array([name in SURFACE_POINTS for name in names])
     pick = np.array(
@@ -89,10 +104,10 @@ def keypoint_jacobian(
     # Places are linear in the offsets of joints from their parents, and these in shape.
     parent = jnp.array(PARENTS[1:])
     by_shape_offset = by_shape_rest[1:] - by_shape_rest[parent]
-    carried = _times(G[parent], by_shape_offset).reshape(23, 30)
+    carried = times(G[parent], by_shape_offset).reshape(23, 30)
     path = jnp.asarray(ancestors()[1:], dtype)
     offsets = (rest[1:] - rest[parent])[..., None]
-    x = path.T @ _times(G[parent], offsets)[..., 0]
+    x = path.T @ times(G[parent], offsets)[..., 0]
     by_shape_x = path.T @ carried
     shaped = body.template[vertex] + body.shape_dirs[vertex] @ shape
     if features:
@@ -105,16 +120,41 @@ def keypoint_jacobian(
     carries = (joint[..., None] == jnp.arange(24, dtype=joint.dtype)).astype(
         dtype
     ) * weight[..., None]
-    share = jnp.sum(carries, axis=1).T
-    lever = jnp.einsum("kni,knc->ikc", carries, arm)
-    placed = share[..., None] * x[:, None] + _times(lever, G.swapaxes(-1, -2))
-    position = jnp.sum(placed, axis=0)
     by_shape_arm = jnp.where(
         on_skin[..., None], body.shape_dirs[vertex][:, None] - by_shape_rest[joint], 0.0
     )
-    by_shape_lever = jnp.einsum("kni,kncs->icks", carries, by_shape_arm)
-    moved = G.swapaxes(0, 1).reshape(3, 72) @ by_shape_lever.reshape(72, -1)
-    by_shape = (share.T @ by_shape_x).reshape(-1, 3, 10)
+    return Carried(
+        G=G,
+        x=x,
+        share=jnp.sum(carries, axis=1).T,
+        lever=jnp.einsum("kni,knc->ikc", carries, arm),
+        x_by_shape=by_shape_x.reshape(24, 3, 10),
+        lever_by_shape=jnp.einsum("kni,kncs->icks", carries, by_shape_arm),
+        vertex=vertex,
+        on_skin=skinned,
+    )
+
+
+def keypoint_jacobian(
+    body: BodyModel,
+    pose: Float[Array, "23 3"],
+    shape: Float[Array, " 10"],
+    layout: str,
+    bias: float | Float[Array, ""],
+) -> tuple[Float[Array, "k 3"], Float[Array, "3 k 69"], Float[Array, "k 3 10"]]:
+    """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
+    by shape."""
+    dtype = pose.dtype
+    R = jaxlie.SO3.exp(pose).as_matrix()
+    found = carried_by_joints(body, R, shape, layout, bias)
+    G, x, share = found.G, found.x, found.share
+    count = share.shape[1]
+    features = body.pose_dirs.shape[-1]
+    path = jnp.asarray(ancestors()[1:], dtype)
+    placed = share[..., None] * x[:, None] + times(found.lever, G.swapaxes(-1, -2))
+    position = jnp.sum(placed, axis=0)
+    moved = G.swapaxes(0, 1).reshape(3, 72) @ found.lever_by_shape.reshape(72, -1)
+    by_shape = (share.T @ found.x_by_shape.reshape(24, 30)).reshape(-1, 3, 10)
     by_shape = by_shape + moved.reshape(3, -1, 10).swapaxes(0, 1)
     # All that hangs below a joint, about that joint.
     moment = (path @ placed.reshape(24, -1)).reshape(23, -1, 3)
@@ -132,12 +172,13 @@ def keypoint_jacobian(
         # dR_j / dδ_ja = R_j [e_a]x, for the joints whose entries are blended.
         basis = np.array([np.cross(np.eye(3)[a], np.eye(3)).T for a in range(3)])
         turned = jnp.einsum("jik,akl->jail", R, jnp.asarray(basis, dtype))
-        dirs = jnp.pad(body.pose_dirs[vertex], ((0, 0), (0, 0), (0, 207 - features)))
-        dirs = dirs.reshape(len(names), 3, 23, 9)
+        dirs = body.pose_dirs[found.vertex]
+        dirs = jnp.pad(dirs, ((0, 0), (0, 0), (0, 207 - features)))
+        dirs = dirs.reshape(count, 3, 23, 9)
         bent = jnp.einsum("kcjp,jap->kcja", dirs, turned.reshape(23, 3, 9))
         frame = (share.T @ G.reshape(24, 9)).reshape(-1, 3, 3)
-        moved = jnp.einsum("kic,kcm->ikm", frame, bent.reshape(len(names), 3, 69))
-        moved = jnp.where(skinned[:, None], moved, 0.0)
+        moved = jnp.einsum("kic,kcm->ikm", frame, bent.reshape(count, 3, 69))
+        moved = jnp.where(found.on_skin[:, None], moved, 0.0)
         by_pose = [by_pose[i] + moved[i] for i in range(3)]
     return position, jnp.stack(by_pose), by_shape
 
@@ -147,12 +188,12 @@ def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
     G = jnp.concatenate([jnp.eye(3, dtype=R.dtype)[None], R])
     above = np.maximum(np.array(PARENTS), 0)
     for _ in range(4):  # 2^4 is more than the depth of the tree
-        G = _times(G[above], G)
+        G = times(G[above], G)
         above = above[above]
     return G
 
 
-def _times(a: Float[Array, "*b i c"], b: Float[Array, "*b c j"]) -> Array:
+def times(a: Float[Array, "*b i c"], b: Float[Array, "*b c j"]) -> Array:
     """A product of many small matrices, fused: a call for each would take longer."""
     term = lambda c: a[..., :, c, None] * b[..., c, None, :]
     return sum((term(c) for c in range(1, a.shape[-1])), term(0))

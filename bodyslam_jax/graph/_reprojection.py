@@ -119,14 +119,15 @@ class JointReprojection(AbstractFrameFactor):
         """
 
         def one(data, window, shared, _):
-            residual, parts = self.jacobian(data, window, shared)
-            (frame,) = window
-            weight = self.loss.weight(squared_norm(residual))[:, None]
-            by_C = parts["root", 0][..., 3:]
-            pull = jnp.sum((weight * residual)[..., None] * by_C, axis=1)
-            return keypoint_curvature(
-                *(self.body, frame.pose, shared.shape, self.layout, self.bias),
-                pull @ frame.root[:3, :3],
+            (pixel, sigma), (frame,) = data, window
+            given = self.body, frame.pose, shared.shape, self.layout, self.bias
+            C_CH = frame.root[:3, :3]
+            p_C = keypoint_jacobian(*given)[0] @ C_CH.T + frame.root[:3, 3]
+            residual, pull = jax.vjp(
+                lambda p: (project(shared.intrinsics, p) - pixel) / sigma[:, None], p_C
             )
+            weight = self.loss.weight(squared_norm(residual))[:, None]
+            (by_C,) = pull(weight * residual)
+            return keypoint_curvature(*given, by_C @ C_CH)
 
         return self.map_frames(one, state)

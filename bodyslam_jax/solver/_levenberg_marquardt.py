@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
 from bodyslam_jax.solver._blocks import Linearisation, sizes_of
 from bodyslam_jax.solver._coupling import with_coupling
-from bodyslam_jax.solver._curvature import with_curvature
+from bodyslam_jax.solver._curvature import bend, curvature_if, next_share
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final, History, Loop
 from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, eliminate
@@ -86,6 +86,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             cost=jnp.asarray(jnp.inf, dtype),
             first_cost=jnp.asarray(jnp.inf, dtype),
             steps=jnp.zeros(s, int),
+            share=jnp.zeros((), dtype),
             bent=jnp.array(True),
             finished=(stage == s) & ~self.keep,
             result=optx.RESULTS.successful,
@@ -118,14 +119,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             None,
         )
         problem: Problem = args.with_prediction(prediction)
-        lin = jax.lax.cond(
-            last & state.bent,
-            lambda lin: with_curvature(problem, lin, y, sizes),
-            lambda lin: lin,
-            lin,
-        )
+        share = jnp.where(last, state.bent.astype(dtype), state.share)
+        curvature = curvature_if(share > 0, problem, lin, y, sizes)
+        bent = bend(lin, curvature, share)
         known = jnp.sum(lin.costs)
-        trial = attempt(problem, y, lin, sizes, state.damping, state.caution, last)
+        trial = attempt(problem, y, bent, sizes, state.damping, state.caution, last)
         accept, before = trial.accepted, jnp.sum(trial.terms)
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
         done = _is_done(trial, known, enough)
@@ -157,6 +155,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         following = jnp.where(over, self._after(at), state.stage)
         # Away from a minimum the curvature may have no inverse: then without it.
         sound = ~state.bent | jnp.isfinite(trial.predicted)
+        share = next_share(state.share, accept, known - before, known)
+        share = jnp.where(self.damping > 0, share, 0.0)  # Gauss-Newton knows none
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
         history = History(
@@ -179,6 +179,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             cost=cost,
             first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
             steps=steps,
+            share=jnp.where(over, 0.0, share).astype(dtype),
             bent=state.bent & ~last,
             finished=(last & sound) | ((following == len(self.limit)) & ~self.keep),
             result=optx.RESULTS.where(last, state.result, result),

@@ -31,6 +31,7 @@ class Final(eqx.Module):
     """The normal equations where the solver stopped, hardly damped, factorised."""
 
     lin: Linearisation
+    """Without what keypoints bend (`_curvature`), which the factor may have."""
     factor: Factor
     roots: Roots | None
     """Of the people's roots that were eliminated within chunks."""
@@ -55,8 +56,10 @@ class Loop(eqx.Module):
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]
     steps: Int[Array, " s"]
+    share: Float[Array, ""]
+    """Of what keypoints bend (`_curvature`), in the next step."""
     bent: Bool[Array, ""]
-    """Whether the last factorisation is to have what keypoints bend (`_curvature`)."""
+    """Whether the last factorisation is to have all of that."""
     finished: Bool[Array, ""]
     result: optx.RESULTS
     history: History

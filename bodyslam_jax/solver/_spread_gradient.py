@@ -13,7 +13,7 @@ from bodyslam_jax.compilation import in_full_precision
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver._blocks import Linearisation, Sizes, sizes_of
 from bodyslam_jax.solver._coupling import with_coupling
-from bodyslam_jax.solver._curvature import with_curvature
+from bodyslam_jax.solver._curvature import bend, curvature_of
 from bodyslam_jax.solver._levenberg_marquardt import final_of
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._loop import Final
@@ -42,7 +42,7 @@ def _bent(
     problem: Problem, lin: Linearisation, state: State, sizes: Sizes
 ) -> Linearisation:
     """With the curvature of keypoints where there is an inverse, as in the loop."""
-    bent = with_curvature(problem, lin, state, sizes)
+    bent = bend(lin, curvature_of(problem, lin, state, sizes))
     tried = jax.lax.stop_gradient(bent)
     factor = eliminate(problem, tried, sizes, _damping(tried, sizes)).factor
     sound = jnp.all(jnp.isfinite(factor.half))
