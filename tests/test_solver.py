@@ -26,6 +26,7 @@ from bodyslam_jax.solver import (
     solve,
     trace,
 )
+from bodyslam_jax.solver._curvature import next_share
 from bodyslam_jax.solver._gmres import RESTART, gmres
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad
@@ -144,6 +145,29 @@ def test_gauss_newton_reaches_the_same_optimum():
     assert best.status == found.status == "converged"
     assert found.histories[0].damping[0] == 0
     assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-8)
+
+
+def test_last_steps_know_what_keypoints_bend():
+    problem, _, start = make(2, people=1, frames=12)
+    schedule = (Stage(rtol=1e-12, max_steps=100),)
+    found = solve(problem, start, schedule=schedule)
+    # The same program, in which Gauss-Newton's steps know of J^T J alone.
+    plain = solve(problem, start, schedule=schedule, damping=0.0)
+    assert found.status == plain.status == "converged"
+    assert float(found.cost) == pytest.approx(float(plain.cost), rel=1e-8)
+    assert int(found.num_steps[0]) < 0.7 * int(plain.num_steps[0])
+
+
+def test_curvature_comes_in_when_steps_gain_little_and_goes_where_it_has_no_minimum():
+    following = lambda share, accepted, gained: float(
+        next_share(jnp.asarray(share), jnp.array(accepted), jnp.asarray(gained), 1.0)
+    )
+    assert following(0.0, True, 0.5) == following(0.0, False, 0.0) == 0
+    share = following(0.0, True, 1e-4)
+    assert 0 < share < 1
+    assert share < following(share, True, 0.5) < 1
+    assert following(share, False, 0.0) == share / 2
+    assert following(0.99, True, 1e-4) == following(1.0, True, 1e-4) == 1
 
 
 @pytest.mark.parametrize("solver", STOCK)

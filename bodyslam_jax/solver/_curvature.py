@@ -43,7 +43,7 @@ def next_share(
     share: Float[Array, ""],
     accepted: Bool[Array, ""],
     gained: Float[Array, ""],
-    cost: Float[Array, ""],
+    cost: float | Float[Array, ""],
 ) -> Float[Array, ""]:
     """How much of the curvature the next step knows."""
     more = jnp.where(share > 0, jnp.minimum(_MORE * share, 1.0), _FIRST)

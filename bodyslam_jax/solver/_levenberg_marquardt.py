@@ -2,8 +2,9 @@
 
 Steps are damped, and accepted on the true robust cost (`_trial`). The linearisation is
 kept after a rejected step. The motion model's prediction is frozen within a step and
-made anew after each accepted one, unless it is coupled (`_coupling`). Landmarks that no
-step would bring back are triangulated anew (`_triangulation`).
+made anew after each accepted one, unless it is coupled (`_coupling`). Steps that gain
+little know what keypoints bend (`_curvature`). Landmarks that no step would bring back
+are triangulated anew (`_triangulation`).
 
 The stages of a schedule are phases of one loop, and differ by a mask: what they do is
 compiled once, and so is what covariances need of the last linearisation.

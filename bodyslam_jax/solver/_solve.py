@@ -52,8 +52,9 @@ def solve(
     - `schedule`: stages one after another, each with its free variables, most steps
       and tolerances; `PAPER_SCHEDULE` is the paper's.
     - `damping`: of the first step of each stage, as a share of each variable's own
-      curvature; later steps adapt it. 0 is Gauss-Newton: full steps as long as they
-      lower the cost. Baselines have their own.
+      curvature; later steps adapt it, and once they gain little know what keypoints
+      bend, too, which `J^T J` leaves out. 0 is Gauss-Newton: full steps of `J^T J`, as
+      long as they lower the cost. Baselines have their own.
     - `mixed_precision`: of `structured`, solves for steps in single precision, in two
       thirds of the time for long videos; residuals, gradients and costs, and so where
       it ends, keep that of `state`. Flat directions are damped a little more.
