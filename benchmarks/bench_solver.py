@@ -40,6 +40,7 @@ from bodyslam_jax.solver import Stage, over_devices, solve
 from bodyslam_jax.solver._assembly import assemble
 from bodyslam_jax.solver._blocks import cast, sizes_of
 from bodyslam_jax.solver._chunks import factorise
+from bodyslam_jax.solver._curvature import curvature_of
 from bodyslam_jax.solver._landmarks import eliminate_landmarks
 from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, solve_step
@@ -85,6 +86,8 @@ def breakdown(problem, state, mixed, repeats):
     seen = gather(problem)
     part("cost of a trial", lambda p, s: p.cost(s), problem, state)
     lin = part("residuals and Jacobians", linearise, problem, seen, state, sizes.dtype)
+    bent = lambda p, lin, s: curvature_of(p, lin, s, sizes)
+    part("what keypoints bend", bent, problem, lin, state)
     damping = damped(diagonals(lin, sizes), jnp.asarray(1e-4, state.scale.dtype))
     lin, damping = cast((lin, damping), sizes.dtype)
     reduced = part(
