@@ -82,7 +82,8 @@ def bend(
     lin: Linearisation, curvature: Curvature, share: float | Float[Array, ""] = 1.0
 ) -> Linearisation:
     """The same equations with a share of the curvature."""
-    add = lambda x, more: x + jnp.where(share > 0, share * more, 0).astype(x.dtype)
+    some = lambda more: jnp.asarray(share, more.dtype) * more
+    add = lambda x, more: x + jnp.where(share > 0, some(more), 0).astype(x.dtype)
     blocks = {
         key: add(block, curvature.blocks[key]) if key in curvature.blocks else block
         for key, block in lin.blocks.items()
