@@ -174,6 +174,9 @@ def main():
         "(landmarks, joint, breakdown, peers)",
     )
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument(
+        "--draw", type=int, default=0, help="of the noise (landmarks, joint, breakdown)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the scene (peers)")
     parser.add_argument("--rtol", type=float, default=1e-6)
     parser.add_argument("--steps", type=int, default=8)
@@ -228,7 +231,8 @@ def main():
             others[args.what](frames)
             continue
         people = 0 if args.what == "landmarks" else 1
-        problem, truth, start = make(frames, people, dtype=dtype, tracks=args.tracks)
+        kind = dict(tracks=args.tracks, draw=args.draw)
+        problem, truth, start = make(frames, people, dtype=dtype, **kind)
         count = sum(
             len(f.frame) for f in problem.factors if isinstance(f, g.Reprojection)
         )

@@ -6,6 +6,7 @@ from solver_scene import make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, marginals, solve
+from bodyslam_jax.solver._triangulation import tracks_of
 
 INLIERS = g.BlakeZisserman(4.5)
 """Of `robust` solutions' second half: what is no outlier keeps its weight."""
@@ -47,10 +48,6 @@ def tell(name, *draws):
         f"{deviations.mean():+6.3f} {np.median(size):9.4f}"
     )
     return square.mean(), inside.mean()
-
-
-def tracks_of(problem):
-    return next(f for f in problem.factors if isinstance(f, g.Reprojection))
 
 
 def note(errors, problem, found, truth):

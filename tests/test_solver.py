@@ -26,11 +26,14 @@ from bodyslam_jax.solver import (
     solve,
     trace,
 )
-from bodyslam_jax.solver._curvature import next_share
+from bodyslam_jax.solver._blocks import sizes_of
+from bodyslam_jax.solver._curvature import bend, curvature_of, next_share
 from bodyslam_jax.solver._gmres import RESTART, gmres
+from bodyslam_jax.solver._linearise import linearise
 from bodyslam_jax.solver._mapping import in_turn
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._solve import check_start
+from bodyslam_jax.solver._tables import gather
 from bodyslam_jax.solver._triangular import invert_lower
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -168,6 +171,32 @@ def test_curvature_comes_in_when_steps_gain_little_and_goes_where_it_has_no_mini
     assert share < following(share, True, 0.5) < 1
     assert following(share, False, 0.0) == share / 2
     assert following(0.99, True, 1e-4) == following(1.0, True, 1e-4) == 1
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_share_of_the_curvature_of_all_keypoints_joins_the_equations(dtype):
+    problem, state, _ = make(people=1, frames=3, noise=5.0)
+    problem, state = pad(problem, state)
+    sizes = sizes_of(problem, state, np.dtype(dtype))
+    like = eqx.filter_eval_shape(
+        linearise, problem, gather(problem), state, sizes.dtype
+    )
+    lin = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), like)
+    (keypoints,) = (f for f in problem.factors if isinstance(f, g.JointReprojection))
+    twice = dataclasses.replace(problem, factors=(*problem.factors, keypoints))
+    bent = eqx.filter_jit(curvature_of)
+    one, two = (bent(p, lin, state, sizes) for p in (problem, twice))
+    assert all(x.dtype == dtype and jnp.any(x != 0) for x in jax.tree.leaves(one))
+    assert eqx.tree_equal(two, jax.tree.map(lambda x: 2 * x, one), rtol=1e-5)
+    # The share has the state's precision, which blocks may not have.
+    found = bend(lin, one, jnp.asarray(0.25, state.scale.dtype))
+    for key, more in one.blocks.items():
+        assert found.blocks[key].dtype == dtype
+        assert jnp.allclose(found.blocks[key], 1 + more / 4)
+    for more, block in zip(one.limbs, found.limbs[0], strict=True):
+        assert jnp.allclose(block, 1 + more / 4)
+    same = {key for key in lin.blocks if key not in one.blocks}
+    assert same and all(found.blocks[k] is lin.blocks[k] for k in same)
 
 
 @pytest.mark.parametrize("solver", STOCK)

@@ -20,6 +20,10 @@ from bodyslam_jax.graph._keypoint_jacobian import (
     times,
 )
 
+_UPPER = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
+"""1 where the joint of a coordinate (row) is above that of the other, a half where they
+are of one joint."""
+
 
 def keypoint_curvature(
     body: BodyModel,
@@ -57,11 +61,6 @@ def keypoint_curvature(
     spread = cross(found.x_by_shape, own) + _crossed(arms)
     spread = below(spread) - cross(found.x_by_shape, all_own)
     return turns, times(G.swapaxes(1, 2), spread).reshape(72, 10)
-
-
-_UPPER = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
-"""1 where the joint of a coordinate (row) is above that of the other, a half where they
-are of one joint."""
 
 
 def _crossed(y: Float[Array, "i 3 s 3"]) -> Float[Array, "i 3 s"]:

@@ -60,13 +60,16 @@ def turning_joints(
 
 
 class Carried(NamedTuple):
-    """What each joint carries of each keypoint, in H, m:
-    `p_k = Σ_i share_ik x_i + G_i lever_ik`."""
+    """What joints carry of keypoints, m in H: `p_k = Σ_i share_ik x_i + G_i lever_ik`"""
 
     G: Float[Array, "24 3 3"]
+    """Axes of the joints in H."""
     x: Float[Array, "24 3"]
+    """Joints, from the pelvis."""
     share: Float[Array, "24 k"]
+    """Weights of skinning, 1."""
     lever: Float[Array, "24 k 3"]
+    """From the joint to the keypoint, in the joint's axes, times the share."""
     x_by_shape: Float[Array, "24 3 10"]
     lever_by_shape: Float[Array, "24 3 k 10"]
     vertex: Int[Array, " k"]

@@ -9,8 +9,8 @@ are.
 Steps of `J^T J` alone are too short there, for dozens of iterations that gain next to
 nothing each. So once they gain little, steps know a share of the curvature as well. At
 first there may be limbs about to turn over, where all of it has no minimum: then the
-share is halved, and it grows again with each step that is accepted. (By chunks it would
-not help: one by one all have a minimum, as limbs lean over for seconds.)
+share is halved, and it grows again with each step that is accepted. One share serves
+all: each chunk of frames has a minimum by itself, as limbs lean over for seconds.
 """
 
 import dataclasses
@@ -45,7 +45,13 @@ def next_share(
     gained: Float[Array, ""],
     cost: float | Float[Array, ""],
 ) -> Float[Array, ""]:
-    """How much of the curvature the next step knows."""
+    """How much of the curvature the next step knows.
+
+    Args:
+        share: that the step before knew.
+        gained: decrease of the cost in it, if it was accepted.
+        cost: before it.
+    """
     more = jnp.where(share > 0, jnp.minimum(_MORE * share, 1.0), _FIRST)
     more = jnp.where((share > 0) | (gained < _LITTLE * cost), more, 0.0)
     return jnp.where(accepted, more, _LESS * share).astype(share.dtype)
@@ -70,10 +76,14 @@ def curvature_of(
 ) -> Curvature:
     """Of keypoints, for those blocks that there are: of groups that are all held there
     are none."""
-    found = Curvature({}, [])
-    for factor in problem.factors:
-        if isinstance(factor, JointReprojection):
-            found = _blocks_of(factor, problem, state, sizes)
+    each = [
+        _blocks_of(factor, problem, state, sizes)
+        for factor in problem.factors
+        if isinstance(factor, JointReprojection)
+    ]
+    if not each:
+        return Curvature({}, [])
+    found = jax.tree.map(lambda *x: sum(x[1:], x[0]), *each)
     blocks = {key: found.blocks[key] for key in lin.blocks if key in found.blocks}
     return Curvature(blocks, found.limbs if 0 in lin.limbs else [])
 
@@ -83,7 +93,7 @@ def bend(
 ) -> Linearisation:
     """The same equations with a share of the curvature."""
     some = lambda more: jnp.asarray(share, more.dtype) * more
-    add = lambda x, more: x + jnp.where(share > 0, some(more), 0).astype(x.dtype)
+    add = lambda x, more: x + jnp.where(share > 0, some(more), 0)
     blocks = {
         key: add(block, curvature.blocks[key]) if key in curvature.blocks else block
         for key, block in lin.blocks.items()
