@@ -151,14 +151,30 @@ def test_gauss_newton_reaches_the_same_optimum():
 
 
 def test_last_steps_know_what_keypoints_bend():
-    problem, _, start = make(2, people=1, frames=12)
-    schedule = (Stage(rtol=1e-12, max_steps=100),)
-    found = solve(problem, start, schedule=schedule)
-    # The same program, in which Gauss-Newton's steps know of J^T J alone.
-    plain = solve(problem, start, schedule=schedule, damping=0.0)
-    assert found.status == plain.status == "converged"
-    assert float(found.cost) == pytest.approx(float(plain.cost), rel=1e-8)
-    assert int(found.num_steps[0]) < 0.7 * int(plain.num_steps[0])
+    problem, _, start = make(2, people=1, frames=12, noise=5.0)
+    robust = g.Reprojection, g.JointReprojection
+    # What weights of robust losses bend is left out, and would hide the rest.
+    factors = tuple(
+        dataclasses.replace(f, loss=g.Squared()) if isinstance(f, robust) else f
+        for f in problem.factors
+    )
+    problem = dataclasses.replace(problem, factors=factors)
+    run = lambda state, steps, damping=1e-4: (
+        solve(
+            problem,
+            state,
+            schedule=(Stage(rtol=0.0, max_steps=steps),),
+            damping=damping,
+        ).state
+    )
+    best = run(run(start, 100), 100)
+    rng = np.random.default_rng(0)
+    move = 1e-3 * problem.free.poses * jnp.asarray(rng.standard_normal((1, 12, 23, 3)))
+    near = best.retract(dataclasses.replace(best.zero_step(), poses=move))
+    away = lambda state: float(jnp.abs(state.poses - best.poses).max())
+    # Those of Gauss-Newton know of J^T J alone: errors halve with each.
+    plain = away(run(near, 12, damping=0.0))
+    assert away(run(near, 12)) < plain / 20 < 1e-5
 
 
 def test_curvature_comes_in_when_steps_gain_little_and_goes_where_it_has_no_minimum():

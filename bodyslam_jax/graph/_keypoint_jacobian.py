@@ -60,7 +60,7 @@ def turning_joints(
 
 
 class Carried(NamedTuple):
-    """What joints carry of keypoints, m in H: `p_k = Σ_i share_ik x_i + G_i lever_ik`"""
+    """What joints carry of keypoints: `p_k = Σ_i share_ik x_i + G_i lever_ik`, m, H."""
 
     G: Float[Array, "24 3 3"]
     """Axes of the joints in H."""
