@@ -85,11 +85,14 @@ def summarise(
         tall, sigma = None, None
         if result.present[h].any():
             tall, sigma = stature(body, result.betas[h], joint.shape_covariance[h])
+        steps = export.gait(result, h)
+        warnings += _slow_motion(h, steps, scale_sigma / result.scale, sequence.fps)
         persons.append(
             {
                 "frames": int(result.present[h].sum()),
                 "path_m": facts.distance,
                 "speed_m_s": facts.distance / max(facts.seconds, 1e-9),
+                "steps_per_s": None if steps is None else steps.frequency,
                 "stature_m": tall,
                 "stature_sigma_m": sigma,
             }
@@ -199,6 +202,23 @@ def _disagreement(start: ScaleStart, apart: float) -> list[str]:
         f"people's motion makes the map {ratio:.2f} times as large as the ground under "
         "their feet does: postures, focal length or ground are off; look at both. The "
         f"metres are known to no better than {50 * apart:.0f} % for it."
+    ]
+
+
+def _slow_motion(
+    person: int, steps: export.Gait | None, unsure: float, fps: float
+) -> list[str]:
+    """A line where somebody's steps are so rare that time must be stretched.
+
+    `unsure` is the share by which metres may be off; NaN where nothing tells.
+    """
+    if steps is None or not steps.is_slow_motion(float(np.nan_to_num(unsure))):
+        return []
+    return [
+        f"person {person} takes {steps.frequency:.1f} steps a second, each "
+        f"{steps.step:.1f} of a leg long: people do that about {steps.slowness:.1f} "
+        f"times as fast. If this is slow motion, or {fps:g} fps is not its frame rate, "
+        "speeds are too low by that."
     ]
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bodyslam_jax import rehearsal, synthetic
+from bodyslam_jax import export, rehearsal, synthetic
 from bodyslam_jax.assembly import assemble
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
@@ -88,3 +88,16 @@ def test_the_summary_says_who_and_what_is_left_out():
     assert whole["people"][0]["stature_m"] > 1
     assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
     assert not any("are used" in w for w in whole["warnings"])
+
+
+def test_steps_that_are_too_slow_for_people_are_told(monkeypatch):
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = dataclasses.replace(rehearsal._joint(sequence), scale_sigma=np.nan)
+    cameras = rehearsal._cameras(sequence)
+    found = lambda: assemble(sequence, config, body, cameras, joint, {}).summary
+    assert found()["people"][0]["steps_per_s"] is None  # half a second
+    monkeypatch.setattr(export, "gait", lambda *_: export.Gait(0.7, 0.9, 0.8))
+    told = found()
+    assert told["people"][0]["steps_per_s"] == 0.7
+    assert any("person 0 takes 0.7 steps a second" in w for w in told["warnings"])

@@ -4,6 +4,8 @@ from bodyslam_jax.export._facts import PathFacts as PathFacts
 from bodyslam_jax.export._facts import camera_facts as camera_facts
 from bodyslam_jax.export._facts import person_facts as person_facts
 from bodyslam_jax.export._facts import stature as stature
+from bodyslam_jax.export._gait import Gait as Gait
+from bodyslam_jax.export._gait import gait as gait
 from bodyslam_jax.export._ground import ground_scale as ground_scale
 from bodyslam_jax.export._meshes import write_bvh as write_bvh
 from bodyslam_jax.export._meshes import write_mesh as write_mesh
