@@ -263,6 +263,8 @@ def test_tables_as_text():
     ]
     lines = _tables.to_csv(columns, rows).splitlines()
     assert lines[1].split(",") == ["E1", "44.3", "0.94", "converged"]
+    told = _tables.to_csv(columns, rows, "seed 3").splitlines()
+    assert told[0].endswith(",data") and told[2].endswith(",converged,seed 3")
 
 
 def test_papers_figures_are_the_papers():
@@ -395,6 +397,8 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
     assert text.count(f"| E1-room |{both} |") == 1
     first, _ = csv.DictReader((tmp_path / "table1.csv").read_text().splitlines())
     assert first["the paper's J-ATE Sim(3) full, mm"] == "115.9"
+    for words in ("Simulated", "noise level `real`", "300 frames each"):
+        assert words in first["data"]
     for method in ("depth", "start", "scale_only", "per_frame"):
         assert first[f"H-ATE Sim(3) {method}, mm"] == "12.5"
         assert first[f"scale {method}"] == "0.8"

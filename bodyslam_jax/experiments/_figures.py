@@ -1,5 +1,6 @@
-"""Pictures like the paper's, of simulated sequences."""
+"""Pictures like the paper's, of simulated sequences; `about` says which, below each."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ _THEIRS: dict[str, Any] = {
     "label": "the paper's, its own data",
 }
 """How the paper's figures are drawn, in the colour of ours."""
+_LETTERS = 17
+"""Of the smallest print in an inch."""
 _FAR = 0.25
 """From a ratio of 1: what is farther off is told as a number and sets no axis."""
 
@@ -43,6 +46,13 @@ def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper cent
     )
 
 
+def _save(figure, path: Path, about: str) -> None:
+    """Writes a picture, with what it is of below it: it may be shown alone."""
+    line = int(_LETTERS * figure.get_figwidth())
+    figure.supxlabel(textwrap.fill(about, line), fontsize=7, color=_TRUTH)
+    figure.savefig(path, dpi=110)
+
+
 def _log_mm(values: Sequence[float]) -> tuple[float, float]:
     """Ends of a log axis of errors: from 1 mm, or less where one of them is less."""
     known = np.array(values, float)
@@ -53,7 +63,9 @@ def _log_mm(values: Sequence[float]) -> tuple[float, float]:
     return min(1.0, low), max(10.0, 1.5 * known.max())
 
 
-def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> None:
+def draw_table(
+    path: Path, rows: Sequence[Row], paper: Sequence[Row | None], about: str
+) -> None:
     """C-, H- and J-ATE under SE(3) by sequence, and the scale: bars, the paper's dots.
 
     `paper` has the paper's row for each of ours, or `None`.
@@ -91,10 +103,10 @@ def draw_table(path: Path, rows: Sequence[Row], paper: Sequence[Row | None]) -> 
     scale.grid(axis="y", alpha=0.3)
     scale.set_xticks(at, [str(r["sequence"]) for r in rows], rotation=60, fontsize=8)
     _legend(figure, axes, "simulated sequences, after SE(3)")
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)
 
 
-def draw_paths(path: Path, rows: Sequence[Row]) -> None:
+def draw_paths(path: Path, rows: Sequence[Row], about: str) -> None:
     """Cameras and human centres from above after SE(3), as the paper's appendix."""
     rows = [row for row in rows if row.get("paths")]
     if not rows:
@@ -111,10 +123,10 @@ def draw_paths(path: Path, rows: Sequence[Row]) -> None:
             axis.set(title=f"{row['sequence']}: {what}", xlabel="x, m", ylabel="z, m")
             axis.set_aspect("equal", adjustable="datalim")
     _legend(figure, [axes[0, 0]], "simulated, from above, after SE(3)")
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)
 
 
-def draw_scale(path: Path, rows: Sequence[Row]) -> None:
+def draw_scale(path: Path, rows: Sequence[Row], about: str) -> None:
     """H-ATE under SE(3), and s over what it should be, after each iteration."""
     figure = _figure(9.0, 3.0 * len(rows))
     axes = figure.subplots(len(rows), 2, squeeze=False, sharex=True)
@@ -130,10 +142,10 @@ def draw_scale(path: Path, rows: Sequence[Row]) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("iteration")
     _legend(figure, [axes[0, 0]], "simulated", columns=6)
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)
 
 
-def draw_variants(path: Path, rows: Sequence[Row]) -> None:
+def draw_variants(path: Path, rows: Sequence[Row], about: str) -> None:
     """C- and J-ATE under SE(3), and how far the scale is off, one line a variant."""
     figure = _figure(11.0, max(2.4, 1.2 + 0.28 * len(rows)))
     figure.suptitle(f"{rows[0]['sequence']}, simulated", fontsize=10)
@@ -156,7 +168,7 @@ def draw_variants(path: Path, rows: Sequence[Row]) -> None:
             errors[0].text(0.02, y, said, transform=where, fontsize=7, va="center")
     errors[0].set_yticks(at, [str(row["label"]) for row in rows], fontsize=8)
     errors[0].set_ylim(-0.7, len(rows) - 0.3)
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)
 
 
 def _draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
@@ -183,7 +195,7 @@ def _draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
 
 
 def draw_structure(
-    path: Path, rows: Sequence[Row], paper: Sequence[Row | None]
+    path: Path, rows: Sequence[Row], paper: Sequence[Row | None], about: str
 ) -> None:
     """C-ATE of the shaken cameras, and after both optimisations."""
     figure = _figure(max(6.0, 1.5 + 1.1 * len(rows)), 3.4)
@@ -201,10 +213,10 @@ def draw_structure(
     axis.set(ylabel="C-ATE, SE(3), mm", yscale="log", ylim=_log_mm(drawn))
     axis.set_xticks(np.arange(len(rows)), [str(row["sequence"]) for row in rows])
     _legend(figure, [axis], "simulated", columns=4)
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)
 
 
-def draw_learning(path: Path, row: Row) -> None:
+def draw_learning(path: Path, row: Row, about: str) -> None:
     """The error on the training sequences by step, and the weights on the way."""
     figure = _figure(9.0, 3.0)
     left, right = figure.subplots(1, 2)
@@ -214,4 +226,4 @@ def draw_learning(path: Path, row: Row) -> None:
         right.plot(values, label=name)
     right.set(xlabel="step", ylabel="log of the factor on σ")
     _legend(figure, [right], "simulated", columns=1, where="right upper")
-    figure.savefig(path, dpi=110)
+    _save(figure, path, about)

@@ -90,8 +90,8 @@ def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "sequence.",
     )
     parts = [("By perturbation", columns, flat), ("Spread", spread, rows)]
-    written = write_tables(out, "scale", head, parts)
-    figures.draw_scale(out / "scale.png", rows)
+    written = write_tables(out, "scale", head, parts, about)
+    figures.draw_scale(out / "scale.png", rows, about)
     return [*written, out / "scale.png"]
 
 
@@ -128,8 +128,9 @@ def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "C-ATE, SE(3), mean over frames. Every camera is moved by up to 100 mm and "
         "0.01 rad in each coordinate, then everything is optimised.",
     )
-    written = write_tables(out, "landmarks", head, [("By sequence", columns, beside)])
-    figures.draw_structure(out / "landmarks.png", rows, theirs)
+    parts = [("By sequence", columns, beside)]
+    written = write_tables(out, "landmarks", head, parts, about)
+    figures.draw_structure(out / "landmarks.png", rows, theirs, about)
     return [*written, out / "landmarks.png"]
 
 
@@ -183,7 +184,7 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         own = [row for row in rows if row["sequence"] == sequence]
         parts.append((sequence, columns, own))
         picture = out / f"ablation_{sequence}.png"
-        figures.draw_variants(picture, own)
+        figures.draw_variants(picture, own, about)
         written.append(picture)
     head = intro(
         "Ablations",
@@ -191,8 +192,8 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "`seconds` are wall time with compilation, but processor time without it for "
         "the three rows on orders. `past frames` are those that the motion model sees.",
     )
-    files = write_tables(out, "ablation", head, parts)
-    everything = to_csv([Column("sequence", "sequence"), *columns], rows)
+    files = write_tables(out, "ablation", head, parts, about)
+    everything = to_csv([Column("sequence", "sequence"), *columns], rows, about)
     write_text(out / "ablation.csv", everything)
     return [*files, *written]
 
@@ -228,7 +229,8 @@ def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         for name in ("training", "test")
     ]
     parts = [part for part in parts if part[2]]
-    files = write_tables(out, "weights", head, [*parts, ("Learnt", learnt, factors)])
-    write_text(out / "weights.csv", to_csv(columns, judged))
-    figures.draw_learning(out / "weights.png", found)
+    parts.append(("Learnt", learnt, factors))
+    files = write_tables(out, "weights", head, parts, about)
+    write_text(out / "weights.csv", to_csv(columns, judged, about))
+    figures.draw_learning(out / "weights.png", found, about)
     return [*files, out / "weights.png"]

@@ -76,13 +76,13 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         + "; ".join(f"`{name}`: {meaning}" for name, meaning in METHODS.items())
         + ".",
     )
-    written = write_tables(out, "table1", head, parts)
+    written = write_tables(out, "table1", head, parts, about)
     columns = [_SEQUENCE, *_beside("se3"), *_beside("sim3"), *_scales()]
     for method in baselines:
         columns += [*_errors(method, f" {method}"), _scale(method, f" {method}")]
-    write_text(out / "table1.csv", to_csv([*columns, *_BEHIND], rows))
-    figures.draw_table(out / "table1.png", rows, papers)
-    figures.draw_paths(out / "table1_paths.png", rows)
+    write_text(out / "table1.csv", to_csv([*columns, *_BEHIND], rows, about))
+    figures.draw_table(out / "table1.png", rows, papers, about)
+    figures.draw_paths(out / "table1_paths.png", rows, about)
     return [*written, out / "table1.png", out / "table1_paths.png"]
 
 

@@ -59,14 +59,20 @@ def markdown(
     return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
 
 
-def to_csv(columns: Sequence[Column], rows: Sequence[dict[str, Any]]) -> str:
-    """The same columns in full precision, units as in the titles."""
+def to_csv(
+    columns: Sequence[Column], rows: Sequence[dict[str, Any]], about: str = ""
+) -> str:
+    """The same columns in full precision, units as in the titles.
+
+    The last one, `data`, has what the rows are of, if that is given.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([column.title for column in columns])
+    last = [about] if about else []
+    writer.writerow([column.title for column in columns] + ["data"] * len(last))
     for row in rows:
         cells = [column.value(row) for column in columns]
-        writer.writerow(["" if c is None else c for c in cells])
+        writer.writerow([*("" if c is None else c for c in cells), *last])
     return out.getvalue()
 
 
@@ -87,11 +93,13 @@ def write_tables(
     name: str,
     head: str,
     parts: Sequence[tuple[str, Sequence[Column], Sequence[Row]]],
+    about: str,
 ) -> list[Path]:
-    """`name.md` with all parts under their titles, `name.csv` with the first."""
+    """`name.md` with all parts under their titles, `name.csv` with the first, of which
+    `about` says what data they are of."""
     text = head
     for title, columns, rows in parts:
         text += f"## {title}\n\n{markdown(columns, rows, mean=len(rows) > 1)}\n"
     write_text(out / f"{name}.md", text)
-    write_text(out / f"{name}.csv", to_csv(parts[0][1], parts[0][2]))
+    write_text(out / f"{name}.csv", to_csv(*parts[0][1:], about))
     return [out / f"{name}.md", out / f"{name}.csv"]
