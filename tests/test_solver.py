@@ -221,6 +221,15 @@ def test_all_second_order_solvers_reach_the_same_optimum(solver):
     best = solve(problem, start, schedule=TIGHT)
     found = solve(problem, start, solver=solver, schedule=TIGHT)
     assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-8)
+    assert found.status == "converged"
+
+
+@pytest.mark.parametrize("solver", STOCK)
+def test_a_stock_solver_that_is_not_there_yet_says_so(solver):
+    problem, _, start = make()
+    few = (Stage(rtol=1e-13, max_steps=1),)
+    found = solve(problem, start, solver=solver, schedule=few)
+    assert found.status == "ran out of steps" and found.cost < found.first_cost
 
 
 @pytest.mark.parametrize("solver", [*STOCK, "adam"])

@@ -149,7 +149,10 @@ def _jaxopt(name, problem, state, stage):
         whole = eqx.combine(arrays, static)
         return jnp.concatenate([whole.residual(unravel(x)), 1e-9 * x])
 
-    options = {"maxiter": 4 * stage.max_steps, "tol": 1e-10}
+    # Of the largest slope at the start: by itself it depends on what costs are of.
+    slope = jax.lax.stop_gradient(jax.grad(flat.cost)(zero))
+    slope = jnp.abs(ravel_pytree(slope)[0]).max()
+    options = {"maxiter": 4 * stage.max_steps, "tol": stage.rtol * slope}
     if name == "LevenbergMarquardt":
         options |= {"solver": "cholesky", "materialize_jac": True, "xtol": 1e-14}
     method = getattr(jaxopt, name)(residual, **options)
@@ -157,6 +160,13 @@ def _jaxopt(name, problem, state, stage):
     with jax.numpy_dtype_promotion("standard"):
         found = method.run(start, arrays)
     converged = found.state.error <= options["tol"]
+    if name == "LevenbergMarquardt":
+        # Where rounding lets no step lower the cost, it tries ever shorter ones.
+        last = found.state
+        least = 1e-12 * jnp.diag(jnp.max(jnp.diag(last.jtj)) * jnp.ones_like(start))
+        step = jnp.linalg.solve(last.jtj + least, last.gradient)
+        gain = 0.5 * last.gradient @ step
+        converged |= gain <= jnp.maximum(stage.rtol * last.value, stage.atol)
     return flat.retract(unravel(found.params)), found.state.iter_num, _result(converged)
 
 
