@@ -62,7 +62,7 @@ def fitting() -> tuple[g.State, dict[str, g.AbstractFactor]]:
         g.SquarePixels(ones(1)),
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
         g.RootPlace(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
-        g.StanceFoot(body, ones(1, T, 4)),
+        g.StanceFoot(body, ones(1, T, 4).at[:, 0].set(jnp.inf)),
         g.UpDirection(jnp.array([0.0, -1, 0]), ones(1, T)),
         g.GroundContact(body, jnp.array([0.0, -1, 0, 1.5]), ones(1, T)),
     ]
@@ -378,6 +378,7 @@ EARLY_FRAMES = [
     ("RootSmoothness", "sigma", 0),
     ("RootSmoothness", "sigma", 1),
     ("RootTurning", "sigma", 1),
+    ("StanceFoot", "sigma", 0),
     ("CameraSmoothness", "sigma", 1),
 ]
 """Factors, their fields, and frames that have no earlier one to look back to."""

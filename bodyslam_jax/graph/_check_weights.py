@@ -19,6 +19,7 @@ from bodyslam_jax.graph._root_priors import (
     RootSmoothness,
     RootTurning,
 )
+from bodyslam_jax.graph._stance import StanceFoot
 from bodyslam_jax.graph._state import State, Step
 
 _EARLY = (
@@ -29,6 +30,7 @@ _EARLY = (
     (RootOrientation, "correlation", 1, 0.0),
     (RootPlace, "correlation", 1, 0.0),
     (OrientationChange, "sigma", 1, np.inf),
+    (StanceFoot, "sigma", 1, np.inf),
     (CameraSmoothness, "sigma", 2, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
     (RootTurning, "sigma", 2, np.inf),
