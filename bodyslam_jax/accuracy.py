@@ -25,7 +25,7 @@ def errors(
     """What `bodyslam evaluate` says, before and after the joint estimate.
 
     Cameras alone are judged, if they moved, by what needs neither scale nor people; for
-    all else a word says what is missing.
+    all else a word says what is missing. Without people that is all there is to say.
     """
     after = evaluation.evaluate(result, truth, body)
     found: dict[str, dict[str, float | str]] = {}
@@ -39,7 +39,8 @@ def errors(
         for name in _WITHOUT_SCALE:
             for key in (name, f"{name}_rmse"):
                 found[ALONE][key] = float(before[key])
-    found[JOINT] = {k: float(v) for k, v in after.items()}
+    if result.present.any() or ALONE not in found:
+        found[JOINT] = {k: float(v) for k, v in after.items()}
     return found
 
 

@@ -227,9 +227,7 @@ def estimate(
     return Joint(
         scale=float(best.scale),
         start=prepared.scale,
-        scale_sigma=(
-            float(spread.scale) ** 0.5 if spread and prepared.moving else np.nan
-        ),
+        scale_sigma=_scale_sigma(prepared, spread),
         shape_covariance=(
             np.full((len(best.shapes), 10, 10), np.nan)
             if spread is None
@@ -246,6 +244,14 @@ def estimate(
         status=solution.status,
         stages=(*prepared.stages, stage),
     )
+
+
+def _scale_sigma(prepared: Prepared, spread: solver.Marginals | None) -> float:
+    """m per unit of the map; infinite without people, who alone tell metres, and NaN
+    where it was not computed or there is no map."""
+    if not spread or not prepared.moving:
+        return np.nan
+    return float(spread.scale) ** 0.5 if prepared.roots.present.any() else np.inf
 
 
 def of_fitted_sizes(

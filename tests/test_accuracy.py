@@ -90,6 +90,12 @@ def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     assert "in metres: C-ATE, SE(3) 4.9" in second and "H-ATE" in second
 
 
+def test_a_run_without_people_has_no_metres_to_be_judged():
+    result, truth = _result(_path(SMALLER)), _result(_path(0.0))
+    nobody = dataclasses.replace(result, present=np.zeros_like(result.present))
+    assert list(accuracy.errors(nobody, _cameras(), truth, BODY)) == [accuracy.ALONE]
+
+
 @pytest.mark.parametrize("kind", ["static", "rotation"])
 def test_a_camera_without_a_path_is_not_judged_alone(kind):
     truth = _result(_path(0.0))

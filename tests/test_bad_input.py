@@ -286,6 +286,10 @@ INPUTS = {
         "camera.json: not a JSON file",
     ),
     "NaN in bodies": (nan_bodies, "bodies.npz: .*poses"),
+    "bodies between frames": (
+        lambda f: save(f / "bodies.npz", bodies(), frame=np.arange(NUM) + 0.5),
+        "bodies.npz: .*`frame` has 0.5 in it, expected whole numbers",
+    ),
     "bodies of a longer video": (
         lambda f: save(f / "bodies.npz", bodies(NUM + 3)),
         "bodies.npz: .*frame.* 8",

@@ -56,6 +56,13 @@ def test_a_reader_that_leaves_is_no_error():
     assert done.stderr == b"" and done.returncode == 141
 
 
+def test_output_that_is_closed_is_no_error():
+    """As daemons have it."""
+    command = f"exec {sys.executable} -m bodyslam_jax --help >&-"
+    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE)
+    assert done.stderr == b"" and done.returncode == 0
+
+
 @pytest.mark.parametrize(
     "argv",
     [["run"], ["nosuch"], ["run", "x", "--out", "y", "--nosuch", "1"], ["evaluate"]],
@@ -132,6 +139,13 @@ def test_preset_and_settings_are_where_options_start(tmp_path):
     path.write_text("solver: adam\nweights:\n  pixel_sigma: 2\n")
     found = cli.base_config([f"--settings={path}"])
     assert found.solver == "adam" and found.weights.pixel_sigma == 2.0
+    # What is given twice counts as it is given last.
+    twice = ["--preset=paper", "--settings", str(path), "--preset", "default"]
+    assert cli.option(twice, "--preset") == "default"
+    other = tmp_path / "other.yaml"
+    other.write_text("weights:\n  pixel_sigma: 3\n")
+    found = cli.base_config([*twice, f"--settings={other}"])
+    assert found.weights.pixel_sigma == 3.0 and found.solver != "adam"
 
 
 @pytest.mark.parametrize(

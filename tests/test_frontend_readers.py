@@ -312,6 +312,10 @@ GOOD_CAMERA = {
     [
         ({"model": "FISHEYE"}, "model 'FISHEYE'"),
         ({"params": [80, 80, 30]}, "3 params for PINHOLE, not 4"),
+        ({"params": [[80, 80, 30, 25]]}, "params in no plain list for PINHOLE, not 4"),
+        ({"width": 64.5}, "width 64.5 is no whole number of pixels"),
+        ({"height": float("inf")}, "height inf is no whole number of pixels"),
+        ({"height": True}, "height True is no whole number of pixels"),
         ({"params": [80, -80, 30, 25]}, "not those of a camera"),
         ({"params": [80, "x", 30, 25]}, "numbers expected"),
         ({"params": [80, float("nan"), 30, 25]}, "not those of a camera"),

@@ -72,6 +72,19 @@ def test_what_is_an_outlier_by_its_likelihood_pulls_no_more(dtype):
     assert weight[4] == pytest.approx(0.5, abs=1e-5)
 
 
+@pytest.mark.parametrize("c", [0.3, 1.5, 4.5, 9.0])
+def test_small_errors_cost_what_they_should_in_single_precision(c):
+    s = jnp.array([0, 1e-12, 1e-6, 1e-4, 0.1, 0.9999, 1.0, 1.1, 30.0, 3e38])
+    single = s.astype(jnp.float32)
+    loss = g.BlakeZisserman(jnp.asarray(c, jnp.float32))
+    outlier, x = np.exp(-(c**2) / 2), np.asarray(s)
+    large = -2 * np.log((np.exp(-x / 2) + outlier) / (1 + outlier))
+    expected = np.where(x < 1e-3, x / (1 + outlier), large)
+    assert np.allclose(loss.rho(single), expected, rtol=5e-5, atol=0)
+    slope = jax.vmap(jax.grad(loss.rho))(single)
+    assert np.allclose(slope, loss.weight(single), rtol=1e-5, atol=1e-30)
+
+
 def test_keypoint_jacobian_is_that_of_the_keypoints(rng):
     body = scenes.body_model()
     pose = jnp.asarray(0.4 * rng.standard_normal((23, 3)))
@@ -234,6 +247,33 @@ def test_posture_residual_of_correlated_errors_is_white(rng):
     whitened = factor.residual(state)
     assert abs(jnp.var(whitened) - 1) < 0.01
     assert abs(jnp.mean(whitened[0, 1:] * whitened[0, :-1])) < 0.01
+
+
+def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
+    """Neither its placeholder, nor, in derivatives, its infinite deviation."""
+    state = scenes.truth(rng, 4, 1, 2)
+    factor = g.Posture(
+        rotation=state.poses + 0.1,
+        sigma=jnp.full((1, 4, 23), 0.3).at[0, 1, 4].set(jnp.inf),
+        correlation=g.runs(jnp.ones((1, 4), bool), 0.9),
+    )
+    other = eqx.tree_at(
+        lambda f: f.rotation, factor, factor.rotation.at[0, 1, 4].set(2.0)
+    )
+    assert other.cost(state) == factor.cost(state)
+    begins = factor.residual(state)[0, 2, 4]
+    error = g.rotation_between(factor.rotation, state.poses)
+    assert jnp.allclose(begins, error[0, 2, 4] / 0.3, rtol=1e-12)
+    one_by_one = factor.map_frames(lambda d, w, s, _: factor.local(d, w, s), state)
+    assert jnp.allclose(one_by_one, factor.residual(state), rtol=1e-12)
+
+    def cost(correlation):
+        rho = jnp.asarray(correlation)
+        return dataclasses.replace(factor, correlation=rho).cost(state)
+
+    check_grads(cost, (factor.correlation,), 1, modes=("rev",), rtol=1e-6)
+    by_sigma = jax.grad(lambda x: dataclasses.replace(factor, sigma=x).cost(state))
+    assert jnp.isfinite(by_sigma(factor.sigma)).all()
 
 
 def test_runs_start_anew_after_a_gap():

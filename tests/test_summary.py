@@ -86,6 +86,10 @@ def test_the_summary_says_who_and_what_is_left_out():
     assert not any("person 0" in line for line in empty["headline"])
     assert empty["people"][0]["stature_m"] is None
     assert whole["people"][0]["stature_m"] > 1
+    unknown = dataclasses.replace(joint, present=nobody, scale_sigma=np.inf)
+    empty = found(unknown, 0, 14)
+    assert "no people" in empty["status"]
+    assert " m, of no known size, in" in empty["headline"][1]
     assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
     assert not any("are used" in w for w in whole["warnings"])
 

@@ -84,6 +84,9 @@ Without any file: `bodyslam demo`. A video of your own: `bodyslam run VIDEO.mp4
 
 def main() -> None:
     """Runs one command and turns its outcome into an exit code."""
+    if sys.stdout is None:
+        # Closed, as daemons have it: what would be printed goes nowhere.
+        sys.stdout = open(os.devnull, "w")
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     logging.getLogger("jax").setLevel(logging.WARNING)
     argv = sys.argv[1:]

@@ -37,7 +37,8 @@ def run(
         tracks: tracks.npz made elsewhere, if not in the input.
         masks: Folder of person masks, if not in the input.
         preset: `paper` has the weights and the first-order schedule of the paper.
-        settings: A config.yaml to start from; options beside it prevail.
+        settings: A config.yaml to start from, which prevails over a preset; options
+            beside it prevail over both.
         config: Settings of every stage.
     """
     from bodyslam_jax import frontend, pipeline
@@ -67,7 +68,8 @@ def demo(
     Args:
         out: Run folder to write.
         preset: `paper` has the weights and the first-order schedule of the paper.
-        settings: A config.yaml to start from; options beside it prevail.
+        settings: A config.yaml to start from, which prevails over a preset; options
+            beside it prevail over both.
         config: Settings of every stage.
     """
     from bodyslam_jax import pipeline
@@ -110,7 +112,13 @@ def evaluate(
     truth = evaluation.read_truth(groundtruth, body_model)
     # Toes and heels slide, where the joints of both sides are this body's.
     body = bs.load_body_model(body_model)
-    found = evaluation.evaluate(evaluation.read_result(run), truth, body, offset)
+    result = evaluation.read_result(run)
+    if not result.present.any():
+        log.warning(
+            "nobody is in this run, so that it has no metres: its errors after SE(3) "
+            "and its scale mean nothing."
+        )
+    found = evaluation.evaluate(result, truth, body, offset)
     if found.scope is not None:
         for line in evaluation.gaps(found.scope):
             log.warning(line)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,14 @@ def base_config(argv: list[str]) -> Config:
 
 
 def option(argv: list[str], flag: str) -> str | None:
-    joined = [a.partition("=")[2] for a in argv if a.startswith(f"{flag}=")]
-    after = [argv[i + 1] for i, a in enumerate(argv[:-1]) if a == flag]
-    return (joined + after + [None])[0]
+    """What is given for a flag, after it or after its `=`; the last counts."""
+    found = None
+    for arg, after in itertools.pairwise([*argv, None]):
+        if arg == flag and after is not None:
+            found = after
+        elif arg is not None and arg.startswith(f"{flag}="):
+            found = arg.partition("=")[2]
+    return found
 
 
 def read_settings(path: Path, base: Config) -> Config:

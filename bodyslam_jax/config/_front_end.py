@@ -32,7 +32,8 @@ class Association:
     max_people: int = 8
     """People kept, those that fill most of the video first."""
     min_duration: float = 0.4
-    """Time that a person must be seen for, s."""
+    """Time that a person must be seen for, s; at most all of the video, and unless
+    nobody would be left."""
     max_gap: float = 0.7
     """Time that a person may be unseen and still be recognised, s."""
 

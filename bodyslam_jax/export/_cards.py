@@ -4,6 +4,8 @@ import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.export import _facts as facts
 from bodyslam_jax.result import Result
@@ -57,7 +59,11 @@ def cards(
         )
     scale = summary.get("scale") or {}
     sigma = scale.get("sigma") if isinstance(scale, dict) else None
-    if sigma is not None and result.scale > 0:
+    if not result.present.any():
+        told = "nothing tells it: there are no people"
+    else:
+        told = "its uncertainty was not computed"
+    if sigma is not None and np.isfinite(sigma) and result.scale > 0:
         percent = 100 * sigma / result.scale
         own = scale.get("sigma_of_covariance", sigma)
         how = "one standard deviation of the scale, as the estimate itself sees it"
@@ -83,7 +89,7 @@ def cards(
                 f"{result.scale:.4g}",
                 "",
                 "metres per unit of the unscaled map",
-                "its uncertainty was not computed",
+                told,
             )
         )
     found += _focal_length(summary.get("intrinsics") or {})

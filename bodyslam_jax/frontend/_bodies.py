@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.config import Association
-from bodyslam_jax.frontend._body_parts import join
+from bodyslam_jax.frontend._body_parts import join, whole_of
 from bodyslam_jax.frontend._body_tools import READERS, from_spin
 from bodyslam_jax.frontend._numbering import Unfit, Warn
 from bodyslam_jax.frontend._pickle import restricted_load
@@ -109,9 +109,8 @@ def _from_contract(data: dict, video: Video) -> Rows:
             raise Unfit(f"`{name}` is {array.shape}, not {shape}")
         if not np.isfinite(array).all():
             raise Unfit(f"`{name}` has NaN or infinity in it")
-        arrays[name] = array.astype(
-            np.int64 if name in ("frame", "person") else np.float64
-        )
+        whole = name in ("frame", "person")
+        arrays[name] = whole_of(array, name) if whole else array.astype(np.float64)
     return Rows(**arrays, shapes_regressed=regressed)
 
 

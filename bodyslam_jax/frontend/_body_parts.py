@@ -44,15 +44,26 @@ def betas_of(data: dict, key: str, n: int) -> np.ndarray:
     return betas[:, :10].copy()
 
 
+def whole_of(array: np.ndarray, name: str) -> np.ndarray:
+    """Numbers of frames or people as integers.
+
+    **Raises:** `Unfit` if one is none.
+    """
+    off = array[array != np.round(array)]
+    if len(off):
+        raise Unfit(f"`{name}` has {off[0]:g} in it, expected whole numbers")
+    return array.astype(np.int64)
+
+
 def people_of(data: dict, n: int) -> np.ndarray:
     if "person" not in data:
         return np.zeros(n, dtype=np.int64)
-    return numbers_of(data, "person", (n,)).astype(np.int64)
+    return whole_of(numbers_of(data, "person", (n,)), "person")
 
 
 def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarray:
     if key in data:
-        found = np.ravel(numbers_of(data, key, None)).astype(np.int64)
+        found = whole_of(np.ravel(numbers_of(data, key, None)), key)
         if len(found) != n:
             raise Unfit(f"`{key}` has {len(found)} entries for {n} bodies")
         return found

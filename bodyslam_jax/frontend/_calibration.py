@@ -3,6 +3,7 @@
 import json
 import logging
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ def read_camera(path: Path) -> tuple[Intrinsics, float | None]:
     """
     try:
         data = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path}: not a JSON file ({error}).") from None
     if not isinstance(data, dict):
         raise ValueError(
@@ -42,14 +43,15 @@ def read_camera(path: Path) -> tuple[Intrinsics, float | None]:
         )
     try:
         params = np.asarray(data["params"], dtype=np.float64)
-        width, height = int(data["width"]), int(data["height"])
+        width, height = (_whole(data[k], k) for k in ("width", "height"))
         fps = None if data.get("fps") is None else float(data["fps"])
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: numbers expected ({error}).") from None
     if params.shape != (_NUM_PARAMS[model],):
-        raise ValueError(
-            f"{path}: {params.size} params for {model}, not {_NUM_PARAMS[model]}."
+        found = (
+            f"{params.size} params" if params.ndim == 1 else "params in no plain list"
         )
+        raise ValueError(f"{path}: {found} for {model}, not {_NUM_PARAMS[model]}.")
     params = _from_colmap(model, params)
     if not np.isfinite(params).all() or (params[:2] <= 0).any():
         raise ValueError(f"{path}: params {params.tolist()} are not those of a camera.")
@@ -63,6 +65,12 @@ def read_camera(path: Path) -> tuple[Intrinsics, float | None]:
     if fps is not None and not 0.1 <= fps <= 1000:
         raise ValueError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
     return Intrinsics(params, width, height), fps
+
+
+def _whole(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not float(value).is_integer():
+        raise ValueError(f"{name} {value} is no whole number of pixels")
+    return int(value)
 
 
 def guess_camera(width: int, height: int, image: Path | None = None) -> Intrinsics:

@@ -45,14 +45,20 @@ class Posture(AbstractFrameFactor):
     def data(self):
         t = self.rotation.shape[1]
         previous = self.rotation[:, jnp.maximum(jnp.arange(t) - 1, 0)]
-        return self.rotation, previous, self.sigma, self.correlation
+        return self.rotation, previous, self.sigma, self._lasting
+
+    @property
+    def _lasting(self) -> Float[Array, "h t 23"]:
+        """ρ of each joint: 0 where it was not measured in the frame before."""
+        known = jnp.isfinite(before(self.sigma))
+        return jnp.where(known, self.correlation[..., None], 0.0)
 
     def local(self, data, window, shared):
         rotation, previous, sigma, correlation = data
         error = rotation_between(rotation, window[0].pose)
         if self.correlated:
             last = rotation_between(previous, window[1].pose)
-            error = innovation(error, last, correlation)
+            error = innovation(error, last, correlation[:, None])
         return error / sigma[:, None]
 
     def residual(self, state: State) -> Float[Array, "h t 23 3"]:
@@ -69,8 +75,9 @@ class Posture(AbstractFrameFactor):
 
     def _innovation(self, error):
         """The residual, and what it takes of this frame's error and the last one's."""
-        rho = self.correlation[..., None, None]
-        now = 1 / (self.sigma[..., None] * jnp.sqrt(1 - rho**2))
+        rho = self._lasting[..., None]
+        # An infinite sigma last, or its derivative by ρ is no number.
+        now = 1 / jnp.sqrt(1 - rho**2) / self.sigma[..., None]
         earlier = -rho * now
         if not self.correlated:
             return error / self.sigma[..., None], 1 / self.sigma[..., None], earlier

@@ -95,7 +95,11 @@ class BlakeZisserman(AbstractLoss):
 
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         never = -(self.scale**2) / 2
-        return 2 * (jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never))
+        far = jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never)
+        # The same, where the difference of logarithms has no digits left.
+        less = jnp.expm1(-jnp.minimum(s, 1) / 2)
+        near = -jnp.log1p(less * jax.nn.sigmoid(-never))
+        return 2 * jnp.where(s < 1, near, far)
 
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         return jax.nn.sigmoid((self.scale**2 - s) / 2)

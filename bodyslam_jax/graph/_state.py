@@ -96,10 +96,11 @@ def retract_pose(
 def retract_rotation(
     rotation: Float[Array, "*b 3"], step: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
-    """`Log(Exp(rotation) Exp(step))`, continuous in `step` at every angle.
+    """`Log(Exp(rotation) Exp(step))`, continuous in `step` around every angle up to pi.
 
-    The logarithm is taken on the branch of the base point: an axis-angle vector may
-    leave the ball of radius pi, but it does not jump.
+    Where it is more than 2 rad long the logarithm is taken on the branch of the base
+    point: an axis-angle vector may leave the ball of radius pi, and does not jump
+    there. Beyond 2 pi - 2 it comes back by a full turn, to the same rotation.
     """
     moved = log_of(compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)))
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)

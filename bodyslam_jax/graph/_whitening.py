@@ -6,7 +6,9 @@ from jaxtyping import Array, Bool, Float
 
 
 def innovation(
-    error: Float[Array, "*n"], last: Float[Array, "*n"], correlation: Float[Array, ""]
+    error: Float[Array, "*n"],
+    last: Float[Array, "*n"],
+    correlation: Float[Array, "*#n"],
 ) -> Float[Array, "*n"]:
     """What is new in an error of which `correlation` lasts from frame to frame,
     `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`: as large as the error in the long run, and

@@ -195,7 +195,9 @@ def _backward(
         found,
         is_leaf=lambda x: x is None,
     )
-    now = restrict(problem, schedule[-1].free)
+    # A stage without steps has moved nothing.
+    taken = [stage for stage in schedule if stage.max_steps] or schedule
+    now = restrict(problem, taken[-1].free)
     given = cotangent_of_problem(now, found, full)
     given = dataclasses.replace(given, variables=problem.variables)
     if cotangent.cost is not None:
@@ -227,6 +229,9 @@ def _solve_baseline(problem, state, solver, schedule):
     first = cost = _cost(problem, state)
     counts, result = [], optx.RESULTS.successful
     for stage in schedule:
+        if not stage.max_steps:
+            counts.append(jnp.array(0))
+            continue
         held = restrict(problem, stage.free)
         state, cost, count, result = program(solver, held, state, stage)
         counts.append(count)
