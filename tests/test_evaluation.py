@@ -524,8 +524,10 @@ def test_what_is_compared_is_said():
         NUM,
         (evaluation.Pair(0, evaluation.NOBODY, 0, NUM), evaluation.Pair(1, 0, 25, NUM)),
         0,
+        (False, True),
     )
-    first, second = evaluation.gaps(scope)
+    straight, first, second = evaluation.gaps(scope)
+    assert "person 1 goes along a line, to 10 cm" in straight
     assert "person 0 of the ground truth is not found" in first
     assert "person 1 is compared in 25 of 250 frames" in second
     # Evaluations of pairs with as many people stack.
@@ -545,6 +547,10 @@ def test_what_is_compared_is_said():
     assert (scope.cameras, scope.of_cameras) == (0, 0)
     assert [(p.frames, p.of_frames) for p in scope.people] == [(63, 125)] * 2
     assert len(evaluation.gaps(scope)) == 2
+    # Alignment brings two poses together whatever they are.
+    brief = _result(truth.timestamps[:2], truth.T_WC[:2], truth.joints[:, :2])
+    said = evaluation.gaps(evaluation.evaluate(brief, truth).scope)
+    assert any("in 2 frames only, which alignment brings together" in x for x in said)
 
 
 def test_poses_beyond_a_cut_are_not_compared():

@@ -67,6 +67,18 @@ def test_people_who_come_later_are_absent_first(tmp_path, body):
     np.testing.assert_array_equal(found.present[0], np.arange(30) < 20)
 
 
+def test_bodies_after_the_last_camera_are_told(tmp_path, body, caplog):
+    _camera(tmp_path / "camera.txt", np.arange(20) / 30)
+    np.savez(tmp_path / "body.npz", **_person(40), mocap_framerate=30.0)
+    assert len(read_groundtruth(tmp_path, body).timestamps) == 20
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith(f"{tmp_path / 'body.npz'}: 40 frames, of which the last 20 ")
+    caplog.clear()
+    np.savez(tmp_path / "body.npz", **_person(77), mocap_framerate=120.0)
+    read_groundtruth(tmp_path, body)
+    assert not caplog.records
+
+
 def test_joints_of_the_file_win(tmp_path, body):
     other = np.random.default_rng(0).normal(0, 1, (9, 24, 3))
     np.savez(tmp_path / "b.npz", **_person(9), mocap_framerate=30.0, joints=other)

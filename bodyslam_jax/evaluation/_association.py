@@ -18,6 +18,7 @@ from bodyslam_jax.evaluation._evaluation import (
     FEET,
     NOBODY,
     PELVIS,
+    STRAIGHT,
     Evaluation,
     Pair,
     Scope,
@@ -132,7 +133,7 @@ def _scope(
 
     camera = truth.summary.get("has_camera", True)
     everywhere = np.full(len(truth.timestamps), bool(camera))
-    people = []
+    people, straight = [], []
     for i, own in enumerate(truth.present):
         who = partner.get(i)
         both = true.present[i] & (False if who is None else found.present[who])
@@ -140,12 +141,21 @@ def _scope(
         if of:
             someone = NOBODY if who is None or not compared else who
             people.append(Pair(i, someone, compared, of))
+            path = true.joints[i, both, PELVIS]
+            straight.append(bool(compared) and _from_a_line(path) < STRAIGHT)
     matched = sum(pair.estimate != NOBODY for pair in people)
     return Scope(
         *counts(found.camera_valid & true.camera_valid, everywhere),
         tuple(people),
         int(found.present.any(axis=1).sum()) - matched,
+        tuple(straight),
     )
+
+
+def _from_a_line(points: Float[np.ndarray, "t 3"]) -> float:
+    """Root mean square distance from the line that fits best, m."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(np.linalg.norm(spread[1:]) / np.sqrt(len(points)))
 
 
 def _without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:

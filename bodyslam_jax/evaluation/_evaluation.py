@@ -14,6 +14,9 @@ PELVIS = 0
 NOBODY = -1
 STILL = 0.01
 """m; a camera whose path has a smaller radius (root mean square) stands still."""
+STRAIGHT = 0.1
+"""m, root mean square; how far about a path that is straighter a person is turned,
+alignment A1 hardly tells, and J-ATE is of little else."""
 FEET = (7, 10, 8, 11)
 """Left ankle and foot, right ankle and foot: what slides where no mesh is known."""
 
@@ -62,6 +65,9 @@ class Scope(eqx.Module):
     """One for each person of the truth."""
     others: int
     """People of the estimate who are none of the truth's."""
+    straight: tuple[bool, ...] = ()
+    """For each of `people`: whether, where compared, their true pelvis stays within
+    `STRAIGHT` of a line."""
 
 
 class Evaluation(eqx.Module):

@@ -1,6 +1,7 @@
 """Run folders and ground truths, read into one `Result` each."""
 
 import json
+import logging
 import zipfile
 import zlib
 from pathlib import Path
@@ -15,6 +16,8 @@ from bodyslam_jax.body import BodyModel, joints
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation._association import brackets, interpolate_poses
 from bodyslam_jax.result import Result
+
+log = logging.getLogger(__name__)
 
 _RUN_FIELDS = {
     "timestamps": ("t",),
@@ -102,6 +105,9 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     people = [_read_body(file, body) for file in bodies]
     camera = read_tum(cameras[0]) if cameras else None
     times, T_WC = _timeline(camera, people)
+    if camera is not None:
+        for file, person in zip(bodies, people, strict=True):
+            _tell_beyond(file, person, times)
     placed = [_at(person, times, camera is not None) for person in people]
     stack = lambda name, *shape: np.reshape(
         [person[name] for person in placed], (len(placed), *shape)
@@ -179,6 +185,18 @@ def _timeline(
     at = times[0] + np.arange(len(longest["poses"])) / longest["fps"]
     before, after, weight, close = brackets(times, at)
     return at[close], interpolate_poses(T_WC, before, after, weight)[close]
+
+
+def _tell_beyond(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
+    """Warns of bodies after the last true camera, which are left out."""
+    num, fps = len(person["poses"]), person["fps"]
+    beyond = times[0] + (num - 1) / fps - times[-1]
+    if num != len(times) and beyond > 1.5 / fps:
+        log.warning(
+            "%s: %d frames, of which the last %d are after the last true camera and "
+            "left out.",
+            *(file, num, round(beyond * fps)),
+        )
 
 
 def _at(

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
-from bodyslam_jax.evaluation._evaluation import NOBODY, Evaluation, Scope
+from bodyslam_jax.evaluation._evaluation import (
+    NOBODY,
+    STRAIGHT,
+    Evaluation,
+    Scope,
+)
+
+_FEW = 3
+"""Poses, from which on an alignment leaves errors to be seen."""
 
 _MM, _PERCENT, _DEGREES = 1e3, 100.0, 180 / math.pi
 ROWS: tuple[tuple[str, str, str, float], ...] = (
@@ -99,6 +107,17 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
             f"cameras are compared in {scope.cameras} of {scope.of_cameras} frames of "
             "the ground truth only."
         )
+    if 0 < scope.cameras < _FEW:
+        found.append(
+            f"cameras are compared in {scope.cameras} frames only, which alignment "
+            "brings together: their errors say nothing."
+        )
+    found += [
+        f"person {pair.truth} goes along a line, to {100 * STRAIGHT:.0f} cm: how far "
+        "they are turned about it alignment A1 leaves open, and J-ATE may be of that."
+        for pair, straight in zip(scope.people, scope.straight)
+        if straight
+    ]
     for pair in scope.people:
         if pair.estimate == NOBODY:
             found.append(f"person {pair.truth} of the ground truth is not found.")
