@@ -398,6 +398,24 @@ def test_weights_of_frames_without_an_earlier_one_are_refused(name, field, at):
     make(**{name: one(first + 1)})
 
 
+@pytest.mark.parametrize("name", ["RootOrientation", "RootPlace", "HumanMotion"])
+def test_errors_that_go_on_from_what_was_not_measured_are_refused(name):
+    factor = fitting()[1][name]
+    where = "whitening" if name == "HumanMotion" else "sigma"
+    measured = changed(factor, where, lambda x: jnp.ones_like(x).at[:, 0].set(0.0))
+    if where == "sigma":
+        measured = factor
+    lasts = changed(measured, "correlation", lambda x: x.at[:, 2].set(0.5))
+    make(**{name: lasts})
+    nothing = 0.0 if where == "whitening" else jnp.inf
+    lost = changed(lasts, where, lambda x: x.at[:, 1].set(nothing))
+    message = f"{name}.correlation: found 0.5 in frame 2 of person 0, expected 0.0"
+    with pytest.raises(ValueError, match=message):
+        make(**{name: lost})
+    # Nor does it matter where this one is not measured, either.
+    make(**{name: changed(lost, where, lambda x: x.at[:, 2].set(nothing))})
+
+
 def test_a_state_has_one_precision():
     state, factors = fitting()
     mixed = changed(state, "landmarks", lambda x: x.astype(jnp.float32))

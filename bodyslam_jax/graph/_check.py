@@ -17,7 +17,7 @@ from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
 from bodyslam_jax.graph._camera_priors import CameraPrior
-from bodyslam_jax.graph._check_weights import check_early, check_loss
+from bodyslam_jax.graph._check_weights import check_early, check_loss, check_runs
 from bodyslam_jax.graph._ground import GroundContact
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._reprojection import JointReprojection, Reprojection
@@ -90,6 +90,7 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
         _check_frames(factor, name, sizes)
     _check_values(factor, name)
     check_early(factor, name)
+    check_runs(factor, name)
     if isinstance(factor, Reprojection):
         _check_tracks(factor, sizes)
     if isinstance(factor, RootOrientation):

@@ -109,3 +109,31 @@ def check_early(factor: AbstractFactor, name: str) -> None:
                 f"{name}.{field}: found {other[0]} within {frames}, expected {empty}: "
                 "there is no earlier frame."
             )
+
+
+def check_runs(factor: AbstractFactor, name: str) -> None:
+    """Refuses errors that go on from a frame in which nothing was measured.
+
+    What stands there is not a measurement, and would be compared with.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    if isinstance(factor, HumanMotion):
+        weight, known = factor.whitening, lambda x: (x != 0).any(axis=(-1, -2))
+    elif isinstance(factor, RootOrientation | RootPlace):
+        weight, known = factor.sigma, np.isfinite
+    else:
+        return
+    if is_traced((weight, factor.correlation)):
+        return
+    there: np.ndarray = np.asarray(known(np.asarray(weight)))
+    there = np.any(there.reshape(*there.shape[:2], -1), axis=-1)
+    on = np.asarray(factor.correlation)[:, 1:] != 0
+    lost = np.argwhere(on & there[:, 1:] & ~there[:, :-1])
+    if len(lost):
+        person, frame = lost[0]
+        raise ValueError(
+            f"{name}.correlation: found {factor.correlation[person, frame + 1]} in "
+            f"frame {frame + 1} of person {person}, expected 0.0: the frame before is "
+            "not measured (`graph.runs`)."
+        )
