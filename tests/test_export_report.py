@@ -136,6 +136,15 @@ def test_metres_that_two_cues_dispute_say_so(tmp_path, body):
     assert share(0.6) in text(scale)
 
 
+def test_without_people_nothing_is_in_metres(tmp_path, body):
+    scale = {"scale": {"value": 1.0, "sigma": float("inf")}}
+    text = _write(tmp_path, dataclasses.replace(_walk(people=0), summary=scale), body)
+    cards = text[text.index('class="cards"') : text.index("</section>")]
+    assert "3 units" in cards and "own unit" in cards
+    assert "nothing tells it: there are no people" in cards
+    assert "m/s" not in cards and "How sure" not in cards
+
+
 def test_absent_people_and_no_map(tmp_path, body):
     result = _walk(people=2)
     present = result.present.copy()

@@ -19,15 +19,21 @@ def cards(
     body: BodyModel,
 ) -> str:
     """The summary that a person understands: how far, how fast, how tall, how sure."""
-    found = [
-        _card(
-            "Camera",
+    if result.present.any():
+        known_of_camera = (
             f"{camera.distance:.1f} m",
             "camera",
             f"way over the ground, {camera.mean_speed:.2f} m/s on average",
             f"held {camera.height:.2f} m above the floor",
         )
-    ]
+    else:
+        own = f"{camera.distance:.2g} units"
+        known_of_camera = (
+            own,
+            "camera",
+            "way in the map's own unit: people alone tell metres",
+        )
+    found = [_card("Camera", *known_of_camera)]
     known = summary.get("people") or []
     for person, way in enumerate(people):
         if not result.present[person].any():
