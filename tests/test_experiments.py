@@ -287,7 +287,7 @@ def test_choice_of_sequences():
         ("D1", "follow"),
     ]
     assert {s.length for s in found} == {50}
-    one = simulations(Experiment(sequences=("M4",)), ("E2",), ("room", "follow"))
+    one = simulations(Experiment(sequences=("M4", "M4")), ("E2",), ("room", "follow"))
     assert [(s.sequence, s.family) for s in one] == [("M4", "room"), ("M4", "follow")]
 
 

@@ -92,7 +92,7 @@ def simulations(
     A seed that was chosen makes every sequence another one, and not all of them the
     same: their names count as well.
     """
-    chosen = experiment.sequences or tuple(sequences)
+    chosen = dict.fromkeys(experiment.sequences or sequences)  # each once
     kinds = families
     if experiment.family is not None:
         kinds = (
