@@ -153,7 +153,9 @@ def _scope(
 
 
 def _from_a_line(points: Float[np.ndarray, "t 3"]) -> float:
-    """Root mean square distance from the line that fits best, m."""
+    """Root mean square distance from the line that fits best, m; NaN if a point is."""
+    if not np.isfinite(points).all():
+        return np.nan
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.linalg.norm(spread[1:]) / np.sqrt(len(points)))
 
