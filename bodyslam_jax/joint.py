@@ -227,7 +227,11 @@ def estimate(
     return Joint(
         scale=float(best.scale),
         start=prepared.scale,
-        scale_sigma=_scale_sigma(prepared, spread),
+        scale_sigma=_scale_sigma(
+            float(spread.scale) if spread else np.nan,
+            moving=prepared.moving,
+            anybody=bool(prepared.roots.present.any()),
+        ),
         shape_covariance=(
             np.full((len(best.shapes), 10, 10), np.nan)
             if spread is None
@@ -246,12 +250,12 @@ def estimate(
     )
 
 
-def _scale_sigma(prepared: Prepared, spread: solver.Marginals | None) -> float:
+def _scale_sigma(variance: float, *, moving: bool, anybody: bool) -> float:
     """m per unit of the map; infinite without people, who alone tell metres, and NaN
     where it was not computed or there is no map."""
-    if not spread or not prepared.moving:
+    if np.isnan(variance) or not moving:
         return np.nan
-    return float(spread.scale) ** 0.5 if prepared.roots.present.any() else np.inf
+    return variance**0.5 if anybody else np.inf
 
 
 def of_fitted_sizes(

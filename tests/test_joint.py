@@ -254,3 +254,12 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
         given = other.weight(jnp.asarray((far / sigma) ** 2))
         expected = loss.weight(jnp.asarray(9.0))
         np.testing.assert_allclose(given, expected, rtol=1e-9)
+
+
+def test_metres_are_not_known_where_nobody_tells_them():
+    sigma = joint._scale_sigma
+    assert sigma(0.04, moving=True, anybody=True) == pytest.approx(0.2)
+    # Held at 1, the scale has no variance; that is not to know it.
+    assert sigma(0.0, moving=True, anybody=False) == np.inf
+    assert np.isnan(sigma(0.0, moving=False, anybody=False))
+    assert np.isnan(sigma(np.nan, moving=True, anybody=False))
