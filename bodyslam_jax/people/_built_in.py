@@ -52,7 +52,7 @@ class _Frame:
     """What was found in one image, and the image as long as it may be needed."""
 
     image: UInt8[np.ndarray, "y x 3"]
-    mask: Bool[np.ndarray, "y x"]
+    mask: Bool[np.ndarray, "r c"]
     """At every `SILHOUETTE_STEP`-th pixel, where people are."""
     known: dict[int, np.ndarray]
     """By number of the tracklet, COCO keypoints."""

@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from bodyslam_jax.people._appearance import difference, mean_look
-from bodyslam_jax.people._tracking import Tracklet, displacement, height
+from bodyslam_jax.people._tracking import GROWTH, Tracklet, displacement, height
 
 _NEAR = 1.0
 """s: gaps up to which the place in the image counts."""
-_REACH = 0.35
+_REACH = 0.2
 """How far from where they were expected people are seen again, of their height."""
 _REACH_PER_SECOND = 1.2
 _SAME_CLOTHES = 14.0
@@ -89,8 +89,9 @@ def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
     if gap <= 0:
         return np.inf
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
-    growth = abs(np.log(_size(a, last=True) / _size(b, last=False))) / np.log(_GROWTH)
+    growth = abs(np.log(_size(a, last=True) / _size(b, last=False)))
     seconds = gap / fps
+    growth /= np.log(_GROWTH if seconds > _NEAR else GROWTH)
     if seconds > _NEAR:
         clothes = looks / _SAME_CLOTHES if np.isfinite(looks) else np.inf
         return float(max(clothes, growth)) if max(clothes, growth) < 1 else np.inf

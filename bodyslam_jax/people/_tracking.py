@@ -24,7 +24,7 @@ _FADING = 0.5
 """Time constant with which an unseen person is taken to stop, s."""
 _SMOOTHING = 0.1
 """Time constant of the velocity's mean, s."""
-_GROWTH = 1.6
+GROWTH = 1.6
 """Ratio of sizes from which it is somebody else."""
 OTHER_CLOTHES = 30.0
 """Difference of colours (`_appearance.difference`) from which it is somebody else."""
@@ -174,7 +174,7 @@ class Tracker:
 def _unlike(place: float, growth: float, clothes: float) -> float:
     """A cost below 1 only if each of the three may be: distance in what is within
     reach, ratio of sizes, difference of clothes (NaN is unknown)."""
-    growth = abs(float(np.log(growth))) / np.log(_GROWTH)
+    growth = abs(float(np.log(growth))) / np.log(GROWTH)
     clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
     if max(place, growth, clothes) >= 1:
         return 1e3
