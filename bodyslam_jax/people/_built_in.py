@@ -40,6 +40,9 @@ _SOONER = 3
 """Frames after a search until the next where somebody was lost."""
 _OVERLAP = 0.25
 """Share of a person's box that others may cover while its colours are the person's."""
+_LITTLE = 0.03
+"""How much there is to see of somebody who is estimated, at least: of what there is of
+the person who is seen best."""
 _PRESENCE = 0.5
 _LEAST_FOR_FEET = 60.0
 """Height of people, px, below which BlazePose is of no use."""
@@ -131,6 +134,7 @@ class _Finder:
     def result(self) -> Found:
         everybody = link(self.tracker.tracklets, self.fps)
         people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
+        people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
         rows = [(frame, -1, as_body25(points, None)) for frame, points in self.others]
         for tracklet in self.tracker.tracklets:
@@ -141,6 +145,11 @@ class _Finder:
             rows += [(frame, -1, as_body25(p, None)) for frame, p in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
+        if len(everybody) > len(people):
+            warnings.append(
+                f"{len(everybody) - len(people)} more people, small or seen briefly, "
+                "are kept out of the map and not estimated."
+            )
         return Found(
             np.array([row[0] for row in rows], int),
             np.array([row[2] for row in rows]).reshape(-1, 25, 3),

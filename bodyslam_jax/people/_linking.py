@@ -22,6 +22,9 @@ _SAME_CLOTHES = 14.0
 """Difference of colours up to which a person seen again after a while is the same."""
 _CLOTHES_NEARBY = 22.0
 """The same, where the place fits too."""
+_JUMP = 3.0
+"""Distance, of the height, over which a detector may go from one person to another;
+beyond it somebody left, and somebody came."""
 _GROWTH = 2.0
 """Ratio of sizes before and after from which it is somebody else."""
 _ENDS = 20
@@ -75,7 +78,9 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
                 continue
             frame = first.frames[0]
             away = displacement(others[-1].expected(frame, fps), first.points[0])
-            where = f"{away:.1f} of their height away" if away < np.inf else "elsewhere"
+            if away > _JUMP:
+                continue
+            where = f"{away:.1f} of their height away"
             found.append(
                 f"person {number} begins in frame {frame}, {gap:.2g} s after person "
                 f"{other} was lost, {where}: taken for somebody else."
