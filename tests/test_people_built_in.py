@@ -2,12 +2,15 @@
 
 import dataclasses
 import socket
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from bodyslam_jax import frontend, people, synthetic
-from bodyslam_jax.config import Detect, Simulation
+from bodyslam_jax import frontend, people, pipeline, synthetic
+from bodyslam_jax.cache import Cache
+from bodyslam_jax.config import Config, Detect, Simulation
 from bodyslam_jax.frontend._person_mask import person_masks
 from bodyslam_jax.people import _blazepose, _found, _movenet, _networks
 from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence
@@ -133,6 +136,33 @@ def test_a_video_without_people(scene):
     found = people.find_tracked(images, 30.0)
     assert (found.person == -1).all() and not found.warnings
     assert with_people(images, found).keypoints is None
+
+
+def test_a_still_video_without_people_ends_well(tmp_path):
+    """Nothing to estimate from, which is a result, and said."""
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 255, (30, 40, 3), np.uint8)
+    image = cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_CUBIC)
+    for k in range(8):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    config = Config(overlay=False, uncertainty=False)
+    result = pipeline.run(frontend.read_sequence(tmp_path), config)
+    assert result.poses.shape == (0, 8, 72)
+    assert any("nobody was found" in text for text in result.summary["warnings"])
+    assert result.summary["status"] != "ok"
+
+
+@pytest.mark.parametrize("detect", ["auto", "none"])
+def test_given_keypoints_come_first(scene, detect, monkeypatch):
+    """The networks are not even opened, nor where nobody is to be looked for."""
+    monkeypatch.setattr(people, "find_tracked", lambda *a: pytest.fail("looked"))
+    given = synthetic.as_sequence(scene[0])
+    if detect == "none":
+        given = dataclasses.replace(given, keypoints=None)
+    given = dataclasses.replace(given, frames=Path("video.mp4"))
+    config = Config(detect=detect)
+    found = pipeline._detected(given, config, Cache(None), pipeline.Stopwatch())
+    assert found is given
 
 
 @pytest.mark.parametrize("harm", ["missing", "damaged"])
