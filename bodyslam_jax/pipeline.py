@@ -211,10 +211,17 @@ def _tracked(
         key = fingerprint(sequence, config.detection, config.association)
         found = cache.stage("detection", key, people.Found, find)
     points, person = found.by_frame(sequence.num_frames)
-    sequence = _warned(sequence, found.warnings)
-    return frontend.with_detections(
-        sequence, points, config.association, person=person, seen=found.seen()
+    sequence = frontend.with_detections(
+        _warned(sequence, found.warnings),
+        points,
+        config.association,
+        person=person,
+        seen=found.seen(),
     )
+    if sequence.keypoints is None:
+        return sequence
+    keypoints = people.with_depths(sequence.keypoints, found, sequence.intrinsics)
+    return dataclasses.replace(sequence, keypoints=keypoints)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,13 @@ from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.frontend import SILHOUETTE_STEP
 from bodyslam_jax.people import _blazepose, _movenet
 from bodyslam_jax.people._appearance import SIZE, describe
-from bodyslam_jax.people._found import AGREES, Found, as_body25, find_feet
+from bodyslam_jax.people._found import (
+    AGREES,
+    Found,
+    as_body25,
+    find_feet,
+    find_relative,
+)
 from bodyslam_jax.people._linking import link, remarks
 from bodyslam_jax.people._movenet import Region, sure_points
 from bodyslam_jax.people._networks import BLAZEPOSE, MOVENET, open_network
@@ -101,6 +107,7 @@ class _Finder:
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
         """By tracklet and frame: heel and big toe of both sides (4, 3)."""
+        self.relative: dict[tuple[int, int], np.ndarray] = {}
         self.others: list[tuple[int, np.ndarray]] = []
         self.masks: list[np.ndarray] = []
 
@@ -136,13 +143,16 @@ class _Finder:
         people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
-        rows = [(frame, -1, as_body25(points, None)) for frame, points in self.others]
+        unknown = np.zeros((25, 3))
+        alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
+        rows = [alone(*other) for other in self.others]
         for tracklet in self.tracker.tracklets:
             who = number.get(tracklet.number, -1)
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
-                feet = self.feet.get((tracklet.number, frame))
-                rows.append((frame, who, as_body25(points, feet)))
-            rows += [(frame, -1, as_body25(p, None)) for frame, p in between(tracklet)]
+                key = tracklet.number, frame
+                body = as_body25(points, self.feet.get(key))
+                rows.append((frame, who, body, self.relative.get(key, unknown)))
+            rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
         if len(everybody) > len(people):
@@ -154,6 +164,7 @@ class _Finder:
             np.array([row[0] for row in rows], int),
             np.array([row[2] for row in rows]).reshape(-1, 25, 3),
             np.array([row[1] for row in rows], int),
+            np.array([row[3] for row in rows]).reshape(-1, 25, 3),
             np.stack(self.masks),
             tuple(warnings),
         )
@@ -214,6 +225,7 @@ class _Finder:
         if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
             return
         self.feet[number, k] = find_feet(pose, points, apart)
+        self.relative[number, k] = find_relative(pose)
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= _blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 
