@@ -24,7 +24,8 @@ def estimate_bodies(
     (others,) = np.nonzero(without_bodies(sequence))
     if keypoints is None or not len(others):
         return found
-    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others])
+    depth = None if keypoints.depth is None else keypoints.depth[others]
+    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
     fitted = fit_bodies(seen, camera, body, fps, settings)
     for name in ("present", "poses", "shapes", "trans"):
         getattr(found, name)[others] = getattr(fitted, name)
