@@ -49,6 +49,8 @@ _OVERLAP = 0.25
 _LITTLE = 0.03
 """How much there is to see of somebody who is estimated, at least: of what there is of
 the person who is seen best."""
+_BRIEF = 0.2
+"""s: who is seen for less is masked without a word, as it may be nobody."""
 _PRESENCE = 0.5
 _LEAST_FOR_FEET = 60.0
 """Height of people, px, below which BlazePose is of no use."""
@@ -155,10 +157,12 @@ class _Finder:
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
-        if len(everybody) > len(people):
+        seen = [sum(len(t.frames) for t in pieces) for pieces in everybody]
+        others = sum(n >= _BRIEF * self.fps for n in seen) - len(people)
+        if others > 0:
             warnings.append(
-                f"{len(everybody) - len(people)} more people, small or seen briefly, "
-                "are kept out of the map and not estimated."
+                f"{others} more people, small or seen briefly, are kept out of the map "
+                "and not estimated."
             )
         return Found(
             np.array([row[0] for row in rows], int),
