@@ -60,6 +60,8 @@ def read_camera_path(
         T_WC[at], known[at] = poses, True
     else:
         times, poses = read_tum(path)
+        if len(times) < _FEWEST:
+            raise ValueError(f"{path}: one pose, expected {_FEWEST} or more.")
         T_WC, known = _at_times(times, poses, timestamps)
     if known.sum() < _FEWEST:
         raise ValueError(

@@ -147,7 +147,8 @@ def _binary_images(path: Path) -> Iterator[tuple[str, list[float]]]:
         end = reader.data.index(b"\0", reader.at)
         name = reader.data[reader.at : end].decode()
         reader.at = end + 1
-        reader.at += 24 * reader.take("Q")[0]
+        (points,) = reader.take("Q")
+        reader.at += 24 * points
         yield name, numbers
 
 

@@ -163,19 +163,32 @@ def _along(
     builder = Builder(problem.views, *size, problem.focal, config, refine)
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
-    if len(problem.views.frame) and grown.has_point.sum() < config.min_shared:
-        text = "the camera path that is given shows no parallax: the camera only turns."
-        every = np.ones(len(problem.views.frame), bool)
-        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
-    known = np.flatnonzero(path.known)
-    share, tested = builder.share_explained(grown, known)
-    if tested >= _TESTED and share < _EXPLAINED:
-        raise ValueError(
-            f"camera path: {100 * share:.0f} % of the points in the images fit it, "
-            f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
-            "world to camera, with other axes, or another focal length?"
+    share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
+    if tested < _TESTED or share >= _EXPLAINED:
+        return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
+    shot = problem.views
+    motion = config.keyframe_motion * max(
+        problem.intrinsics.width, problem.intrinsics.height
+    )
+    keyframes = choose_keyframes(
+        shot,
+        int(shot.frame.min()),
+        int(shot.frame.max()),
+        motion / problem.focal,
+        config.min_shared,
+    )
+    pairs = rotation_error(shot, keyframes, 1 / problem.focal)
+    if _turning_error(pairs) * problem.focal < config.rotation_error:
+        text = (
+            "the images show no parallax along the given path: the camera only turns."
         )
-    return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
+        every = np.ones(len(shot.frame), bool)
+        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
+    raise ValueError(
+        f"camera path: {100 * share:.0f} % of the points in the images fit it, "
+        f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
+        "world to camera, with other axes, or another focal length?"
+    )
 
 
 def _longest_shot(
