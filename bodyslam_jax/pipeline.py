@@ -116,6 +116,7 @@ def _run(
     sequence = _detected(sequence, config, cache, watch)
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
+    sequence = people.select_people(sequence, config.person)
     seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     with watch("joint"):
         rehearsal.wait("prediction")
@@ -145,7 +146,9 @@ def before_joint(
     key = fingerprint(sequence, config.tracking)
     with watch("tracks"):
         tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
-    key = fingerprint(key, config.structure, config.weights.landmark_loss)
+    key = fingerprint(
+        key, config.structure, config.weights.landmark_loss, config.static_camera
+    )
     with watch("cameras"):
         cameras = cache.stage(
             "cameras",
@@ -153,6 +156,7 @@ def before_joint(
             Cameras,
             lambda: reconstruction.estimate(sequence, tracks, config),
         )
+    sequence = people.select_people(sequence, config.person)
     sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)

@@ -63,10 +63,10 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     guess = sequence.intrinsics
     found = _reconstruct(sequence, tracks, guess, config)
-    cameras = _unadjusted(found, guess, config)
+    cameras = _unadjusted(sequence, found, guess, config)
     if found.kind != "moving":
         return cameras
-    if guess.is_guess:
+    if guess.is_refined:
         cameras = _with_focal(sequence, tracks, cameras, found.error, config)
     else:
         cameras = _adjusted(cameras, 1.0, config, None)
@@ -90,7 +90,10 @@ def _with_focal(
             break
         better = dataclasses.replace(guess, params=adjusted.intrinsics)
         again = _reconstruct(sequence, tracks, better, config)
-        cameras, sigma = _unadjusted(again, better, config), adjusted.pixel_sigma
+        cameras, sigma = (
+            _unadjusted(sequence, again, better, config),
+            adjusted.pixel_sigma,
+        )
         if again.kind != "moving":
             if again.error > _WORSE * _PER_SIGMA * sigma:
                 return adjusted  # little as it moves, turning alone does not explain it
@@ -145,13 +148,22 @@ def _reconstruct(
     sequence: Sequence, tracks: Tracks, intrinsics: Intrinsics, config: Config
 ) -> frontend.Reconstruction:
     return frontend.reconstruct(
-        tracks, intrinsics, sequence.num_frames, config.structure
+        tracks,
+        intrinsics,
+        sequence.num_frames,
+        config.structure,
+        path=sequence.camera_path,
+        static=config.static_camera,
     )
 
 
 def _unadjusted(
-    found: frontend.Reconstruction, intrinsics: Intrinsics, config: Config
+    sequence: Sequence,
+    found: frontend.Reconstruction,
+    intrinsics: Intrinsics,
+    config: Config,
 ) -> Cameras:
+    path = sequence.camera_path if found.kind == "moving" else None
     return Cameras(
         kind=found.kind,
         T_WC=found.T_WC,
@@ -166,6 +178,9 @@ def _unadjusted(
         focal_sigma=float("nan"),
         costs=(0.0, 0.0),
         warnings=tuple(found.warnings),
+        path=None if path is None else found.T_WC,
+        path_known=None if path is None else path.known,
+        path_scale=found.unit if path and path.metric else float("nan"),
     )
 
 
@@ -177,7 +192,7 @@ def _with_guess(
     found = _reconstruct(sequence, tracks, guess, config)
     held = dataclasses.replace(config.structure, focal_sigma=_HELD)
     cameras = _adjusted(
-        _unadjusted(found, guess, config),
+        _unadjusted(sequence, found, guess, config),
         adjusted.pixel_sigma,
         dataclasses.replace(config, structure=held),
         guess,
@@ -207,7 +222,8 @@ def _adjusted(
     if guess is not None and config.structure.focal_sigma > _HELD:
         # Places are those of the focal length that was thought so far.
         again = dataclasses.replace(again, whitening=0 * again.whitening)
-    problem = _problem(factor, again, state, config.structure, guess)
+    path = initialisation.path_factors(cameras.path, cameras.path_known)
+    problem = _problem([factor, again, *path], state, config.structure, guess)
     solution = solver.solve(problem, state)
     before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
@@ -239,22 +255,24 @@ _residual = jit_once(lambda factor, state: factor.residual(state))
 
 
 def _problem(
-    factor: graph.Reprojection,
-    again: graph.LandmarkPrior,
+    factors: list[graph.AbstractFactor],
     state: graph.State,
     structure: Structure,
     guess: Intrinsics | None,
 ) -> graph.Problem:
     if guess is None:
-        return graph.make_problem([factor, again], state)
+        return graph.make_problem(factors, state)
     known = np.asarray(guess.params, float)
     focal = known[0]
     # Errors of a track last, so `focal_runs` observations count for one: here the
     # prior's weight is multiplied, which is the same as dividing theirs.
     sigma = np.full(len(known), _HELD * focal)
-    sigma[:2] = structure.focal_sigma * focal / np.sqrt(structure.focal_runs)
+    error = guess.focal_sigma or structure.focal_sigma * focal
+    sigma[:2] = min(error, structure.focal_sigma * focal) / np.sqrt(
+        structure.focal_runs
+    )
     factors = [
-        factor,
+        *factors,
         graph.IntrinsicsPrior(jnp.asarray(known)[None], jnp.asarray(sigma)[None]),
         graph.SquarePixels(jnp.asarray([_SQUARE * focal])),
     ]

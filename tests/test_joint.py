@@ -56,7 +56,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     def motion_factor(*_, shared_error):
         told.append(float(shared_error[0]))
 
-    def scale_start(*_, shared_error):
+    def scale_start(*_, shared_error, **__):
         told.append(shared_error)
         return ScaleStart(motion=2.0, motion_error=0.1)
 
@@ -258,8 +258,8 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
 
 def test_metres_are_not_known_where_nobody_tells_them():
     sigma = joint._scale_sigma
-    assert sigma(0.04, moving=True, anybody=True) == pytest.approx(0.2)
+    assert sigma(0.04, moving=True, told=True) == pytest.approx(0.2)
     # Held at 1, the scale has no variance; that is not to know it.
-    assert sigma(0.0, moving=True, anybody=False) == np.inf
-    assert np.isnan(sigma(0.0, moving=False, anybody=False))
-    assert np.isnan(sigma(np.nan, moving=True, anybody=False))
+    assert sigma(0.0, moving=True, told=False) == np.inf
+    assert np.isnan(sigma(0.0, moving=False, told=False))
+    assert np.isnan(sigma(np.nan, moving=True, told=False))

@@ -51,6 +51,7 @@ def run(
         tracks=tracks,
         masks=masks,
         config=config.association,
+        known=config,
     )
     result = pipeline.run_to_folder(sequence, out, config, first=_is_first())
     return _finish(result, out)

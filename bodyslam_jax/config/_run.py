@@ -5,12 +5,13 @@ from typing import Literal
 
 from bodyslam_jax.config._check import check
 from bodyslam_jax.config._front_end import Association, Detect, Structure, Tracking
+from bodyslam_jax.config._known import RANGES, Known
 from bodyslam_jax.config._people import PeopleFit
 from bodyslam_jax.config._weights import GraphWeights
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Known):
     """Settings of a whole run, one class per stage."""
 
     body_model: str | None = None
@@ -45,7 +46,8 @@ class Config:
     is smoothed without it."""
 
     def __post_init__(self):
-        check(self)
+        check(self, RANGES)
+        self.check_known()
 
     @classmethod
     def paper(cls) -> "Config":

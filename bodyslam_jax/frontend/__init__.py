@@ -12,4 +12,5 @@ from bodyslam_jax.frontend._revisits import told_by_other_pieces as told_by_othe
 from bodyslam_jax.frontend._sequence import read_sequence as read_sequence
 from bodyslam_jax.frontend._sequence import with_detections as with_detections
 from bodyslam_jax.frontend._tracks import track as track
+from bodyslam_jax.frontend._tum import read_tum as read_tum
 from bodyslam_jax.frontend._video import frames as frames

@@ -173,6 +173,13 @@ def resampled(
     return times[picks], picks, (text,)
 
 
+def at_rate(footage: Footage, fps: float) -> Footage:
+    """All frames of a video file, one every 1/`fps` s, whatever the file says."""
+    times = np.arange(footage.num_read) / fps
+    kept = tuple(w for w in footage.warnings if "announced" in w)
+    return dataclasses.replace(footage, timestamps=times, picks=None, warnings=kept)
+
+
 def _look_at_images(folder: Path, fps: float | None) -> Footage:
     images = list_images(folder)
     if not images:

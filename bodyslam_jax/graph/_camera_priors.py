@@ -34,6 +34,29 @@ class CameraPrior(AbstractFrameFactor):
         return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
 
 
+class ScalePrior(AbstractFrameFactor):
+    """A known size of the map, `(s - s̃) / σ`: of a camera path that is in metres."""
+
+    scale: Float[Array, " t"]
+    """s̃, m per unit of the map."""
+    sigma: Float[Array, " t"]
+    """m per unit of the map; finite in one frame, `inf` in all others."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ("scale", "sigma")
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("scale", 0),)
+
+    def data(self):
+        return self.scale, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        return (shared.scale - known)[None] / sigma
+
+
 class AbstractIntrinsicsFactor(AbstractFrameFactor):
     """A factor of the intrinsics alone: one for the whole video."""
 

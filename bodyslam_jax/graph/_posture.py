@@ -108,6 +108,39 @@ class Shape(AbstractFrameFactor):
         return (shared.shape - shape) / sigma
 
 
+class Stature(AbstractFrameFactor):
+    """A known height of the person, `(h_0 + g · β - h̃) / σ`.
+
+    The height of the mesh at rest, between the vertices that are highest and lowest in
+    the mean shape, is linear in β.
+    """
+
+    template: Float[Array, ""]
+    """h_0, m"""
+    slope: Float[Array, " 10"]
+    """g, m"""
+    height: Float[Array, "h t"]
+    """h̃, m"""
+    sigma: Float[Array, "h t"]
+    """m; finite in one frame of each person who was measured, `inf` elsewhere."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("height", "sigma")
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("shape", 0),)
+
+    def data(self):
+        return self.height, self.sigma
+
+    def local(self, data, window, shared):
+        height, sigma = data
+        return (self.template + jnp.dot(self.slope, shared.shape) - height)[
+            None
+        ] / sigma
+
+
 def rotation_between(
     first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:

@@ -1,5 +1,7 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -8,7 +10,7 @@ from scipy.ndimage import maximum_filter1d
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.compilation import jit_once
-from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.config import PATH_SIGMA, GraphWeights, Measured
 from bodyslam_jax.people import Roots
 from bodyslam_jax.sequence import Sequence, Tracks
 
@@ -39,6 +41,46 @@ def revisit_factor(
     whitening = np.sqrt(np.maximum(size, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
     return graph.LandmarkPrior(
         place=jnp.asarray(places, float), whitening=jnp.asarray(whitening / sigma)
+    )
+
+
+def path_factors(
+    path: Float[np.ndarray, "t 4 4"] | None,
+    known: Bool[np.ndarray, " t"] | None,
+    scale: float = float("nan"),
+) -> list[graph.AbstractFactor]:
+    """Camera poses that came with the video, and metres per unit of the map if they
+    are in metres; none without them."""
+    if path is None or known is None:
+        return []
+    sigma = np.repeat(np.where(known, PATH_SIGMA, np.inf)[:, None], 6, axis=1)
+    factors: list[graph.AbstractFactor] = []
+    factors.append(graph.CameraPrior(jnp.asarray(path), jnp.asarray(sigma)))
+    if np.isfinite(scale):
+        once = np.full(len(known), np.inf)
+        once[0] = PATH_SIGMA * scale
+        of_map = jnp.full(len(known), scale)
+        factors.append(graph.ScalePrior(of_map, jnp.asarray(once)))
+    return factors
+
+
+def stature_factor(
+    statures: Mapping[int, Measured],
+    present: Bool[np.ndarray, "h t"],
+    body: BodyModel,
+) -> graph.Stature:
+    """Statures that are known, one measurement a person."""
+    linear = people.linear_stature(body)
+    height, sigma = np.ones(present.shape), np.full(present.shape, np.inf)
+    for h, known in statures.items():
+        height[h] = known.value
+        if present[h].any():
+            sigma[h, present[h].argmax()] = known.sigma
+    return graph.Stature(
+        template=jnp.asarray(linear.template),
+        slope=jnp.asarray(linear.slope),
+        height=jnp.asarray(height),
+        sigma=jnp.asarray(sigma),
     )
 
 
@@ -76,9 +118,17 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
 
 
 def people_factors(
-    sequence: Sequence, roots: Roots, weights: GraphWeights, body: BodyModel
+    sequence: Sequence,
+    roots: Roots,
+    weights: GraphWeights,
+    body: BodyModel,
+    *,
+    shape: Float[np.ndarray, "h 10"] | None = None,
 ) -> list[graph.AbstractFactor]:
-    """Keypoints, postures, shapes and smooth paths of `h` people."""
+    """Keypoints, postures, shapes and smooth paths of `h` people.
+
+    `shape` is what a regressor or a fit says of β, where `roots` have more than that.
+    """
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
@@ -108,7 +158,8 @@ def people_factors(
     if placed.any():
         rho = graph.runs(jnp.asarray(placed), weights.root_correlation**per_frame)
         factors.append(_place_factor(roots, placed, rho, weights))
-    factors.append(_shape_factor(roots, weights))
+    measured = roots.shape if shape is None else shape
+    factors.append(_shape_factor(roots.present, measured, weights))
     if weights.root_sigma is not None:
         factors.append(
             graph.RootOrientation(
@@ -153,13 +204,17 @@ def _place_factor(
     )
 
 
-def _shape_factor(roots: Roots, weights: GraphWeights) -> graph.Shape:
-    counted = roots.present.astype(float)
+def _shape_factor(
+    present: Bool[np.ndarray, "h t"],
+    measured: Float[np.ndarray, "h 10"],
+    weights: GraphWeights,
+) -> graph.Shape:
+    counted = present.astype(float)
     if not weights.shape_each_frame:
         counted = np.zeros_like(counted)
-        counted[np.arange(len(counted)), roots.present.argmax(axis=1)] = 1.0
+        counted[np.arange(len(counted)), present.argmax(axis=1)] = 1.0
     sigma = np.where(counted > 0, weights.shape_sigma, np.inf)
-    shape = np.broadcast_to(roots.shape[:, None], (*counted.shape, 10))
+    shape = np.broadcast_to(measured[:, None], (*counted.shape, 10))
     return graph.Shape(
         shape=jnp.asarray(shape),
         sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
