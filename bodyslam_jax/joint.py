@@ -79,15 +79,12 @@ def prepare(
     stages = []
     factors = []
     if moving:
+        sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
         factors.append(
-            initialisation.map_factor(
-                cameras.tracks, cameras.keep, cameras.pixel_sigma, weights
-            )
+            initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
         )
         factors.append(
-            initialisation.revisit_factor(
-                cameras.places, cameras.elsewhere, cameras.pixel_sigma
-            )
+            initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
         )
     anybody = len(roots.present) > 0
     free = None if moving else initialisation.free_people(state)
@@ -103,7 +100,11 @@ def prepare(
         return eqx.tree_at(lambda p: p.free.cameras, problem, mask)
 
     if anybody:
-        factors += initialisation.people_factors(sequence, roots, weights, body)
+        seen = predict(predictor, state)
+        known = seen.valid if weights.posture_predicted else None
+        factors += initialisation.people_factors(
+            sequence, roots, weights, body, predicted=known
+        )
         there = roots.present & cameras.registered
         walked = lambda seen, state: [
             initialisation.motion_factor(
@@ -127,7 +128,7 @@ def prepare(
         upright = initialisation.upright_factor(state, there, sequence.fps, weights)
         if upright is not None:
             factors.append(upright)
-        problem = make([*factors, *walked(predict(predictor, state), state)], state)
+        problem = make([*factors, *walked(seen, state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
         seen = predict(predictor, state)
@@ -150,6 +151,8 @@ def prepare(
         )
     problem = make(factors, state)
     if config.motion_coupling == "frozen":
+        if anybody and weights.posture_predicted:
+            problem = problem.with_prediction({"body_pose": seen.body_pose})
         problem = dataclasses.replace(problem, motion=None)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
 

@@ -19,6 +19,7 @@ class CameraPrior(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("cameras", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -39,6 +40,7 @@ class AbstractIntrinsicsFactor(AbstractFrameFactor):
 
     of_people = False
     frame_fields = ()
+    padding = {}  # its one row is no frame
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -92,6 +94,7 @@ class CameraSmoothness(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

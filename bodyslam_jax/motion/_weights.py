@@ -19,7 +19,9 @@ from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._predict import MotionModel
 
 _FORMAT = "bodyslam-motion-1"
-_DEFAULT = Path(__file__).parent / "assets" / "default.npz"
+_ASSETS = Path(__file__).parent / "assets"
+SHIPPED = ("default", "paper")
+"""Motion models that come with the package: the default, and the paper's network."""
 
 
 def save_motion_model(path: Path | str, model: MotionModel) -> None:
@@ -58,11 +60,12 @@ def save_motion_model(path: Path | str, model: MotionModel) -> None:
 
 
 def load_motion_model(path: Path | str | None = None) -> MotionModel:
-    """Reads a model's weights (float32), by default those that come with the package.
+    """Reads a model's weights (float32): of a file, or by name of `SHIPPED`.
 
     **Raises:** `FileNotFoundError`; `ValueError` if the file holds no motion model.
     """
-    path = _DEFAULT if path is None else Path(path)
+    name = "default" if path is None else str(path)
+    path = _ASSETS / f"{name}.npz" if name in SHIPPED else Path(name)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such motion model.")
     try:
