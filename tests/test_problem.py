@@ -448,6 +448,7 @@ def test_added_frames_weigh_nothing_to_any_factor():
 def test_a_loss_has_one_scale_or_one_for_each_keypoint():
     state, factors = fitting()
     keypoints = factors["JointReprojection"]
+    assert isinstance(keypoints, g.JointReprojection)
     each = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0 * ones(1, T, 25)))
     one = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0))
     moved = dataclasses.replace(state, roots=state.roots.at[..., 2, 3].set(4.0))

@@ -165,9 +165,10 @@ def check_padding(factor: AbstractFrameFactor, state: State) -> None:
     axes = ["h", "t"] if factor.of_people else ["t"]
     for field in dataclasses.fields(factor):
         kind = field.type
-        annotated = isinstance(kind, type) and issubclass(kind, AbstractArray)
-        over_frames = annotated and kind.dim_str.split()[: len(axes)] == axes
-        if over_frames and field.name not in fields:
+        if not (isinstance(kind, type) and issubclass(kind, AbstractArray)):
+            continue
+        leading = kind.dim_str.split()[: len(axes)]
+        if leading == axes and field.name not in fields:
             raise ValueError(
                 f"{name}.frame_fields: found {list(fields)}, expected {field.name!r}, "
                 "an array over frames, among them."
