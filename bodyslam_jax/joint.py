@@ -87,15 +87,12 @@ def prepare(
     stages = []
     factors = []
     if moving:
+        sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
         factors.append(
-            initialisation.map_factor(
-                cameras.tracks, cameras.keep, cameras.pixel_sigma, weights
-            )
+            initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
         )
         factors.append(
-            initialisation.revisit_factor(
-                cameras.places, cameras.elsewhere, cameras.pixel_sigma
-            )
+            initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
         )
         factors += initialisation.path_factors(
             cameras.path, cameras.path_known, cameras.path_scale
@@ -114,8 +111,10 @@ def prepare(
         return eqx.tree_at(lambda p: p.free.cameras, problem, mask)
 
     if anybody:
+        seen = predict(predictor, state)
+        known = seen.valid if weights.posture_predicted else None
         factors += initialisation.people_factors(
-            sequence, roots, weights, body, shape=measured
+            sequence, roots, weights, body, shape=measured, predicted=known
         )
         if statures:
             factors.append(initialisation.stature_factor(statures, roots.present, body))
@@ -142,7 +141,7 @@ def prepare(
         upright = initialisation.upright_factor(state, there, sequence.fps, weights)
         if upright is not None:
             factors.append(upright)
-        problem = make([*factors, *walked(predict(predictor, state), state)], state)
+        problem = make([*factors, *walked(seen, state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
         seen = predict(predictor, state)
@@ -174,6 +173,8 @@ def prepare(
         )
     problem = make(factors, state)
     if config.motion_coupling == "frozen":
+        if anybody and weights.posture_predicted:
+            problem = problem.with_prediction({"body_pose": seen.body_pose})
         problem = dataclasses.replace(problem, motion=None)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
 

@@ -173,7 +173,7 @@ def _unadjusted(
         keep=np.ones(len(found.tracks.frame), bool),
         elsewhere=found.elsewhere,
         places=found.landmarks,
-        pixel_sigma=config.weights.pixel_sigma,
+        pixel_sigma=config.weights.pixel_sigma or 1.0,
         intrinsics=np.asarray(intrinsics.params, float),
         focal_sigma=float("nan"),
         costs=(0.0, 0.0),
@@ -215,9 +215,9 @@ def _adjusted(
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
     )
-    factor = initialisation.map_factor(
-        cameras.tracks, cameras.keep, sigma, config.weights
-    )
+    # What the joint graph is to take for the noise does not change what it is.
+    weights = dataclasses.replace(config.weights, pixel_sigma=None)
+    factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
     again = initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
     if guess is not None and config.structure.focal_sigma > _HELD:
         # Places are those of the focal length that was thought so far.

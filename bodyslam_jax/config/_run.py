@@ -17,7 +17,8 @@ class Config(Known):
     body_model: str | None = None
     """Body model file or folder; without it the default body or the one found."""
     motion_model: str | None = None
-    """Motion model's weights; without them the ones that ship."""
+    """Motion model's weights: a file, or `paper` for the paper's network, which ships
+    too; without it the default one."""
     people: bool = True
     """Whether people are estimated; if not, cameras and map stay without a unit."""
     detect: bool = False
@@ -51,8 +52,12 @@ class Config(Known):
 
     @classmethod
     def paper(cls) -> "Config":
-        """Weights and schedule of section 3.6 of the paper."""
+        """Section 3.6 of the paper: its weights, its motion network of section 3.4,
+        whose predictions are measurements that stay as they are, and its first-order
+        schedule. docs/differences_from_the_paper.md says what differs all the same."""
         return cls(
+            motion_model="paper",
+            motion_coupling="frozen",
             weights=GraphWeights.paper(),
             people_fit=PeopleFit(regressor_shape_gain=1.0),
             solver="adam",

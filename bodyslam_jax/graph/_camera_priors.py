@@ -19,6 +19,7 @@ class CameraPrior(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("cameras", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -44,6 +45,7 @@ class ScalePrior(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("scale", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -62,6 +64,7 @@ class AbstractIntrinsicsFactor(AbstractFrameFactor):
 
     of_people = False
     frame_fields = ()
+    padding = {}  # its one row is no frame
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -115,6 +118,7 @@ class CameraSmoothness(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

@@ -36,6 +36,7 @@ class Posture(AbstractFrameFactor):
     """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
     of_people = True
     frame_fields = ("rotation", "sigma", "correlation")
+    padding = {"sigma": jnp.inf, "correlation": 0.0}
     per_joint = True
 
     @property
@@ -95,6 +96,7 @@ class Shape(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("shape", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -126,6 +128,7 @@ class Stature(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("height", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

@@ -8,6 +8,7 @@ ground under people's feet.
 
 from bodyslam_jax.initialisation._factors import PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE
 from bodyslam_jax.initialisation._factors import keypoint_sigma as keypoint_sigma
+from bodyslam_jax.initialisation._factors import landmark_sigma as landmark_sigma
 from bodyslam_jax.initialisation._factors import map_factor as map_factor
 from bodyslam_jax.initialisation._factors import motion_factor as motion_factor
 from bodyslam_jax.initialisation._factors import path_factors as path_factors

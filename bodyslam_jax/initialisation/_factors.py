@@ -16,12 +16,25 @@ from bodyslam_jax.sequence import Sequence, Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
 """px: what a track's noise can be; outside, it is the model that is wrong."""
+_PREDICTED_AFTER = 16 / 30
+"""Time that a person must have been seen for before a posture counts as predicted, s,
+where the predictions are not at hand: what the longest window that ships needs."""
+
+
+def landmark_sigma(measured: float, weights: GraphWeights) -> float:
+    """Standard deviation of a static point in the joint graph, px: `pixel_sigma` of the
+    weights, or else what was `measured` of the tracks."""
+    return measured if weights.pixel_sigma is None else weights.pixel_sigma
 
 
 def map_factor(
     tracks: Tracks, keep: Bool[np.ndarray, " m"], sigma: float, weights: GraphWeights
 ) -> graph.Reprojection:
-    """Static landmarks; rejected observations are left out (their `sigma` is `inf`)."""
+    """Static landmarks; rejected observations are left out (their `sigma` is `inf`).
+
+    `sigma` is what was measured of the tracks (px): `landmark_sigma`.
+    """
+    sigma = landmark_sigma(sigma, weights)
     return graph.Reprojection(
         frame=jnp.asarray(tracks.frame, jnp.int32),
         landmark=jnp.asarray(tracks.landmark, jnp.int32),
@@ -117,6 +130,19 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
     return weights.keypoint_inflation * float(np.sqrt(sequence.fps / 30.0))
 
 
+def _keypoint_loss(
+    sequence: Sequence, sigma: Float[np.ndarray, "h t 25"], weights: GraphWeights
+) -> graph.GemanMcClure:
+    """What lasts counts less, but an outlier is as far away as ever: the loss is of the
+    error in px, whatever the keypoint weighs."""
+    if weights.keypoint_sigma is None:
+        scale = weights.keypoint_loss / _inflation(sequence, weights)
+        return graph.GemanMcClure(jnp.asarray(scale))
+    pixels = weights.keypoint_loss * weights.keypoint_sigma
+    scale = np.where(np.isfinite(sigma), pixels / sigma, 1.0)
+    return graph.GemanMcClure(jnp.asarray(scale))
+
+
 def people_factors(
     sequence: Sequence,
     roots: Roots,
@@ -124,31 +150,40 @@ def people_factors(
     body: BodyModel,
     *,
     shape: Float[np.ndarray, "h 10"] | None = None,
+    predicted: Bool[Array, "h t"] | None = None,
 ) -> list[graph.AbstractFactor]:
     """Keypoints, postures, shapes and smooth paths of `h` people.
 
-    `shape` is what a regressor or a fit says of β, where `roots` have more than that.
+    Args:
+        shape: what a regressor or a fit says of β, where `roots` have more than that.
+        predicted: of which frames the motion model has a prediction
+            (`Prediction.valid`); only there are postures held to it, if they are to be.
     """
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
-        # What lasts counts less, but an outlier is as far away as ever.
-        loss = weights.keypoint_loss / _inflation(sequence, weights)
+        sigma = keypoint_sigma(sequence, roots, weights)
         factors.append(
             graph.JointReprojection(
                 body=body,
                 pixel=jnp.asarray(sequence.keypoints.uv, float),
-                sigma=jnp.asarray(keypoint_sigma(sequence, roots, weights)),
-                loss=graph.GemanMcClure(jnp.asarray(loss)),
+                sigma=jnp.asarray(sigma),
+                loss=_keypoint_loss(sequence, sigma, weights),
             )
         )
     per_frame = 30.0 / sequence.fps
     between = lambda rho: graph.runs(there, rho**per_frame)
     where = lambda mask, sigma: jnp.where(mask, sigma, jnp.inf)
+    held = there
+    if weights.posture_predicted:
+        if predicted is None:
+            count = 1 + round(_PREDICTED_AFTER * sequence.fps)
+            predicted = jnp.asarray(_in_a_row(roots.present, count))
+        held = there & predicted
     factors.append(
         graph.Posture(
             rotation=jnp.asarray(roots.body_pose),
-            sigma=where(there[..., None], weights.posture_sigma) * jnp.ones(23),
+            sigma=where(held[..., None], weights.posture_sigma) * jnp.ones(23),
             correlation=between(weights.posture_correlation),
             correlated=weights.posture_correlation > 0,
             predicted=weights.posture_predicted,
@@ -238,7 +273,8 @@ def motion_factor(
     *,
     shared_error: Float[np.ndarray, " h"] | float = 0.0,
 ) -> graph.HumanMotion:
-    """The motion model's displacements, weighted by its own covariance.
+    """The motion model's displacements, weighted by its own covariance, in lengths of
+    the leg or, if the weights say so, in metres.
 
     `shared_error` is a share by which all of a person's steps may be wrong together:
     they say no more of the scale than that allows, however many there are.
@@ -250,13 +286,14 @@ def motion_factor(
         whitening=whitening,
         correlation=graph.runs(seen.valid, weights.motion_correlation),
         correlated=weights.motion_correlation > 0,
-        body=body,
+        body=body if weights.motion_in_legs else None,
     )
 
 
 @jit_once
 def _steps(seen, shapes, body, weights, shared_error):
-    """Displacements in lengths of the leg, and what whitens their errors."""
+    """Displacements in lengths of the leg, or in metres, and what whitens their
+    errors."""
     valid = seen.valid
     eye = jnp.eye(3, dtype=seen.translation.dtype)
     if weights.motion_sigma is None:
@@ -272,5 +309,7 @@ def _steps(seen, shapes, body, weights, shared_error):
     told = jnp.sum((whitening @ step[..., None]) ** 2, axis=(1, 2, 3), keepdims=True)
     told = told * (1 - rho) / (1 + rho)  # information on a factor of all steps
     whitening = whitening / jnp.sqrt(1 + shared_error**2 * told)
+    if not weights.motion_in_legs:
+        return step, whitening
     leg = motion.leg_length(body, shapes)[:, None, None]
     return step / leg, whitening * leg[..., None]
