@@ -91,14 +91,19 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
         if np.median(moved[movers]) < _TIMES_STILL * limit:
             continue
         away, fits = _contradiction(
-            rays(at_a, K, distortion), rays(at_b, K, distortion), movers, limit / K[0, 0]
+            rays(at_a, K, distortion),
+            rays(at_b, K, distortion),
+            movers,
+            limit / K[0, 0],
         )
         if away is None or not _covers(at_a, fits, still, size):
             continue
         telling += 1
         tested[ids[still]] += 1
         against[ids[still]] += away[still] > _TOLERANCE
-    burnt = (against >= _FEWEST_INCONSISTENT) & (against >= _SHARE_INCONSISTENT * tested)
+    burnt = (against >= _FEWEST_INCONSISTENT) & (
+        against >= _SHARE_INCONSISTENT * tested
+    )
     burnt &= telling >= max(_FEWEST_TELLING[0], _FEWEST_TELLING[1] * resting)
     # Tracks that stay for a while only, as where two objects cross, are of the scene.
     burnt &= stays >= 0.5 * pairs

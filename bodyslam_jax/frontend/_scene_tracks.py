@@ -28,8 +28,10 @@ _MANY_STILL = 0.5
 gives no points beside it."""
 _MOST_HIDDEN = 0.6
 """Of the image: if what is still covers more, the camera stands still."""
-_BLACK, _WHITE = 24, 235
-"""Grey levels of a border."""
+_LITTLE = 0.3
+"""Of the image: if what is still lies in less, it may be text and no scene."""
+_BLACK, _FLAT = 24, 8
+"""Grey level of a border at most, and how much it may vary."""
 _STEP = 12
 """Least difference of grey levels between a border and the scene beside it."""
 _LEAST_BORDER = 0.015
@@ -61,7 +63,7 @@ def track(
     hidden: list[tuple[np.ndarray, np.ndarray]] = []
     share = 0.0
     for _ in range(_MOST_PASSES):
-        wanted, sure = _unwanted(found, sequence)
+        wanted, sure, cover = _unwanted(found, sequence)
         if not wanted.any() and not bordered:
             break
         these = wanted[found.landmark]
@@ -70,6 +72,8 @@ def track(
         again = follow(sequence, config, hidden=masks, progress=progress)
         bordered = False
         if not sure and wanted.any() and not _confirmed(found, again, wanted, sequence):
+            if cover < _LITTLE:
+                warnings = (*warnings, _only_here(cover))
             break
         share = max(share, float(these.mean()) if len(these) else 0.0)
         found, hidden = again, trial
@@ -79,21 +83,31 @@ def track(
     return dataclasses.replace(found, warnings=warnings)
 
 
-def _unwanted(tracks: Tracks, sequence: Sequence) -> tuple[Bool[np.ndarray, " l"], bool]:
-    """Tracks that are burnt in, or that may be if nothing else is seen; and whether
-    that is sure."""
+def _only_here(cover: float) -> str:
+    return (
+        f"all points that stand still lie in {100 * cover:.0f} % of the image: if that "
+        "is text over a scene too dark to see, what is said of the camera is wrong."
+    )
+
+
+def _unwanted(
+    tracks: Tracks, sequence: Sequence
+) -> tuple[Bool[np.ndarray, " l"], bool, float]:
+    """Tracks that are burnt in, or that may be if nothing else is seen; whether that is
+    sure; and the share of the image near such as may be."""
     burnt = find_burnt_in(tracks, sequence.intrinsics, sequence.num_frames)
     if burnt.found or not len(tracks.landmark):
-        return burnt.of_landmark, True
+        return burnt.of_landmark, True, 0.0
     still = burnt.still[tracks.landmark]
     if still.mean() < _MANY_STILL:
-        return burnt.of_landmark, True
+        return burnt.of_landmark, True, 0.0
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
     # What is not near a point that stays is where a hidden scene would be looked for.
     near = np.zeros((size[1], size[0]), dtype=np.uint8)
     for x, y in np.unique(np.round(tracks.uv[still] / 8), axis=0) * 8:
         cv2.circle(near, (int(x), int(y)), max(size) // 20, 1, -1)
-    return (burnt.still if near.mean() < _MOST_HIDDEN else burnt.of_landmark), False
+    cover = float(near.mean())
+    return (burnt.still if cover < _MOST_HIDDEN else burnt.of_landmark), False, cover
 
 
 def _confirmed(
@@ -132,46 +146,47 @@ def _masks(
 
 
 class _Border:
-    """Rows and columns at the edges that are black, or white, in all images.
+    """Rows above and below, or columns on both sides, that are black in all images.
 
-    Text may stand in them: half of each row or column decides.
+    Text may stand in them: the darker half of each row or column decides.
     """
 
     def __init__(self, width: int, height: int):
         self.size = (width, height)
-        self.low = [np.full(n, 255) for n in self.size]
-        self.high = [np.zeros(n, int) for n in self.size]
+        self.darkest = [np.full(n, 255) for n in self.size]
+        self.brightest = [np.zeros(n, np.int64) for n in self.size]
 
     def look(self, image: UInt8[np.ndarray, "y x"]) -> None:
         """Takes another image into account."""
         for axis, lines in enumerate((image[::4].T, image[:, ::4])):
-            if lines.shape[0] != len(self.low[axis]):
+            if lines.shape[0] != len(self.darkest[axis]):
                 return  # of another size than was said, which is refused elsewhere
-            quarter = lines.shape[1] // 4
-            part = np.partition(lines, (quarter, lines.shape[1] - 1 - quarter), axis=1)
-            self.low[axis] = np.minimum(self.low[axis], part[:, quarter])
-            self.high[axis] = np.maximum(self.high[axis], part[:, -1 - quarter])
+            ranks = lines.shape[1] // 8, lines.shape[1] // 2
+            part = np.partition(lines, ranks, axis=1)
+            self.darkest[axis] = np.minimum(self.darkest[axis], part[:, ranks[0]])
+            self.brightest[axis] = np.maximum(self.brightest[axis], part[:, ranks[1]])
 
     def inside(self) -> tuple[int, int, int, int]:
         """x, y, width and height (px) of the image without its border."""
         (x, right), (y, bottom) = (
             _inside(low, high)
-            for low, high in zip(self.low, self.high, strict=True)
+            for low, high in zip(self.darkest, self.brightest, strict=True)
         )
         return x, y, right - x, bottom - y
 
 
 def _inside(low: np.ndarray, high: np.ndarray) -> tuple[int, int]:
     """First line within the border, and first beyond."""
-    edge = (high <= _BLACK) | (low >= _WHITE)
+    edge = (high <= _BLACK) & (high - low <= _FLAT)
+    count = len(edge)
     if edge.all():
-        return 0, len(low)
-    first, last = int(np.argmin(edge)), len(edge) - int(np.argmin(edge[::-1]))
-    least = max(2, round(_LEAST_BORDER * len(low)))
-    # Beside a border the image begins at once, not little by little as at night.
-    begins = lambda a, b: max(abs(high[b] - high[a]), abs(low[b] - low[a])) >= _STEP
-    if first < least or not begins(first - 1, min(first + 1, len(low) - 1)):
-        first = 0
-    if len(low) - last < least or not begins(last, max(last - 2, 0)):
-        last = len(low)
-    return first, last
+        return 0, count
+    before, after = int(np.argmin(edge)), int(np.argmin(edge[::-1]))
+    # Bars come in pairs and end at once: what is dark by itself, as at night, does not.
+    alike = abs(before - after) <= max(2, 0.1 * before)
+    if min(before, after) < max(2, _LEAST_BORDER * count) or not alike:
+        return 0, count
+    steps = high[before + 1] - high[before - 1], high[-after - 2] - high[-after]
+    if min(steps) < _STEP:
+        return 0, count
+    return before, count - after
