@@ -11,7 +11,7 @@ from bodyslam_jax.frontend._reconstruct import Reconstruction as Reconstruction
 from bodyslam_jax.frontend._reconstruct import reconstruct as reconstruct
 from bodyslam_jax.frontend._revisits import cut_tracks as cut_tracks
 from bodyslam_jax.frontend._revisits import told_by_other_pieces as told_by_other_pieces
+from bodyslam_jax.frontend._scene_tracks import track as track
 from bodyslam_jax.frontend._sequence import read_sequence as read_sequence
 from bodyslam_jax.frontend._sequence import with_detections as with_detections
-from bodyslam_jax.frontend._scene_tracks import track as track
 from bodyslam_jax.frontend._video import frames as frames

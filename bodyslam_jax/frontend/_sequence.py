@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config import Association
+from bodyslam_jax.frontend._aspect import aspect_warnings, at_size_of
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
@@ -139,10 +140,15 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
     if known:
         intrinsics = known[0]
         if footage:
+            intrinsics = at_size_of(intrinsics, footage)
             warnings += _check_camera(parts, intrinsics, fps, footage)
+            warnings += aspect_warnings(intrinsics, footage)
     elif footage:
         first = footage.path / images[0] if images else None
-        intrinsics = guess_camera(footage.width, footage.height, first)
+        intrinsics = guess_camera(
+            footage.width, footage.height, first, footage.pixel_aspect
+        )
+        warnings += aspect_warnings(intrinsics, footage)
         warnings.append(
             f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px."
         )
