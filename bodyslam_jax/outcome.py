@@ -35,6 +35,9 @@ class Cameras:
     costs: tuple[float, float]
     """Before and after bundle adjustment."""
     warnings: tuple[str, ...]
+    zoom: Float[np.ndarray, " t"] | None = None
+    """Logarithm of each frame's focal length over that of `intrinsics`, which is that
+    of the images with the zoom undone; None where the camera does not zoom."""
 
     @property
     def focal(self) -> float:

@@ -41,7 +41,9 @@ class Repeats:
         now = None
         if image is not None:
             step = max(1, max(image.shape[:2]) // _SAMPLES)
-            plane = image[::step, ::step, 1] if image.ndim == 3 else image[::step, ::step]
+            plane = (
+                image[::step, ::step, 1] if image.ndim == 3 else image[::step, ::step]
+            )
             now = np.ascontiguousarray(plane)
         if self.most or self.last is not None:
             most, typical = _change(self.last, now)
