@@ -41,6 +41,9 @@ class Cameras:
     path_known: Bool[np.ndarray, " t"] | None = None
     path_scale: float = float("nan")
     """m per unit of the map, as that path has it; NaN if it is not metric."""
+    zoom: Float[np.ndarray, " t"] | None = None
+    """Logarithm of each frame's focal length over that of `intrinsics`, which is that
+    of the images with the zoom undone; None where the camera does not zoom."""
 
     @property
     def focal(self) -> float:

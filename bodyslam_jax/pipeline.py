@@ -117,7 +117,7 @@ def _run(
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
     sequence = people.select_people(sequence, config.person)
-    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     with watch("joint"):
         rehearsal.wait("prediction")
         joint = cache.stage(
@@ -157,7 +157,9 @@ def before_joint(
             lambda: reconstruction.estimate(sequence, tracks, config),
         )
     sequence = people.select_people(sequence, config.person)
-    sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    sequence = reconstruction.with_intrinsics(
+        sequence, cameras.intrinsics, cameras.zoom
+    )
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)
     with watch("people"):
@@ -305,7 +307,7 @@ def _to_folder(
             with watch("overlay"):
                 view.write_overlay(
                     partial / "overlay.webm",
-                    frontend.frames(sequence),
+                    _images(sequence, cameras),
                     result,
                     body,
                     _seen(cameras),
@@ -314,6 +316,14 @@ def _to_folder(
         export.write_files(partial, result, config)
         export.write_report(partial / "report.html", result, body)
     return result
+
+
+def _images(sequence: Sequence, cameras: Cameras) -> Iterator[np.ndarray]:
+    """The images, with the zoom undone where there is one."""
+    images = frontend.frames(sequence)
+    if cameras.zoom is None:
+        return images
+    return frontend.without_zoom(images, cameras.zoom, cameras.intrinsics[2:4])
 
 
 def _seen(cameras: Cameras) -> Tracks:

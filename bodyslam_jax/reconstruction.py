@@ -61,13 +61,37 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 
 
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
-    guess = sequence.intrinsics
-    found = _reconstruct(sequence, tracks, guess, config)
+    num_frames = sequence.num_frames
+    warnings = tracks.warnings
+    tracks, share = frontend.without_burnt_in(tracks, sequence.intrinsics, num_frames)
+    if share > 0 and sequence.tracks is not None:
+        warnings = (*warnings, frontend.burnt_in_warning(share))
+    if config.static_camera or sequence.camera_path is not None:
+        found = _reconstruct(sequence, tracks, sequence.intrinsics, config)
+        model = frontend.CameraModel(sequence.intrinsics, None, tracks, found, ())
+    else:
+        model = frontend.find_camera_model(
+            tracks, sequence.intrinsics, num_frames, config.structure
+        )
+    sequence = dataclasses.replace(sequence, intrinsics=model.intrinsics)
+    cameras = _of_model(sequence, model, config)
+    warnings = (*warnings, *model.warnings, *cameras.warnings)
+    moved = frontend.second_motion(model.tracks, model.found, model.intrinsics)
+    if moved is not None:
+        warnings = (*warnings, moved)
+    return dataclasses.replace(cameras, warnings=warnings, zoom=model.zoom)
+
+
+def _of_model(
+    sequence: Sequence, model: frontend.CameraModel, config: Config
+) -> Cameras:
+    """Cameras of a sequence whose intrinsics are the model's, adjusted."""
+    guess, found = sequence.intrinsics, model.found
     cameras = _unadjusted(sequence, found, guess, config)
     if found.kind != "moving":
         return cameras
     if guess.is_refined:
-        cameras = _with_focal(sequence, tracks, cameras, found.error, config)
+        cameras = _with_focal(sequence, model.tracks, cameras, found.error, config)
     else:
         cameras = _adjusted(cameras, 1.0, config, None)
     if cameras.kind != "moving":
@@ -123,25 +147,51 @@ def _cut(cameras: Cameras, span: int) -> Cameras:
 
 
 def with_intrinsics(
-    sequence: Sequence, intrinsics: Float[np.ndarray, " i"]
+    sequence: Sequence,
+    intrinsics: Float[np.ndarray, " i"],
+    zoom: Float[np.ndarray, " t"] | None = None,
 ) -> Sequence:
     """The sequence as another focal length has it.
 
     Regressed bodies stay where they are in the image, and as large: their depth was
     read off their size, and is proportional to the focal length.
+
+    Args:
+        zoom: logarithm of each frame's focal length, over that of `intrinsics`:
+            keypoints and bodies are those of the images with the zoom undone.
     """
+    if zoom is not None:
+        sequence = _without_zoom(sequence, zoom)
     known = sequence.intrinsics
     if np.array_equal(known.params, intrinsics):
         return sequence
     bodies = sequence.bodies
     if bodies is not None:
-        ratio = np.array([1.0, 1.0, intrinsics[0] / known.params[0]])
+        # The camera may have got distortion, or pixels that are not square.
+        focal = np.sqrt(intrinsics[0] * intrinsics[1])
+        focal /= np.sqrt(known.params[0] * known.params[1])
+        ratio = np.array([1.0, 1.0, focal])
         bodies = dataclasses.replace(bodies, trans=bodies.trans * ratio)
     return dataclasses.replace(
         sequence,
         intrinsics=dataclasses.replace(known, params=intrinsics),
         bodies=bodies,
     )
+
+
+def _without_zoom(sequence: Sequence, zoom: Float[np.ndarray, " t"]) -> Sequence:
+    size = np.exp(zoom)
+    keypoints, bodies = sequence.keypoints, sequence.bodies
+    if keypoints is not None:
+        centre = np.asarray(sequence.intrinsics.params[2:4], float)
+        uv = centre + (keypoints.uv - centre) / size[:, None, None]
+        uv = np.where(keypoints.confidence[..., None] > 0, uv, keypoints.uv)
+        keypoints = dataclasses.replace(keypoints, uv=uv)
+    if bodies is not None:
+        # As far from the axis, and as much farther as the image is larger.
+        trans = bodies.trans * np.stack([size * 0 + 1, size * 0 + 1, size], axis=-1)
+        bodies = dataclasses.replace(bodies, trans=trans)
+    return dataclasses.replace(sequence, keypoints=keypoints, bodies=bodies)
 
 
 def _reconstruct(
@@ -274,7 +324,9 @@ def _problem(
     factors = [
         *factors,
         graph.IntrinsicsPrior(jnp.asarray(known)[None], jnp.asarray(sigma)[None]),
-        graph.SquarePixels(jnp.asarray([_SQUARE * focal])),
+        graph.SquarePixels(
+            jnp.asarray([_SQUARE * focal]), ratio=float(focal / known[1])
+        ),
     ]
     return graph.make_problem(factors, state, free_intrinsics=True)
 

@@ -67,6 +67,8 @@ class Tracks:
     """Index of the point, 0 to `num_landmarks - 1`."""
     uv: Float[np.ndarray, "m 2"]
     """px"""
+    warnings: tuple[str, ...] = ()
+    """What was left out while following them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -125,18 +125,27 @@ def _whole(value: Any, name: str) -> int:
     return int(value)
 
 
-def guess_camera(width: int, height: int, image: Path | None = None) -> Intrinsics:
-    """Intrinsics of an unknown camera: from the EXIF data of `image`, else typical."""
-    focal = _focal_from_exif(image, max(width, height)) if image else None
-    focal = focal or _GUESSED_FOCAL * max(width, height)
-    params = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
+def guess_camera(
+    width: int, height: int, image: Path | None = None, pixel_aspect: float = 1.0
+) -> Intrinsics:
+    """Intrinsics of an unknown camera: from the EXIF data of `image`, else typical.
+
+    Args:
+        pixel_aspect: width of a pixel over its height.
+    """
+    longer = max(width * pixel_aspect, height)
+    focal = _focal_from_exif(image, longer) if image else None
+    focal = focal or _GUESSED_FOCAL * longer
+    centre = (width - 1) / 2, (height - 1) / 2
+    params = np.array([focal / pixel_aspect, focal, *centre])
     return Intrinsics(params, width, height, is_guess=True)
 
 
 def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics:
-    """The camera with a focal length that somebody knows, px, to within `sigma`."""
+    """The camera with a focal length fx that somebody knows, px, to within `sigma`;
+    the shape of its pixels stays."""
     params = intrinsics.params.copy()
-    params[:2] = focal
+    params[:2] *= focal / params[0]
     return dataclasses.replace(
         intrinsics, params=params, is_guess=False, focal_sigma=sigma
     )
@@ -186,7 +195,7 @@ def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
     return params
 
 
-def _focal_from_exif(image: Path, longer_side: int) -> float | None:
+def _focal_from_exif(image: Path, longer_side: float) -> float | None:
     """px, from the 35 mm equivalent that phones write; None where there is none."""
     from PIL import Image  # comes with matplotlib
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.config import Association, Known
+from bodyslam_jax.frontend._aspect import aspect_warnings, at_size_of
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera, with_focal
@@ -208,11 +209,16 @@ def _read_parts(
     if calibrated:
         intrinsics = calibrated[0]
         if footage:
+            intrinsics = at_size_of(intrinsics, footage)
             rate = None if known.fps else fps
             warnings += _check_camera(parts, intrinsics, rate, footage)
+            warnings += aspect_warnings(intrinsics, footage)
     elif footage:
         first = footage.path / images[0] if images else None
-        intrinsics = guess_camera(footage.width, footage.height, first)
+        intrinsics = guess_camera(
+            footage.width, footage.height, first, footage.pixel_aspect
+        )
+        warnings += aspect_warnings(intrinsics, footage)
         if known.focal is None and known.fov is None:
             warnings.append(
                 f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px."

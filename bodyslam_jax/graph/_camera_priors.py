@@ -92,17 +92,19 @@ class IntrinsicsPrior(AbstractIntrinsicsFactor):
 
 
 class SquarePixels(AbstractIntrinsicsFactor):
-    """One focal length for rows and columns, `(fx - fy) / σ`."""
+    """One focal length for rows and columns, `(fx - a fy) / σ`."""
 
     sigma: Float[Array, " 1"]
     """px"""
     loss: AbstractLoss = Squared()
+    ratio: float = eqx.field(static=True, default=1.0)
+    """a, the height of a pixel over its width: 1 for square pixels."""
 
     def data(self):
         return self.sigma
 
     def local(self, data, window, shared):
-        return (shared.intrinsics[:1] - shared.intrinsics[1:2]) / data
+        return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data
 
 
 class CameraSmoothness(AbstractFrameFactor):
