@@ -116,7 +116,8 @@ def _run(
     sequence = _detected(sequence, config, cache, watch)
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
-    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    sequence = people.select_people(sequence, config.person)
+    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     with watch("joint"):
         rehearsal.wait("prediction")
         joint = cache.stage(
@@ -145,7 +146,9 @@ def before_joint(
     key = fingerprint(sequence, config.tracking)
     with watch("tracks"):
         tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
-    key = fingerprint(key, config.structure, config.weights.landmark_loss)
+    key = fingerprint(
+        key, config.structure, config.weights.landmark_loss, config.static_camera
+    )
     with watch("cameras"):
         cameras = cache.stage(
             "cameras",
@@ -153,7 +156,10 @@ def before_joint(
             Cameras,
             lambda: reconstruction.estimate(sequence, tracks, config),
         )
-    sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    sequence = people.select_people(sequence, config.person)
+    sequence = reconstruction.with_intrinsics(
+        sequence, cameras.intrinsics, cameras.zoom
+    )
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)
     with watch("people"):
@@ -308,7 +314,7 @@ def _to_folder(
             with watch("overlay"):
                 view.write_overlay(
                     partial / "overlay.webm",
-                    frontend.frames(sequence),
+                    _images(sequence, cameras),
                     result,
                     body,
                     _seen(cameras),
@@ -317,6 +323,14 @@ def _to_folder(
         export.write_files(partial, result, config)
         export.write_report(partial / "report.html", result, body)
     return result
+
+
+def _images(sequence: Sequence, cameras: Cameras) -> Iterator[np.ndarray]:
+    """The images, with the zoom undone where there is one."""
+    images = frontend.frames(sequence)
+    if cameras.zoom is None:
+        return images
+    return frontend.without_zoom(images, cameras.zoom, cameras.intrinsics[2:4])
 
 
 def _seen(cameras: Cameras) -> Tracks:

@@ -22,6 +22,15 @@ class Intrinsics:
     height: int
     is_guess: bool = False
     """Whether the focal length was guessed, so that the graph should refine it."""
+    focal_sigma: float | None = None
+    """Standard deviation of the focal length, px, where somebody who knows it roughly
+    gave it: it is refined within that. `None` for a calibration, which is held, and for
+    a guess, whose standard deviation is a setting."""
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether the focal length is a variable of the estimate."""
+        return self.is_guess or self.focal_sigma is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +70,19 @@ class Tracks:
     """Index of the point, 0 to `num_landmarks - 1`."""
     uv: Float[np.ndarray, "m 2"]
     """px"""
+    warnings: tuple[str, ...] = ()
+    """What was left out while following them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPath:
+    """Camera poses that came with a video."""
+
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world; identity where not known."""
+    known: Bool[np.ndarray, " t"]
+    metric: bool
+    """Whether translations are in metres; else their unit is arbitrary."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +117,7 @@ class Sequence:
     picks: Int[np.ndarray, " t"] | None = None
     """Which frames of the video these are, if not all: its rate varied."""
     groundtruth: Path | None = None
+    camera_path: CameraPath | None = None
     seen: Seen | None = None
     """All people in the images, for their masks."""
     warnings: tuple[str, ...] = ()
