@@ -53,7 +53,8 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
         raise ValueError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
     index = list(dict.fromkeys(people))
     if keypoints is not None:
-        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index])
+        depth = None if keypoints.depth is None else keypoints.depth[index]
+        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index], depth)
     if bodies is not None:
         bodies = dataclasses.replace(
             bodies,
