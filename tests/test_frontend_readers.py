@@ -202,7 +202,7 @@ def _npz(name="k.npz", **arrays):
 
 def _nan():
     bad = person()
-    bad[3, 0] = np.nan
+    bad[3:, 0] = np.nan
     return bad
 
 
