@@ -29,31 +29,14 @@ HEAD_TOP, SPINE = 25, 26
 NUM_PARTS = 27
 
 _AS_COCO17 = [0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11]
+_HUMAN36M = [*range(8, 15), SPINE, 1, 0, HEAD_TOP, 5, 6, 7, 2, 3, 4]
 _FEET = [19, 20, 21, 22, 23, 24]
 
 VITPOSE = [0, 16, 15, 18, 17, 1, 5, 2, 6, 3, 7, 4, 12, 9, 8, 13, 10, 14, 11, *_FEET]
 LAYOUTS: dict[int, dict[str, list[int]]] = {
     17: {
         "COCO": _AS_COCO17,
-        "Human3.6M": [
-            8,
-            9,
-            10,
-            11,
-            12,
-            13,
-            14,
-            SPINE,
-            1,
-            0,
-            HEAD_TOP,
-            5,
-            6,
-            7,
-            2,
-            3,
-            4,
-        ],
+        "Human3.6M": _HUMAN36M,
     },
     18: {
         "OpenPose's COCO": [0, 1, 2, 3, 4, 5, 6, 7, *range(9, 15), 15, 16, 17, 18],

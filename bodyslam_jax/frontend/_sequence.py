@@ -153,7 +153,9 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
     found_tracks = None
     if parts.tracks:
         count = footage.num_read if footage else None
-        found_tracks = read_tracks(parts.tracks, num_frames=count, size=size)
+        found_tracks = read_tracks(
+            parts.tracks, num_frames=count, size=size, warn=warnings.append
+        )
     if footage:
         stamps, num_frames, picks = footage.timestamps, footage.num_read, footage.picks
     else:
