@@ -302,7 +302,7 @@ INPUTS = {
         lambda f: (f / "bodies.npz").write_text("no archive"),
         "bodies.npz: ",
     ),
-    "infinity in tracks": (nan_tracks, "tracks.npz: 153 of 160 observations not finite"),
+    "infinity in tracks": (nan_tracks, "tracks.npz: 153 of 160 observations not"),
     "tracks of a longer video": (
         lambda f: save(
             f / "tracks.npz", tracks(), frame=tracks()["frame"] + 5

@@ -117,7 +117,7 @@ def _between(
     low = np.floor(at).astype(np.int64)
     high = np.minimum(low + 1, len(poses) - 1)
     part = (at - low)[:, None]
-    known = np.isfinite(poses).all(axis=1)[:, None]
+    known = np.asarray(np.isfinite(poses).all(axis=1))[:, None]
     safe = np.where(known, poses, 0.0)
     a, b = (Rotation.from_rotvec(safe[k].reshape(-1, 3)) for k in (low, high))
     turn = (a.inv() * b).as_rotvec() * np.repeat(part, 24, axis=0)

@@ -59,7 +59,7 @@ def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
     broken, total, lost = 0, 0, 0
     whole = []
     for points in raw:
-        finite = np.isfinite(points).all(axis=-1)
+        finite = np.asarray(np.isfinite(points).all(axis=-1))
         # Without confidence it is no error that there is no place.
         bad = ~finite & ~(points[:, 2] <= 0)
         broken, total = broken + int(bad.sum()), total + len(points)

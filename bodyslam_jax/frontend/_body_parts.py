@@ -131,7 +131,7 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
 
 def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     """Axis-angle of rotation matrices; NaN of those that are not finite."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], matrices, np.eye(3))
     found = Rotation.from_matrix(safe).as_rotvec()
     return np.where(finite[:, None], found, np.nan)

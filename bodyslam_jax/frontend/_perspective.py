@@ -62,8 +62,7 @@ def turn_to_camera(
     """
     fx, fy, px, py = intrinsics.params[:4]
     ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
-    finite = np.isfinite(orientation).all(axis=1) & np.isfinite(ray).all(axis=1)
-    known = finite[:, None]
+    known = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
     ray, turn = np.where(known, ray, 0.0), np.where(known, orientation, 0.0)
     turned = (ray_rotation(ray) * Rotation.from_rotvec(turn)).as_rotvec()
     return np.where(known, turned, np.nan)

@@ -14,7 +14,13 @@ from bodyslam_jax.frontend._given_tracks import read_tracks
 from bodyslam_jax.frontend._keypoints import Detections, read_detections
 from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
-from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
+from bodyslam_jax.frontend._video import (
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    Footage,
+    list_images,
+    look_at,
+)
 from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
 
 _log = logging.getLogger(__name__)
@@ -72,7 +78,10 @@ def read_sequence(
     chosen = {k: Path(v) for k, v in given.items() if v is not None}
     parts = dataclasses.replace(_find_parts(Path(path)), **chosen)
     if parts.footage is None and parts.tracks is None:
-        raise ValueError(f"{path}: no video.mp4, images/ or tracks.npz.")
+        raise ValueError(
+            f"{path}: no video.mp4, images/ or tracks.npz, nor one other video "
+            f"({' '.join(VIDEO_SUFFIXES)}) or images ({' '.join(IMAGE_SUFFIXES)})."
+        )
     return _read_parts(Path(path), parts, config)
 
 
@@ -106,7 +115,15 @@ def _find_parts(path: Path) -> _Parts:
     within = lambda name: path / name if (path / name).exists() else None
     footage = within("video.mp4") or within("images")
     if footage is None:
-        videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+        # Not what a run writes, where its folder is the input's.
+        videos = sorted(
+            p
+            for p in path.iterdir()
+            if p.suffix.lower() in VIDEO_SUFFIXES
+            and p.name != "overlay.webm"
+            and not p.name.startswith(".")
+            and p.is_file()
+        )
         named = [p for p in videos if p.stem == "video"]
         if len(named or videos) > 1:
             names = ", ".join(p.name for p in (named or videos)[:4])

@@ -118,8 +118,8 @@ def from_slahmr(data: dict, video: Video) -> Rows:
 
 def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     """Axis-angle of R exp(rotvec); NaN where one of the two is not finite."""
-    finite = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(rotvec).all(axis=1)
-    known = finite[:, None]
+    both = np.hstack([R.reshape(-1, 9), rotvec])
+    known = np.asarray(np.isfinite(both).all(axis=1))[:, None]
     safe = np.where(known[..., None], R, np.eye(3)), np.where(known, rotvec, 0.0)
     turned = Rotation.from_matrix(safe[0]) * Rotation.from_rotvec(safe[1])
     return np.where(known, turned.as_rotvec(), np.nan)
