@@ -919,9 +919,9 @@ def folder(path: Path) -> Path:
     np.savez(path / "tracks.npz", frame=frame, landmark=landmark * 3, uv=uv)
     (path / "masks").mkdir()
     for k in range(NUM):
-        cv2.imwrite(
-            str(path / "masks" / f"{k}.png"), np.zeros((HEIGHT, WIDTH), np.uint8)
-        )
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[5:40, 20:40] = 255
+        cv2.imwrite(str(path / "masks" / f"{k}.png"), mask)
     return path
 
 

@@ -95,7 +95,7 @@ def choose_layout(
     """The layout of `n` people in frames, of those given, the first the usual one.
 
     Another than the first is chosen only where it is plausible, much better, and better
-    for nearly everybody.
+    for nearly everybody, and where postures change.
     """
     first = next(iter(layouts))
     seen = points[..., 2] > _SEEN
@@ -112,6 +112,7 @@ def choose_layout(
         and mean[best] >= _PLAUSIBLE
         and mean[best] - mean[first] >= _MARGIN
         and better.mean() >= _AGREED
+        and _changes(points, seen)
     ):
         return Choice(best, True, True, False, mean)
     many = seen.sum(axis=1) >= _MANY_POINTS
@@ -177,7 +178,9 @@ def _normalised(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 def _changes(points: np.ndarray, seen: np.ndarray) -> bool:
     """Whether postures differ: points that always lie alike are no moving person."""
-    uv = np.where(seen[..., None], _normalised(points, seen), np.nan)
-    usual = np.nanmedian(uv[:, seen.mean(axis=0) > 0.5], axis=0)
-    away = uv[:, seen.mean(axis=0) > 0.5] - usual
+    often = seen.mean(axis=0) > 0.5
+    if not often.any():
+        return True
+    uv = np.where(seen[..., None], _normalised(points, seen), np.nan)[:, often]
+    away = uv - np.nanmedian(uv, axis=0)
     return bool(np.nanmedian(np.linalg.norm(away, axis=-1)) > _ALIVE)

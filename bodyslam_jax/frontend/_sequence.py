@@ -12,6 +12,7 @@ from bodyslam_jax.frontend._bodies import read_bodies
 from bodyslam_jax.frontend._calibration import guess_camera, read_camera
 from bodyslam_jax.frontend._given_tracks import read_tracks
 from bodyslam_jax.frontend._keypoints import Detections, read_detections
+from bodyslam_jax.frontend._masks import read_masks
 from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
 from bodyslam_jax.frontend._video import (
@@ -217,8 +218,17 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         )
         if people is not None:
             people, regressed = pair(people, regressed, intrinsics)
+    mask_use = None
     if parts.masks:
-        _check_masks(parts.masks, num_frames)
+        mask_use = read_masks(
+            parts.masks,
+            num_frames=num_frames,
+            intrinsics=intrinsics,
+            images=images,
+            people=people,
+            bodies=regressed,
+            warn=warnings.append,
+        )
     for text in warnings:
         _log.warning("%s: %s", parts.name, text)
     sequence = Sequence(
@@ -230,6 +240,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         bodies=regressed,
         tracks=found_tracks,
         masks=parts.masks,
+        mask_use=mask_use,
         groundtruth=parts.groundtruth,
         warnings=tuple(warnings),
     )
@@ -316,13 +327,3 @@ def _check_camera(
             f"camera.json says {fps:g} frames/s, the video {rate:.4g}: video used.",
         )
     return ()
-
-
-def _check_masks(folder: Path, num_frames: int) -> None:
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: not a folder of mask images.")
-    found = len(list_images(folder))
-    if found != num_frames:
-        raise ValueError(
-            f"{folder}: {found} masks, but the video has {num_frames} frames."
-        )
