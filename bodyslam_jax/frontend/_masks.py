@@ -175,7 +175,7 @@ def _judged(
     border = float(np.median([_on_border(mask) for mask in masks.values()]))
     within = _within(masks, points)
     least = within.min(initial=1.0)
-    inverted = border > _BORDER and area > _MOST and least < _OUTSIDE
+    inverted = bool(border > _BORDER and area > _MOST and least < _OUTSIDE)
     if not len(within):
         inverted = border > _BORDER and _MOST < area < 1
     if inverted:
