@@ -155,7 +155,8 @@ def _phalp_factor(data: dict, video: Video) -> float:
         raise Unfit(f"images of several sizes: {sorted(sizes)[:3]}")
     height, width = sizes.pop()
     size = (video.camera.width, video.camera.height)
-    return factor_to((width, height), size, np.zeros((0, 2)), "bodies", video.warn)
+    seen = (float(width), float(height))
+    return factor_to(seen, size, np.zeros((0, 2)), "bodies", video.warn)
 
 
 def from_tram(data: dict, video: Video) -> Rows:
