@@ -27,6 +27,8 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 _EDGE = 1 << 20
 _SOURCE = "source.json"
+_CACHE = ".cache"
+"""The folder of stage results in that of a run."""
 UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
 UNREADABLE += (zipfile.BadZipFile, zlib.error)
 """What `load` raises of a file that is damaged, or of another state of the package."""
@@ -77,7 +79,9 @@ def _update(digest: Any, part: Any) -> None:
         digest.update(str(part.name).encode())
         if part.is_dir():
             for item in sorted(part.iterdir()):
-                if not item.name.startswith("."):
+                # A run that is written into its own input is no part of it.
+                run = item.is_dir() and (item / _CACHE).is_dir()
+                if not item.name.startswith(".") and not run:
                     _update(digest, item)
         elif part.is_file():
             size = part.stat().st_size

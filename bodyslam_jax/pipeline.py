@@ -36,6 +36,8 @@ from bodyslam_jax.summary import describe
 log = logging.getLogger(__name__)
 
 _FEWEST_FRAMES = 3
+_SCENE = "scene"
+"""Where a demonstration's input lies in its run folder."""
 _SECONDS_BETWEEN_LINES = 5.0
 
 
@@ -170,6 +172,24 @@ def before_joint(
     return cameras, bodies
 
 
+def _check_people(sequence: Sequence, config: Config) -> None:
+    """Says at once that nothing tells where people are.
+
+    **Raises:** `ValueError` if people are to be estimated, but there are neither
+    keypoints nor bodies, nor images to find them in.
+    """
+    given = sequence.keypoints is not None or sequence.bodies is not None
+    if not config.people or given:
+        return
+    if sequence.frames is not None and config.detect != "none":
+        return
+    raise ValueError(
+        f"{sequence.name}: neither keypoints nor bodies, nor images to find people "
+        "in (or --detect none), so nobody to estimate; give one of them, or leave people "
+        "out with --no-people."
+    )
+
+
 def _check_length(sequence: Sequence) -> None:
     if sequence.num_frames < _FEWEST_FRAMES:
         raise ValueError(
@@ -284,7 +304,15 @@ def run_to_folder(
     config, warnings = _with_body(config)
     sequence = _warned(sequence, warnings)
     cache = Cache(out / ".cache", describe(sequence))
+    _check_people(sequence, config)
     export.check_folder(out, cache.source, cache.owner())
+    with export.locked(out):
+        return _to_locked_folder(sequence, out, config, cache, first)
+
+
+def _to_locked_folder(
+    sequence: Sequence, out: Path, config: Config, cache: Cache, first: bool
+) -> Result:
     rehearsal = Rehearsal()
     if first:
         body, truth = body_.load_body_model(config.body_model), None
@@ -349,11 +377,16 @@ def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
-    folder, rehearsal, watch = out / "scene", Rehearsal(), Stopwatch()
-    scene = None
     config, warnings = _with_body(config)
-    cache = Cache(out / ".cache", {"name": folder.name})
+    cache = Cache(out / ".cache", {"name": _SCENE})
     export.check_folder(out, cache.source, cache.owner())
+    with export.locked(out):
+        return _demo(out, config, warnings, first)
+
+
+def _demo(out: Path, config: Config, warnings: tuple[str, ...], first: bool) -> Result:
+    folder, rehearsal, watch = out / _SCENE, Rehearsal(), Stopwatch()
+    scene = None
     if first:
         body = body_.load_body_model(config.body_model)
         scene = synthetic.simulate(synthetic.demo_settings())

@@ -99,6 +99,18 @@ class Seen:
 
 
 @dataclasses.dataclass(frozen=True)
+class MaskUse:
+    """How given masks are used, where they are not simply one for each frame."""
+
+    files: tuple[tuple[str, ...], ...]
+    """For each frame of the video the names of its masks, which are put together."""
+    inverted: bool = False
+    """Whether zero is person."""
+    with_keypoints: bool = False
+    """Whether people's keypoints are masked, too."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Sequence:
     """One input: `t` frames and whatever is known about them."""
 
@@ -114,6 +126,8 @@ class Sequence:
     masks: Path | None = None
     """Folder of person masks, one image per frame of the video, whose order they have;
     non-zero is person."""
+    mask_use: MaskUse | None = None
+    """Where masks are used in another way."""
     picks: Int[np.ndarray, " t"] | None = None
     """Which frames of the video these are, if not all: its rate varied."""
     groundtruth: Path | None = None

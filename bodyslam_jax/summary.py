@@ -210,10 +210,17 @@ def _disagreement(start: ScaleStart, apart: float) -> list[str]:
 def _slow_motion(
     person: int, steps: export.Gait | None, unsure: float, fps: float
 ) -> list[str]:
-    """A line where somebody's steps are so rare that time must be stretched.
+    """A line where somebody's steps are so rare, or so many, that time must be wrong.
 
     `unsure` is the share by which metres may be off; NaN where nothing tells.
     """
+    if steps is not None and steps.is_fast_motion(float(np.nan_to_num(unsure))):
+        return [
+            f"person {person} takes {steps.frequency:.1f} steps a second, each "
+            f"{steps.step:.1f} of a leg long: who steps so far does so about "
+            f"{1 / steps.slowness:.1f} times as slowly. If {fps:g} fps is not the "
+            "video's frame rate, speeds are too high by that."
+        ]
     if steps is None or not steps.is_slow_motion(float(np.nan_to_num(unsure))):
         return []
     return [

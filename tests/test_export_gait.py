@@ -55,6 +55,15 @@ def test_steps_are_counted_and_measured(stilts):
     assert found.slowness == pytest.approx(step / found.leg / swing / 1.7)
 
 
+def test_a_walk_is_too_fast_where_its_frame_rate_is_twice_the_true_one(walk):
+    seen = export.gait(walk, 0)
+    assert not seen.is_fast_motion()
+    hurried = export.gait(changed(walk, timestamps=walk.timestamps / 2), 0)
+    assert hurried.is_fast_motion() and not hurried.is_slow_motion()
+    (line,) = _slow_motion(0, hurried, 0.05, 60.0)
+    assert "60 fps is not the video's frame rate" in line
+
+
 def test_a_walk_is_not_slow_motion_until_it_is_slowed(walk):
     seen = export.gait(walk, 0)
     assert 0.75 < seen.slowness < 1.3 and not seen.is_slow_motion()

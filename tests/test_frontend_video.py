@@ -131,7 +131,7 @@ def test_what_belongs_to_frames_left_out_is_left_out(tmp_path, monkeypatch):
     for name in ("keypoints", "masks"):
         (tmp_path / name).mkdir()
     for k in range(12):
-        points = np.tile([20.0 + k, 10.0, 1.0], (25, 1))
+        points = np.tile([4.0 * k + 1.0, 10.0, 1.0], (25, 1))
         points[:, 1] += np.arange(25)
         person = {"pose_keypoints_2d": points.ravel().tolist()}
         text = json.dumps({"people": [person]})
@@ -162,7 +162,8 @@ def test_what_belongs_to_frames_left_out_is_left_out(tmp_path, monkeypatch):
     np.testing.assert_array_equal(sequence.picks, wanted)
     means = [image.mean() / 10 for image in frames(sequence, gray=True)]
     np.testing.assert_allclose(means, wanted, atol=0.4)
-    np.testing.assert_allclose(sequence.keypoints.uv[0, :, 0, 0], np.add(wanted, 20))
+    at = sequence.keypoints.uv[0, :, 0, 0]
+    np.testing.assert_allclose(at, np.multiply(wanted, 4) + 1)
     np.testing.assert_allclose(sequence.bodies.shapes[0, :, 0], np.divide(wanted, 10))
     assert not sequence.bodies.shapes_regressed
     np.testing.assert_allclose(sequence.tracks.uv[::3, 0], np.add(wanted, 5))

@@ -192,6 +192,8 @@ def _prepare_jax() -> None:
     # What was asked for is done by then: Ctrl-C could only change what is said of it.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     _compile_quickly()
+    # XLA's alarms about slow compilation are no error, and errors are raised as well.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     with _interrupts_held():
         import jax
         import jax.numpy

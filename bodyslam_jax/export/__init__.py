@@ -7,6 +7,7 @@ from bodyslam_jax.export._facts import stature as stature
 from bodyslam_jax.export._gait import Gait as Gait
 from bodyslam_jax.export._gait import gait as gait
 from bodyslam_jax.export._ground import ground_scale as ground_scale
+from bodyslam_jax.export._lock import locked as locked
 from bodyslam_jax.export._meshes import write_bvh as write_bvh
 from bodyslam_jax.export._meshes import write_mesh as write_mesh
 from bodyslam_jax.export._meshes import write_trc as write_trc

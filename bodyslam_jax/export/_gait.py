@@ -28,6 +28,8 @@ walks and runs of the CMU archive, of which nine of ten have 1.4 to 2.2."""
 _SLOW = 1.6
 """How many times that much makes it slow motion: of those 85 only two have as much,
 with strides that are exaggerated on purpose."""
+_OFTEN = 2.6
+"""Steps a second, more than of any walk."""
 _STRIDES = 1.5
 """Of two steps each: how many must be seen."""
 _ALIKE, _REGULAR = 0.2, 0.6
@@ -60,6 +62,12 @@ class Gait:
         """Whether nobody walks like that unless on purpose, even if steps are shorter
         by `unsure`, the share by which metres may be off."""
         return self.step > _STEP and self.slowness > _SLOW * (1 + unsure)
+
+    def is_fast_motion(self, unsure: float = 0.0) -> bool:
+        """Whether nobody steps so often who steps so far, even if steps are longer by
+        `unsure`, the share by which metres may be off."""
+        quick = self.slowness * _SLOW * (1 + unsure) < 1
+        return self.step > _STEP and quick and self.frequency > _OFTEN
 
 
 def gait(result: Result, person: int) -> Gait | None:

@@ -21,8 +21,9 @@ def open_npz(path: Path) -> "np.lib.npyio.NpzFile":
     return archive
 
 
-def numbers(path: Path, archive: Any, key: str) -> np.ndarray:
-    """A float64 array of an archive; `ValueError` if not all finite numbers."""
+def numbers(path: Path, archive: Any, key: str, *, finite: bool = True) -> np.ndarray:
+    """A float64 array of an archive; `ValueError` if not all finite numbers, unless
+    `finite` is false."""
     try:
         array = archive[key]
     except Exception as error:
@@ -30,7 +31,7 @@ def numbers(path: Path, archive: Any, key: str) -> np.ndarray:
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{path}: array `{key}` holds {array.dtype}, not numbers.")
     array = np.asarray(array, dtype=np.float64)
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).sum())
         raise ValueError(
             f"{path}: {bad} of {array.size} numbers of `{key}` not finite."

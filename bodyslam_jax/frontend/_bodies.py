@@ -13,17 +13,21 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.config import Association
-from bodyslam_jax.frontend._body_parts import join, whole_of
+from bodyslam_jax.frontend._amass import body_pose, is_smplx
+from bodyslam_jax.frontend._body_parts import PELVIS_SMPL, PELVIS_SMPLX, join, whole_of
 from bodyslam_jax.frontend._body_tools import READERS, from_spin
 from bodyslam_jax.frontend._numbering import Unfit, Warn
 from bodyslam_jax.frontend._pickle import restricted_load
 from bodyslam_jax.frontend._rows import Rows, Video
+from bodyslam_jax.frontend._slahmr import with_track_info
 from bodyslam_jax.sequence import Bodies, Intrinsics
 
 _log = logging.getLogger(__name__)
 
 _MAX_DISTANCE = 200.0
 """A person further away than this is not a person, m."""
+_FEWEST_FINITE = 0.5
+"""Share of the bodies that must be numbers."""
 
 
 def read_bodies(
@@ -60,8 +64,8 @@ def read_bodies(
     if path.is_dir():
         rows = _read_tram_folder(path, video)
     else:
-        rows = _read(path, restricted_load(path), video)
-    return _gather(path, rows, num_frames)
+        rows = _read(path, with_track_info(path, restricted_load(path)), video)
+    return _gather(path, rows, num_frames, warn)
 
 
 def _read(path: Path, data: Any, video: Video) -> Rows:
@@ -94,6 +98,7 @@ def _from_contract(data: dict, video: Video) -> Rows:
         return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
     n = len(np.atleast_1d(np.asarray(data["frame"])))
+    data = _as_smpl(data)
     person = data.get("person", np.zeros(n))
     for name, value, shape in (
         ("frame", data["frame"], (n,)),
@@ -107,11 +112,29 @@ def _from_contract(data: dict, video: Video) -> Rows:
             raise Unfit(f"`{name}` holds {array.dtype}, not numbers")
         if array.shape != shape:
             raise Unfit(f"`{name}` is {array.shape}, not {shape}")
-        if not np.isfinite(array).all():
-            raise Unfit(f"`{name}` has NaN or infinity in it")
         whole = name in ("frame", "person")
         arrays[name] = whole_of(array, name) if whole else array.astype(np.float64)
     return Rows(**arrays, shapes_regressed=regressed)
+
+
+def _as_smpl(data: dict) -> dict:
+    """The same of SMPL, where poses are as long as SMPL-H's or SMPL-X's."""
+    poses, betas = np.asarray(data["poses"]), np.asarray(data["betas"])
+    if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
+        poses72 = poses
+    else:
+        poses72 = body_pose(poses)
+        if is_smplx(data, poses.shape[1]):
+            trans = np.asarray(data["trans"]) + PELVIS_SMPLX - PELVIS_SMPL
+            return {
+                **data,
+                "poses": poses72,
+                "trans": trans,
+                "betas": 0 * betas[:, :10],
+            }
+    if betas.ndim == 2 and betas.shape[1] > 10:
+        betas = betas[:, :10]
+    return {**data, "poses": poses72, "betas": betas}
 
 
 def _flag(data: dict, key: str, default: bool) -> bool:
@@ -142,7 +165,28 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
     return join(rows)
 
 
-def _gather(path: Path, rows: Rows, num_frames: int | None) -> Bodies:
+def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
+    """The bodies of which all is a number; the others are absent in those frames.
+
+    **Raises:** `ValueError` if most are not.
+    """
+    names = ("poses", "betas", "trans")
+    fine = {name: np.isfinite(getattr(rows, name)).all(axis=1) for name in names}
+    kept = np.all(list(fine.values()), axis=0)
+    if kept.all():
+        return rows
+    broken = " and ".join(f"`{name}`" for name in names if not fine[name].all())
+    text = f"{broken} has NaN or infinity in {(~kept).sum()} of {len(kept)} bodies"
+    if kept.mean() < _FEWEST_FINITE:
+        raise ValueError(f"{path}: {text}.")
+    warn(f"{text}: taken as absent in those frames.")
+    arrays = {n: getattr(rows, n)[kept] for n in ("frame", "person", *names)}
+    return dataclasses.replace(rows, **arrays)
+
+
+def _gather(
+    path: Path, rows: Rows, num_frames: int | None, warn: Warn = _log.warning
+) -> Bodies:
     """Sorts rows by person and frame, after a last look at all of them."""
     if not len(rows.frame):
         raise ValueError(f"{path}: no body in any frame.")
@@ -152,8 +196,7 @@ def _gather(path: Path, rows: Rows, num_frames: int | None) -> Bodies:
             raise ValueError(
                 f"{path}: {len(rows.frame)} frames for {len(array)} of `{name}`."
             )
-        if not np.isfinite(array).all():
-            raise ValueError(f"{path}: `{name}` has NaN or infinity in it.")
+    rows = _finite(path, rows, warn)
     low, high = int(rows.frame.min()), int(rows.frame.max())
     if num_frames is None:
         num_frames = high + 1

@@ -4,6 +4,7 @@ An `Unfit` says what is wrong with the content; the caller adds the file's name.
 """
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.frontend._association import identify
@@ -12,20 +13,25 @@ from bodyslam_jax.frontend._perspective import full_translation, turn_to_camera
 from bodyslam_jax.frontend._rows import Rows, Video
 from bodyslam_jax.sequence import Intrinsics
 
+PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
+"""J_0 of SMPL's neutral template, m."""
+PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
+"""J_0 of SMPL-X's neutral template, m."""
 _BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
 """Points in front view of a body's size, about its middle, m."""
 
 
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """A finite float64 array, of the shape given (-1: any length)."""
+    """A float64 array, of the shape given (-1: any length).
+
+    What is not finite in it stays: the bodies that it is of are left out at the end.
+    """
     if not isinstance(data, dict) or key not in data:
         raise Unfit(f"no `{key}`")
     try:
         array = np.asarray(data[key], dtype=np.float64)
     except (TypeError, ValueError):
         raise Unfit(f"`{key}` does not hold numbers") from None
-    if not np.isfinite(array).all():
-        raise Unfit(f"`{key}` has NaN or infinity in it")
     if shape is not None:
         fits = array.ndim == len(shape) and all(
             want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
@@ -49,7 +55,7 @@ def whole_of(array: np.ndarray, name: str) -> np.ndarray:
 
     **Raises:** `Unfit` if one is none.
     """
-    off = array[array != np.round(array)]
+    off = array[~np.isfinite(array) | (array != np.round(array))]
     if len(off):
         raise Unfit(f"`{name}` has {off[0]:g} in it, expected whole numbers")
     return array.astype(np.int64)
@@ -99,6 +105,7 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
     u = fx * (x + _BOX[0].ravel()) / z + cx
     v = fy * (y + _BOX[1].ravel()) / z + cy
     points = np.stack([u, v, np.ones_like(u)], axis=-1)
+    points[~np.isfinite(points).all(axis=-1)] = 0.0
     first = np.searchsorted(frame[order], np.arange(1, frame.max(initial=0) + 1))
     found = identify(np.split(points, first), video.frames_in(video.config.max_gap))
     person = np.empty(len(frame), dtype=np.int64)
@@ -112,7 +119,7 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
     if array.shape[-2:] == (3, 3):
         if joints is not None and array.size % (9 * joints):
             raise Unfit(f"rotations {array.shape}, not of {joints} joints")
-        rotvec = Rotation.from_matrix(array.reshape(-1, 3, 3)).as_rotvec()
+        rotvec = rotvec_of(array.reshape(-1, 3, 3))
         count = joints or array.shape[1]
         return rotvec.reshape(-1, 3 * count)
     return (
@@ -120,6 +127,14 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
         if joints is None
         else array.reshape(-1, 3 * joints)
     )
+
+
+def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """Axis-angle of rotation matrices; NaN of those that are not finite."""
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    safe = np.where(finite[:, None, None], matrices, np.eye(3))
+    found = Rotation.from_matrix(safe).as_rotvec()
+    return np.where(finite[:, None], found, np.nan)
 
 
 def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
@@ -154,6 +169,24 @@ def refocused(
     uv = center + focal * trans[:, :2] / trans[:, 2:]
     xy = (uv - [cx, cy]) / [fx, fy] * z[:, None]
     return np.concatenate([xy, z[:, None]], axis=-1)
+
+
+def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n 3 3"]:
+    """Camera matrices for images of the video's size, which a tool may have resized.
+
+    Told by a principal point in the middle of images of the same shape.
+    """
+    whole = 2 * np.median(K[:, :2, 2], axis=0)
+    size = np.array([video.camera.width, video.camera.height])
+    x, y = whole / size
+    if not (x > 0 and y > 0) or abs(np.log(x / y)) > 0.02 or abs(np.log(x)) < 0.2:
+        return K
+    factor = float(2 / (x + y))
+    video.warn(
+        f"bodies of a camera for images of {whole[0]:.0f}x{whole[1]:.0f} px, but the "
+        f"video has {size[0]}x{size[1]} px: its pixels multiplied by {factor:.4g}."
+    )
+    return np.concatenate([factor * K[:, :2], K[:, 2:]], axis=1)
 
 
 def focals(K: np.ndarray) -> np.ndarray:

@@ -12,12 +12,14 @@ guessed, GLAMR too, which optimises paths only.
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.frontend._amass import from_amass
+from bodyslam_jax.frontend._amass import from_amass, is_amass
 from bodyslam_jax.frontend._body_parts import (
+    PELVIS_SMPL,
+    PELVIS_SMPLX,
     Unfit,
     as_rotvec,
+    at_size,
     betas_of,
     focals,
     frames_of,
@@ -30,13 +32,10 @@ from bodyslam_jax.frontend._body_parts import (
     refocused,
 )
 from bodyslam_jax.frontend._cliff import from_cliff
+from bodyslam_jax.frontend._declared_size import factor_to
 from bodyslam_jax.frontend._perspective import turn_to_camera
 from bodyslam_jax.frontend._rows import Rows, Video
-
-_PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
-"""J_0 of SMPL's neutral template, m."""
-_PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
-"""J_0 of SMPL-X's neutral template, m."""
+from bodyslam_jax.frontend._slahmr import from_slahmr, is_slahmr
 
 
 def from_spin(data: dict, video: Video) -> Rows:
@@ -106,15 +105,20 @@ def from_phalp(data: dict, video: Video) -> Rows:
     relative to the crop's ray.
     """
     names = sorted(data)
-    numbered = frames_of_images([str(n) for n in names], video, complete=True)
+    # Where it reads a video itself, a frame is called by the video and a time.
+    called = [
+        str(data[n].get("time", n[-1]) if isinstance(n, tuple) else n) for n in names
+    ]
+    numbered = frames_of_images(called, video, complete=True)
+    factor = _phalp_factor(data, video)
     frame, person, poses, betas, trans, box = [], [], [], [], [], []
     for number, name in zip(numbered, names, strict=True):
         found = data[name]
-        seen = found.get("tracked_time", found.get("time", []))
+        seen = found.get("tracked_time", [])
         for i, body in enumerate(found["smpl"]):
             if i < len(seen) and np.ravel(seen[i])[0] != 0:
                 continue  # predicted, not seen
-            x, y, w, h = np.ravel(found["bbox"][i])[:4]
+            x, y, w, h = factor * np.ravel(found["bbox"][i])[:4]
             parts = [
                 as_rotvec(np.asarray(body[key]), joints).ravel()
                 for key, joints in (("global_orient", 1), ("body_pose", 23))
@@ -136,6 +140,23 @@ def from_phalp(data: dict, video: Video) -> Rows:
     root = turn_to_camera(poses[:, :3], box, video.camera)
     poses = np.concatenate([root, poses[:, 3:]], axis=-1)
     return Rows(np.asarray(frame), np.asarray(person), poses, betas, trans)
+
+
+def _phalp_factor(data: dict, video: Video) -> float:
+    """Pixels of the video, per pixel of the images that PHALP saw: `size`, (h, w)."""
+    sizes = {
+        tuple(np.ravel(size)[:2].tolist())
+        for found in data.values()
+        for size in found.get("size", [])
+    }
+    if not sizes:
+        return 1.0
+    if len(sizes) > 1:
+        raise Unfit(f"images of several sizes: {sorted(sizes)[:3]}")
+    height, width = sizes.pop()
+    size = (video.camera.width, video.camera.height)
+    seen = (float(width), float(height))
+    return factor_to(seen, size, np.zeros((0, 2)), "bodies", video.warn)
 
 
 def from_tram(data: dict, video: Video) -> Rows:
@@ -163,9 +184,10 @@ def from_gvhmr(data: dict, video: Video) -> Rows:
     body = data["smpl_params_incam"]
     root = numbers_of(body, "global_orient", (-1, 3))
     n = len(root)
-    trans = numbers_of(body, "transl", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
+    trans = numbers_of(body, "transl", (n, 3)) + PELVIS_SMPLX - PELVIS_SMPL
     if "K_fullimg" in data:
         K = np.broadcast_to(numbers_of(data, "K_fullimg", None), (n, 3, 3))
+        K = at_size(K, video)
         trans = refocused(trans, focals(K), K[:, :2, 2], video.camera)
     poses = np.concatenate(
         [root, numbers_of(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
@@ -190,7 +212,7 @@ def from_prompthmr(data: dict, video: Video) -> Rows:
         pose = pose.reshape(n, -1)[:, :66]
         if pose.shape[1] != 66:
             raise Unfit(f"`pose` of {pose.shape[1]} numbers, not 66 or more")
-        trans = numbers_of(body, "trans", (n, 3)) + _PELVIS_SMPLX - _PELVIS_SMPL
+        trans = numbers_of(body, "trans", (n, 3)) + PELVIS_SMPLX - PELVIS_SMPL
         if "img_focal" in world:
             focal = np.full(n, float(np.ravel(world["img_focal"])[0]))
             center = np.asarray(
@@ -209,42 +231,6 @@ def from_prompthmr(data: dict, video: Video) -> Rows:
     return join(rows)
 
 
-def from_slahmr(data: dict, video: Video) -> Rows:
-    """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
-    trans = numbers_of(data, "trans", (-1, -1, 3))
-    p, t = trans.shape[:2]
-    if video.num_frames not in (None, t):
-        raise Unfit(f"{t} frames, but the video has {video.num_frames}")
-    scale = float(np.ravel(data.get("world_scale", 1.0))[0])
-    R = np.broadcast_to(numbers_of(data, "cam_R", None), (p, t, 3, 3))
-    shift = scale * np.broadcast_to(numbers_of(data, "cam_t", None), (p, t, 3))
-    root = numbers_of(data, "root_orient", (p, t, 3))
-    body = numbers_of(data, "pose_body", None).reshape(p, t, 63)
-    betas = np.broadcast_to(
-        numbers_of(data, "betas", None)[..., :10].reshape(p, -1, 10), (p, t, 10)
-    )
-    # A world transform moves the pelvis, not the model's origin.
-    pelvis = np.einsum("ptij,ptj->pti", R, trans + _PELVIS_SMPL) + shift
-    turned = Rotation.from_matrix(R.reshape(-1, 3, 3)) * Rotation.from_rotvec(
-        root.reshape(-1, 3)
-    )
-    moved = pelvis - _PELVIS_SMPL
-    if "intrins" in data:
-        fx, _, cx, cy = np.ravel(numbers_of(data, "intrins", None))[:4]
-        focal = np.full(p * t, fx)
-        moved = refocused(moved.reshape(-1, 3), focal, np.array([cx, cy]), video.camera)
-    seen = np.ones((p, t), dtype=bool)
-    if "track_mask" in data:
-        seen = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
-    poses = np.concatenate(
-        [turned.as_rotvec().reshape(p, t, 3), body, np.zeros((p, t, 6))], -1
-    )
-    person, frame = np.nonzero(seen)
-    moved = moved.reshape(p, t, 3)
-    parts = (poses[seen], betas[seen], moved[seen])
-    return Rows(frame, person, *parts, shapes_regressed=False)
-
-
 def from_glamr(data: dict, video: Video) -> Rows:
     """GLAMR: `root_trans_cam` is the pelvis itself, in the camera of `cam_K`."""
     people = data["person_data"] if "person_data" in data else {0: data}
@@ -254,13 +240,14 @@ def from_glamr(data: dict, video: Video) -> Rows:
     ):
         root = numbers_of(one, "smpl_orient_cam", (-1, 3))
         n = len(root)
-        trans = numbers_of(one, "root_trans_cam", (n, 3)) - _PELVIS_SMPL
+        trans = numbers_of(one, "root_trans_cam", (n, 3)) - PELVIS_SMPL
         if "cam_K" in one:
             K = np.broadcast_to(numbers_of(one, "cam_K", None), (n, 3, 3))
+            K = at_size(K, video)
             pelvis = refocused(
-                trans + _PELVIS_SMPL, focals(K), K[:, :2, 2], video.camera
+                trans + PELVIS_SMPL, focals(K), K[:, :2, 2], video.camera
             )
-            trans = pelvis - _PELVIS_SMPL
+            trans = pelvis - PELVIS_SMPL
         poses = np.concatenate([root, numbers_of(one, "smpl_pose", (n, 69))], axis=-1)
         seen = np.asarray(one.get("visible", np.ones(n))).astype(bool)
         frame = frames_of(one, "frames", n, video.num_frames)
@@ -294,11 +281,7 @@ Reader = Callable[[dict, Video], Rows]
 READERS: list[tuple[str, Callable[[dict], bool], Reader]] = [
     ("SPIN", _has("pose", "betas", "camera"), from_spin),
     ("CLIFF", _has("pose", "shape", "global_t"), from_cliff),
-    (
-        "SLAHMR",
-        _has("trans", "root_orient", "pose_body", "cam_R", "cam_t"),
-        from_slahmr,
-    ),
+    ("SLAHMR", is_slahmr, from_slahmr),
     ("GVHMR", _has("smpl_params_incam"), from_gvhmr),
     ("PromptHMR", _has("people"), from_prompthmr),
     ("TRAM", _has("pred_rotmat", "pred_trans", "pred_shape"), from_tram),
@@ -307,6 +290,6 @@ READERS: list[tuple[str, Callable[[dict], bool], Reader]] = [
     ("WHAM", _each("pose", "trans", "betas", "pose_world"), from_wham),
     ("VIBE", _each("pose", "pred_cam", "betas", "bboxes"), from_vibe),
     ("4D-Humans", _each("smpl", "camera", "bbox", "tid"), from_phalp),
-    ("AMASS", _has("poses", "trans", "betas", "mocap_framerate"), from_amass),
+    ("AMASS", is_amass, from_amass),
 ]
 """Name, whether a file's content is that tool's, and how it is read."""

@@ -1,15 +1,29 @@
 """Point tracks made elsewhere -> one checked table."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from bodyslam_jax.frontend._archive import numbers, open_npz
+from bodyslam_jax.frontend._numbering import Warn
 from bodyslam_jax.sequence import Tracks
 
+_log = logging.getLogger(__name__)
+_FEWEST_FINITE = 0.5
+"""Share of the observations that must be numbers."""
 
-def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) -> Tracks:
+
+def read_tracks(
+    path: Path,
+    *,
+    num_frames: int | None,
+    size: tuple[int, int],
+    warn: Warn = _log.warning,
+) -> Tracks:
     """Reads `frame`, `landmark` and `uv` (px) of point tracks made elsewhere.
+
+    Observations that are not finite are left out, with a warning.
 
     **Raises:** `ValueError`, naming the file, if they do not fit the video.
     """
@@ -18,7 +32,7 @@ def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) ->
         if missing:
             raise ValueError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
         frame, landmark, uv = (
-            numbers(path, archive, k) for k in ("frame", "landmark", "uv")
+            numbers(path, archive, k, finite=False) for k in ("frame", "landmark", "uv")
         )
     if (
         uv.ndim != 2
@@ -29,6 +43,13 @@ def read_tracks(path: Path, *, num_frames: int | None, size: tuple[int, int]) ->
             f"{path}: frame {frame.shape}, landmark {landmark.shape}, uv {uv.shape}; "
             "expected (m,), (m,), (m, 2)."
         )
+    finite = np.isfinite(uv).all(axis=1) & np.isfinite(frame) & np.isfinite(landmark)
+    if not finite.all():
+        text = f"{int((~finite).sum())} of {len(uv)} observations not finite"
+        if finite.mean() < _FEWEST_FINITE:
+            raise ValueError(f"{path}: {text}.")
+        warn(f"tracks: {text}: left out.")
+        frame, landmark, uv = frame[finite], landmark[finite], uv[finite]
     if not len(uv):
         raise ValueError(f"{path}: no observation.")
     if (frame % 1 != 0).any() or (landmark % 1 != 0).any() or frame.min() < 0:

@@ -12,21 +12,32 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.frontend._archive import numbers, open_npz
-from bodyslam_jax.frontend._layouts import to_body25
+from bodyslam_jax.frontend._declared_size import Size, size_in
+from bodyslam_jax.frontend._keypoint_names import names_in
 
 _JSON_SUFFIX = "_keypoints.json"
+_SMALL = 300
+"""Numbers or names of an array that may say something of all the others."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Listed:
-    """The content of a file, before it is known which frames its names mean."""
+    """The content of a file, before it is known which frames its names mean, and which
+    parts of the body its points are."""
 
     rows: list[tuple[str, np.ndarray, int]]
-    """Name of the image, keypoints (25, 3), and who it is, or -1."""
+    """Name of the image, keypoints (j, 3), which may not be finite, and who it is, or
+    -1."""
     names: list[str]
     """All images that are listed, with somebody in them or not."""
     complete: bool = True
     """Whether images with nobody in them are listed, too."""
+    parts: tuple[str, ...] | None = None
+    """Names of the `j` points, if the file has them."""
+    row_first: bool = False
+    """Whether the tool writes (y, x)."""
+    size: Size | None = None
+    """Of the images that the points are in, px, if the file says so."""
 
 
 def read_openpose(folder: Path) -> Listed:
@@ -51,8 +62,7 @@ def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
         flat = person.get("pose_keypoints_2d", person.get("pose_keypoints"))
         if flat is None:
             raise ValueError(f"{file}: a person without `pose_keypoints_2d`.")
-        points = to_body25(file, _triples(file, flat))
-        found.append((points, _who(file, person, "person_id")))
+        found.append((_triples(file, flat), _who(file, person, "person_id")))
     return found
 
 
@@ -63,7 +73,8 @@ def read_json(path: Path) -> Listed:
             return read(path, data)
     what = list(data)[:5] if isinstance(data, dict) else type(data).__name__
     raise ValueError(
-        f"{path}: neither AlphaPose, MMPose nor COCO keypoints, but {what}."
+        f"{path}: neither AlphaPose, MMPose, COCO nor easy_ViTPose keypoints, but "
+        f"{what}."
     )
 
 
@@ -82,7 +93,7 @@ def _read_flat_list(path: Path, data: Any) -> Listed:
     rows = [
         (
             str(e["image_id"]),
-            to_body25(path, _triples(path, e["keypoints"])),
+            _triples(path, e["keypoints"]),
             _who(path, e, "idx", "track_id"),
         )
         for e in data
@@ -100,7 +111,7 @@ def _read_coco(path: Path, data: Any) -> Listed:
         rows = [
             (
                 name[a["image_id"]],
-                to_body25(path, _triples(path, a["keypoints"])),
+                _triples(path, a["keypoints"]),
                 _who(path, a, "track_id"),
             )
             for a in data["annotations"]
@@ -108,7 +119,9 @@ def _read_coco(path: Path, data: Any) -> Listed:
         ]
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: incomplete COCO annotations ({error}).") from None
-    return Listed(rows, list(name.values()))
+    return Listed(
+        rows, list(name.values()), parts=_parts(data), size=size_in(path, data)
+    )
 
 
 def _read_mmpose(path: Path, data: Any) -> Listed:
@@ -125,10 +138,37 @@ def _read_mmpose(path: Path, data: Any) -> Listed:
                     )
                 points = np.concatenate([xy, score[:, None]], axis=-1)
                 who = _who(path, person, "track_id")
-                rows.append((names[-1], to_body25(path, points), who))
+                rows.append((names[-1], points, who))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: incomplete MMPose result ({error!r}).") from None
-    return Listed(rows, names)
+    return Listed(rows, names, parts=_parts(data), size=size_in(path, data))
+
+
+def _is_by_frame(data: Any) -> bool:
+    """easy_ViTPose: people by number, in a list of frames."""
+    frames = data.get("keypoints") if isinstance(data, dict) else None
+    return isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
+
+
+def _read_by_frame(path: Path, data: Any) -> Listed:
+    """easy_ViTPose: `keypoints`, for each frame `{person: [[y, x, score], ...]}`."""
+    rows = [
+        (str(k), _triples(path, points), _who(path, {"id": person}, "id"))
+        for k, found in enumerate(data["keypoints"])
+        for person, points in found.items()
+    ]
+    return Listed(
+        rows,
+        [str(k) for k in range(len(data["keypoints"]))],
+        parts=_parts(data),
+        row_first=True,
+        size=size_in(path, data),
+    )
+
+
+def _parts(data: Any) -> tuple[str, ...] | None:
+    found = names_in(data)
+    return None if found is None else tuple(found)
 
 
 def _has(*keys: str) -> Callable[[Any], bool]:
@@ -139,6 +179,7 @@ _JSON_READERS: list[tuple[Callable[[Any], bool], Callable[[Path, Any], Listed]]]
     (_is_flat_list, _read_flat_list),
     (_has("annotations", "images"), _read_coco),
     (_has("instance_info"), _read_mmpose),
+    (_is_by_frame, _read_by_frame),
 ]
 
 
@@ -149,9 +190,11 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
     """
     with open_npz(path) as archive:
         if "keypoints" in archive.files:
-            points = numbers(path, archive, "keypoints")
+            points = numbers(path, archive, "keypoints", finite=False)
         elif {"uv", "confidence"} <= set(archive.files):
-            uv, confidence = (numbers(path, archive, k) for k in ("uv", "confidence"))
+            uv, confidence = (
+                numbers(path, archive, k, finite=False) for k in ("uv", "confidence")
+            )
             if uv.shape != (*confidence.shape, 2):
                 raise ValueError(
                     f"{path}: uv {uv.shape}, confidence {confidence.shape}."
@@ -159,6 +202,8 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
             points = np.concatenate([uv, confidence[..., None]], axis=-1)
         else:
             raise ValueError(f"{path}: no array `keypoints`, only {archive.files}.")
+        header = {k: archive[k] for k in archive.files if archive[k].size < _SMALL}
+    header = {k: v.tolist() for k, v in header.items() if v.dtype.kind in "fiuU"}
     if points.ndim == 3:
         points = points[None]
     if points.ndim != 4 or points.shape[-1] != 3:
@@ -168,12 +213,16 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
             f"{path}: keypoints of {points.shape[1]} frames, but the video has "
             f"{num_frames}."
         )
-    points = to_body25(path, points)
     rows = [
         (str(k), points[h, k], int(h))
-        for h, k in np.argwhere(points[..., 2].max(axis=-1) > 0)
+        for h, k in np.argwhere(~(points[..., 2] <= 0).all(axis=-1))
     ]
-    return Listed(rows, [str(k) for k in range(points.shape[1])])
+    return Listed(
+        rows,
+        [str(k) for k in range(points.shape[1])],
+        parts=_parts(header),
+        size=size_in(path, header),
+    )
 
 
 def _load_json(file: Path) -> Any:
@@ -188,8 +237,6 @@ def _array(path: Path, values: Any) -> np.ndarray:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{path}: keypoints that are not numbers.") from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"{path}: keypoints with NaN or infinity.")
     return array
 
 

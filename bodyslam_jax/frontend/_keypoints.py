@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.frontend._arrange import arranged
+from bodyslam_jax.frontend._declared_size import Size, factor_to, scaled
 from bodyslam_jax.frontend._keypoint_files import read_json, read_npz, read_openpose
 from bodyslam_jax.frontend._numbering import Unfit, Warn, frames_of_names
 
@@ -42,14 +44,17 @@ def read_detections(
     warn: Warn = _log.warning,
 ) -> Detected:
     """Reads whatever `path` is: a folder of OpenPose JSON files, a JSON file of
-    AlphaPose, MMPose or COCO, or a generic `.npz`.
+    AlphaPose, MMPose, COCO or easy_ViTPose, or a generic `.npz`.
+
+    Broken values are missing points; points in another order than usual, in (y, x), or
+    in images of another size that the file names, are put right. All is said.
 
     Args:
         num_frames: of the video; None for as many as the file has.
         images: names of the video's frames, if it is a folder of images.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these, has NaN or
-    infinity in it, or belongs to another video.
+    **Raises:** `ValueError`, naming the file, if it is none of these, is mostly NaN, is
+    in no known order, or belongs to another video.
     """
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder.")
@@ -74,11 +79,14 @@ def read_detections(
     if num_frames is None:
         num_frames = max(frames.values(), default=-1) + 1
     by_frame: list[list[tuple[np.ndarray, int]]] = [[] for _ in range(num_frames)]
-    for name, points, who in listed.rows:
+    for (name, _, who), points in zip(
+        listed.rows, arranged(path, listed, warn), strict=True
+    ):
         by_frame[frames[name]].append((points, who))
     points = [np.array([p for p, _ in f]).reshape(-1, 25, 3) for f in by_frame]
     person = [np.array([who for _, who in f], dtype=np.int64) for f in by_frame]
-    return _to_pixels(path, points, _checked(person, warn), (width, height), warn)
+    person = _checked(person, warn)
+    return _to_pixels(path, points, person, (width, height), listed.size, warn)
 
 
 def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:
@@ -101,9 +109,11 @@ def _to_pixels(
     detections: Detections,
     person: list[np.ndarray] | None,
     size: tuple[int, int],
+    declared: Size | None,
     warn: Warn,
 ) -> Detected:
-    """Undoes OpenPose's `--keypoint_scale`, and clears what is missing."""
+    """Undoes OpenPose's `--keypoint_scale` and another size that the file declares, and
+    clears what is missing."""
     counts = [len(d) for d in detections]
     if not sum(counts):
         raise ValueError(f"{path}: no person in any frame.")
@@ -112,8 +122,16 @@ def _to_pixels(
     if not seen.any():
         raise ValueError(f"{path}: all confidences are zero.")
     sure = points[..., 2] > _SURE
-    points[..., :2] = _unscaled(points, sure if sure.any() else seen, size, warn)
-    at = points[sure][:, :2]
+    sure = sure if sure.any() else seen
+    if (uv := _relative(points, sure, size, warn)) is not None:
+        points[..., :2] = uv
+    elif declared is not None:
+        try:
+            factor = factor_to(declared, size, points[sure][:, :2], "keypoints", warn)
+        except Unfit as error:
+            raise ValueError(f"{path}: {error}") from None
+        points[..., :2] = scaled(points[..., :2], factor)
+    at = points[points[..., 2] > _SURE][:, :2]
     outside = ((at < 0) | (at > size)).any(axis=-1)
     if len(at) and outside.mean() > 0.3:
         raise ValueError(
@@ -128,17 +146,18 @@ def _to_pixels(
     return Detected([d[k] for d, k in zip(split, kept, strict=True)], person)
 
 
-def _unscaled(
+def _relative(
     points: np.ndarray, sure: np.ndarray, size: tuple[int, int], warn: Warn
-) -> np.ndarray:
-    """Pixels, also of points that are relative to the image: in [0, 1] or [-1, 1].
+) -> np.ndarray | None:
+    """Pixels of points that are relative to the image, in [0, 1] or [-1, 1]; None of
+    those that are not.
 
     Told by most of the sure points: single ones may be well outside the image.
     """
     uv = points[..., :2]
     low, high = np.quantile(uv[sure], [0.05, 0.95], axis=0)
     if high.max() > 1.5 or low.min() < -1.5:
-        return uv
+        return None
     # Half a person beyond the left or top side is rarer than [-1, 1].
     zero = -1.0 if low.min() < -0.1 else 0.0
     warn(f"keypoints in [{zero:g}, 1]: taken as relative to the size of the image.")

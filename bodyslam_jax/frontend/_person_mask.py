@@ -1,13 +1,15 @@
 """Where people are in an image: given masks, or capsules around their keypoints."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from bodyslam_jax.frontend._video import frames, list_images, picked
-from bodyslam_jax.sequence import Keypoints, Seen, Sequence
+from bodyslam_jax.frontend._masks import read_mask, resized_to
+from bodyslam_jax.frontend._video import list_images
+from bodyslam_jax.sequence import Keypoints, MaskUse, Seen, Sequence
 
 # BODY_25 limbs and their half widths, of the person's height.
 _LIMBS = (
@@ -66,17 +68,12 @@ def person_masks(
         kernel = cv2.getStructuringElement(
             cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
         )
-        names = list_images(sequence.masks)
-        masks = zip(names, frames(sequence.masks, gray=True), strict=True)
-        if sequence.picks is not None:
-            masks = picked(masks, sequence.picks)
-        for name, image in masks:
-            if image.shape != size:
-                raise ValueError(
-                    f"{name}: {image.shape[1]}x{image.shape[0]} px, but the video is "
-                    f"{size[1]}x{size[0]} px."
-                )
-            yield cv2.dilate(np.where(image > 0, 255, 0).astype(np.uint8), kernel)
+        people = _painted(sequence)
+        for k, given in enumerate(_given_masks(sequence, sequence.masks)):
+            mask = cv2.dilate(np.where(given, 255, 0).astype(np.uint8), kernel)
+            for person in people:
+                draw_person(mask, person[k], margin)
+            yield mask
     elif sequence.keypoints is not None or sequence.seen is not None:
         people = np.zeros((0, sequence.num_frames, 25, 3))
         if sequence.keypoints is not None:
@@ -91,6 +88,33 @@ def person_masks(
     else:
         for _ in range(sequence.num_frames):
             yield None
+
+
+def _given_masks(sequence: Sequence, folder: Path) -> Iterator[Bool[np.ndarray, "y x"]]:
+    """The masks of the sequence's frames as they are given: true is person."""
+    use = sequence.mask_use
+    size = (sequence.intrinsics.width, sequence.intrinsics.height)
+    if use is None:
+        use = MaskUse(tuple((path.name,) for path in list_images(folder)))
+    files = use.files
+    if sequence.picks is not None:
+        files = [files[k] for k in sequence.picks]
+    for names in files:
+        mask = np.zeros(size[::-1], dtype=bool)
+        for name in names:
+            found = read_mask(folder / name)
+            if found.shape != mask.shape:
+                found = resized_to(folder / name, found, size)
+            mask |= found != use.inverted
+        yield mask
+
+
+def _painted(sequence: Sequence) -> Float[np.ndarray, "h t 25 3"]:
+    """People whose keypoints are masked beside given masks; none if these are right."""
+    use = sequence.mask_use
+    if use is None or not use.with_keypoints or sequence.keypoints is None:
+        return np.zeros((0, sequence.num_frames, 25, 3))
+    return _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
 
 
 def _draw_seen(mask: UInt8[np.ndarray, "y x"], seen: Seen, k: int, margin: float):

@@ -55,13 +55,17 @@ def turn_to_camera(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """Root rotations (axis-angle, rad) seen along each crop's ray -> in the camera.
+    """Root rotations (axis-angle, rad) seen along each crop's ray -> in the camera; NaN
+    where one of the two is not finite.
 
     The pelvis stays where it is: rotations pivot at `J_0(β) + trans`.
     """
     fx, fy, px, py = intrinsics.params[:4]
     ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
-    return (ray_rotation(ray) * Rotation.from_rotvec(orientation)).as_rotvec()
+    known = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
+    ray, turn = np.where(known, ray, 0.0), np.where(known, orientation, 0.0)
+    turned = (ray_rotation(ray) * Rotation.from_rotvec(turn)).as_rotvec()
+    return np.where(known, turned, np.nan)
 
 
 def ray_rotation(xy: Float[np.ndarray, "m 2"]) -> Rotation:

@@ -15,9 +15,11 @@ from bodyslam_jax.frontend._calibration import guess_camera, read_camera, with_f
 from bodyslam_jax.frontend._camera_path import read_camera_path
 from bodyslam_jax.frontend._given_tracks import read_tracks
 from bodyslam_jax.frontend._keypoints import Detections, read_detections
+from bodyslam_jax.frontend._masks import read_masks
 from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
 from bodyslam_jax.frontend._video import (
+    IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
     Footage,
     at_rate,
@@ -91,7 +93,10 @@ def read_sequence(
     chosen = {k: Path(v) for k, v in given.items() if v is not None}
     parts = dataclasses.replace(_find_parts(Path(path)), **chosen)
     if parts.footage is None and parts.tracks is None:
-        raise ValueError(f"{path}: no video.mp4, images/ or tracks.npz.")
+        raise ValueError(
+            f"{path}: no video.mp4, images/ or tracks.npz, nor one other video "
+            f"({' '.join(VIDEO_SUFFIXES)}) or images ({' '.join(IMAGE_SUFFIXES)})."
+        )
     return _read_parts(Path(path), parts, config, known)
 
 
@@ -167,7 +172,15 @@ def _find_parts(path: Path) -> _Parts:
     within = lambda name: path / name if (path / name).exists() else None
     footage = within("video.mp4") or within("images")
     if footage is None:
-        videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+        # Not what a run writes, where its folder is the input's.
+        videos = sorted(
+            p
+            for p in path.iterdir()
+            if p.suffix.lower() in VIDEO_SUFFIXES
+            and p.name != "overlay.webm"
+            and not p.name.startswith(".")
+            and p.is_file()
+        )
         named = [p for p in videos if p.stem == "video"]
         if len(named or videos) > 1:
             names = ", ".join(p.name for p in (named or videos)[:4])
@@ -233,7 +246,9 @@ def _read_parts(
     found_tracks = None
     if parts.tracks:
         count = footage.num_read if footage else None
-        found_tracks = read_tracks(parts.tracks, num_frames=count, size=size)
+        found_tracks = read_tracks(
+            parts.tracks, num_frames=count, size=size, warn=warnings.append
+        )
     if footage:
         stamps, num_frames, picks = footage.timestamps, footage.num_read, footage.picks
     else:
@@ -279,8 +294,17 @@ def _read_parts(
         )
         if people is not None:
             people, regressed = pair(people, regressed, intrinsics)
+    mask_use = None
     if parts.masks:
-        _check_masks(parts.masks, num_frames)
+        mask_use = read_masks(
+            parts.masks,
+            num_frames=num_frames,
+            intrinsics=intrinsics,
+            images=images,
+            people=people,
+            bodies=regressed,
+            warn=warnings.append,
+        )
     path_ = None
     if known.camera_path is not None:
         times = stamps if picks is None else _times_of_all(stamps, picks, num_frames)
@@ -306,6 +330,7 @@ def _read_parts(
         bodies=regressed,
         tracks=found_tracks,
         masks=parts.masks,
+        mask_use=mask_use,
         groundtruth=parts.groundtruth,
         camera_path=path_,
         seen=seen,
@@ -423,13 +448,3 @@ def _check_camera(
             f"camera.json says {fps:g} frames/s, the video {rate:.4g}: video used.",
         )
     return ()
-
-
-def _check_masks(folder: Path, num_frames: int) -> None:
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: not a folder of mask images.")
-    found = len(list_images(folder))
-    if found != num_frames:
-        raise ValueError(
-            f"{folder}: {found} masks, but the video has {num_frames} frames."
-        )

@@ -17,7 +17,12 @@ from bodyslam_jax.sequence import Sequence
 _log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+_VIDEO_SUFFIXES = """
+mp4 mov m4v qt avi mkv webm mpg mpeg mpe m1v m2v mpv mts m2ts m2t ts mod tod vob 3gp
+3g2 3gpp wmv asf flv f4v gif ogv ogm ogg divx xvid dv mxf mjpg mjpeg y4m nut rm rmvb
+insv lrv h264 264 avc h265 265 hevc av1 ivf amv dav"""
+VIDEO_SUFFIXES = tuple(f".{name}" for name in _VIDEO_SUFFIXES.split())
+"""Of files that FFmpeg, by which OpenCV reads, takes for videos; in either case."""
 _LEAST_SIDE = 16
 """px; BRISK's pyramid fails below 6; so small images have nothing to follow."""
 _ODD = 0.2

@@ -1,0 +1,88 @@
+"""Whether people lie on their side because x and y were exchanged.
+
+(y, x) in place of (x, y) lays everybody down, with the head to the left. So does a
+quarter turn of the image, but it does not mirror: whoever faces the camera has the
+right side of the body on the left of an upright image.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+_SEEN = 0.05
+_SURE = 0.3
+_NECK, _MID_HIP = 1, 8
+_FACE = (0, 15, 16)
+_RIGHT, _LEFT = (2, 9), (5, 12)
+_FEET = ((19, 21), (22, 24))
+"""Toe and heel of either foot."""
+_STEEP = 35.0
+"""degrees from the image's rows, that the trunk of who lies is at most."""
+_ASIDE = 0.2
+"""Of the trunk: less of breadth is a side view, which tells nothing."""
+_ALWAYS = 0.99
+"""Share of the people and frames with a face above which the detector says so of
+everybody, also of who is seen from behind."""
+_FEWEST = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Lying:
+    """People who lie on their side with their heads to the left of the image."""
+
+    share: float
+    """Of all people in frames, those who do."""
+    mirrored: float
+    """Of those of whom it can be told, the share for whom exchanging x and y fits what
+    is seen of face and feet; for the others turning the image does. NaN where it cannot
+    be told."""
+
+
+def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
+    """How `n` people in frames lie, given as (u px, v px, confidence) in BODY_25 order.
+
+    Args:
+        has_face: whether the detector's layout has nose and eyes, so that none means
+            that none is seen.
+    """
+    known = (points[:, [_NECK, _MID_HIP], 2] > _SEEN).all(axis=1)
+    points = points[known]
+    if not len(points):
+        return Lying(0.0, np.nan)
+    trunk = points[:, _MID_HIP, :2] - points[:, _NECK, :2]
+    length = np.maximum(np.linalg.norm(trunk, axis=1), 1e-9)
+    flat = trunk[:, 0] > np.cos(np.radians(_STEEP)) * length
+    sure = points[..., 2] > _SURE
+    sides = zip(_RIGHT, _LEFT, strict=True)
+    across = [points[:, r, 1] - points[:, l, 1] for r, l in sides]
+    breadth = np.mean(across, axis=0) / length
+    usable = flat & sure[:, [*_RIGHT, *_LEFT]].all(axis=1) & (np.abs(breadth) > _ASIDE)
+    facing = _facing(points, sure, length, has_face)
+    usable &= facing != 0
+    if usable.sum() < _FEWEST:
+        return Lying(float(flat.mean()), np.nan)
+    # With x and y exchanged, y is to the right: the right side is there at small y.
+    fits = np.sign(-breadth[usable]) == np.sign(facing[usable])
+    share = float(np.average(fits, weights=np.abs(facing[usable])))
+    return Lying(float(flat.mean()), share)
+
+
+def _facing(
+    points: np.ndarray, sure: np.ndarray, length: np.ndarray, has_face: bool
+) -> np.ndarray:
+    """Positive for who faces the camera, negative for who turns away, 0 for unknown.
+
+    By whether a face is seen; if one is of everybody, by the feet: toes of who comes
+    are lower in an upright image than the heels, as the camera is above the ground. Of
+    who lies with the head to the left, lower is further to the right.
+    """
+    face = sure[:, list(_FACE)].sum(axis=1) >= 2
+    if has_face and face.mean() <= _ALWAYS:
+        none = (points[:, list(_FACE), 2] <= _SEEN).all(axis=1)
+        return np.where(face, 1.0, np.where(none, -1.0, 0.0))
+    lower = np.zeros((len(_FEET), len(points)))
+    for row, (toe, heel) in zip(lower, _FEET, strict=True):
+        both = sure[:, toe] & sure[:, heel]
+        row[both] = ((points[:, toe, 0] - points[:, heel, 0]) / length)[both]
+    return lower.mean(axis=0)

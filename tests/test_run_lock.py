@@ -1,0 +1,257 @@
+"""What is around a run: one at a time, into any folder, and only its own words."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from bodyslam_jax import cli, export, pipeline
+from bodyslam_jax.cache import fingerprint
+from bodyslam_jax.config import Config
+from bodyslam_jax.export import _lock
+from bodyslam_jax.frontend import read_sequence
+
+HOLD = """
+import importlib.util, sys, time
+from pathlib import Path
+spec = importlib.util.spec_from_file_location("lock", sys.argv[2])  # not all of JAX
+lock = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(lock)
+with lock.locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the folder."""
+    started = []
+
+    def hold(folder: Path) -> subprocess.Popen:
+        process = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(folder), _lock.__file__],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        return process
+
+    yield hold
+    for process in started:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def test_a_folder_is_held_once_and_left_clean(tmp_path):
+    folder = tmp_path / "deep" / "run"
+    with export.locked(folder):
+        owner = json.loads((folder / ".lock").read_text())
+        assert owner == {"host": socket.gethostname(), "pid": os.getpid()}
+        with pytest.raises(ValueError, match=f"run: process {os.getpid()} on "):
+            with export.locked(folder):
+                pass
+    assert not folder.exists()
+    folder.mkdir()
+    (folder / "result").touch()
+    with pytest.raises(RuntimeError), export.locked(folder):
+        raise RuntimeError
+    assert [p.name for p in folder.iterdir()] == ["result"]
+
+
+def test_the_lock_of_a_killed_process_is_taken_over(tmp_path, holder):
+    process = holder(tmp_path / "run")
+    with pytest.raises(ValueError, match=f"process {process.pid} on .* is writing"):
+        with export.locked(tmp_path / "run"):
+            pass
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (tmp_path / "run" / ".lock").exists()
+    with export.locked(tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run" / ".lock").exists()
+
+
+def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
+    """Where the file system does not pass locks on."""
+    file = tmp_path / ".lock"
+    file.write_text(json.dumps({"host": "node17", "pid": 4}))
+    message = "process 4 on node17 is writing this run.*try again in 60 s"
+    with pytest.raises(ValueError, match=message), export.locked(tmp_path):
+        pass
+    old = time.time() - 2 * _lock._STALE
+    os.utime(file, (old, old))
+    with export.locked(tmp_path):
+        assert json.loads(file.read_text())["pid"] == os.getpid()
+        assert time.time() - file.stat().st_mtime < _lock._STALE
+    file.write_text("half")  # of a process that was killed as it wrote
+    with export.locked(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_renewed(tmp_path, monkeypatch):
+    monkeypatch.setattr(_lock, "_RENEWED", 0.01)
+    with export.locked(tmp_path):
+        file = tmp_path / ".lock"
+        os.utime(file, (0, 0))
+        for _ in range(500):
+            if file.stat().st_mtime > 0:
+                break
+            time.sleep(0.01)
+        assert file.stat().st_mtime > 0
+
+
+@pytest.fixture
+def sequence(tmp_path) -> Path:
+    folder = tmp_path / "walk"
+    (folder / "keypoints").mkdir(parents=True)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    person = np.random.default_rng(0).uniform([20, 10, 1], [40, 40, 1], (25, 3))
+    text = json.dumps({"people": [{"pose_keypoints_2d": person.ravel().tolist()}]})
+    for k in range(8):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), image)
+        (folder / "keypoints" / f"a_{k:012d}_keypoints.json").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+
+    def run(*argv) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        code, err = stopped.value.code, capsys.readouterr().err
+        return (1, err + code) if isinstance(code, str) else (code or 0, err)
+
+    return run
+
+
+def reached(*args, **kwargs):
+    raise AssertionError("computed")
+
+
+@pytest.mark.parametrize("what", ["run", "demo"])
+def test_a_second_run_into_a_folder_says_so_and_leaves(
+    what, sequence, command, holder, monkeypatch, tmp_path
+):
+    process = holder(tmp_path / "out")
+    monkeypatch.setattr(pipeline, "_run", reached)
+    argv = ["run", sequence] if what == "run" else ["demo"]
+    code, err = command(*argv, "--out", tmp_path / "out")
+    assert code == 1
+    line = err.strip().splitlines()[-1]
+    assert f"out: process {process.pid} on {socket.gethostname()}" in line
+
+
+def test_nobody_and_no_way_to_find_anybody_is_said_at_once(
+    sequence, command, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(pipeline, "_run", reached)
+    for file in (sequence / "keypoints").iterdir():
+        file.unlink()
+    (sequence / "keypoints").rmdir()
+    for file in sequence.glob("*.png"):
+        file.unlink()
+    camera = {"model": "PINHOLE", "width": 64, "height": 48, "params": [80, 80, 31, 23]}
+    (sequence / "camera.json").write_text(json.dumps(camera))
+    frame, landmark = (a.ravel() for a in np.mgrid[:8, :20])
+    uv = np.random.default_rng(0).uniform(5, 40, (len(frame), 2))
+    np.savez(sequence / "tracks.npz", frame=frame, landmark=landmark, uv=uv)
+    code, err = command("run", sequence, "--out", tmp_path / "out")
+    assert code == 1 and "neither keypoints nor bodies" in err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+    code, err = command("run", sequence, "--out", tmp_path / "out", "--no-people")
+    assert code == 3 and "computed" in err
+
+
+@pytest.mark.parametrize("inside", [".", "run", "keypoints/run"])
+def test_a_run_written_into_its_input_is_not_read_as_input(sequence, inside):
+    before = read_sequence(sequence)
+    key = fingerprint(before)
+    out = sequence / inside
+    (out / ".cache").mkdir(parents=True)
+    for name in ("overlay.webm", "report.html", "summary.json", "body_0.npz"):
+        (out / name).write_text("{}")
+    again = read_sequence(sequence)
+    assert again.frames == before.frames and again.num_frames == 8
+    assert again.warnings == before.warnings
+    if inside != ".":
+        assert fingerprint(again) == key
+
+
+def test_reading_leaves_the_input_as_it_is(sequence):
+    """As it must where the folder cannot be written."""
+    state = lambda: {
+        p: (p.stat().st_mtime_ns, p.stat().st_size)
+        for p in [sequence, *sequence.rglob("*")]
+    }
+    before = state()
+    read_sequence(sequence)
+    assert state() == before
+
+
+@pytest.mark.parametrize(
+    "name", ["00001.MTS", "clip.m2ts", "clip.TS", "clip.3gp", "clip.wmv", "clip.GIF"]
+)
+def test_a_camcorders_video_is_found_in_its_folder(tmp_path, name):
+    codec = cv2.VideoWriter.fourcc(*"MJPG")
+    plain = tmp_path / "plain.avi"
+    writer = cv2.VideoWriter(str(plain), codec, 25, (64, 48))
+    for k in range(4):
+        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
+    writer.release()
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    plain.rename(folder / name)
+    assert read_sequence(folder).num_frames == 4
+    (folder / name).rename(folder / "clip.xyz")
+    with pytest.raises(ValueError, match=r"no video.mp4.*\.mts .*\.wmv"):
+        read_sequence(folder)
+
+
+def test_alarms_of_slow_compilation_stay_off_the_terminal(tmp_path):
+    """XLA's, which it prints of a constant that it takes more than a second to fold."""
+    program = """
+import os, sys
+from bodyslam_jax import cli
+cli._prepare_jax()
+import jax, jax.numpy as jnp
+window = lambda x: jax.lax.reduce_window(x, 0.0, jax.lax.add, (9, 9), (1, 1), "SAME")
+jax.jit(lambda: window(jnp.ones((80, 80))).sum()).lower().compile()
+print("compiled")
+"""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("TF_CPP")}
+    environment |= {"BODYSLAM_CACHE": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    said = lambda more: subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment | more,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
+    quiet = said({})
+    assert quiet.stdout == "compiled\n" and quiet.stderr == ""
+
+
+def test_settings_do_not_matter_for_who_holds_a_folder(tmp_path, sequence, holder):
+    """Also by the library, and for any input."""
+    holder(tmp_path / "out")
+    with pytest.raises(ValueError, match="is writing this run"):
+        pipeline.run_to_folder(
+            read_sequence(sequence), tmp_path / "out", Config(overlay=False)
+        )
