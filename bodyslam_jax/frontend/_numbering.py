@@ -153,6 +153,13 @@ def _first(
             f"{what} of frames {first} to {last}, but the video has {num_frames} frames"
         )
     if first == 0:
+        if complete and unbroken:
+            warn(
+                f"{what} of {len(numbers)} frames, numbered 0 to {last}, but the video "
+                f"has {num_frames}: taken as its first ones; detectors that write "
+                "every "
+                "frame have been given fewer, perhaps every n-th."
+            )
         return 0
     # Whoever lists every image would have listed number 0, but some have been deleted
     # where there are gaps.
