@@ -23,7 +23,7 @@ from bodyslam_jax.diagnostics._image_points import (
     People,
     centred,
     distances,
-    have_points,
+    in_common,
     project,
 )
 
@@ -134,7 +134,12 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
         [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
     )
     for factor, reason in _likely(ratios, usual / fx, _SIZE, inverse=False):
-        yield Explanation("focal", scaled([1, 1, factor]), factor=factor, reason=reason)
+        # Of people nearby, the size is not quite proportional to the focal length.
+        for by in (1.0,) if reason else (0.85, 0.92, 1.0, 1.08, 1.17):
+            value = by * factor
+            forecast = scaled([1, 1, value])
+            name = "" if by == 1 else "of people nearby"
+            yield Explanation("focal", forecast, None, None, value, name, reason)
     # Bodies that are `factor` times too far look as small: mm, cm, dm, feet.
     for factor, reason in _likely(ratios, (10.0, 100.0, 1000.0, 1 / 0.3048), _SIZE):
         yield Explanation(
@@ -154,9 +159,12 @@ def _of_unit(camera, factor):
 
 def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
     """Moved by a constant, at the same size or resized, which nothing bounds."""
-    (q, _), (p, _) = centred(seen), centred(posed)
+    middles = [
+        [centred(uv)[0] for uv in in_common(seen[:, k], posed[:, b])]
+        for k, b in itertools.product(range(seen.shape[1]), range(posed.shape[1]))
+    ]
     for scale in (1.0, *ratios):
-        shift = (q[:, :, None] - scale * p[:, None]).reshape(-1, 2)
+        shift = np.concatenate([q - scale * p for q, p in middles])
         shift = shift[np.isfinite(shift).all(-1)]
         if len(shift):
             image = ImageMap(scale * np.eye(2), np.median(shift, axis=0))
@@ -168,15 +176,14 @@ def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
 def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
     """How many times as large people are in keypoints as in bodies, or as far from the
     image's corner, by pairs of rows."""
-    (q, big), (p, small) = centred(seen), centred(posed)
     found: list[float] = []
-    for k, b in itertools.product(range(big.shape[1]), range(small.shape[1])):
+    for k, b in itertools.product(range(seen.shape[1]), range(posed.shape[1])):
+        pair = in_common(seen[:, k], posed[:, b])
+        (q, big), (p, small) = (centred(uv) for uv in pair)
         if about_corner:
-            ratio = (q[:, k] * p[:, b]).sum(-1) / np.maximum(
-                (p[:, b] ** 2).sum(-1), 1.0
-            )
+            ratio = (q * p).sum(-1) / np.maximum((p**2).sum(-1), 1.0)
         else:
-            ratio = big[:, k] / np.maximum(small[:, b], 1e-3)
+            ratio = big / np.maximum(small, 1e-3)
         ratio = ratio[np.isfinite(ratio)]
         middle = float(np.median(ratio)) if len(ratio) >= 3 else 0.0
         if (
@@ -258,10 +265,11 @@ def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> Peop
 def some_frames(people: People, most: int) -> np.ndarray:
     """Up to `most` frames with both kinds in them, evenly spread."""
     (where,) = np.nonzero(people.both)
-    return where[np.unique(np.linspace(0, len(where) - 1, most).round().astype(int))]
+    return evenly(where, most)
 
 
-def has_both(people: People) -> bool:
-    return bool(
-        have_points(people.keypoints).any() and have_points(people.bodies).any()
-    )
+def evenly(where: np.ndarray, most: int) -> np.ndarray:
+    """Up to `most` of these, evenly spread."""
+    if len(where) <= most:
+        return where
+    return where[np.linspace(0, len(where) - 1, most).round().astype(int)]

@@ -5,6 +5,7 @@ keypoints and bodies are usually made by different programs, the one kind tells 
 numbers of the other belong together.
 """
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -84,6 +85,10 @@ def _joined(persons, apart, points, there) -> list[Person]:
     middle, count = _medians(apart)
     fits = (count >= _FEWEST) & (middle < _SAME)
 
+    @functools.cache
+    def same_place(kind: int, rows_a, rows_b) -> bool:
+        return _same_place(points[kind], rows_a, rows_b, there[kind])
+
     def linked(a: Person, b: Person) -> bool:
         crossed = [fits[np.ix_(x.keypoints, y.bodies)] for x, y in ((a, b), (b, a))]
         return any(bool(c.any()) for c in crossed)
@@ -94,13 +99,12 @@ def _joined(persons, apart, points, there) -> list[Person]:
         a, b = (there[kind][list(rows)].any(0) for rows in (rows_a, rows_b))
         if (a & b).sum() <= _OVERLAP * min(a.sum(), b.sum()):
             return False
-        return not _same_place(points[kind], rows_a, rows_b, there[kind])
+        return not same_place(kind, rows_a, rows_b)
 
     def one(a: Person, b: Person) -> bool:
         kinds = ((0, a.keypoints, b.keypoints), (1, a.bodies, b.bodies))
         known = linked(a, b) or any(
-            x and y and _same_place(points[kind], x, y, there[kind])
-            for kind, x, y in kinds
+            x and y and same_place(kind, x, y) for kind, x, y in kinds
         )
         return known and not any(at_two_places(*kind) for kind in kinds)
 
@@ -161,16 +165,14 @@ def _goes_on(middle, radius, end, start) -> bool:
 
 def _same_place(points, rows_a, rows_b, there) -> bool:
     """Whether two people are in one place in most of the frames that they share."""
-    near = np.zeros(len(points), bool)
     shared = there[list(rows_a)].any(0) & there[list(rows_b)].any(0)
     fewest = min(there[list(rows)].any(0).sum() for rows in (rows_a, rows_b))
     if shared.sum() <= max(_FEWEST, _OVERLAP * fewest):
         return False
-    for a in rows_a:
-        for b in rows_b:
-            gap = distances(points[:, [a]], points[:, [b]])[:, 0, 0]
-            near |= np.where(np.isfinite(gap), gap, np.inf) < _TWICE
-    return bool(near[shared].mean() >= _MOST)
+    both = points[shared]
+    gap = distances(both[:, list(rows_a)], both[:, list(rows_b)])
+    near = (np.where(np.isfinite(gap), gap, np.inf) < _TWICE).any((1, 2))
+    return bool(near.mean() >= _MOST)
 
 
 def _say_who_is_one(persons, there, warn: Warn) -> None:

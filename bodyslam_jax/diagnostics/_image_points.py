@@ -141,7 +141,7 @@ def distances(
 ) -> Float[np.ndarray, "t k b"]:
     """Mean distance of the points of two people, in sizes of the first; NaN where they
     share too few."""
-    apart = np.linalg.norm(seen[:, :, None] - posed[:, None], axis=-1)
+    apart = np.hypot(*np.moveaxis(seen[:, :, None] - posed[:, None], -1, 0))
     there = np.isfinite(apart)
     size = sizes(seen)[:, :, None]
     limit = _FARTHEST * np.where(np.isfinite(size), size, 1.0)
@@ -153,14 +153,32 @@ def distances(
 def centred(
     uv: Float[np.ndarray, "*n 14 2"],
 ) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
-    """Centre of each person's points and their r.m.s. distance from it, px."""
-    there = np.isfinite(uv[..., :1])
-    count = np.maximum(there.sum(-2), 1)
-    middle = np.where(there, uv, 0.0).sum(-2) / count
-    away = np.where(there, uv - middle[..., None, :], 0.0)
-    radius = np.sqrt((away**2).sum((-1, -2)) / count[..., 0])
+    """Median of each person's points, and the mean distance from it of the three
+    quarters that are nearest, px."""
+    middle = _median(uv, -2)
+    away = np.sort(np.hypot(*np.moveaxis(uv - middle[..., None, :], -1, 0)), -1)
+    count = np.isfinite(away).sum(-1)
+    kept = np.arange(away.shape[-1]) < np.ceil(0.75 * count)[..., None]
+    total = np.where(kept, away, 0.0).sum(-1)
     fine = have_points(uv)
+    radius = total / np.maximum(kept.sum(-1), 1)
     return np.where(fine[..., None], middle, np.nan), np.where(fine, radius, np.nan)
+
+
+def in_common(
+    a: Float[np.ndarray, "*n 14 2"], b: Float[np.ndarray, "*n 14 2"]
+) -> tuple[Float[np.ndarray, "*n 14 2"], Float[np.ndarray, "*n 14 2"]]:
+    """Two people with the points that both have."""
+    there = np.isfinite(a) & np.isfinite(b)
+    return np.where(there, a, np.nan), np.where(there, b, np.nan)
+
+
+def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m"]:
+    """Of what is not NaN; NaN if nothing is."""
+    count = np.isfinite(values).sum(axis, keepdims=True)
+    ordered = np.sort(values, axis=axis)  # NaN last
+    at = lambda i: np.take_along_axis(ordered, np.maximum(i, 0), axis=axis)
+    return ((at((count - 1) // 2) + at(count // 2 * (count > 0))) / 2).squeeze(axis)
 
 
 def compact(points: Float[np.ndarray, "t h 14 c"], most: int):

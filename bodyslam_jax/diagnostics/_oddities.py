@@ -12,6 +12,7 @@ from bodyslam_jax.diagnostics._image_points import (
     centred,
     distances,
     have_points,
+    in_common,
     project,
 )
 from bodyslam_jax.diagnostics._postures import opposed, shares, trunk_directions
@@ -82,7 +83,8 @@ def _warn_of_person(h: int, seen, posed, people: People, warn) -> None:
             "person's size from the keypoints: of somebody else there?"
         )
     near = both & ~away
-    ratio = centred(seen)[1][near] / centred(posed)[1][near]
+    big, small = (centred(uv[near])[1] for uv in in_common(seen, posed))
+    ratio = big / np.maximum(small, 1e-3)
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < _FEWEST:
         return

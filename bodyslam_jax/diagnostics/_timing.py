@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.diagnostics._explanations import disagreement
+from bodyslam_jax.diagnostics._explanations import disagreement, evenly
 from bodyslam_jax.diagnostics._image_points import (
     People,
     distances,
@@ -24,7 +24,7 @@ _RATES = (24 / 25, 24 / 30, 25 / 30, 24 / 60, 25 / 60, 30 / 50, 24 / 50)
 """Frame rates that one and the same video is converted between, as ratios."""
 _LONGEST = 90
 """Frames: shifts beyond this are not tried."""
-_SAMPLE = 60
+_SAMPLE = 50
 """Frames that are compared."""
 _FEWEST = 8
 _PENALTY, _RATE_PENALTY = 2e-4, 0.003
@@ -60,14 +60,20 @@ def best_timing(people: People) -> tuple[Timing, Timing]:
     """As given, and the one at which bodies and keypoints fit best."""
     posed = project(people.camera, people.bodies)
     (where,) = np.nonzero(have_points(people.keypoints).any(1))
-    where = where[
-        np.unique(np.linspace(0, len(where) - 1, _SAMPLE).round().astype(int))
-    ]
+    where = evenly(where, _SAMPLE)
     given = _fit(people.keypoints[where], posed, where, Timing(), 3)
     reach = min(_LONGEST, len(posed) // 3)
     tries = [Timing(shift=d) for d in range(-reach, reach + 1) if d]
     ratios = [*map(float, _STEPS), *_RATES]
-    tries += [Timing(rate=r) for a in ratios for r in (a, 1 / a)]
+    ends = [
+        int(np.flatnonzero(have_points(p).any(1))[-1])
+        for p in (people.keypoints, people.bodies)
+    ]
+    for rate in (r for a in ratios for r in (a, 1 / a)):
+        # What was numbered anew ends so early that it fits when it is put back.
+        last = ends[0] * rate if rate > 1 else ends[1] / rate
+        if last < len(posed) + max(rate, 1 / rate):
+            tries.append(Timing(rate=rate))
     best = given
     for timing in tries:
         found = _fit(people.keypoints[where], posed, where, timing, _FEWEST)
