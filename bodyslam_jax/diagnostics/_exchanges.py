@@ -57,7 +57,13 @@ def _stretches(
     (known,) = np.nonzero(np.isfinite(gain))
     if len(known) < _FEWEST:
         return
-    exchanged = median_filter(gain[known], _WINDOW, mode="nearest") > _CLEAR
+    smooth = median_filter(gain[known], _WINDOW, mode="nearest")
+    decided = np.abs(smooth) > _CLEAR
+    if not decided.any():
+        return
+    # Where both fit, as people cross, it stays as it was.
+    last = np.maximum.accumulate(np.where(decided, np.arange(len(known)), -1))
+    exchanged = smooth[np.where(last >= 0, last, decided.argmax())] > 0
     edges = np.diff(np.concatenate([[False], exchanged, [False]]).astype(int))
     starts: Int[np.ndarray, " n"] = np.flatnonzero(edges == 1)
     ends = np.flatnonzero(edges == -1) - 1

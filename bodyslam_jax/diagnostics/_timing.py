@@ -31,6 +31,8 @@ _PENALTY, _RATE_PENALTY = 2e-4, 0.003
 """Of each frame of a shift, and of an odd ratio of rates, in sizes of a person: of
 equal ones the simplest."""
 
+_NEAR, _ALIKE = 0.06, 0.01
+
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
@@ -74,11 +76,13 @@ def best_timing(people: People) -> tuple[Timing, Timing]:
         last = ends[0] * rate if rate > 1 else ends[1] / rate
         if last < len(posed) + max(rate, 1 / rate):
             tries.append(Timing(rate=rate))
-    best = given
-    for timing in tries:
-        found = _fit(people.keypoints[where], posed, where, timing, _FEWEST)
-        if _cost(found) < _cost(best):
-            best = found
+    found = [_fit(people.keypoints[where], posed, where, t, _FEWEST) for t in tries]
+    best = min((given, *found), key=_cost)
+    if best.rate != 1:
+        # An odd rate near every n-th frame fits nearly as well, and is less likely.
+        steps = [t for t in found if t.step and abs(t.rate / best.rate - 1) < _NEAR]
+        steps = [t for t in steps if t.disagreement < best.disagreement + _ALIKE]
+        best = min(steps, key=_cost, default=best)
     if best.rate == 1 and best.shift:
         share = _share_better(people.keypoints, posed, best.shift)
         best = dataclasses.replace(best, better=share)

@@ -172,7 +172,7 @@ def _complexity(explanation: Explanation) -> float:
     if explanation.kind in free:
         return free[explanation.kind]
     if explanation.kind == "focal" and explanation.name:
-        return 2 * measured["focal"]
+        return measured["focal"] + 0.01
     return 0.0 if explanation.reason else measured.get(explanation.kind, 0.0)
 
 
