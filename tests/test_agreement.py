@@ -331,6 +331,8 @@ def test_numbers_of_one_person_become_one_person():
     assert "bodies of 3 numbers are of one person: frames 0-19, 20-40, 43-59" in said(
         found
     )
+    brief = reconcile(numbered(true, "bodies", (0, 30), (30, 31), (31, FRAMES)), BODY)
+    same_people(brief, true)
     found = reconcile(numbered(true, "keypoints", *pieces), BODY)
     same_people(found, true)
     assert "keypoints of 3 numbers" in said(found)
@@ -338,6 +340,13 @@ def test_numbers_of_one_person_become_one_person():
     same_people(reconcile(both, BODY), true)
     alone = dataclasses.replace(numbered(true, "bodies", *pieces), keypoints=None)
     assert len(reconcile(alone, BODY).bodies.present) == 1
+
+
+def test_bodies_of_frames_without_keypoints_go_with_their_neighbours():
+    true = numbered(sequence(), "bodies", (0, 20), (20, 32), (32, FRAMES))
+    hidden = retimed(true, "keypoints", np.where((K > 18) & (K < 33), -1, K))
+    found = reconcile(hidden, BODY)
+    assert found.bodies.present.all() and len(found.bodies.present) == 1
 
 
 def test_one_person_twice_at_once_becomes_one_person():
@@ -466,45 +475,52 @@ def test_every_source_passes():
         bs.run(given, Config())
 
 
-def test_a_tools_own_focal_length_is_taken(tmp_path):
-    """WHAM's file does not say that its camera has the image's diagonal."""
-    s = sequence()
-    poses, trans = s.bodies.poses[0], s.bodies.trans[0]
-    one = {"pose": poses, "betas": np.zeros((FRAMES, 10)), "frame_ids": K}
-    far = (trans + J_0) * [1, 1, 800 / FOCAL] - J_0
-    file = tmp_path / "wham_output.pkl"
-    file.write_bytes(pickle.dumps({0: {**one, "trans": far, "pose_world": poses}}))
-    camera = {"model": "PINHOLE", "width": W, "height": H, "fps": 30.0}
-    camera["params"] = CAMERA.params.tolist()
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    track = np.arange(FRAMES)
-    np.savez(
-        tmp_path / "tracks.npz",
-        frame=np.repeat(track, 2),
-        landmark=np.tile([0, 1], FRAMES),
-        uv=np.full((2 * FRAMES, 2), 50.0),
-    )
-    found = frontend.read_sequence(tmp_path, bodies=file)
-    lines = said(found)
-    np.testing.assert_allclose(found.bodies.trans[0], trans, atol=0.02)
-    assert "its default of 800 px" in lines and "525 px" in lines
-
-
-def test_fewer_files_than_frames_are_said(tmp_path):
-    camera = {"model": "PINHOLE", "width": W, "height": H, "fps": 30.0}
-    camera["params"] = CAMERA.params.tolist()
+def folder(tmp_path, uv, confidence, size=(W, H)):
+    """A sequence folder of `FRAMES` frames with one person's keypoints."""
+    camera = {"model": "PINHOLE", "width": size[0], "height": size[1], "fps": 30.0}
+    camera["params"] = [FOCAL, FOCAL, size[0] / 2, size[1] / 2]
     (tmp_path / "camera.json").write_text(json.dumps(camera))
     np.savez(
         tmp_path / "tracks.npz", frame=K, landmark=K % 2, uv=np.full((FRAMES, 2), 50.0)
     )
-    keypoints = sequence().keypoints
     (tmp_path / "keypoints").mkdir()
-    for k in range(25):
-        points = np.concatenate(
-            [keypoints.uv[0, k], keypoints.confidence[0, k, :, None]], axis=-1
-        )
+    for k, points in enumerate(np.concatenate([uv, confidence[..., None]], -1)):
         person = {"pose_keypoints_2d": points.ravel().tolist()}
         file = tmp_path / "keypoints" / f"{k:06d}_keypoints.json"
         file.write_text(json.dumps({"people": [person]}))
-    found = frontend.read_sequence(tmp_path)
+    return tmp_path
+
+
+def test_fewer_files_than_frames_are_said(tmp_path):
+    keypoints = sequence().keypoints
+    path = folder(tmp_path, keypoints.uv[0, :25], keypoints.confidence[0, :25])
+    found = frontend.read_sequence(path)
     assert "25 frames, numbered 0 to 24, but the video has 60" in said(found)
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+def test_keypoints_of_a_phones_video_as_it_is_stored(tmp_path, clockwise):
+    """Shown as 480x640, stored as 640x480: people lie, some beyond the right edge."""
+    start = (-0.2, -0.8 if clockwise else 0.0, 3.0)
+    keypoints = sequence(walker(start=start, velocity=(0, 0, 0))).keypoints
+    shown = keypoints.uv[0] + [-(W - H) / 2, (W - H) / 2]
+    u, v = shown[..., 0], shown[..., 1]
+    stored = np.stack([W - 1 - v, u] if clockwise else [v, H - 1 - u], -1)
+    path = folder(tmp_path, stored, keypoints.confidence[0], (H, W))
+    found = frontend.read_sequence(path)
+    np.testing.assert_allclose(found.keypoints.uv[0], shown, atol=1e-9)
+    assert "before the video's rotation" in said(found)
+
+
+def test_a_tools_own_focal_length_is_taken(tmp_path):
+    """WHAM's file does not say that its camera has the image's diagonal."""
+    s = sequence()
+    poses, trans = s.bodies.poses[0], s.bodies.trans[0]
+    path = folder(tmp_path, s.keypoints.uv[0], s.keypoints.confidence[0])
+    one = {"pose": poses, "betas": np.zeros((FRAMES, 10)), "frame_ids": K}
+    far = (trans + J_0) * [1, 1, 800 / FOCAL] - J_0
+    file = path / "wham_output.pkl"
+    file.write_bytes(pickle.dumps({0: {**one, "trans": far, "pose_world": poses}}))
+    found = frontend.read_sequence(path, bodies=file)
+    np.testing.assert_allclose(found.bodies.trans[0], trans, atol=0.02)
+    assert "its default of 800 px" in said(found) and "525 px" in said(found)

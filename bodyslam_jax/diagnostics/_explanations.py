@@ -161,7 +161,7 @@ def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
     """Moved by a constant, at the same size or resized, which nothing bounds."""
     middles = [
         [centred(uv)[0] for uv in in_common(seen[:, k], posed[:, b])]
-        for k, b in itertools.product(range(seen.shape[1]), range(posed.shape[1]))
+        for k, b in _pairs(seen, posed)
     ]
     for scale in (1.0, *ratios):
         shift = np.concatenate([q - scale * p for q, p in middles])
@@ -173,11 +173,17 @@ def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
             yield Explanation(kind, forecast, image, factor=scale)
 
 
+def _pairs(seen, posed) -> list[tuple[int, int]]:
+    """Rows that may be of one person, likelier ones first."""
+    rows = itertools.product(range(seen.shape[1]), range(posed.shape[1]))
+    return sorted(rows, key=lambda pair: (sum(pair), abs(pair[0] - pair[1])))[:24]
+
+
 def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
     """How many times as large people are in keypoints as in bodies, or as far from the
     image's corner, by pairs of rows."""
     found: list[float] = []
-    for k, b in itertools.product(range(seen.shape[1]), range(posed.shape[1])):
+    for k, b in _pairs(seen, posed):
         pair = in_common(seen[:, k], posed[:, b])
         (q, big), (p, small) = (centred(uv) for uv in pair)
         if about_corner:
@@ -192,7 +198,7 @@ def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
             and all(abs(np.log(middle / f)) > 0.02 for f in found)
         ):
             found.append(middle)
-    return found[:6]
+    return found[:12]
 
 
 def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, bool]]:

@@ -45,7 +45,9 @@ def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequen
     apart = distances(people.keypoints, posed)
     persons = _pair(apart, there)
     persons = _joined(persons, apart, (people.keypoints, posed), there)
-    if not there[0].any():
+    if there[0].any():
+        persons = _attached(persons, apart, posed, there[1])
+    else:
         persons = _joined_by_place(persons, posed, there[1], warn)
     _say_who_is_one(persons, there, warn)
     persons = _worth_keeping(persons, sequence, posed, apart, there, warn)
@@ -83,7 +85,10 @@ def _pair(apart, there) -> list[Person]:
 def _joined(persons, apart, points, there) -> list[Person]:
     """People of whom the one kind lies on the other's, unless at two places."""
     middle, count = _medians(apart)
-    fits = (count >= _FEWEST) & (middle < _SAME)
+    # All of what is there for a frame or two only.
+    seen, posed = (at.sum(1) for at in there)
+    enough = np.minimum(_FEWEST, np.minimum(seen[:, None], posed))
+    fits = (count >= np.maximum(enough, 1)) & (middle < _SAME)
 
     @functools.cache
     def same_place(kind: int, rows_a, rows_b) -> bool:
@@ -125,10 +130,47 @@ def _joined(persons, apart, points, there) -> list[Person]:
     return done
 
 
+def _attached(persons, apart, posed, posed_at) -> list[Person]:
+    """Bodies of frames without keypoints, to those that they go on from or lead to."""
+    shape = centred(posed)
+    lone = [
+        p
+        for p in persons
+        if not p.keypoints and not np.isfinite(apart[:, :, list(p.bodies)]).any()
+    ]
+    kept = [p for p in persons if p not in lone]
+    for person in sorted(lone, key=lambda p: int(_frames(posed_at, p)[0])):
+        own = _frames(posed_at, person)
+        for other in [p for p in kept if p.bodies]:
+            theirs = _frames(posed_at, other)
+            before, after = theirs[theirs < own[0]], theirs[theirs > own[-1]]
+            links = []
+            if len(before):
+                links.append(((before[-1], other.bodies), (own[0], person.bodies)))
+            if len(after):
+                links.append(((own[-1], person.bodies), (after[0], other.bodies)))
+            apart_in_time = not np.isin(own, theirs).any()
+            if apart_in_time and any(
+                start[0] - end[0] <= _SOON and _goes_on(*shape, end, start)
+                for end, start in links
+            ):
+                kept.remove(other)
+                both = tuple(sorted((*other.bodies, *person.bodies)))
+                kept.append(Person(other.keypoints, both))
+                break
+        else:
+            kept.append(person)
+    return kept
+
+
+def _frames(posed_at, person: Person) -> np.ndarray:
+    return np.flatnonzero(posed_at[list(person.bodies)].any(0))
+
+
 def _joined_by_place(persons, posed, posed_at, warn: Warn) -> list[Person]:
     """Without keypoints: a body that begins where another has just ended."""
     middle, radius = centred(posed)
-    ends = lambda p: np.flatnonzero(posed_at[list(p.bodies)].any(0))[[0, -1]]
+    ends = lambda p: _frames(posed_at, p)[[0, -1]]
     done: list[Person] = []
     for person in sorted(persons, key=lambda p: int(ends(p)[0])):
         first = int(ends(person)[0])

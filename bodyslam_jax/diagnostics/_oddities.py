@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bodyslam_jax.diagnostics._explanations import ImageMap
+from bodyslam_jax.diagnostics._facing import opposed, shares, trunk_directions
 from bodyslam_jax.diagnostics._image_points import (
     MID_HIP,
     NECK,
@@ -15,7 +16,6 @@ from bodyslam_jax.diagnostics._image_points import (
     in_common,
     project,
 )
-from bodyslam_jax.diagnostics._postures import opposed, shares, trunk_directions
 from bodyslam_jax.diagnostics._undo import with_keypoints_mapped_back
 from bodyslam_jax.sequence import Sequence
 

@@ -62,7 +62,8 @@ def best_timing(people: People) -> tuple[Timing, Timing]:
     """As given, and the one at which bodies and keypoints fit best."""
     posed = project(people.camera, people.bodies)
     (where,) = np.nonzero(have_points(people.keypoints).any(1))
-    where = evenly(where, _SAMPLE)
+    pairs = people.keypoints.shape[1] * posed.shape[1]
+    where = evenly(where, max(_SAMPLE // 3, min(_SAMPLE, 4 * _SAMPLE // pairs)))
     given = _fit(people.keypoints[where], posed, where, Timing(), 3)
     reach = min(_LONGEST, len(posed) // 3)
     tries = [Timing(shift=d) for d in range(-reach, reach + 1) if d]

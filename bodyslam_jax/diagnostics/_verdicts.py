@@ -6,8 +6,8 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics._explanations import Explanation
+from bodyslam_jax.diagnostics._facing import shares, trunk_directions
 from bodyslam_jax.diagnostics._image_points import People, people_of, sizes
-from bodyslam_jax.diagnostics._postures import shares, trunk_directions
 from bodyslam_jax.diagnostics._undo import with_bodies_moved, with_keypoints_mapped_back
 from bodyslam_jax.sequence import Sequence
 

@@ -26,6 +26,7 @@ from bodyslam_jax.diagnostics._explanations import (
     of_frames,
     some_frames,
 )
+from bodyslam_jax.diagnostics._facing import shares, trunk_directions
 from bodyslam_jax.diagnostics._identities import settle_identities
 from bodyslam_jax.diagnostics._image_points import (
     People,
@@ -35,7 +36,6 @@ from bodyslam_jax.diagnostics._image_points import (
     project,
 )
 from bodyslam_jax.diagnostics._oddities import warn_of_oddities
-from bodyslam_jax.diagnostics._postures import shares, trunk_directions
 from bodyslam_jax.diagnostics._times import settle_times
 from bodyslam_jax.diagnostics._timing import best_timing
 from bodyslam_jax.diagnostics._verdicts import undone
@@ -59,7 +59,7 @@ _CONTRADICTION, _DOUBT = 0.35, 0.25
 """Distance from which bodies and keypoints are not of the same people; are doubtful."""
 _SAMPLE = 40
 """Frames that are compared for each explanation."""
-_CROWD = 4
+_CROWD = 12
 """People of each kind and frame that are compared."""
 
 Warn = Callable[[str], None]
@@ -113,7 +113,8 @@ def _made_to_meet(
 ) -> tuple[Sequence, bool]:
     """Bodies and keypoints at the same place and time in the image; and whether left
     and right were found to contradict."""
-    frames = some_frames(crowd, _SAMPLE)
+    pairs = crowd.keypoints.shape[1] * crowd.bodies.shape[1]
+    frames = some_frames(crowd, max(_SAMPLE // 3, min(_SAMPLE, 4 * _SAMPLE // pairs)))
     given, chosen, best = _best_explanation(of_frames(crowd, frames, frames))
     as_timed, timing = best_timing(crowd)
     if timing.rate != 1 or abs(timing.shift) > 1:
