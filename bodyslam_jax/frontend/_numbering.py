@@ -155,10 +155,9 @@ def _first(
     if first == 0:
         if complete and unbroken:
             warn(
-                f"{what} of {len(numbers)} frames, numbered 0 to {last}, but the video "
-                f"has {num_frames}: taken as its first ones; detectors that write "
-                "every "
-                "frame have been given fewer, perhaps every n-th."
+                f"{what} numbered 0 to {last} for {num_frames} frames: taken as counted "
+                f"from 0, the first {len(numbers)}; but what writes every frame that it "
+                "sees has been given fewer, perhaps every n-th."
             )
         return 0
     # Whoever lists every image would have listed number 0, but some have been deleted
