@@ -155,8 +155,10 @@ def _first(
     if first == 0:
         if complete and unbroken:
             warn(
-                f"{what} numbered 0 to {last} for {num_frames} frames: taken as counted "
-                f"from 0, the first {len(numbers)}; but what writes every frame that it "
+                f"{what} numbered 0 to {last} for {num_frames} frames: taken as "
+                "counted "
+                f"from 0, the first {len(numbers)}; but what writes every frame that "
+                "it "
                 "sees has been given fewer, perhaps every n-th."
             )
         return 0
