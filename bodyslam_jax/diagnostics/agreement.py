@@ -47,7 +47,7 @@ _BELIEVED = 0.2
 """Distance that an explanation has to come down to."""
 _BETTER = 0.7
 """What it may leave of the distance without it."""
-_MUCH_BETTER = 0.5
+_COPY, _MUCH_BETTER = 0.15, 0.5
 """The same where any shift and size would do."""
 _GAIN = 0.03
 """Distance that it has to gain."""
@@ -160,7 +160,7 @@ def _best_explanation(people: People) -> tuple[float, Explanation | None, float]
         fine,
         key=lambda pair: pair[0] + _complexity(pair[1]) + _oddness(pair[1], people),
     )
-    if chosen.kind == "copy" and distance > _MUCH_BETTER * given:
+    if chosen.kind == "copy" and distance > min(_COPY, _MUCH_BETTER * given):
         return given, None, distance
     return given, chosen, distance
 
