@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
 from bodyslam_jax.compilation import jit_once
-from bodyslam_jax.config import Config
+from bodyslam_jax.config import PATH_SIGMA, Config
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.people import Roots
@@ -65,6 +65,15 @@ def prepare(
     within = cameras.within
     bodies = dataclasses.replace(bodies, present=bodies.present & within)
     roots = people.roots_from_bodies(bodies, body)
+    fitted = people.without_bodies(sequence)
+    numbers = config.person or range(len(roots.present))
+    statures = people.of_each(config.heights(), list(dict.fromkeys(numbers)))
+    measured = roots.shape
+    if statures:
+        unsure = np.where(fitted, 1.0, config.weights.shape_sigma)
+        roots = people.with_statures(roots, statures, body, unsure)
+        # The graph holds fitted shapes tighter than they are known.
+        measured = np.where(fitted[:, None], roots.shape, measured)
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
     )
@@ -73,21 +82,20 @@ def prepare(
     start = ScaleStart()
     contact = None
     weights = config.weights
-    fitted = people.without_bodies(sequence)
     shared = np.where(fitted, weights.fitted_step_error, weights.step_error)
     told = shared[roots.present.any(axis=1)] if roots.present.any() else shared
     stages = []
     factors = []
     if moving:
+        sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
         factors.append(
-            initialisation.map_factor(
-                cameras.tracks, cameras.keep, cameras.pixel_sigma, weights
-            )
+            initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
         )
         factors.append(
-            initialisation.revisit_factor(
-                cameras.places, cameras.elsewhere, cameras.pixel_sigma
-            )
+            initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
+        )
+        factors += initialisation.path_factors(
+            cameras.path, cameras.path_known, cameras.path_scale
         )
     anybody = len(roots.present) > 0
     free = None if moving else initialisation.free_people(state)
@@ -103,7 +111,13 @@ def prepare(
         return eqx.tree_at(lambda p: p.free.cameras, problem, mask)
 
     if anybody:
-        factors += initialisation.people_factors(sequence, roots, weights, body)
+        seen = predict(predictor, state)
+        known = seen.valid if weights.posture_predicted else None
+        factors += initialisation.people_factors(
+            sequence, roots, weights, body, shape=measured, predicted=known
+        )
+        if statures:
+            factors.append(initialisation.stature_factor(statures, roots.present, body))
         there = roots.present & cameras.registered
         walked = lambda seen, state: [
             initialisation.motion_factor(
@@ -127,13 +141,17 @@ def prepare(
         upright = initialisation.upright_factor(state, there, sequence.fps, weights)
         if upright is not None:
             factors.append(upright)
-        problem = make([*factors, *walked(predict(predictor, state), state)], state)
+        problem = make([*factors, *walked(seen, state)], state)
         state, stage = _settle_people(problem, state, config)
         stages.append(stage)
         seen = predict(predictor, state)
         if moving:
             start = initialisation.scale_start(
-                state, seen, contact, shared_error=float(told.min())
+                state,
+                seen,
+                contact,
+                shared_error=float(told.min()),
+                path=cameras.path_scale,
             )
             log.info(
                 "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
@@ -143,6 +161,11 @@ def prepare(
             )
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
         factors += walked(seen, state)
+    elif moving and np.isfinite(cameras.path_scale):
+        start = ScaleStart(
+            path=cameras.path_scale, path_error=PATH_SIGMA * cameras.path_scale
+        )
+        state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
     if not factors:
         raise ValueError(
             f"{sequence.name}: no landmarks and no people; expected a camera moving "
@@ -150,6 +173,8 @@ def prepare(
         )
     problem = make(factors, state)
     if config.motion_coupling == "frozen":
+        if anybody and weights.posture_predicted:
+            problem = problem.with_prediction({"body_pose": seen.body_pose})
         problem = dataclasses.replace(problem, motion=None)
     return Prepared(problem, state, start, roots, moving, tuple(stages))
 
@@ -209,8 +234,11 @@ def estimate(
 ) -> Joint:
     """The paper's graph: two steps, then the optimum of everything.
 
-    **Raises:** as `prepare`.
+    **Raises:** as `prepare`, unless a detector looked at all images and found nobody.
     """
+    looked = sequence.seen is not None and sequence.keypoints is None
+    if looked and cameras.kind != "moving" and not len(bodies.present):
+        return without_anything(cameras)
     prepared = prepare(sequence, cameras, bodies, body, config)
     problem = prepared.problem
     solution, stage = solve_stage(problem, prepared.state, config, "joint")
@@ -230,7 +258,8 @@ def estimate(
         scale_sigma=_scale_sigma(
             float(spread.scale) if spread else np.nan,
             moving=prepared.moving,
-            anybody=bool(prepared.roots.present.any()),
+            told=bool(prepared.roots.present.any())
+            or bool(np.isfinite(cameras.path_scale)),
         ),
         shape_covariance=(
             np.full((len(best.shapes), 10, 10), np.nan)
@@ -250,12 +279,34 @@ def estimate(
     )
 
 
-def _scale_sigma(variance: float, *, moving: bool, anybody: bool) -> float:
-    """m per unit of the map; infinite without people, who alone tell metres, and NaN
-    where it was not computed or there is no map."""
+def without_anything(cameras: Cameras) -> Joint:
+    """The estimate where the camera did not move and nobody was found: cameras stay
+    where they are, and nothing has a size."""
+    frames = len(cameras.registered)
+    return Joint(
+        scale=1.0,
+        start=ScaleStart(),
+        scale_sigma=float("nan"),
+        shape_covariance=np.zeros((0, 10, 10)),
+        unobserved=(),
+        cameras=np.asarray(cameras.T_WC),
+        roots=np.zeros((0, frames, 4, 4)),
+        poses=np.zeros((0, frames, 23, 3)),
+        shapes=np.zeros((0, 10)),
+        landmarks=np.asarray(cameras.landmarks),
+        intrinsics=np.asarray(cameras.intrinsics),
+        present=np.zeros((0, frames), bool),
+        status="converged",
+        stages=(),
+    )
+
+
+def _scale_sigma(variance: float, *, moving: bool, told: bool) -> float:
+    """m per unit of the map; infinite where neither people nor a metric path tell
+    metres, and NaN where it was not computed or there is no map."""
     if np.isnan(variance) or not moving:
         return np.nan
-    return variance**0.5 if anybody else np.inf
+    return variance**0.5 if told else np.inf
 
 
 def of_fitted_sizes(
@@ -273,16 +324,18 @@ def of_fitted_sizes(
     where they belong, and makes variances as much too small. What is given back goes
     to the scale by the length of legs, which is the metre of all that moves.
     """
-    more = np.maximum(shape_sigma**-2.0 - 1, 0.0)
+    # Of weight w in place of 1: the variance of the estimate is Σ (Σ⁻¹ - w + w²) Σ.
+    weight = np.maximum(shape_sigma**-2.0, 1.0)
+    more = weight * (weight - 1)
+    extra = more[:, None, None] * (spread.shapes @ spread.shapes)
     log_leg = lambda shape: jnp.log(motion.leg_length(body, shape))
     slope = jax.vmap(jax.grad(log_leg))(state.shapes)
-    legs = more * jnp.einsum("hi,hij,hj->h", slope, spread.shapes, slope)
+    legs = jnp.einsum("hi,hij,hj->h", slope, extra, slope)
     # The mean of the people there are, who differ independently of each other.
     scale = (
         spread.scale + state.scale**2 * jnp.sum(legs[there]) / float(there.sum()) ** 2
     )
-    shapes = (1 + more)[:, None, None] * spread.shapes
-    return dataclasses.replace(spread, scale=scale, shapes=shapes)
+    return dataclasses.replace(spread, scale=scale, shapes=spread.shapes + extra)
 
 
 def solve_stage(

@@ -35,6 +35,15 @@ class Cameras:
     costs: tuple[float, float]
     """Before and after bundle adjustment."""
     warnings: tuple[str, ...]
+    path: Float[np.ndarray, "t 4 4"] | None = None
+    """Poses T_WC that were given with the video, in the map's unit and world; identity
+    where not known."""
+    path_known: Bool[np.ndarray, " t"] | None = None
+    path_scale: float = float("nan")
+    """m per unit of the map, as that path has it; NaN if it is not metric."""
+    zoom: Float[np.ndarray, " t"] | None = None
+    """Logarithm of each frame's focal length over that of `intrinsics`, which is that
+    of the images with the zoom undone; None where the camera does not zoom."""
 
     @property
     def focal(self) -> float:

@@ -117,7 +117,8 @@ def _run(
     sequence = diagnostics.reconcile(_detected(sequence, config, cache, watch), body)
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
-    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    sequence = people.select_people(sequence, config.person)
+    seen = reconstruction.with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     with watch("joint"):
         rehearsal.wait("prediction")
         joint = cache.stage(
@@ -146,7 +147,9 @@ def before_joint(
     key = fingerprint(sequence, config.tracking)
     with watch("tracks"):
         tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
-    key = fingerprint(key, config.structure, config.weights.landmark_loss)
+    key = fingerprint(
+        key, config.structure, config.weights.landmark_loss, config.static_camera
+    )
     with watch("cameras"):
         cameras = cache.stage(
             "cameras",
@@ -154,7 +157,10 @@ def before_joint(
             Cameras,
             lambda: reconstruction.estimate(sequence, tracks, config),
         )
-    sequence = reconstruction.with_intrinsics(sequence, cameras.intrinsics)
+    sequence = people.select_people(sequence, config.person)
+    sequence = reconstruction.with_intrinsics(
+        sequence, cameras.intrinsics, cameras.zoom
+    )
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)
     with watch("people"):
@@ -176,15 +182,46 @@ def _check_length(sequence: Sequence) -> None:
 def _detected(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
-    """The sequence with keypoints found in its images, if asked for and none given."""
-    if not config.detect or sequence.keypoints is not None:
+    """The sequence with people found in its images, if none of its keypoints are given.
+
+    Not where there are no images, nor where nobody is to be estimated and masks, or
+    tracks that are given, keep people out of the map.
+    """
+    if config.detect == "none" or sequence.keypoints is not None:
         return sequence
+    masked = sequence.masks is not None or sequence.tracks is not None
+    if sequence.frames is None or (masked and not config.people):
+        return sequence
+    if config.detect != "yolox":
+        return _tracked(sequence, config, cache, watch)
     key = fingerprint(sequence, config.detection)
     with watch("detection"):
         found = cache.stage(
             "detection", key, Detections, lambda: _detections(sequence, config)
         )
     return frontend.with_detections(sequence, found.split(), config.association)
+
+
+def _tracked(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """The same by the networks that ship."""
+    counter = Counter("detection", sequence.num_frames)
+    find = lambda: people.find_tracked(
+        frontend.frames(sequence),
+        sequence.fps,
+        config.detection,
+        config.association,
+        counter,
+    )
+    with watch("detection"):
+        key = fingerprint(sequence, config.detection, config.association)
+        found = cache.stage("detection", key, people.Found, find)
+    points, person = found.by_frame(sequence.num_frames)
+    sequence = _warned(sequence, found.warnings)
+    return frontend.with_detections(
+        sequence, points, config.association, person=person, seen=found.seen()
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,7 +308,7 @@ def _to_folder(
             with watch("overlay"):
                 view.write_overlay(
                     partial / "overlay.webm",
-                    frontend.frames(sequence),
+                    _images(sequence, cameras),
                     result,
                     body,
                     _seen(cameras),
@@ -280,6 +317,14 @@ def _to_folder(
         export.write_files(partial, result, config)
         export.write_report(partial / "report.html", result, body)
     return result
+
+
+def _images(sequence: Sequence, cameras: Cameras) -> Iterator[np.ndarray]:
+    """The images, with the zoom undone where there is one."""
+    images = frontend.frames(sequence)
+    if cameras.zoom is None:
+        return images
+    return frontend.without_zoom(images, cameras.zoom, cameras.intrinsics[2:4])
 
 
 def _seen(cameras: Cameras) -> Tracks:

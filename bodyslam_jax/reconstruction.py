@@ -61,13 +61,37 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
 
 
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
-    guess = sequence.intrinsics
-    found = _reconstruct(sequence, tracks, guess, config)
-    cameras = _unadjusted(found, guess, config)
+    num_frames = sequence.num_frames
+    warnings = tracks.warnings
+    tracks, share = frontend.without_burnt_in(tracks, sequence.intrinsics, num_frames)
+    if share > 0 and sequence.tracks is not None:
+        warnings = (*warnings, frontend.burnt_in_warning(share))
+    if config.static_camera or sequence.camera_path is not None:
+        found = _reconstruct(sequence, tracks, sequence.intrinsics, config)
+        model = frontend.CameraModel(sequence.intrinsics, None, tracks, found, ())
+    else:
+        model = frontend.find_camera_model(
+            tracks, sequence.intrinsics, num_frames, config.structure
+        )
+    sequence = dataclasses.replace(sequence, intrinsics=model.intrinsics)
+    cameras = _of_model(sequence, model, config)
+    warnings = (*warnings, *model.warnings, *cameras.warnings)
+    moved = frontend.second_motion(model.tracks, model.found, model.intrinsics)
+    if moved is not None:
+        warnings = (*warnings, moved)
+    return dataclasses.replace(cameras, warnings=warnings, zoom=model.zoom)
+
+
+def _of_model(
+    sequence: Sequence, model: frontend.CameraModel, config: Config
+) -> Cameras:
+    """Cameras of a sequence whose intrinsics are the model's, adjusted."""
+    guess, found = sequence.intrinsics, model.found
+    cameras = _unadjusted(sequence, found, guess, config)
     if found.kind != "moving":
         return cameras
-    if guess.is_guess:
-        cameras = _with_focal(sequence, tracks, cameras, found.error, config)
+    if guess.is_refined:
+        cameras = _with_focal(sequence, model.tracks, cameras, found.error, config)
     else:
         cameras = _adjusted(cameras, 1.0, config, None)
     if cameras.kind != "moving":
@@ -90,7 +114,10 @@ def _with_focal(
             break
         better = dataclasses.replace(guess, params=adjusted.intrinsics)
         again = _reconstruct(sequence, tracks, better, config)
-        cameras, sigma = _unadjusted(again, better, config), adjusted.pixel_sigma
+        cameras, sigma = (
+            _unadjusted(sequence, again, better, config),
+            adjusted.pixel_sigma,
+        )
         if again.kind != "moving":
             if again.error > _WORSE * _PER_SIGMA * sigma:
                 return adjusted  # little as it moves, turning alone does not explain it
@@ -120,19 +147,30 @@ def _cut(cameras: Cameras, span: int) -> Cameras:
 
 
 def with_intrinsics(
-    sequence: Sequence, intrinsics: Float[np.ndarray, " i"]
+    sequence: Sequence,
+    intrinsics: Float[np.ndarray, " i"],
+    zoom: Float[np.ndarray, " t"] | None = None,
 ) -> Sequence:
     """The sequence as another focal length has it.
 
     Regressed bodies stay where they are in the image, and as large: their depth was
     read off their size, and is proportional to the focal length.
+
+    Args:
+        zoom: logarithm of each frame's focal length, over that of `intrinsics`:
+            keypoints and bodies are those of the images with the zoom undone.
     """
+    if zoom is not None:
+        sequence = _without_zoom(sequence, zoom)
     known = sequence.intrinsics
     if np.array_equal(known.params, intrinsics):
         return sequence
     bodies = sequence.bodies
     if bodies is not None:
-        ratio = np.array([1.0, 1.0, intrinsics[0] / known.params[0]])
+        # The camera may have got distortion, or pixels that are not square.
+        focal = np.sqrt(intrinsics[0] * intrinsics[1])
+        focal /= np.sqrt(known.params[0] * known.params[1])
+        ratio = np.array([1.0, 1.0, focal])
         bodies = dataclasses.replace(bodies, trans=bodies.trans * ratio)
     return dataclasses.replace(
         sequence,
@@ -141,17 +179,41 @@ def with_intrinsics(
     )
 
 
+def _without_zoom(sequence: Sequence, zoom: Float[np.ndarray, " t"]) -> Sequence:
+    size = np.exp(zoom)
+    keypoints, bodies = sequence.keypoints, sequence.bodies
+    if keypoints is not None:
+        centre = np.asarray(sequence.intrinsics.params[2:4], float)
+        uv = centre + (keypoints.uv - centre) / size[:, None, None]
+        uv = np.where(keypoints.confidence[..., None] > 0, uv, keypoints.uv)
+        keypoints = dataclasses.replace(keypoints, uv=uv)
+    if bodies is not None:
+        # As far from the axis, and as much farther as the image is larger.
+        trans = bodies.trans * np.stack([size * 0 + 1, size * 0 + 1, size], axis=-1)
+        bodies = dataclasses.replace(bodies, trans=trans)
+    return dataclasses.replace(sequence, keypoints=keypoints, bodies=bodies)
+
+
 def _reconstruct(
     sequence: Sequence, tracks: Tracks, intrinsics: Intrinsics, config: Config
 ) -> frontend.Reconstruction:
     return frontend.reconstruct(
-        tracks, intrinsics, sequence.num_frames, config.structure
+        tracks,
+        intrinsics,
+        sequence.num_frames,
+        config.structure,
+        path=sequence.camera_path,
+        static=config.static_camera,
     )
 
 
 def _unadjusted(
-    found: frontend.Reconstruction, intrinsics: Intrinsics, config: Config
+    sequence: Sequence,
+    found: frontend.Reconstruction,
+    intrinsics: Intrinsics,
+    config: Config,
 ) -> Cameras:
+    path = sequence.camera_path if found.kind == "moving" else None
     return Cameras(
         kind=found.kind,
         T_WC=found.T_WC,
@@ -161,11 +223,14 @@ def _unadjusted(
         keep=np.ones(len(found.tracks.frame), bool),
         elsewhere=found.elsewhere,
         places=found.landmarks,
-        pixel_sigma=config.weights.pixel_sigma,
+        pixel_sigma=config.weights.pixel_sigma or 1.0,
         intrinsics=np.asarray(intrinsics.params, float),
         focal_sigma=float("nan"),
         costs=(0.0, 0.0),
         warnings=tuple(found.warnings),
+        path=None if path is None else found.T_WC,
+        path_known=None if path is None else path.known,
+        path_scale=found.unit if path and path.metric else float("nan"),
     )
 
 
@@ -177,7 +242,7 @@ def _with_guess(
     found = _reconstruct(sequence, tracks, guess, config)
     held = dataclasses.replace(config.structure, focal_sigma=_HELD)
     cameras = _adjusted(
-        _unadjusted(found, guess, config),
+        _unadjusted(sequence, found, guess, config),
         adjusted.pixel_sigma,
         dataclasses.replace(config, structure=held),
         guess,
@@ -200,14 +265,15 @@ def _adjusted(
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
     )
-    factor = initialisation.map_factor(
-        cameras.tracks, cameras.keep, sigma, config.weights
-    )
+    # What the joint graph is to take for the noise does not change what it is.
+    weights = dataclasses.replace(config.weights, pixel_sigma=None)
+    factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
     again = initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
     if guess is not None and config.structure.focal_sigma > _HELD:
         # Places are those of the focal length that was thought so far.
         again = dataclasses.replace(again, whitening=0 * again.whitening)
-    problem = _problem(factor, again, state, config.structure, guess)
+    path = initialisation.path_factors(cameras.path, cameras.path_known)
+    problem = _problem([factor, again, *path], state, config.structure, guess)
     solution = solver.solve(problem, state)
     before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
@@ -239,24 +305,28 @@ _residual = jit_once(lambda factor, state: factor.residual(state))
 
 
 def _problem(
-    factor: graph.Reprojection,
-    again: graph.LandmarkPrior,
+    factors: list[graph.AbstractFactor],
     state: graph.State,
     structure: Structure,
     guess: Intrinsics | None,
 ) -> graph.Problem:
     if guess is None:
-        return graph.make_problem([factor, again], state)
+        return graph.make_problem(factors, state)
     known = np.asarray(guess.params, float)
     focal = known[0]
     # Errors of a track last, so `focal_runs` observations count for one: here the
     # prior's weight is multiplied, which is the same as dividing theirs.
     sigma = np.full(len(known), _HELD * focal)
-    sigma[:2] = structure.focal_sigma * focal / np.sqrt(structure.focal_runs)
+    error = guess.focal_sigma or structure.focal_sigma * focal
+    sigma[:2] = min(error, structure.focal_sigma * focal) / np.sqrt(
+        structure.focal_runs
+    )
     factors = [
-        factor,
+        *factors,
         graph.IntrinsicsPrior(jnp.asarray(known)[None], jnp.asarray(sigma)[None]),
-        graph.SquarePixels(jnp.asarray([_SQUARE * focal])),
+        graph.SquarePixels(
+            jnp.asarray([_SQUARE * focal]), ratio=float(focal / known[1])
+        ),
     ]
     return graph.make_problem(factors, state, free_intrinsics=True)
 

@@ -9,7 +9,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +22,15 @@ class Intrinsics:
     height: int
     is_guess: bool = False
     """Whether the focal length was guessed, so that the graph should refine it."""
+    focal_sigma: float | None = None
+    """Standard deviation of the focal length, px, where somebody who knows it roughly
+    gave it: it is refined within that. `None` for a calibration, which is held, and for
+    a guess, whose standard deviation is a setting."""
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether the focal length is a variable of the estimate."""
+        return self.is_guess or self.focal_sigma is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +67,32 @@ class Tracks:
     """Index of the point, 0 to `num_landmarks - 1`."""
     uv: Float[np.ndarray, "m 2"]
     """px"""
+    warnings: tuple[str, ...] = ()
+    """What was left out while following them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPath:
+    """Camera poses that came with a video."""
+
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world; identity where not known."""
+    known: Bool[np.ndarray, " t"]
+    metric: bool
+    """Whether translations are in metres; else their unit is arbitrary."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Everybody whom a detector found in `t` frames, also who is not estimated: `n`
+    times somebody. They move, so that nothing of them belongs in the map."""
+
+    frame: Int[np.ndarray, " n"]
+    points: Float[np.ndarray, "n 25 3"]
+    """BODY_25: u px, v px, confidence."""
+    silhouettes: UInt8[np.ndarray, "t y x8"] | None = None
+    """Where people are at every fourth pixel of every fourth row, eight bits to a
+    byte, as `np.packbits` has them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +114,9 @@ class Sequence:
     picks: Int[np.ndarray, " t"] | None = None
     """Which frames of the video these are, if not all: its rate varied."""
     groundtruth: Path | None = None
+    camera_path: CameraPath | None = None
+    seen: Seen | None = None
+    """All people in the images, for their masks."""
     warnings: tuple[str, ...] = ()
     """What was guessed or dropped while reading, for the report."""
 

@@ -37,13 +37,14 @@ def summarise(
     """`summary.json`: what a person wants to know first, then everything else."""
     warnings = [*sequence.warnings, *cameras.warnings, *joint.unobserved]
     status = "ok"
-    if not joint.present.any():
+    metric = bool(np.isfinite(cameras.path_scale))
+    if not joint.present.any() and not metric:
         status = "no people: cameras and map have no unit"
     elif not np.isfinite(result.T_WC).all():
         status = "failed"
     elif cameras.kind == "failed":
         status = "camera motion not found: people are placed as if it stood still"
-    if cameras.kind != "moving":
+    if cameras.kind != "moving" and joint.present.any():
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
         )
@@ -171,6 +172,7 @@ def _cues(start: ScaleStart) -> dict[str, list[float] | None]:
     cues = {
         "from_motion": [start.motion, start.motion_error],
         "from_ground": [start.ground, start.ground_error],
+        "from_path": [start.path, start.path_error],
     }
     return {k: v if np.isfinite(v[1]) else None for k, v in cues.items()}
 
@@ -237,7 +239,7 @@ def focal_length(sequence: Sequence, cameras: Cameras) -> dict[str, Any]:
 
     `focal_sigma_px` is `None` unless a guess could be refined.
     """
-    guessed = sequence.intrinsics.is_guess
+    guessed = sequence.intrinsics.is_refined
     refined = np.isfinite(cameras.focal_sigma)
     return {
         "guessed": guessed,

@@ -134,7 +134,8 @@ def test_what_cannot_be_written_is_named_as_it_was_given(
 
 def test_preset_and_settings_are_where_options_start(tmp_path):
     assert cli.base_config([]) == Config()
-    assert cli.base_config(["--preset", "paper"]).solver == "adam"
+    paper = cli.base_config(["--preset", "paper"])
+    assert (paper.solver, paper.motion_model) == ("adam", "paper")
     path = tmp_path / "config.yaml"
     path.write_text("solver: adam\nweights:\n  pixel_sigma: 2\n")
     found = cli.base_config([f"--settings={path}"])

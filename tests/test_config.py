@@ -40,7 +40,7 @@ NAN, INF = float("nan"), float("inf")
         (PeopleFit, "detector_bias", 2.0, "0 to 1"),
         (PeopleFit, "regressor_shape_gain", 0.0, "more than 0, and finite, or nothing"),
         (GraphWeights, "keypoint_sigma", "abc", "a number, or nothing"),
-        (GraphWeights, "pixel_sigma", None, "a number"),
+        (GraphWeights, "landmark_loss", None, "a number"),
         (GraphWeights, "posture_correlation", 1.0, "0 to 0.999999"),
         (GraphWeights, "step_error", -0.1, "0 or more"),
         (GraphWeights, "posture_correlation", INF, "0 to 0.999999"),

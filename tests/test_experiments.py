@@ -399,7 +399,7 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
     assert first["the paper's J-ATE Sim(3) full, mm"] == "115.9"
     for words in ("Simulated", "noise level `real`", "300 frames each"):
         assert words in first["data"]
-    for method in ("depth", "start", "scale_only", "per_frame"):
+    for method in ("depth", "start", "scale_only", "per_frame", "published"):
         assert first[f"H-ATE Sim(3) {method}, mm"] == "12.5"
         assert first[f"scale {method}"] == "0.8"
     (tmp_path / "table1.md").unlink()
@@ -482,8 +482,8 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
         f"{plain} Not as by default: motion of `walk.npz`; `body_model` b.npz; "
         "`motion_model` m.npz; `weights.pixel_sigma` 2.0."
     )
-    paper = dataclasses.replace(Config.paper(), motion_coupling="frozen")
-    told = "Not as by default: preset `paper`; `motion_coupling` frozen."
+    paper = dataclasses.replace(Config.paper(), motion_coupling="refreshed")
+    told = "Not as by default: preset `paper`; `motion_coupling` refreshed."
     assert _about.deviations(Experiment(), paper) == told
     on, _ = made_up
     for seed in (3, 4):

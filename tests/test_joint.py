@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     def motion_factor(*_, shared_error):
         told.append(float(shared_error[0]))
 
-    def scale_start(*_, shared_error):
+    def scale_start(*_, shared_error, **__):
         told.append(shared_error)
         return ScaleStart(motion=2.0, motion_error=0.1)
 
@@ -258,8 +259,157 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
 
 def test_metres_are_not_known_where_nobody_tells_them():
     sigma = joint._scale_sigma
-    assert sigma(0.04, moving=True, anybody=True) == pytest.approx(0.2)
+    assert sigma(0.04, moving=True, told=True) == pytest.approx(0.2)
     # Held at 1, the scale has no variance; that is not to know it.
-    assert sigma(0.0, moving=True, anybody=False) == np.inf
-    assert np.isnan(sigma(0.0, moving=False, anybody=False))
-    assert np.isnan(sigma(np.nan, moving=True, anybody=False))
+    assert sigma(0.0, moving=True, told=False) == np.inf
+    assert np.isnan(sigma(0.0, moving=False, told=False))
+    assert np.isnan(sigma(np.nan, moving=True, told=False))
+
+
+def _tracked() -> Cameras:
+    """The same cameras, of which two landmarks are known, to 0.6 px."""
+    frame = np.repeat(np.arange(T), 2)
+    landmark = np.tile(np.arange(2), T)
+    points = np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 5.0]])
+    uv = (500 * points[:, :2] / points[:, 2:] + [320, 240])[landmark]
+    return dataclasses.replace(
+        _cameras(),
+        landmarks=points,
+        tracks=Tracks(frame, landmark, uv),
+        keep=np.arange(2 * T) > 0,
+        elsewhere=np.tile(np.eye(3), (2, 1, 1)),
+        places=points,
+        pixel_sigma=0.6,
+    )
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [
+        (GraphWeights(), 0.6),
+        (GraphWeights(pixel_sigma=5.0), 5.0),
+        (GraphWeights.paper(), 2.25 / 8),
+    ],
+)
+def test_the_weight_of_landmarks_is_what_was_asked_for(weights, expected):
+    """λ_lm of the paper is 64/b² = 12.64 px^-2; unless asked, what was measured."""
+    cameras = _tracked()
+    rows = lambda *shape: np.zeros((0, T, *shape))
+    nobody = Bodies(np.zeros((0, T), bool), rows(72), rows(10), rows(3))
+    config = dataclasses.replace(Config(), weights=weights)
+    body = load_body_model(dtype=jnp.float64)
+    prepared = joint.prepare(_sequence(None), cameras, nobody, body, config)
+    track, prior = prepared.problem.factors
+    assert isinstance(track, graph.Reprojection)
+    assert isinstance(prior, graph.LandmarkPrior)
+    sigma = np.asarray(track.sigma)
+    assert np.isinf(sigma[0])
+    np.testing.assert_allclose(sigma[1:], expected)
+    # What is known of places is of the same errors.
+    np.testing.assert_allclose(prior.whitening[0], np.eye(3) / expected, atol=1e-12)
+
+
+def test_keypoints_of_the_papers_preset_saturate_at_the_same_distance():
+    """λ_joint is confidence squared, outside a loss with 100 px for every keypoint."""
+    body = load_body_model(dtype=jnp.float64)
+    roots = people.roots_from_bodies(_bodies(), body)
+    confidence = np.linspace(0.0, 1.0, 25)
+    seen = Keypoints(np.zeros((1, T, 25, 2)), np.tile(confidence, (1, T, 1)))
+    sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
+    weights = GraphWeights.paper()
+    found = initialisation.people_factors(sequence, roots, weights, body)
+    (factor,) = (f for f in found if isinstance(f, graph.JointReprojection))
+    for pixels in (3.0, 100.0, 1000.0):
+        cost = factor.loss.rho((pixels / factor.sigma) ** 2)
+        expected = confidence**2 * 1e4 * pixels**2 / (1e4 + pixels**2)
+        np.testing.assert_allclose(cost[0, 0], expected, rtol=1e-9)
+
+
+def _prediction(step, valid):
+    """What a motion model says that has everybody's joints turned by 0.2 rad."""
+    of_one = motion.Prediction(
+        translation=jnp.tile(step, (T, 1)),
+        covariance=jnp.tile(1e-4 * jnp.eye(3), (T, 1, 1)),
+        body_pose=jnp.full((T, 23, 3), 0.2),
+        rotation=jnp.zeros((T, 3)),
+        valid=valid,
+    )
+    return jax.tree.map(lambda x: x[None], of_one)
+
+
+def test_displacements_of_the_papers_preset_are_in_metres():
+    body = load_body_model(dtype=jnp.float64)
+    step = jnp.array([0.1, 0.0, 0.05])
+    seen = _prediction(step, jnp.arange(T) > 0)
+    state = initialisation.first_state(
+        _cameras().T_WC,
+        np.zeros((0, 3)),
+        people.roots_from_bodies(_bodies(), body),
+        _cameras().intrinsics,
+    )
+    make = lambda weights, shape: initialisation.motion_factor(
+        seen, shape, body, weights
+    )
+    for shape in (state.shapes, state.shapes + 1.0):
+        other = dataclasses.replace(state, shapes=shape)
+        factor = make(GraphWeights.paper(), shape)
+        # λ_mm = 100 of an error that is the whole step, as nobody moves.
+        found = factor.residual(other)
+        np.testing.assert_allclose(found[0, 1:], [-10 * step] * (T - 1), rtol=1e-9)
+        assert ("shape", 0) not in factor.touches
+    assert ("shape", 0) in make(GraphWeights(), state.shapes).touches
+
+
+@pytest.mark.parametrize("coupling", ["frozen", "refreshed"])
+def test_postures_are_held_to_predictions_only_where_there_are_any(
+    monkeypatch, coupling
+):
+    """Not in the frames after a gap, in which what stands there means nothing."""
+    valid = np.array([[False, False, True, False]])
+    predicted = _prediction(jnp.zeros(3), jnp.asarray(valid[0]))
+    monkeypatch.setattr(joint, "predict", lambda *_: predicted)
+    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
+    sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
+    config = dataclasses.replace(Config.paper(), motion_coupling=coupling)
+    body = load_body_model(dtype=jnp.float64)
+    prepared = joint.prepare(sequence, _cameras(), _bodies(), body, config)
+    (factor,) = (f for f in prepared.problem.factors if isinstance(f, graph.Posture))
+    known = np.isfinite(np.asarray(factor.sigma)).all(axis=-1)
+    np.testing.assert_array_equal(known, valid)
+    held = prepared.problem.motion is None
+    assert held == (coupling == "frozen")
+    if held:  # to the prediction, which nobody makes again
+        np.testing.assert_allclose(factor.rotation[0, 2], 0.2)
+
+
+def test_a_posture_that_may_not_be_predicted_is_not_held():
+    """Where predictions are not at hand: for as long after a gap as any model needs."""
+    body, frames = load_body_model(dtype=jnp.float64), 50
+    rows = lambda x: np.tile(x, (1, frames, 1)).astype(float)
+    given = Bodies(
+        np.ones((1, frames), bool),
+        rows(np.zeros(72)),
+        rows(np.zeros(10)),
+        rows([0.0, 0.0, 4.0]),
+    )
+    given.present[0, 20:24] = False
+    sequence = dataclasses.replace(
+        _sequence(given), timestamps=np.arange(frames) / 30.0
+    )
+    roots = people.roots_from_bodies(given, body)
+    weights = GraphWeights.paper()
+    make = lambda **known: next(
+        factor
+        for factor in initialisation.people_factors(
+            sequence, roots, weights, body, **known
+        )
+        if isinstance(factor, graph.Posture)
+    )
+    held = lambda factor: jnp.isfinite(factor.sigma).all(axis=-1)[0]
+    known = held(make())
+    assert known[16:20].all() and known[40:].all()
+    assert not known[:16].any() and not known[20:40].any()
+    there = jnp.arange(frames)[None] > 2
+    known = held(make(predicted=there))
+    np.testing.assert_array_equal(known, np.asarray(there)[0] & given.present[0])

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from test_motion_data import make_clip
 
-from bodyslam_jax import cli, frontend
+from bodyslam_jax import cli, frontend, synthetic
 from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config
 from bodyslam_jax.motion import (
     MotionModel,
     Prediction,
@@ -215,6 +216,34 @@ def test_weights_survive_a_file(tmp_path, key, kind):
     assert jax.tree.structure(found.network) == jax.tree.structure(network)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(saved), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_weights_take_half_the_space_and_hardly_lose(tmp_path, key, model):
+    save_motion_model(tmp_path / "whole.npz", model)
+    save_motion_model(tmp_path / "half.npz", model, half=True)
+    whole, half = (tmp_path / f"{n}.npz" for n in ("whole", "half"))
+    assert half.stat().st_size < 0.6 * whole.stat().st_size
+    for a, b in zip(
+        jax.tree.leaves(model), jax.tree.leaves(load_motion_model(half)), strict=True
+    ):
+        assert b.dtype == jnp.float32
+        np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-6)
+
+
+def test_the_papers_network_ships_and_is_what_its_preset_uses(body):
+    """Trained on walks: it tells steps of people whom it has not seen."""
+    paper = load_motion_model(Config.paper().motion_model)
+    assert isinstance(paper.network, PaperNetwork) and paper.past == 2
+    assert paper.network.encoder[0].weight.shape == (154, 1024)
+    assert Config().motion_model is None
+    assert isinstance(load_motion_model().network, MetricNetwork)
+    check_compatible(paper, body, 30.0)
+    clips = Path(synthetic.__file__).parent / "assets" / "walking.npz"
+    found = evaluate_model(paper, body, read_motion(clips)[:3])["walk"]
+    assert 0.8 < found["slope"] < 1.15
+    assert found["ratio"] < 0.4
+    # Its constant covariance was measured over exact and noisy postures together.
+    assert 0.1 < found["nees"] < 1.5
 
 
 def test_weights_of_something_else_are_refused(tmp_path, model, body):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import optax
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
@@ -128,6 +129,38 @@ def test_what_is_not_coupled_has_no_derivative():
 
     push = jax.grad(predicted)(state.zero_step())
     assert not ravel_pytree(push)[0].any()
+
+
+def test_first_order_steps_follow_what_is_predicted_anew():
+    """Each by the gradient of the cost with the prediction at its place, held."""
+    problem, start = make((), held_to_prediction)
+    count, rate = 6, 1e-2
+    schedule = (Stage(max_steps=count),)
+    found = solve(problem, start, solver="adam", schedule=schedule)
+    mask = mask_of(problem)
+    zero = start.zero_step()
+
+    @eqx.filter_jit
+    def slope(step):
+        place = lambda step: start.retract(jax.tree.map(jnp.multiply, mask, step))
+        now = problem.refresh(place(step))
+        cost = lambda step: now.cost(place(step))
+        return jax.value_and_grad(cost)(step)
+
+    method = optax.adam(rate)
+    step, memory = zero, method.init(zero)
+    costs = []
+    with jax.numpy_dtype_promotion("standard"):
+        for _ in range(count):
+            cost, gradient = slope(step)
+            change, memory = method.update(gradient, memory)
+            step = optax.apply_updates(step, change)
+            costs.append(float(cost))
+    expected = float(slope(step)[0])
+    assert float(found.first_cost) == pytest.approx(costs[0], rel=1e-9)
+    assert float(found.cost) == pytest.approx(expected, rel=1e-6)
+    moved = start.retract(jax.tree.map(jnp.multiply, mask, step))
+    np.testing.assert_allclose(found.state.poses, moved.poses, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -301,18 +301,29 @@ def test_motion_that_is_not_wanted_is_left_out(clips):
         corpus([dance], none)
 
 
-@pytest.mark.parametrize("sliding", [True, False])
-def test_windows_of_a_corpus(clips, sliding):
-    settings = dataclasses.replace(NOISY, sliding=sliding)
-    found = corpus(clips, settings)
-    assert len(found.poses) == sum((len(c.poses) - 1) * 4 + 1 for c in clips)
-    # a window of 1 + past frames at 30 Hz starts at any of four phases
-    ends = np.asarray(found.start) + 4 * settings.past
-    assert (ends <= np.asarray(found.last)).all()
-    expected = sum((len(c.poses) - 1) * 4 + 1 - 16 for c in clips)
-    assert (
-        found.num_windows == expected if sliding else found.num_windows < expected / 4
-    )
+@pytest.mark.parametrize("past", [2, 4])
+def test_windows_of_a_corpus(clips, past):
+    """All that there are at 120 Hz, or none that shares a moment with another."""
+    settings = dataclasses.replace(NOISY, past=past, steps=1)
+    span = 4 * past  # a window of 1 + past frames at 30 Hz
+    lengths = [(len(c.poses) - 1) * 4 + 1 for c in clips]
+    for sliding in (True, False):
+        found = corpus(clips, dataclasses.replace(settings, sliding=sliding))
+        assert len(found.poses) == sum(lengths)
+        start, last = np.asarray(found.start), np.asarray(found.last)
+        assert (start + span <= last).all()
+        if sliding:
+            assert found.num_windows == sum(t - span for t in lengths)
+            continue
+        assert (start[1:] > start[:-1] + span).all()
+        # As many as fit without a frame of the 30 Hz sequences in two of them.
+        assert found.num_windows == sum(len(c.poses) // (past + 1) for c in clips)
+
+
+def test_windows_that_may_not_overlap_are_drawn_one_by_one():
+    with pytest.raises(ValueError, match="steps: found 16, expected 1"):
+        MotionTraining(sliding=False)
+    assert MotionTraining.paper().steps == 1
 
 
 def test_a_batch_is_consistent_with_its_labels(clean_batch):

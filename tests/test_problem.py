@@ -427,3 +427,40 @@ def test_a_state_has_one_precision():
     half = jax.tree.map(lambda x: x.astype(jnp.float16), state)
     with pytest.raises(ValueError, match="found float16, expected float32 or float64"):
         make(half)
+
+
+def test_added_frames_weigh_nothing_to_any_factor():
+    """Wherever the frames are: they stay where they were as others move."""
+    state, factors = fitting()
+    longer = g.extend_state(state, 2)
+    longer = dataclasses.replace(longer, cameras=longer.cameras.at[T:, 0, 3].add(0.3))
+    checked = 0
+    for name, factor in factors.items():
+        if isinstance(factor, g.AbstractFrameFactor):
+            padded = g.pad_factor(factor, state, 2)
+            assert not isinstance(padded, g.Masked), name
+            found, expected = padded.cost(longer), factor.cost(state)
+            np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=name)
+            checked += 1
+    assert checked >= 10
+
+
+def test_a_loss_has_one_scale_or_one_for_each_keypoint():
+    state, factors = fitting()
+    keypoints = factors["JointReprojection"]
+    assert isinstance(keypoints, g.JointReprojection)
+    each = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0 * ones(1, T, 25)))
+    one = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0))
+    moved = dataclasses.replace(state, roots=state.roots.at[..., 2, 3].set(4.0))
+    make(JointReprojection=each)
+    np.testing.assert_allclose(each.cost(moved), one.cost(moved), rtol=1e-12)
+    for a, b in zip(each.curvature(moved), one.curvature(moved), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    padded = g.pad_factor(each, moved, 2)
+    longer = g.extend_state(moved, 2)
+    np.testing.assert_allclose(padded.cost(longer), one.cost(moved), rtol=1e-12)
+    wrong = dataclasses.replace(keypoints, loss=g.GemanMcClure(ones(25)))
+    with pytest.raises(
+        ValueError, match=r"scale: shape \(25,\), expected one number, "
+    ):
+        make(JointReprojection=wrong)

@@ -104,7 +104,7 @@ def experiment(
     Args:
         name: Which one.
         out: Folder for tables and figures; finished rows are kept there.
-        preset: `paper` has the weights and the first-order schedule of the paper.
+        preset: `paper` has the paper's weights, motion network and first-order steps.
         settings: A config.yaml to start from; options beside it prevail.
         on: What it runs on.
         config: Settings of every stage.

@@ -36,7 +36,7 @@ def run(
         camera: camera.json, if not in the input.
         tracks: tracks.npz made elsewhere, if not in the input.
         masks: Folder of person masks, if not in the input.
-        preset: `paper` has the weights and the first-order schedule of the paper.
+        preset: `paper` has the paper's weights, motion network and first-order steps.
         settings: A config.yaml to start from, which prevails over a preset; options
             beside it prevail over both.
         config: Settings of every stage.
@@ -51,6 +51,7 @@ def run(
         tracks=tracks,
         masks=masks,
         config=config.association,
+        known=config,
     )
     result = pipeline.run_to_folder(sequence, out, config, first=_is_first())
     return _finish(result, out)
@@ -67,7 +68,7 @@ def demo(
 
     Args:
         out: Run folder to write.
-        preset: `paper` has the weights and the first-order schedule of the paper.
+        preset: `paper` has the paper's weights, motion network and first-order steps.
         settings: A config.yaml to start from, which prevails over a preset; options
             beside it prevail over both.
         config: Settings of every stage.

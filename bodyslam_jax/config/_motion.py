@@ -29,7 +29,8 @@ class MotionTraining:
     seed: int = 0
     """Initial weights and every random choice follow from it."""
     epochs: int = 80
-    """Each has as many windows as the data have 120 Hz starting points."""
+    """Each has as many windows as the data have: one for every 120 Hz starting point,
+    or as many as do not overlap."""
     validate_every: int = 1
     """Epochs from one look at the validation subjects to the next."""
     segments: int = 128
@@ -69,13 +70,19 @@ class MotionTraining:
     mirror: bool = True
     """Whether half of the segments are mirrored."""
     sliding: bool = True
-    """Whether windows may overlap; the paper's do not."""
+    """Whether windows may overlap; the paper's do not. Each is then drawn by itself:
+    successive windows of a segment (`steps`) share frames."""
 
     def __post_init__(self):
         ranges = dict.fromkeys(_SHARES.split(), SHARE)
         ranges |= dict.fromkeys(_MAY_BE_0.split(), NOT_NEGATIVE)
         # What a random key is made of.
         check(self, ranges | {"seed": (-(2**63), 2**63 - 1)})
+        if not self.sliding and self.steps > 1:
+            raise ValueError(
+                f"steps: found {self.steps}, expected 1 where windows may not overlap "
+                "(`sliding` false): those of a segment do."
+            )
 
     @staticmethod
     def paper() -> "MotionTraining":

@@ -5,22 +5,25 @@ from typing import Literal
 
 from bodyslam_jax.config._check import check
 from bodyslam_jax.config._front_end import Association, Detect, Structure, Tracking
+from bodyslam_jax.config._known import RANGES, Known
 from bodyslam_jax.config._people import PeopleFit
 from bodyslam_jax.config._weights import GraphWeights
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Known):
     """Settings of a whole run, one class per stage."""
 
     body_model: str | None = None
     """Body model file or folder; without it the default body or the one found."""
     motion_model: str | None = None
-    """Motion model's weights; without them the ones that ship."""
+    """Motion model's weights: a file, or `paper` for the paper's network, which ships
+    too; without it the default one."""
     people: bool = True
     """Whether people are estimated; if not, cameras and map stay without a unit."""
-    detect: bool = False
-    """Whether people's keypoints are looked for in the images, if none are given."""
+    detect: Literal["auto", "built-in", "yolox", "none"] = "auto"
+    """Which networks find people in the images where no keypoints are given: those that
+    ship (also `auto`), YOLOX and RTMPose, which are fetched once, or none."""
     offline: bool = False
     """Whether the network is never used: models must be there already."""
     overlay: bool = True
@@ -45,12 +48,17 @@ class Config:
     is smoothed without it."""
 
     def __post_init__(self):
-        check(self)
+        check(self, RANGES)
+        self.check_known()
 
     @classmethod
     def paper(cls) -> "Config":
-        """Weights and schedule of section 3.6 of the paper."""
+        """Section 3.6 of the paper: its weights, its motion network of section 3.4,
+        whose predictions are measurements that stay as they are, and its first-order
+        schedule. docs/differences_from_the_paper.md says what differs all the same."""
         return cls(
+            motion_model="paper",
+            motion_coupling="frozen",
             weights=GraphWeights.paper(),
             people_fit=PeopleFit(regressor_shape_gain=1.0),
             solver="adam",

@@ -16,10 +16,11 @@ class GraphWeights:
     taken for what they are. `GraphWeights.paper()` has the paper's λ's.
     """
 
-    pixel_sigma: float = 1.0
-    """Static points, px."""
+    pixel_sigma: float | None = None
+    """Static points in the joint graph, px. Without it, what bundle adjustment found
+    of the tracks at hand."""
     landmark_loss: float = 1.5
-    """Cauchy scale, in `pixel_sigma`."""
+    """Cauchy scale, in standard deviations of a static point."""
     keypoint_sigma: float | None = None
     """Keypoints of confidence 1, px; divided by the confidence. Without it, the
     detector's usual error in metres of the body, as it appears at its distance."""
@@ -28,8 +29,9 @@ class GraphWeights:
     rate. Errors last for about 0.15 s: taken for independent, keypoints stretch the
     body by some per cent."""
     keypoint_loss: float = 4.0
-    """Geman-McClure scale, in standard deviations of one keypoint, before the inflation
-    (Bogo et al.: 100 px)."""
+    """Geman-McClure scale, in standard deviations of one keypoint, before the
+    inflation. With `keypoint_sigma` in those of a keypoint of confidence 1, for all
+    keypoints: the same distance in px, as in Bogo et al. (100 px)."""
     motion_inflation: float = 1.0
     """Factor on the motion model's own standard deviation, 1."""
     step_error: float = 0.05
@@ -40,6 +42,9 @@ class GraphWeights:
     swing towards it, and steps come out short."""
     motion_sigma: float | None = None
     """Instead of the motion model's own covariance, m a frame."""
+    motion_in_legs: bool = True
+    """Whether displacements are compared in lengths of the person's leg. In metres a
+    smaller person in a smaller world has smaller errors, and the estimate shrinks."""
     motion_correlation: float = 0.8
     """Of the motion model's errors in successive frames."""
     posture_sigma: float = 0.2
@@ -50,7 +55,8 @@ class GraphWeights:
     whole video, and what changes lasts for seconds. Published errors of joints, 98 mm
     and 19.9 m/s² (HMR2 on EMDB), go with 0.987."""
     posture_predicted: bool = False
-    """Whether postures are held to the motion model's prediction instead."""
+    """Whether postures are held to the motion model's prediction instead, in frames
+    that have one."""
     shape_sigma: float = 0.4
     """Regressed β; one measurement a person, as the regressor errs alike in all. Where
     bodies are fitted to keypoints it holds β to the fit, and errors are those of 1."""
@@ -95,6 +101,7 @@ class GraphWeights:
         free = ("step_error", "fitted_step_error")
         # Deviations say nothing then; losses, factors and shares would be no numbers.
         never = ("correlation", "inflation", "loss", "error", "each", "predicted")
+        never += ("legs",)
         silent = [x for x in vars(self) if not any(word in x for word in never)]
         check(self, ranges | dict.fromkeys(free, NOT_NEGATIVE), infinite=silent)
 
@@ -102,8 +109,9 @@ class GraphWeights:
     def paper(cls) -> "GraphWeights":
         """λ_lm = 64/b² with b = 2.25 px, λ_mm = 100, λ_posture = λ_shape = 1.
 
-        Its joint weight is read as confidence squared (SMPLify), in px^-2; the scale
-        of its Cauchy loss is not stated.
+        Its joint weight is read as confidence squared (SMPLify), in px^-2, outside the
+        robust loss; the scale of its Cauchy loss is not stated, and is that of OKVIS,
+        whose λ_lm it has. What else differs: docs/differences_from_the_paper.md.
         """
         return cls(
             pixel_sigma=2.25 / 8,
@@ -113,6 +121,7 @@ class GraphWeights:
             step_error=0.0,
             fitted_step_error=0.0,
             motion_sigma=0.1,
+            motion_in_legs=False,
             motion_correlation=0.0,
             posture_sigma=1.0,
             posture_correlation=0.0,

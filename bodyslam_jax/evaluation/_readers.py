@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, joints
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation._association import brackets, interpolate_poses
+from bodyslam_jax.frontend import read_tum as read_tum
 from bodyslam_jax.result import Result
 
 log = logging.getLogger(__name__)
@@ -125,49 +125,6 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
         present=stack("present", len(times)).astype(bool),
         summary={"input": str(path), "has_camera": camera is not None},
     )
-
-
-def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
-    """Timestamps (s) and poses (camera to world, m) of a TUM trajectory, sorted.
-
-    A line is `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
-
-    **Raises:** `ValueError` naming the file, what was found and what was expected.
-    """
-    rows = []
-    try:
-        lines = path.read_text().splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: a binary file, not a TUM trajectory.") from None
-    for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != 8 or not np.all(np.isfinite(row)):
-            raise ValueError(
-                f"{path}, line {number}: {line.strip()[:60]!r}, not eight numbers "
-                "`timestamp tx ty tz qx qy qz qw`."
-            )
-        rows.append(row)
-    if not rows:
-        raise ValueError(f"{path}: no pose in it; expected TUM lines of eight numbers.")
-    table = np.array(rows)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    if np.any(np.diff(table[:, 0]) <= 0):
-        raise ValueError(f"{path}: two poses have the same timestamp.")
-    length = np.linalg.norm(table[:, 4:], axis=1)
-    if np.any(abs(length - 1) > 0.05):
-        worst = float(length[np.argmax(abs(length - 1))])
-        raise ValueError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
-    T_WC = np.tile(np.eye(4), (len(table), 1, 1))
-    wxyz = table[:, [7, 4, 5, 6]] / length[:, None]
-    T_WC[:, :3, :3] = np.asarray(jaxlie.SO3(jnp.asarray(wxyz)).as_matrix())
-    T_WC[:, :3, 3] = table[:, 1:4]
-    return table[:, 0], T_WC
 
 
 def _timeline(

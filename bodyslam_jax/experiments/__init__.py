@@ -5,6 +5,7 @@
 
 from bodyslam_jax.config import Experiment as Experiment
 from bodyslam_jax.experiments._ablation import ablate as ablate
+from bodyslam_jax.experiments._ablation import as_published as as_published
 from bodyslam_jax.experiments._ablation import compare_orders as compare_orders
 from bodyslam_jax.experiments._ablation import with_motion_model as with_motion_model
 from bodyslam_jax.experiments._ablation import with_weights as with_weights

@@ -9,6 +9,7 @@ import jax
 from bodyslam_jax import graph, joint, motion, solver
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments._case import Case
+from bodyslam_jax.experiments._score import NAMES
 from bodyslam_jax.experiments._variants import FULL, VARIANTS
 
 INDEPENDENT = {
@@ -23,6 +24,8 @@ SETTINGS: dict[str, GraphWeights] = {
     "the paper's weights": GraphWeights.paper(),
 }
 """Other weights, solved from the start that they give."""
+PUBLISHED = "as published"
+"""The paper's weights, its motion network and its first-order schedule together."""
 ORDERS = ("second order", "first order, as long", "first order, 200 + 100 steps")
 _TRIAL = 20
 """Steps from which the time of one is known."""
@@ -52,6 +55,22 @@ def with_weights(case: Case, weights: GraphWeights) -> dict[str, float | str]:
 def with_motion_model(case: Case, file: str) -> dict[str, float | str]:
     """Errors with another motion model, such as one that sees fewer past frames."""
     config = dataclasses.replace(case.config, motion_model=file)
+    return _past(config) | _solved(case, case.prepare(config), config)
+
+
+def as_published(case: Case) -> dict[str, float | str]:
+    """Errors with the paper's weights, network and schedule, m; NaN where that network
+    does not know the body.
+
+    Cameras, map and regressed bodies are those that all methods begin with.
+    """
+    paper = Config.paper()
+    names = ("weights", "motion_model", "motion_coupling", "solver")
+    config = dataclasses.replace(case.config, **{n: getattr(paper, n) for n in names})
+    model = motion.load_motion_model(config.motion_model)
+    if model.body != case.body.kind:
+        missing = dict.fromkeys(NAMES, float("nan"))
+        return {**missing, "status": f"no network of the paper for {case.body.kind}"}
     return _past(config) | _solved(case, case.prepare(config), config)
 
 

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import evaluation, graph, people
+from bodyslam_jax.experiments._ablation import as_published
 from bodyslam_jax.experiments._case import Case
 from bodyslam_jax.experiments._problems import with_scale, without_map
-from bodyslam_jax.experiments._score import trajectories
+from bodyslam_jax.experiments._score import NAMES, trajectories
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.joint import solve_stage
 
@@ -18,6 +19,7 @@ METHODS = {
     "start": "scale in closed form from motion and ground, same people",
     "scale_only": "cameras held, s and people optimised, no landmarks",
     "per_frame": "the regressor's bodies in the cameras of the full estimate",
+    "published": "as published: the paper's weights, network and first-order steps",
     "full": "the full estimate",
 }
 """What is compared, from the same tracks, keypoints and regressed bodies."""
@@ -69,6 +71,8 @@ def compare_methods(case: Case) -> dict[str, Any]:
     for name, state in states.items():
         found = case.score(state, prepared.roots.present)
         row |= {f"{name}/{key}": value for key, value in found.items()}
+    published = as_published(case)
+    row |= {f"published/{name}": published[name] for name in NAMES}
     row["scale_ratio"] = 1 / float(row["full/scale"])
     drawn = {name: states[name] for name in ("no_mm", "full")}
     return row | {"paths": _paths(case, drawn, prepared.roots.present)}

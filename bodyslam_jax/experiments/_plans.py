@@ -40,7 +40,7 @@ def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ALL,
         ("room", "follow"),
         compare_methods,
-        (2.0, 4.0),
+        (3.0, 6.0),
         FORM,
     )
     return Plan(jobs, functools.partial(write_table1, about=about(experiment, config)))
@@ -135,6 +135,7 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         for label, weights in _ablation.SETTINGS.items():
             one = lambda s=s, w=weights: _ablation.with_weights(case(s), w)
             add(s, label, one, extra=(weights,))
+        add(s, _ablation.PUBLISHED, lambda s=s: _ablation.as_published(case(s)))
         for file in experiment.motion_models:
             one = lambda s=s, f=file: _ablation.with_motion_model(case(s), f)
             add(s, f"motion model {Path(file).stem}", one, extra=(Path(file),))

@@ -101,9 +101,12 @@ def beside(
 
 def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     motion = problem.motion
-    if motion is None:
-        raise ValueError("the problem has no people; expected a moving person.")
-    return motion.body, motion.present
+    if motion is not None:
+        return motion.body, motion.present
+    for factor in problem.factors:  # where predictions stay as they are
+        if isinstance(factor, graph.JointReprojection):
+            return factor.body, jnp.isfinite(factor.sigma).any(axis=-1)
+    raise ValueError("the problem has no people; expected a moving person.")
 
 
 FULL = "full"

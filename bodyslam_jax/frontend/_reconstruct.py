@@ -20,9 +20,13 @@ from bodyslam_jax.frontend._camera_motion import (
 from bodyslam_jax.frontend._mapper import Growing, Refine
 from bodyslam_jax.frontend._revisits import told_by_others
 from bodyslam_jax.frontend._structure import Builder, build_map
-from bodyslam_jax.sequence import Intrinsics, Tracks
+from bodyslam_jax.sequence import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
+
+_EXPLAINED, _TESTED = 0.3, 200
+"""Share of the observations that a known camera path must explain, and how many there
+must be to tell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +54,8 @@ class Reconstruction:
     px² per squared unit of the map: to be divided by the variance of a pixel."""
     error: float
     """Median reprojection error of the inliers, px."""
+    unit: float = 1.0
+    """The map's unit in that of a camera path that was known."""
     warnings: tuple[str, ...] = ()
 
 
@@ -59,6 +65,9 @@ def reconstruct(
     num_frames: int,
     config: Structure = Structure(),
     refine: Refine | None = None,
+    *,
+    path: CameraPath | None = None,
+    static: bool = False,
 ) -> Reconstruction:
     """Structure from motion that says what kind of motion there was.
 
@@ -68,6 +77,10 @@ def reconstruct(
     Args:
         refine: adjusts cameras and points in place, in the stead of the built-in bundle
             adjustment while the reconstruction grows.
+        path: camera poses that are known: points are triangulated from them.
+        static: whether the camera is known not to move.
+
+    **Raises:** `ValueError` if the points do not fit a path that is known.
     """
     K, distortion = as_opencv(intrinsics.params)
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
@@ -83,6 +96,10 @@ def reconstruct(
         focal,
     )
 
+    if path is not None:
+        return _along(problem, path, config, refine)
+    if static:
+        return _fixed(problem, np.ones(len(views.frame), bool), "static", None, ())
     first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
@@ -111,9 +128,9 @@ def reconstruct(
         inlier = np.zeros(len(tracks.frame), dtype=bool)
         inlier[within] = grown.inlier
         found = _moving(problem, grown, inlier, (first, last), warnings)
-        path = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
+        extent = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
         # A wrong focal length makes even a turning camera seem to move a little.
-        if away > 6 or path > config.min_baseline:
+        if away > 6 or extent > config.min_baseline:
             return found
     elif away > 6:
         text = "no pair of frames has enough parallax to start a map."
@@ -133,6 +150,45 @@ class _Problem:
     num_frames: int
     num_landmarks: int
     focal: float
+
+
+def _along(
+    problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
+) -> Reconstruction:
+    """The map of a camera whose path is known, and the frames that the path lacks.
+
+    **Raises:** `ValueError` if most points fit no place in the scene.
+    """
+    size = (problem.num_frames, problem.num_landmarks)
+    builder = Builder(problem.views, *size, problem.focal, config, refine)
+    grown = builder.begin(path)
+    builder.complete(grown, np.arange(problem.num_frames))
+    share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
+    if tested < _TESTED or share >= _EXPLAINED:
+        return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
+    shot = problem.views
+    motion = config.keyframe_motion * max(
+        problem.intrinsics.width, problem.intrinsics.height
+    )
+    keyframes = choose_keyframes(
+        shot,
+        int(shot.frame.min()),
+        int(shot.frame.max()),
+        motion / problem.focal,
+        config.min_shared,
+    )
+    pairs = rotation_error(shot, keyframes, 1 / problem.focal)
+    if _turning_error(pairs) * problem.focal < config.rotation_error:
+        text = (
+            "the images show no parallax along the given path: the camera only turns."
+        )
+        every = np.ones(len(shot.frame), bool)
+        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
+    raise ValueError(
+        f"camera path: {100 * share:.0f} % of the points in the images fit it, "
+        f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
+        "world to camera, with other axes, or another focal length?"
+    )
 
 
 def _longest_shot(
@@ -199,6 +255,7 @@ def _moving(
         inlier,
         warnings,
         elsewhere=elsewhere,
+        unit=unit,
     )
 
 
@@ -250,6 +307,7 @@ def _pack(
     warnings: tuple[str, ...],
     *,
     elsewhere: np.ndarray | None = None,
+    unit: float = 1.0,
 ) -> Reconstruction:
     """`which`: the track that each landmark is of; the landmark of each inlier."""
     ids, landmark = which
@@ -270,6 +328,7 @@ def _pack(
         landmark_ids=ids,
         elsewhere=np.zeros((len(ids), 3, 3)) if elsewhere is None else elsewhere,
         error=error,
+        unit=unit,
         warnings=warnings,
     )
 

@@ -5,17 +5,33 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from bodyslam_jax.config import Association
+from bodyslam_jax.config import Association, Known
+from bodyslam_jax.frontend._aspect import aspect_warnings, at_size_of
 from bodyslam_jax.frontend._association import associate
 from bodyslam_jax.frontend._bodies import read_bodies
-from bodyslam_jax.frontend._calibration import guess_camera, read_camera
+from bodyslam_jax.frontend._calibration import guess_camera, read_camera, with_focal
+from bodyslam_jax.frontend._camera_path import read_camera_path
 from bodyslam_jax.frontend._given_tracks import read_tracks
 from bodyslam_jax.frontend._keypoints import Detections, read_detections
 from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
-from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
-from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
+from bodyslam_jax.frontend._video import (
+    VIDEO_SUFFIXES,
+    Footage,
+    at_rate,
+    list_images,
+    look_at,
+)
+from bodyslam_jax.sequence import (
+    Bodies,
+    Intrinsics,
+    Keypoints,
+    Seen,
+    Sequence,
+    Tracks,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +63,7 @@ def read_sequence(
     tracks: str | Path | None = None,
     masks: str | Path | None = None,
     config: Association = Association(),
+    known: Known = Known(),
 ) -> Sequence:
     """Reads a sequence folder, a video file or a folder of images.
 
@@ -58,6 +75,8 @@ def read_sequence(
         camera: `camera.json`; without one the intrinsics are guessed.
         tracks: point tracks, `.npz`; without them they come from the images.
         masks: folder of person masks, one image per frame.
+        known: what a user knows: focal length, camera path, frame rate, where to begin
+            and to end.
 
     **Raises:** `ValueError`, one line that names the file, what was found and what was
     expected; nothing that is not finite and in range gets past here.
@@ -73,28 +92,70 @@ def read_sequence(
     parts = dataclasses.replace(_find_parts(Path(path)), **chosen)
     if parts.footage is None and parts.tracks is None:
         raise ValueError(f"{path}: no video.mp4, images/ or tracks.npz.")
-    return _read_parts(Path(path), parts, config)
+    return _read_parts(Path(path), parts, config, known)
 
 
 def with_detections(
-    sequence: Sequence, detections: Detections, config: Association = Association()
+    sequence: Sequence,
+    detections: Detections,
+    config: Association = Association(),
+    *,
+    person: list[np.ndarray] | None = None,
+    seen: Seen | None = None,
 ) -> Sequence:
     """The sequence with people made of what a detector found in each of its frames.
 
-    **Raises:** `ValueError` if nobody was found in any frame.
+    Where bodies are given, they say who is estimated: keypoints of others only keep
+    them out of the map.
+
+    Args:
+        person: for each frame who each detection is, where the detector says so.
+        seen: everybody, also whom `detections` leaves out; by default who is in it.
     """
+    seen = seen or _seen(detections)
+    sequence = dataclasses.replace(sequence, seen=seen)
     if not any(len(found) for found in detections):
-        raise ValueError(f"{sequence.name}: no person detected in any frame.")
-    people, warnings = associate(detections, config, sequence.fps)
+        text = "nobody was found in the images"
+        if sequence.bodies is None:
+            text += ": cameras and map only, and these without a unit"
+        return _warned(sequence, (f"{text}.",))
+    people, warnings = associate(detections, config, sequence.fps, person)
     bodies = sequence.bodies
     if bodies is not None:
+        count = len(bodies.present)
         people, bodies = pair(people, bodies, sequence.intrinsics)
-    return dataclasses.replace(
-        sequence,
-        keypoints=people,
-        bodies=bodies,
-        warnings=(*sequence.warnings, *warnings),
+        people, bodies, others = _with_body(people, bodies)
+        if others:
+            warnings = (*warnings, _OTHERS.format(others, count))
+    sequence = dataclasses.replace(sequence, keypoints=people, bodies=bodies)
+    return _warned(sequence, warnings)
+
+
+_OTHERS = "{} more people were found than the {} whose bodies are given: not estimated."
+
+
+def _warned(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
+    return dataclasses.replace(sequence, warnings=(*sequence.warnings, *warnings))
+
+
+def _seen(detections: Detections) -> Seen:
+    count = [len(found) for found in detections]
+    points = np.concatenate([np.zeros((0, 25, 3)), *detections])
+    return Seen(np.repeat(np.arange(len(count)), count), points)
+
+
+def _with_body(people: Keypoints, bodies: Bodies) -> tuple[Keypoints, Bodies, int]:
+    """Only people with a body, in the order of `pair`, and how many had none."""
+    kept = bodies.present.any(axis=1)
+    if not kept.any():
+        return people, bodies, 0
+    cut = dataclasses.replace(
+        bodies,
+        **{
+            n: getattr(bodies, n)[kept] for n in ("present", "poses", "shapes", "trans")
+        },
     )
+    return Keypoints(people.uv[kept], people.confidence[kept]), cut, int((~kept).sum())
 
 
 def _find_parts(path: Path) -> _Parts:
@@ -126,28 +187,47 @@ def _find_parts(path: Path) -> _Parts:
     )
 
 
-def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
-    known = read_camera(parts.camera) if parts.camera else None
-    fps = known[1] if known else None
-    footage = look_at(parts.footage, fps) if parts.footage else None
+def _read_parts(
+    path: Path, parts: _Parts, config: Association, known: Known
+) -> Sequence:
+    footage, calibrated = None, None
+    if parts.footage and not parts.footage.is_dir():
+        footage = look_at(parts.footage)
+        footage = at_rate(footage, known.fps) if known.fps else footage
+    if parts.camera:
+        size = (footage.width, footage.height) if footage else None
+        calibrated = read_camera(parts.camera, size)
+    fps = known.fps or (calibrated[1] if calibrated else None)
+    if parts.footage and footage is None:
+        footage = look_at(parts.footage, fps)
     warnings = list(footage.warnings) if footage else []
     images: tuple[str, ...] = ()
     if footage and footage.path.is_dir():
         images = tuple(p.name for p in list_images(footage.path))
         gap = gap_among(images)
         warnings += [gap] if gap else []
-    if known:
-        intrinsics = known[0]
+    if calibrated:
+        intrinsics = calibrated[0]
         if footage:
-            warnings += _check_camera(parts, intrinsics, fps, footage)
+            intrinsics = at_size_of(intrinsics, footage)
+            rate = None if known.fps else fps
+            warnings += _check_camera(parts, intrinsics, rate, footage)
+            warnings += aspect_warnings(intrinsics, footage)
     elif footage:
         first = footage.path / images[0] if images else None
-        intrinsics = guess_camera(footage.width, footage.height, first)
-        warnings.append(
-            f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px."
+        intrinsics = guess_camera(
+            footage.width, footage.height, first, footage.pixel_aspect
         )
+        warnings += aspect_warnings(intrinsics, footage)
+        if known.focal is None and known.fov is None:
+            warnings.append(
+                f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px."
+            )
     else:
         raise ValueError(f"{path}: tracks without a video need a camera.json.")
+    focal = known.focal_length(intrinsics.width)
+    if focal is not None:
+        intrinsics = with_focal(intrinsics, *focal)
     size = (intrinsics.width, intrinsics.height)
 
     found_tracks = None
@@ -172,7 +252,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
             "the motion model, of 30, has to take them to."
         )
 
-    people = None
+    people, seen = None, None
     if parts.keypoints:
         detected = read_detections(
             parts.keypoints,
@@ -184,6 +264,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         )
         people, more = associate(detected.points, config, rate, detected.person)
         warnings += more
+        seen = _seen(detected.points)
     regressed = None
     if parts.bodies:
         regressed = read_bodies(
@@ -200,8 +281,22 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
             people, regressed = pair(people, regressed, intrinsics)
     if parts.masks:
         _check_masks(parts.masks, num_frames)
+    path_ = None
+    if known.camera_path is not None:
+        times = stamps if picks is None else _times_of_all(stamps, picks, num_frames)
+        path_ = read_camera_path(
+            Path(known.camera_path),
+            timestamps=times,
+            metric=known.camera_path_metric,
+            images=images,
+            warn=warnings.append,
+        )
     for text in warnings:
         _log.warning("%s: %s", parts.name, text)
+    chosen = _between(parts.name, stamps, known)
+    if chosen is not None:
+        stamps = stamps[chosen]
+        picks = chosen if picks is None else picks[chosen]
     sequence = Sequence(
         name=parts.name,
         frames=parts.footage,
@@ -212,9 +307,31 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         tracks=found_tracks,
         masks=parts.masks,
         groundtruth=parts.groundtruth,
+        camera_path=path_,
+        seen=seen,
         warnings=tuple(warnings),
     )
     return sequence if picks is None else _thinned(sequence, picks)
+
+
+def _between(
+    name: str, stamps: Float[np.ndarray, " t"], known: Known
+) -> Int[np.ndarray, " k"] | None:
+    """Which of the frames at `stamps` (s) are asked for; `None` for all.
+
+    **Raises:** `ValueError` if there are none.
+    """
+    if known.start is None and known.end is None:
+        return None
+    start = 0.0 if known.start is None else known.start
+    end = np.inf if known.end is None else known.end
+    (chosen,) = np.nonzero((stamps >= start - 1e-6) & (stamps <= end + 1e-6))
+    if not len(chosen):
+        raise ValueError(
+            f"{name}: no frame between {start:g} and {end:g} s, the video is "
+            f"{stamps[-1]:.2f} s long."
+        )
+    return chosen
 
 
 def _count_frames(
@@ -265,18 +382,27 @@ def _thinned(sequence: Sequence, picks: np.ndarray) -> Sequence:
             bundle, **{k: v[:, picks] for k, v in arrays.items()}
         )
 
+    path = sequence.camera_path
+    if path is not None:
+        path = dataclasses.replace(path, T_WC=path.T_WC[picks], known=path.known[picks])
     tracks = sequence.tracks
     if tracks is not None:
         kept = np.isin(tracks.frame, picks)
         _, landmark = np.unique(tracks.landmark[kept], return_inverse=True)
         frame = np.searchsorted(picks, tracks.frame[kept])
         tracks = Tracks(frame, landmark.astype(np.int64), tracks.uv[kept])
+    seen = sequence.seen
+    if seen is not None:
+        kept = np.isin(seen.frame, picks)
+        seen = Seen(np.searchsorted(picks, seen.frame[kept]), seen.points[kept])
     return dataclasses.replace(
         sequence,
         keypoints=cut(sequence.keypoints),
         bodies=cut(sequence.bodies),
         tracks=tracks,
+        seen=seen,
         picks=picks,
+        camera_path=path,
     )
 
 

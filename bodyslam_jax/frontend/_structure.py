@@ -13,6 +13,7 @@ import numpy as np
 from bodyslam_jax.frontend._bundle import Scene
 from bodyslam_jax.frontend._geometry import relative_pose, resect
 from bodyslam_jax.frontend._mapper import Growing, Mapper
+from bodyslam_jax.sequence import CameraPath
 
 _log = logging.getLogger(__name__)
 
@@ -92,6 +93,26 @@ class Builder(Mapper):
     """Frame that the map grew from."""
     thin: dict[int, int]
     """Keyframes that were located by few points, and by how many."""
+
+    def begin(self, path: CameraPath) -> Growing:
+        """The map that cameras at known places see; they stay where they are."""
+        R_WC, centre = path.T_WC[:, :3, :3], path.T_WC[:, :3, 3]
+        scene = Scene(
+            np.swapaxes(R_WC, 1, 2).copy(),
+            centre.copy(),
+            np.zeros((self.num_landmarks, 3)),
+        )
+        grown = Growing(
+            scene,
+            path.known.copy(),
+            np.zeros(self.num_landmarks, dtype=bool),
+            np.zeros(len(self.views.frame), dtype=bool),
+            np.arange(self.num_landmarks),
+        )
+        self.thin = {}
+        self._triangulate(grown, self._views_of(grown))
+        self._mark(grown)
+        return grown
 
     def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> Growing | None:
         """The best of the reconstructions that grow from `pairs` of keyframes.
@@ -250,8 +271,12 @@ class Builder(Mapper):
 
     def score(self, grown: Growing, frames: np.ndarray) -> float:
         """Part of the observations in `frames` that the reconstruction explains."""
+        return self.share_explained(grown, frames)[0]
+
+    def share_explained(self, grown: Growing, frames: np.ndarray) -> tuple[float, int]:
+        """The same, and how many observations could be explained."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.
         seen = np.bincount(self.views.landmark[at], minlength=self.num_landmarks)
         at = at[seen[self.views.landmark[at]] >= 2]
-        return float(grown.inlier[at].mean()) if len(at) else 0.0
+        return (float(grown.inlier[at].mean()) if len(at) else 0.0), len(at)

@@ -7,12 +7,14 @@ RANSAC over a gap removes what does not move with the scene; people are masked o
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from bodyslam_jax.config import Tracking
+from bodyslam_jax.frontend._burnt_in import still_limit
 from bodyslam_jax.frontend._calibration import as_opencv, rays
 from bodyslam_jax.frontend._features import epipolar_inliers, make_brisk, match, spread
 from bodyslam_jax.frontend._person_mask import person_masks
@@ -24,18 +26,29 @@ _REFILL_GAP = 3
 _KEYFRAME_STEP = 12
 """Frames between two that are remembered."""
 _NUM_KEYFRAMES = 12
+_FEWEST_MOVING = 15
+_TIMES_STILL = 4.0
+"""Displacement of a point that moves, of that of one that may be still."""
 _LEAST_CONTRAST = 6
 """BRISK's threshold in the flattest image, grey levels."""
 
 
-def track(
+Mask = UInt8[np.ndarray, "y x"]
+
+
+def follow(
     sequence: Sequence,
-    config: Tracking = Tracking(),
+    config: Tracking,
+    *,
+    hidden: Iterable[Mask] | None = None,
+    look: Callable[[Mask], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracks:
-    """Follows static points through the images of a sequence.
+    """Follows points through the images of a sequence, once.
 
     Args:
+        hidden: a mask (255) for each frame of what is looked at no more than people.
+        look: called with each gray image.
         progress: called with the number of frames done and their total.
 
     **Raises:** `ValueError` if images cannot be read or OpenCV lacks BRISK.
@@ -43,9 +56,16 @@ def track(
     tracker = _Tracker(sequence, config)
     images = frames(sequence, gray=True)
     masks = person_masks(sequence, config.person_margin)
+    if hidden is not None:
+        masks = (
+            other if mask is None else cv2.bitwise_or(mask, other)
+            for mask, other in zip(masks, hidden, strict=False)
+        )
     total = sequence.num_frames
     for k, (image, mask) in enumerate(zip(images, masks, strict=False)):
         tracker.advance(k, image, mask)
+        if look is not None:
+            look(image)
         if progress is not None:
             progress(k + 1, total)
     return tracker.tracks()
@@ -181,6 +201,13 @@ class _Tracker:
             return
         ids, uv = self.recent[0]
         _, now, then = np.intersect1d(live.ids, ids, return_indices=True)
+        # What stays at its pixel fits every essential matrix without rotation: if it is
+        # burnt into the image, what moves would be dropped in its stead.
+        moved = np.linalg.norm(live.uv[now] - uv[then], axis=-1)
+        moving = moved > _TIMES_STILL * still_limit(self.size)
+        if _FEWEST_MOVING < moving.sum() < 0.9 * len(moving):
+            still = moved < still_limit(self.size)
+            now, then = now[~still], then[~still]
         inlier = epipolar_inliers(
             self._normalise(uv[then]),
             self._normalise(live.uv[now]),

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from bodyslam_jax.frontend._repeats import Repeats, repeats_warning, without_repeats
 from bodyslam_jax.sequence import Sequence
 
 _log = logging.getLogger(__name__)
@@ -19,6 +20,10 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 _LEAST_SIDE = 16
 """px; BRISK's pyramid fails below 6; so small images have nothing to follow."""
+_ODD = 0.2
+"""Width of a pixel over its height below which, or above whose inverse, it is a
+mistake."""
+_QUARTER, _LARGE = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
 _MAX_JITTER = 0.25
 """Spread of frame intervals, relative to their median, that is still a fixed rate."""
 
@@ -37,6 +42,8 @@ class Footage:
     """Frames in the file, of which some may be left out."""
     picks: Int[np.ndarray, " t"] | None = None
     """Which of them are used, in order; all without it."""
+    pixel_aspect: float = 1.0
+    """Width of a pixel over its height, as the file says; 1 if it does not."""
 
 
 def look_at(path: Path, fps: float | None = None) -> Footage:
@@ -127,17 +134,50 @@ def _look_at_video(path: Path) -> Footage:
             raise ValueError(f"{path}: a video without a readable frame.")
         nominal = float(capture.get(cv2.CAP_PROP_FPS))
         announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        aspect = _pixel_aspect(capture)
         times = [float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000]
+        repeats = Repeats()
+        repeats.look(image)
         while capture.grab():
             times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000)
+            ok, next_image = capture.retrieve()
+            repeats.look(next_image if ok else None)
     finally:
         capture.release()
-    stamps, picks, warnings = resampled(path, np.asarray(times), nominal)
+    stamps, picks, warnings = _timed(path, np.asarray(times), nominal, repeats)
     # One frame more or less is what containers get wrong; more is a damaged file.
     if announced > len(times) + max(2, 0.02 * announced):
         warnings += (f"{path.name}: {announced} frames announced, {len(times)} read.",)
     size = (image.shape[1], image.shape[0])
-    return Footage(path, stamps, *size, warnings, len(times), picks)
+    return Footage(path, stamps, *size, warnings, len(times), picks, aspect)
+
+
+def _pixel_aspect(capture: cv2.VideoCapture) -> float:
+    """Width of a pixel over its height, of the images as they are read."""
+    across, along = (
+        capture.get(p) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)
+    )
+    if not (across > 0 and along > 0 and _ODD < across / along < 1 / _ODD):
+        return 1.0
+    turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
+    return along / across if turned else across / along
+
+
+def _timed(
+    path: Path, times: Float[np.ndarray, " n"], nominal: float, repeats: Repeats
+) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
+    """`resampled`, of the frames alone that do not repeat the one before."""
+    again = repeats.repeated()
+    if not again.any():
+        return resampled(path, times, nominal)
+    step = np.diff(times)
+    if not np.isfinite(times).all() or (step <= 0).any():
+        times, _, warnings = resampled(path, times, nominal)
+    else:
+        times, warnings = times - times[0], ()
+    stamps, picks = without_repeats(times, again)
+    fps = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else nominal
+    return stamps, picks, (*warnings, repeats_warning(path.name, again, fps))
 
 
 def resampled(
@@ -173,6 +213,13 @@ def resampled(
     return times[picks], picks, (text,)
 
 
+def at_rate(footage: Footage, fps: float) -> Footage:
+    """All frames of a video file, one every 1/`fps` s, whatever the file says."""
+    times = np.arange(footage.num_read) / fps
+    kept = tuple(w for w in footage.warnings if "announced" in w)
+    return dataclasses.replace(footage, timestamps=times, picks=None, warnings=kept)
+
+
 def _look_at_images(folder: Path, fps: float | None) -> Footage:
     images = list_images(folder)
     if not images:
@@ -183,7 +230,16 @@ def _look_at_images(folder: Path, fps: float | None) -> Footage:
         fps = 30.0
         warnings = (f"{folder.name}: frame rate not given, 30 frames/s assumed.",)
     times = np.arange(len(images)) / fps
-    return Footage(folder, times, width, height, warnings, len(images))
+    repeats = Repeats()
+    for path in images:
+        data = np.fromfile(path, dtype=np.uint8)
+        # A quarter of the size is decoded in a fraction of the time.
+        flag = _QUARTER if max(width, height) > _LARGE else cv2.IMREAD_GRAYSCALE
+        repeats.look(cv2.imdecode(data, flag) if data.size else None)
+    stamps, picks, more = _timed(folder, times, fps, repeats)
+    return Footage(
+        folder, stamps, width, height, (*warnings, *more), len(images), picks
+    )
 
 
 def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:

@@ -10,6 +10,7 @@ from bodyslam_jax.graph._abstract import residual_of as residual_of
 from bodyslam_jax.graph._camera_priors import CameraPrior as CameraPrior
 from bodyslam_jax.graph._camera_priors import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph._camera_priors import IntrinsicsPrior as IntrinsicsPrior
+from bodyslam_jax.graph._camera_priors import ScalePrior as ScalePrior
 from bodyslam_jax.graph._camera_priors import SquarePixels as SquarePixels
 from bodyslam_jax.graph._check import check_state as check_state
 from bodyslam_jax.graph._displacement import displacement as displacement
@@ -21,8 +22,13 @@ from bodyslam_jax.graph._layout import Layout as Layout
 from bodyslam_jax.graph._layout import make_layout as make_layout
 from bodyslam_jax.graph._layout import round_up as round_up
 from bodyslam_jax.graph._ordering import CHUNK as CHUNK
+from bodyslam_jax.graph._padding import Masked as Masked
+from bodyslam_jax.graph._padding import extend as extend
+from bodyslam_jax.graph._padding import extend_state as extend_state
+from bodyslam_jax.graph._padding import pad_factor as pad_factor
 from bodyslam_jax.graph._posture import Posture as Posture
 from bodyslam_jax.graph._posture import Shape as Shape
+from bodyslam_jax.graph._posture import Stature as Stature
 from bodyslam_jax.graph._posture import rotation_between as rotation_between
 from bodyslam_jax.graph._problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph._problem import MotionPredictor as MotionPredictor

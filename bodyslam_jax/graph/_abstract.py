@@ -8,12 +8,13 @@ Jacobian) follows from that.
 """
 
 import abc
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.graph._robust import AbstractLoss, squared_norm
 from bodyslam_jax.graph._state import State
@@ -71,6 +72,11 @@ class AbstractFrameFactor(AbstractFactor):
     of_people: eqx.AbstractClassVar[bool]
     frame_fields: eqx.AbstractClassVar[tuple[str, ...]]
     """Fields with leading axes `h t` (or `t`): what is padded to a common length."""
+    padding: ClassVar[Mapping[str, float] | None] = None
+    """The value of a field of `frame_fields` with which a frame weighs nothing, such as
+    `{"sigma": jnp.inf}`; other fields repeat their last frame. The solver adds frames,
+    so that videos of about the same length share a program. Without it, residuals of
+    added frames are masked, whatever fields are called (`Masked`)."""
     per_joint = False
     """Whether row j of the residual depends on joint j of the touched poses alone."""
 
@@ -111,6 +117,10 @@ class AbstractFrameFactor(AbstractFactor):
     def num_lags(self) -> int:
         return 1 + max(lag for _, lag in self.touches)
 
+    def frame_of_row(self, num_frames: int) -> Int[Array, " t"]:
+        """The frame whose variables stand in each row of `map_frames`."""
+        return jnp.arange(num_frames)
+
     def map_frames(self, function, state: State, extra: Any = None):
         """`function(data, window, shared, extra)` over frames, and people if any.
 
@@ -119,7 +129,7 @@ class AbstractFrameFactor(AbstractFactor):
         """
 
         def back(x, lag):
-            return x[jnp.maximum(jnp.arange(x.shape[0]) - lag, 0)]
+            return x[jnp.maximum(self.frame_of_row(x.shape[0]) - lag, 0)]
 
         def one(data, extra, roots, poses, shape):
             windows = tuple(

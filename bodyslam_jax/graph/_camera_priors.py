@@ -19,6 +19,7 @@ class CameraPrior(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("cameras", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -34,11 +35,36 @@ class CameraPrior(AbstractFrameFactor):
         return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
 
 
+class ScalePrior(AbstractFrameFactor):
+    """A known size of the map, `(s - s̃) / σ`: of a camera path that is in metres."""
+
+    scale: Float[Array, " t"]
+    """s̃, m per unit of the map."""
+    sigma: Float[Array, " t"]
+    """m per unit of the map; finite in one frame, `inf` in all others."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ("scale", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("scale", 0),)
+
+    def data(self):
+        return self.scale, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        return (shared.scale - known)[None] / sigma
+
+
 class AbstractIntrinsicsFactor(AbstractFrameFactor):
     """A factor of the intrinsics alone: one for the whole video."""
 
     of_people = False
     frame_fields = ()
+    padding = {}  # its one row is no frame
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -66,17 +92,19 @@ class IntrinsicsPrior(AbstractIntrinsicsFactor):
 
 
 class SquarePixels(AbstractIntrinsicsFactor):
-    """One focal length for rows and columns, `(fx - fy) / σ`."""
+    """One focal length for rows and columns, `(fx - a fy) / σ`."""
 
     sigma: Float[Array, " 1"]
     """px"""
     loss: AbstractLoss = Squared()
+    ratio: float = eqx.field(static=True, default=1.0)
+    """a, the height of a pixel over its width: 1 for square pixels."""
 
     def data(self):
         return self.sigma
 
     def local(self, data, window, shared):
-        return (shared.intrinsics[:1] - shared.intrinsics[1:2]) / data
+        return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data
 
 
 class CameraSmoothness(AbstractFrameFactor):
@@ -92,6 +120,7 @@ class CameraSmoothness(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = False
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

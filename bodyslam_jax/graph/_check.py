@@ -75,6 +75,11 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
         raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     sizes = dict(sizes)
     check_loss(factor.loss, f"{name}.loss")
+    scale = np.shape(getattr(factor.loss, "scale", 0.0))
+    each = isinstance(factor, JointReprojection)
+    if scale and not (each and scale == factor.sigma.shape):
+        expected = f"one number, or {factor.sigma.shape}" if each else "one number"
+        raise ValueError(f"{name}.loss.scale: shape {scale}, expected {expected}.")
     if isinstance(factor, JointReprojection):
         if factor.layout not in KEYPOINT_NAMES:
             raise ValueError(
@@ -173,18 +178,25 @@ def _check_frames(factor, name, sizes):
 
 
 def _check_values(module, name):
+    padding = getattr(module, "padding", None) or {}
+    missing = [f".{field}" for field, value in padding.items() if np.isinf(value)]
     for path, leaf in jax.tree_util.tree_leaves_with_path(module):
         where = name + jax.tree_util.keystr(path)
         if is_traced(leaf) or not eqx.is_inexact_array_like(leaf):
             continue
         values = np.asarray(leaf)
-        if "sigma" in where:
+        if "sigma" in where or jax.tree_util.keystr(path) in missing:
             if not (values > 0).all():
                 raise ValueError(f"{where}: found {values.min()}, expected above 0.")
             continue
         if not np.isfinite(values).all():
             bad = int(np.sum(~np.isfinite(values)))
-            raise ValueError(f"{where}: {bad} of {values.size} values are not finite.")
+            text = f"{where}: {bad} of {values.size} values are not finite."
+            if np.isposinf(values[~np.isfinite(values)]).all() and path[0].name in (
+                getattr(module, "frame_fields", ())
+            ):
+                text += f" If inf is a missing one, say so: `padding` of {name}."
+            raise ValueError(text)
         if where.endswith(".correlation") and not (abs(values) < 1).all():
             far = values.flat[abs(values).argmax()]
             raise ValueError(f"{where}: found {far}, expected between -1 and 1.")

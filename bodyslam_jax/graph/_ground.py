@@ -38,6 +38,7 @@ class GroundContact(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

@@ -43,6 +43,7 @@ class HumanMotion(AbstractFrameFactor):
     body: BodyModel | None = None
     of_people = True
     frame_fields = ("translation", "whitening", "correlation")
+    padding = {"whitening": 0.0, "correlation": 0.0}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -112,6 +113,7 @@ class OrientationChange(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("rotation", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

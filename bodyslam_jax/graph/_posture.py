@@ -36,6 +36,7 @@ class Posture(AbstractFrameFactor):
     """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
     of_people = True
     frame_fields = ("rotation", "sigma", "correlation")
+    padding = {"sigma": jnp.inf, "correlation": 0.0}
     per_joint = True
 
     @property
@@ -95,6 +96,7 @@ class Shape(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("shape", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -106,6 +108,40 @@ class Shape(AbstractFrameFactor):
     def local(self, data, window, shared):
         shape, sigma = data
         return (shared.shape - shape) / sigma
+
+
+class Stature(AbstractFrameFactor):
+    """A known height of the person, `(h_0 + g · β - h̃) / σ`.
+
+    The height of the mesh at rest, between the vertices that are highest and lowest in
+    the mean shape, is linear in β.
+    """
+
+    template: Float[Array, ""]
+    """h_0, m"""
+    slope: Float[Array, " 10"]
+    """g, m"""
+    height: Float[Array, "h t"]
+    """h̃, m"""
+    sigma: Float[Array, "h t"]
+    """m; finite in one frame of each person who was measured, `inf` elsewhere."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("height", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("shape", 0),)
+
+    def data(self):
+        return self.height, self.sigma
+
+    def local(self, data, window, shared):
+        height, sigma = data
+        return (self.template + jnp.dot(self.slope, shared.shape) - height)[
+            None
+        ] / sigma
 
 
 def rotation_between(

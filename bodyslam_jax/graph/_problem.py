@@ -25,6 +25,7 @@ from bodyslam_jax.graph._human_motion import HumanMotion, OrientationChange
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
 from bodyslam_jax.graph._layout import Layout, make_layout
 from bodyslam_jax.graph._memory import check_memory
+from bodyslam_jax.graph._padding import Masked, check_padding
 from bodyslam_jax.graph._posture import Posture
 from bodyslam_jax.graph._reprojection import Reprojection
 from bodyslam_jax.graph._state import State, Step, gauge
@@ -78,7 +79,8 @@ class Problem(eqx.Module):
         """Names of the terms: the factors' classes, numbered where one repeats."""
         names: list[str] = []
         for factor in self.factors:
-            name = type(factor).__name__
+            inner = factor.factor if isinstance(factor, Masked) else factor
+            name = type(inner).__name__
             taken = sum(other.split("_")[0] == name for other in names)
             names.append(f"{name}_{taken + 1}" if taken else name)
         return names
@@ -170,14 +172,17 @@ def make_problem(
 
     **Raises:** `ValueError` if shapes or kinds of arrays do not fit, a value is not
     finite or means nothing (a pose that is not rigid, sigma 0, a correlation of 1, a
-    weight where there is no earlier frame), an index is out of range, or the problem
-    does not fit into memory.
+    weight where there is no earlier frame), an index is out of range, a factor of one's
+    own has another cost once frames are added that measure nothing, or the problem does
+    not fit into memory.
     """
     factors = tuple(factors)
     sizes = check_state(state)
     for factor in factors:
         check_factor(factor, sizes)
         check_precision(factor, state)
+        if isinstance(factor, AbstractFrameFactor):
+            check_padding(factor, state)
     if motion is not None:
         check_shapes(motion, "motion", dict(sizes))
     if free is not None:

@@ -56,6 +56,7 @@ class JointReprojection(AbstractFrameFactor):
     layout: str = eqx.field(static=True, default="body25")
     of_people = True
     frame_fields = ("pixel", "sigma")
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -118,7 +119,12 @@ class JointReprojection(AbstractFrameFactor):
         is left out as well, a share of the error over the body's size in the image.
         """
 
-        def one(data, window, shared, _):
+        # Each frame's own, where a loss has one scale for each measurement.
+        losses = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, self.sigma.shape), self.loss
+        )
+
+        def one(data, window, shared, loss):
             (pixel, sigma), (frame,) = data, window
             given = self.body, frame.pose, shared.shape, self.layout, self.bias
             C_CH = frame.root[:3, :3]
@@ -126,8 +132,8 @@ class JointReprojection(AbstractFrameFactor):
             residual, pull = jax.vjp(
                 lambda p: (project(shared.intrinsics, p) - pixel) / sigma[:, None], p_C
             )
-            weight = self.loss.weight(squared_norm(residual))[:, None]
+            weight = loss.weight(squared_norm(residual))[:, None]
             (by_C,) = pull(weight * residual)
             return keypoint_curvature(*given, by_C @ C_CH)
 
-        return self.map_frames(one, state)
+        return self.map_frames(one, state, losses)

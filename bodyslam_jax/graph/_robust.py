@@ -60,14 +60,15 @@ class GemanMcClure(AbstractLoss):
     length of the pixel error, which does not depend on how the image is turned.
     """
 
-    scale: float | Float[Array, ""]
-    """c, standard deviations"""
+    scale: float | Float[Array, "..."]
+    """c, standard deviations; of `JointReprojection` one for each measurement, too:
+    `c / sigma` of a c in px that is the same for all."""
 
-    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+    def rho(self, s: Float[Array, "*m"]) -> Float[Array, "..."]:
         c2 = self.scale**2
         return s * (c2 / (c2 + s))
 
-    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
+    def weight(self, s: Float[Array, "*m"]) -> Float[Array, "..."]:
         c2 = self.scale**2
         return (c2 / (c2 + s)) ** 2
 

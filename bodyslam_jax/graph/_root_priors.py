@@ -24,6 +24,7 @@ class RootSmoothness(AbstractFrameFactor):
     body: BodyModel | None = None
     of_people = True
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -57,6 +58,7 @@ class RootTurning(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -83,6 +85,7 @@ class RootOrientation(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("orientation", "sigma", "correlation")
+    padding = {"sigma": jnp.inf, "correlation": 0.0}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -116,6 +119,7 @@ class RootPlace(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("place", "sigma", "correlation")
+    padding = {"sigma": jnp.inf, "correlation": 0.0}
 
     @property
     def touches(self) -> tuple[Touch, ...]:
@@ -157,6 +161,7 @@ class UpDirection(AbstractFrameFactor):
     loss: AbstractLoss = Squared()
     of_people = True
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

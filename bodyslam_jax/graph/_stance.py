@@ -35,6 +35,7 @@ class StanceFoot(AbstractFrameFactor):
     """Which keypoints of BODY_25 they are."""
     of_people = True
     frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
 
     @property
     def touches(self) -> tuple[Touch, ...]:

@@ -5,10 +5,12 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 
-from bodyslam_jax.graph._abstract import AbstractFactor
-from bodyslam_jax.graph._human_motion import HumanMotion
+from bodyslam_jax.graph._abstract import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph._camera_priors import AbstractIntrinsicsFactor
 from bodyslam_jax.graph._landmark_prior import LandmarkPrior
+from bodyslam_jax.graph._padding import Masked
 from bodyslam_jax.graph._problem import Problem
+from bodyslam_jax.graph._reprojection import Reprojection
 from bodyslam_jax.graph._state import Step
 
 
@@ -17,16 +19,29 @@ def mute(problem: Problem, *kinds: type[AbstractFactor]) -> Problem:
 
     Their measurements become missing ones.
     """
-    factors = tuple(_missing(f) if isinstance(f, kinds) else f for f in problem.factors)
+    factors = tuple(
+        _missing(f, problem) if isinstance(f, kinds) else f for f in problem.factors
+    )
     return eqx.tree_at(lambda p: p.factors, problem, factors)
 
 
-def _missing(factor: AbstractFactor) -> AbstractFactor:
-    whitened = isinstance(factor, HumanMotion | LandmarkPrior)
-    field = "whitening" if whitened else "sigma"
-    old = getattr(factor, field)
-    value = 0.0 if field == "whitening" else jnp.inf
-    return eqx.tree_at(lambda f: getattr(f, field), factor, jnp.full_like(old, value))
+def _missing(factor: AbstractFactor, problem: Problem) -> AbstractFactor:
+    if isinstance(factor, Reprojection):
+        values = {"sigma": jnp.inf}
+    elif isinstance(factor, LandmarkPrior):
+        values = {"whitening": 0.0}
+    elif isinstance(factor, AbstractIntrinsicsFactor) and hasattr(factor, "sigma"):
+        values = {"sigma": jnp.inf}
+    elif isinstance(factor, AbstractFrameFactor) and factor.padding:
+        values = factor.padding
+    else:
+        free = problem.free
+        lead = free.roots if getattr(factor, "of_people", False) else free.cameras
+        return Masked(factor, jnp.zeros(lead.shape[:-1], bool))
+    for field, value in values.items():
+        full = jnp.full_like(getattr(factor, field), value)
+        factor = eqx.tree_at(lambda f, n=field: getattr(f, n), factor, full)
+    return factor
 
 
 def hold(free: Step, *names: str) -> Step:

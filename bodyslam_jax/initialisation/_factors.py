@@ -1,5 +1,7 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -8,18 +10,31 @@ from scipy.ndimage import maximum_filter1d
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.compilation import jit_once
-from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.config import PATH_SIGMA, GraphWeights, Measured
 from bodyslam_jax.people import Roots
 from bodyslam_jax.sequence import Sequence, Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
 """px: what a track's noise can be; outside, it is the model that is wrong."""
+_PREDICTED_AFTER = 16 / 30
+"""Time that a person must have been seen for before a posture counts as predicted, s,
+where the predictions are not at hand: what the longest window that ships needs."""
+
+
+def landmark_sigma(measured: float, weights: GraphWeights) -> float:
+    """Standard deviation of a static point in the joint graph, px: `pixel_sigma` of the
+    weights, or else what was `measured` of the tracks."""
+    return measured if weights.pixel_sigma is None else weights.pixel_sigma
 
 
 def map_factor(
     tracks: Tracks, keep: Bool[np.ndarray, " m"], sigma: float, weights: GraphWeights
 ) -> graph.Reprojection:
-    """Static landmarks; rejected observations are left out (their `sigma` is `inf`)."""
+    """Static landmarks; rejected observations are left out (their `sigma` is `inf`).
+
+    `sigma` is what was measured of the tracks (px): `landmark_sigma`.
+    """
+    sigma = landmark_sigma(sigma, weights)
     return graph.Reprojection(
         frame=jnp.asarray(tracks.frame, jnp.int32),
         landmark=jnp.asarray(tracks.landmark, jnp.int32),
@@ -39,6 +54,46 @@ def revisit_factor(
     whitening = np.sqrt(np.maximum(size, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
     return graph.LandmarkPrior(
         place=jnp.asarray(places, float), whitening=jnp.asarray(whitening / sigma)
+    )
+
+
+def path_factors(
+    path: Float[np.ndarray, "t 4 4"] | None,
+    known: Bool[np.ndarray, " t"] | None,
+    scale: float = float("nan"),
+) -> list[graph.AbstractFactor]:
+    """Camera poses that came with the video, and metres per unit of the map if they
+    are in metres; none without them."""
+    if path is None or known is None:
+        return []
+    sigma = np.repeat(np.where(known, PATH_SIGMA, np.inf)[:, None], 6, axis=1)
+    factors: list[graph.AbstractFactor] = []
+    factors.append(graph.CameraPrior(jnp.asarray(path), jnp.asarray(sigma)))
+    if np.isfinite(scale):
+        once = np.full(len(known), np.inf)
+        once[0] = PATH_SIGMA * scale
+        of_map = jnp.full(len(known), scale)
+        factors.append(graph.ScalePrior(of_map, jnp.asarray(once)))
+    return factors
+
+
+def stature_factor(
+    statures: Mapping[int, Measured],
+    present: Bool[np.ndarray, "h t"],
+    body: BodyModel,
+) -> graph.Stature:
+    """Statures that are known, one measurement a person."""
+    linear = people.linear_stature(body)
+    height, sigma = np.ones(present.shape), np.full(present.shape, np.inf)
+    for h, known in statures.items():
+        height[h] = known.value
+        if present[h].any():
+            sigma[h, present[h].argmax()] = known.sigma
+    return graph.Stature(
+        template=jnp.asarray(linear.template),
+        slope=jnp.asarray(linear.slope),
+        height=jnp.asarray(height),
+        sigma=jnp.asarray(sigma),
     )
 
 
@@ -75,30 +130,60 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
     return weights.keypoint_inflation * float(np.sqrt(sequence.fps / 30.0))
 
 
+def _keypoint_loss(
+    sequence: Sequence, sigma: Float[np.ndarray, "h t 25"], weights: GraphWeights
+) -> graph.GemanMcClure:
+    """What lasts counts less, but an outlier is as far away as ever: the loss is of the
+    error in px, whatever the keypoint weighs."""
+    if weights.keypoint_sigma is None:
+        scale = weights.keypoint_loss / _inflation(sequence, weights)
+        return graph.GemanMcClure(jnp.asarray(scale))
+    pixels = weights.keypoint_loss * weights.keypoint_sigma
+    scale = np.where(np.isfinite(sigma), pixels / sigma, 1.0)
+    return graph.GemanMcClure(jnp.asarray(scale))
+
+
 def people_factors(
-    sequence: Sequence, roots: Roots, weights: GraphWeights, body: BodyModel
+    sequence: Sequence,
+    roots: Roots,
+    weights: GraphWeights,
+    body: BodyModel,
+    *,
+    shape: Float[np.ndarray, "h 10"] | None = None,
+    predicted: Bool[Array, "h t"] | None = None,
 ) -> list[graph.AbstractFactor]:
-    """Keypoints, postures, shapes and smooth paths of `h` people."""
+    """Keypoints, postures, shapes and smooth paths of `h` people.
+
+    Args:
+        shape: what a regressor or a fit says of β, where `roots` have more than that.
+        predicted: of which frames the motion model has a prediction
+            (`Prediction.valid`); only there are postures held to it, if they are to be.
+    """
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
-        # What lasts counts less, but an outlier is as far away as ever.
-        loss = weights.keypoint_loss / _inflation(sequence, weights)
+        sigma = keypoint_sigma(sequence, roots, weights)
         factors.append(
             graph.JointReprojection(
                 body=body,
                 pixel=jnp.asarray(sequence.keypoints.uv, float),
-                sigma=jnp.asarray(keypoint_sigma(sequence, roots, weights)),
-                loss=graph.GemanMcClure(jnp.asarray(loss)),
+                sigma=jnp.asarray(sigma),
+                loss=_keypoint_loss(sequence, sigma, weights),
             )
         )
     per_frame = 30.0 / sequence.fps
     between = lambda rho: graph.runs(there, rho**per_frame)
     where = lambda mask, sigma: jnp.where(mask, sigma, jnp.inf)
+    held = there
+    if weights.posture_predicted:
+        if predicted is None:
+            count = 1 + round(_PREDICTED_AFTER * sequence.fps)
+            predicted = jnp.asarray(_in_a_row(roots.present, count))
+        held = there & predicted
     factors.append(
         graph.Posture(
             rotation=jnp.asarray(roots.body_pose),
-            sigma=where(there[..., None], weights.posture_sigma) * jnp.ones(23),
+            sigma=where(held[..., None], weights.posture_sigma) * jnp.ones(23),
             correlation=between(weights.posture_correlation),
             correlated=weights.posture_correlation > 0,
             predicted=weights.posture_predicted,
@@ -108,7 +193,8 @@ def people_factors(
     if placed.any():
         rho = graph.runs(jnp.asarray(placed), weights.root_correlation**per_frame)
         factors.append(_place_factor(roots, placed, rho, weights))
-    factors.append(_shape_factor(roots, weights))
+    measured = roots.shape if shape is None else shape
+    factors.append(_shape_factor(roots.present, measured, weights))
     if weights.root_sigma is not None:
         factors.append(
             graph.RootOrientation(
@@ -153,13 +239,17 @@ def _place_factor(
     )
 
 
-def _shape_factor(roots: Roots, weights: GraphWeights) -> graph.Shape:
-    counted = roots.present.astype(float)
+def _shape_factor(
+    present: Bool[np.ndarray, "h t"],
+    measured: Float[np.ndarray, "h 10"],
+    weights: GraphWeights,
+) -> graph.Shape:
+    counted = present.astype(float)
     if not weights.shape_each_frame:
         counted = np.zeros_like(counted)
-        counted[np.arange(len(counted)), roots.present.argmax(axis=1)] = 1.0
+        counted[np.arange(len(counted)), present.argmax(axis=1)] = 1.0
     sigma = np.where(counted > 0, weights.shape_sigma, np.inf)
-    shape = np.broadcast_to(roots.shape[:, None], (*counted.shape, 10))
+    shape = np.broadcast_to(measured[:, None], (*counted.shape, 10))
     return graph.Shape(
         shape=jnp.asarray(shape),
         sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
@@ -183,7 +273,8 @@ def motion_factor(
     *,
     shared_error: Float[np.ndarray, " h"] | float = 0.0,
 ) -> graph.HumanMotion:
-    """The motion model's displacements, weighted by its own covariance.
+    """The motion model's displacements, weighted by its own covariance, in lengths of
+    the leg or, if the weights say so, in metres.
 
     `shared_error` is a share by which all of a person's steps may be wrong together:
     they say no more of the scale than that allows, however many there are.
@@ -195,13 +286,14 @@ def motion_factor(
         whitening=whitening,
         correlation=graph.runs(seen.valid, weights.motion_correlation),
         correlated=weights.motion_correlation > 0,
-        body=body,
+        body=body if weights.motion_in_legs else None,
     )
 
 
 @jit_once
 def _steps(seen, shapes, body, weights, shared_error):
-    """Displacements in lengths of the leg, and what whitens their errors."""
+    """Displacements in lengths of the leg, or in metres, and what whitens their
+    errors."""
     valid = seen.valid
     eye = jnp.eye(3, dtype=seen.translation.dtype)
     if weights.motion_sigma is None:
@@ -217,5 +309,7 @@ def _steps(seen, shapes, body, weights, shared_error):
     told = jnp.sum((whitening @ step[..., None]) ** 2, axis=(1, 2, 3), keepdims=True)
     told = told * (1 - rho) / (1 + rho)  # information on a factor of all steps
     whitening = whitening / jnp.sqrt(1 + shared_error**2 * told)
+    if not weights.motion_in_legs:
+        return step, whitening
     leg = motion.leg_length(body, shapes)[:, None, None]
     return step / leg, whitening * leg[..., None]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.compilation import jit_once
-from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.ground import find_ground
 from bodyslam_jax.initialisation._upright import mean_up
 from bodyslam_jax.people import Roots
@@ -27,7 +27,7 @@ the plane is not what people stand on, it varies more."""
 
 @dataclasses.dataclass(frozen=True)
 class ScaleStart:
-    """The first guess of s, in closed form: two cues, weighted by their errors."""
+    """The first guess of s, in closed form: its cues, weighted by their errors."""
 
     motion: float = 1.0
     """From how people move; 1 if that says nothing."""
@@ -37,22 +37,28 @@ class ScaleStart:
     """From where they stand on the map's ground."""
     ground_error: float = float("inf")
     """Its standard error; infinite if no ground is seen under the feet."""
+    path: float = 1.0
+    """From a camera path that is known in metres."""
+    path_error: float = float("inf")
+    """Its standard error; infinite without one."""
 
     @property
-    def _weights(self) -> Float[np.ndarray, " 2"]:
-        return np.array([self.motion_error, self.ground_error]) ** -2.0
+    def _weights(self) -> Float[np.ndarray, " 3"]:
+        errors = [self.motion_error, self.ground_error, self.path_error]
+        return np.array(errors) ** -2.0
 
     @property
     def value(self) -> float:
-        """s; 1 if neither cue says anything, so that the map stays in its own unit."""
+        """s; 1 if no cue says anything, so that the map stays in its own unit."""
         weight = self._weights
         if not weight.any():
             return 1.0
-        return float(weight @ [self.motion, self.ground] / weight.sum())
+        cues = [self.motion, self.ground, self.path]
+        return float(weight @ cues / weight.sum())
 
     @property
     def standard_error(self) -> float:
-        """Infinite if neither cue says anything."""
+        """Infinite if no cue says anything."""
         total = self._weights.sum()
         return float(total**-0.5) if total else float("inf")
 
@@ -63,12 +69,17 @@ def scale_start(
     contact: graph.GroundContact | None,
     *,
     shared_error: float = 0.0,
+    path: float = float("nan"),
 ) -> ScaleStart:
-    """Both cues of scale: motion, and the ground if there is one.
+    """The cues of scale: motion, the ground and a metric camera path if there are any.
 
-    `shared_error` is the share by which all steps may be wrong together.
+    Args:
+        shared_error: the share by which all steps may be wrong together.
+        path: m per unit of the map, as the path has it; NaN without one.
     """
     start = _motion_scale(state, seen)
+    if np.isfinite(path):
+        start = dataclasses.replace(start, path=path, path_error=PATH_SIGMA * path)
     error = float(np.hypot(start.motion_error, shared_error * start.motion))
     start = dataclasses.replace(start, motion_error=error)
     if contact is None:

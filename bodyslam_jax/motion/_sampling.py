@@ -84,12 +84,12 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
         )
     dense = resample(interleave(wanted), FPS * DENSE)
     span = settings.past * max(settings.strides)
-    spacing = 1 if settings.sliding else (settings.past + 1) * DENSE
+    # A window holds its first and its last frame; the next begins a step later.
+    spacing = 1 if settings.sliding else span + DENSE
     starts, lasts, weights, offset = [], [], [], 0
     for clip in dense:
         t = len(clip.poses)
-        first = np.arange(0, t - span)
-        first = first[first % spacing < DENSE] + offset
+        first = np.arange(0, t - span, spacing) + offset
         starts.append(first)
         lasts.append(np.full(len(first), offset + t - 1))
         weights.append(np.full(len(first), share_of(clip)))

@@ -19,11 +19,19 @@ from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._predict import MotionModel
 
 _FORMAT = "bodyslam-motion-1"
-_DEFAULT = Path(__file__).parent / "assets" / "default.npz"
+_ASSETS = Path(__file__).parent / "assets"
+SHIPPED = ("default", "paper")
+"""Motion models that come with the package: the default, and the paper's network."""
 
 
-def save_motion_model(path: Path | str, model: MotionModel) -> None:
-    """Writes a model; the file appears complete or not at all."""
+def save_motion_model(
+    path: Path | str, model: MotionModel, *, half: bool = False
+) -> None:
+    """Writes a model; the file appears complete or not at all.
+
+    `half` keeps the weights of layers in float16, in half the space. They are of order
+    1, and lose their fourth digit; means, deviations and the rest stay in float32.
+    """
     path = Path(path)
     network = model.network
     sizes = {"past": model.past}
@@ -45,8 +53,11 @@ def save_motion_model(path: Path | str, model: MotionModel) -> None:
         "fps": model.fps,
         "about": json.loads(model.about),
     }
+    kind = lambda x: (
+        np.float16 if half and x.ndim == 2 and x.size > 1000 else np.float32
+    )
     leaves = {
-        f"array_{i}": np.asarray(x, np.float32)
+        f"array_{i}": np.asarray(x, kind(x))
         for i, x in enumerate(jax.tree.leaves(network))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,11 +69,12 @@ def save_motion_model(path: Path | str, model: MotionModel) -> None:
 
 
 def load_motion_model(path: Path | str | None = None) -> MotionModel:
-    """Reads a model's weights (float32), by default those that come with the package.
+    """Reads a model's weights (float32): of a file, or by name of `SHIPPED`.
 
     **Raises:** `FileNotFoundError`; `ValueError` if the file holds no motion model.
     """
-    path = _DEFAULT if path is None else Path(path)
+    name = "default" if path is None else str(path)
+    path = _ASSETS / f"{name}.npz" if name in SHIPPED else Path(name)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such motion model.")
     try:

@@ -1,5 +1,7 @@
 """Bodies in the camera frame, from whatever a sequence tells of its people."""
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Bool
 
@@ -29,6 +31,47 @@ def estimate_bodies(
     for name in ("present", "poses", "shapes", "trans"):
         getattr(found, name)[others] = getattr(fitted, name)
     return found
+
+
+def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
+    """The sequence with these people only, in this order; all of them for `()`.
+
+    **Raises:** `ValueError` if one of them is not there.
+    """
+    if not people:
+        return sequence
+    keypoints, bodies = sequence.keypoints, sequence.bodies
+    count = 0
+    if keypoints is not None:
+        count = len(keypoints.uv)
+    elif bodies is not None:
+        count = len(bodies.present)
+    beyond = [h for h in people if h >= count]
+    if beyond:
+        found = f"people 0 to {count - 1}" if count else "nobody"
+        raise ValueError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
+    index = list(dict.fromkeys(people))
+    if keypoints is not None:
+        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index])
+    if bodies is not None:
+        bodies = dataclasses.replace(
+            bodies,
+            present=bodies.present[index],
+            poses=bodies.poses[index],
+            shapes=bodies.shapes[index],
+            trans=bodies.trans[index],
+        )
+    text = (
+        f"{len(index)} of {count} people are estimated: {', '.join(map(str, index))}."
+    )
+    return dataclasses.replace(
+        sequence,
+        keypoints=keypoints,
+        bodies=bodies,
+        warnings=(*sequence.warnings, text)
+        if len(index) < count
+        else sequence.warnings,
+    )
 
 
 def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:

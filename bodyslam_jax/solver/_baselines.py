@@ -1,8 +1,9 @@
 """Stock solvers, as cross-checks and to be measured against; for small problems.
 
 They see a flat step from the first state (poses do not add, steps do) and the lifted
-residuals; the motion model's prediction stays as it is at the start, but for what is
-coupled, which they differentiate in full. Each is one program with all that it needs.
+residuals. The motion model's prediction is made anew, and held, in each step of Adam.
+In the others it stays as it is at the start of a stage. What is coupled they all
+differentiate in full. Each is one program with all that it needs.
 """
 
 import warnings
@@ -31,9 +32,10 @@ def run(name, problem, state, stage):
     A state that is not finite, or whose cost is not, is not returned: the one that the
     stage began with is.
     """
-    before = problem.follow(state).cost(state)
+    cost_of = lambda state: problem.refresh(state).follow(state).cost(state)
+    before = cost_of(state)
     found, count, result = _METHODS[name](problem, state, stage)
-    cost = problem.follow(found).cost(found)
+    cost = cost_of(found)
     good = jnp.isfinite(cost) & is_finite(found)
     state = jax.tree.map(lambda new, old: jnp.where(good, new, old), found, state)
     result = optx.RESULTS.where(good, result, optx.RESULTS.nonfinite)
@@ -57,8 +59,9 @@ class _Flat(eqx.Module):
         return jnp.concatenate([r.reshape(-1) for r in rows])
 
     def cost(self, step):
+        """With the motion predicted anew, and held."""
         place = self.retract(step)
-        return self.problem.follow(place).cost(place)
+        return self.problem.refresh(place).follow(place).cost(place)
 
 
 def _flat(problem, state):

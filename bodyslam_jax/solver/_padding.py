@@ -4,6 +4,8 @@ What is added has no weight: measurements with `sigma = inf`, variables that may
 move.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.core
@@ -16,11 +18,11 @@ from bodyslam_jax.graph import (
     Problem,
     Reprojection,
     State,
-    Step,
+    extend,
+    extend_state,
+    pad_factor,
     round_up,
 )
-
-_FILL = {"sigma": "inf", "whitening": 0.0, "correlation": 0.0, "present": False}
 
 
 def pad(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -28,30 +30,23 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
     frames = problem.layout.num_chunks * CHUNK - len(state.cameras)
     landmarks = round_up(len(state.landmarks) + 1) - len(state.landmarks)
     factors = tuple(
-        _pad_factor(factor, frames, landmarks) for factor in problem.factors
+        _pad_factor(factor, state, frames, landmarks) for factor in problem.factors
     )
     motion = problem.motion
     if motion is not None:
-        present = _extend(motion.present, 1, frames, False)
+        present = extend(motion.present, 1, frames, False)
         motion = eqx.tree_at(lambda m: m.present, motion, present)
     free = problem.free
-    free = Step(
-        scale=free.scale,
-        cameras=_extend(free.cameras, 0, frames, 0.0),
-        roots=_extend(free.roots, 1, frames, 0.0),
-        poses=_extend(free.poses, 1, frames, 0.0),
-        shapes=free.shapes,
-        landmarks=_extend(free.landmarks, 0, landmarks, 0.0),
-        intrinsics=free.intrinsics,
+    free = dataclasses.replace(
+        free,
+        cameras=extend(free.cameras, 0, frames, 0.0),
+        roots=extend(free.roots, 1, frames, 0.0),
+        poses=extend(free.poses, 1, frames, 0.0),
+        landmarks=extend(free.landmarks, 0, landmarks, 0.0),
     )
-    padded = State(
-        scale=state.scale,
-        cameras=_extend(state.cameras, 0, frames, "edge"),
-        roots=_extend(state.roots, 1, frames, "edge"),
-        poses=_extend(state.poses, 1, frames, "edge"),
-        shapes=state.shapes,
-        landmarks=_extend(state.landmarks, 0, landmarks, 0.0),
-        intrinsics=state.intrinsics,
+    padded = dataclasses.replace(
+        extend_state(state, frames),
+        landmarks=extend(state.landmarks, 0, landmarks, 0.0),
     )
     padded_problem = Problem(factors, free, motion, problem.layout, problem.variables)
     return _typed((padded_problem, padded))
@@ -77,36 +72,20 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
     )
 
 
-def _pad_factor(factor, frames, landmarks):
+def _pad_factor(factor, state, frames, landmarks):
     if isinstance(factor, LandmarkPrior):
         return LandmarkPrior(
-            place=_extend(factor.place, 0, landmarks, 0.0),
-            whitening=_extend(factor.whitening, 0, landmarks, 0.0),
+            place=extend(factor.place, 0, landmarks, 0.0),
+            whitening=extend(factor.whitening, 0, landmarks, 0.0),
             loss=factor.loss,
         )
     if isinstance(factor, Reprojection):
         rows = round_up(len(factor.frame) + 1) - len(factor.frame)
         return Reprojection(
-            frame=_extend(factor.frame, 0, rows, 0),
-            landmark=_extend(factor.landmark, 0, rows, 0),
-            pixel=_extend(factor.pixel, 0, rows, 0.0),
-            sigma=_extend(factor.sigma, 0, rows, jnp.inf),
+            frame=extend(factor.frame, 0, rows, 0),
+            landmark=extend(factor.landmark, 0, rows, 0),
+            pixel=extend(factor.pixel, 0, rows, 0.0),
+            sigma=extend(factor.sigma, 0, rows, jnp.inf),
             loss=factor.loss,
         )
-    axis = 1 if factor.of_people else 0
-    for name in factor.frame_fields:
-        fill = _FILL.get(name, "edge")
-        fill = jnp.inf if fill == "inf" else fill
-        values = _extend(getattr(factor, name), axis, frames, fill)
-        factor = eqx.tree_at(lambda f: getattr(f, name), factor, values)
-    return factor
-
-
-def _extend(x: jax.Array, axis: int, count: int, fill) -> jax.Array:
-    """Outside jit by NumPy: JAX would compile one small program per shape."""
-    widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
-    traced = isinstance(x, jax.core.Tracer)
-    grow = jnp.pad if traced else lambda a, *w, **k: np.pad(np.asarray(a), *w, **k)
-    if fill == "edge":
-        return jnp.asarray(grow(x, widths, mode="edge"))
-    return jnp.asarray(grow(x, widths, constant_values=np.asarray(fill, x.dtype)))
+    return pad_factor(factor, state, frames)

@@ -1,0 +1,128 @@
+"""Frames that only repeat the one before: conversions of the frame rate, and freezes.
+
+A film of 24 frames/s in a file of 30, or of 30 in one of 60, holds frames twice: to a
+motion model they are people who stop and start again many times a second. A repeated
+frame is one that hardly differs from the last in a video in which, just before and
+after, much more changes. A still scene before a still camera has none, and one where
+encoding drops what changes little does not either.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+_SAMPLES = 320
+"""Along the longer side of what is compared."""
+_BLOCK = 16
+_MOVING = 2.0
+"""Mean change of grey levels in the blocks that change most, from which there is
+motion."""
+_SAME = 0.15
+"""Change of a repeated frame, of that of others around it, at most."""
+_AROUND = 10
+"""Frames on each side that are compared with."""
+_SHORT = 4
+"""Repeats in a row that a conversion makes; more are a freeze, or people who stand."""
+_FEWEST = 2
+_REGULAR = 0.8
+"""Frames that a regular conversion may be off a clock by."""
+
+
+class Repeats:
+    """Looks at one image after the other, and keeps only how much it changed."""
+
+    def __init__(self) -> None:
+        self.last: np.ndarray | None = None
+        self.most: list[float] = []
+        self.typical: list[float] = []
+
+    def look(self, image: UInt8[np.ndarray, "y x *c"] | None) -> None:
+        """Takes the next image into account; None is one that says nothing."""
+        now = None
+        if image is not None:
+            step = max(1, max(image.shape[:2]) // _SAMPLES)
+            plane = (
+                image[::step, ::step, 1] if image.ndim == 3 else image[::step, ::step]
+            )
+            now = np.ascontiguousarray(plane)
+        if self.most or self.last is not None:
+            most, typical = _change(self.last, now)
+            self.most.append(most)
+            self.typical.append(typical)
+        elif now is None:
+            self.most.append(np.inf)
+            self.typical.append(np.inf)
+        self.last = now
+
+    def repeated(self) -> Bool[np.ndarray, " t"]:
+        """Which frames repeat the one before."""
+        return repeated(np.asarray(self.most), np.asarray(self.typical))
+
+
+def repeated(
+    most: Float[np.ndarray, " n"], typical: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " t"]:
+    """Which of n + 1 frames repeat the one before.
+
+    Args:
+        most: change (grey levels) from each frame to the next where most changes: of a
+            person, if the camera stands.
+        typical: change of the median block: not small only if the camera moves.
+    """
+    found = np.zeros(len(most) + 1, dtype=bool)
+    for k, change in enumerate(most):
+        near = most[max(0, k - _AROUND) : k + _AROUND + 1]
+        near = np.sort(near[np.isfinite(near)])
+        usual = np.median(near[len(near) // 2 :]) if len(near) else 0.0
+        found[k + 1] = usual >= _MOVING and change < _SAME * usual
+    for first, last in _runs(found):
+        # What moves goes on just before and after; people stop little by little.
+        sides = [first - 2, last]  # changes into the frame before, and after the last
+        sides = [k for k in sides if 0 <= k < len(most)]
+        moves = typical if last - first + 1 > _SHORT else most
+        if not sides or min(moves[k] for k in sides) < _MOVING:
+            found[first : last + 1] = False
+    if found.sum() < _FEWEST:
+        found[:] = False
+    return found
+
+
+def without_repeats(
+    times: Float[np.ndarray, " t"], found: Bool[np.ndarray, " t"]
+) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Times (s) of the frames that are new, and which they are.
+
+    Where new frames come as regularly as a conversion gives them, they were taken at
+    equal times; otherwise each keeps the time at which it was shown first.
+    """
+    picks = np.flatnonzero(~found)
+    kept = times[picks]
+    if len(picks) < 3:
+        return kept, picks
+    even = np.linspace(picks[0], picks[-1], len(picks))
+    if np.abs(even - picks).max() <= _REGULAR:
+        kept = np.linspace(kept[0], kept[-1], len(kept))
+    return kept, picks
+
+
+def repeats_warning(name: str, found: Bool[np.ndarray, " t"], fps: float) -> str:
+    return (
+        f"{name}: {found.sum()} of {len(found)} frames only repeat the one before, as "
+        f"after a conversion of the frame rate: left out, {fps:.4g} frames/s remain."
+    )
+
+
+def _runs(found: np.ndarray) -> list[tuple[int, int]]:
+    """First and last of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], found.astype(int), [0]])))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _change(a: np.ndarray | None, b: np.ndarray | None) -> tuple[float, float]:
+    if a is None or b is None or a.shape != b.shape:
+        return np.inf, np.inf
+    size = max(1, a.shape[1] // _BLOCK), max(1, a.shape[0] // _BLOCK)
+    blocks = cv2.resize(
+        cv2.absdiff(a, b).astype(np.float32), size, interpolation=cv2.INTER_AREA
+    )
+    return float(np.quantile(blocks, 0.98)), float(np.median(blocks))
