@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax import (
     accuracy,
+    diagnostics,
     evaluation,
     export,
     frontend,
@@ -115,7 +116,7 @@ def _run(
     model = motion.load_motion_model(config.motion_model)
     if config.people:  # now, before minutes are spent
         motion.check_compatible(model, body, model.fps)
-    sequence = _detected(sequence, config, cache, watch)
+    sequence = diagnostics.reconcile(_detected(sequence, config, cache, watch), body)
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
     sequence = people.select_people(sequence, config.person)
