@@ -245,11 +245,11 @@ def test_parts_of_a_dressed_person_have_their_own_colours(person, dressed):
     for joint, name in names.items():
         near = np.linalg.norm(skin - person.rest[joint], axis=1).argsort()[:40]
         assert (part[near] == PARTS.index(name)).mean() > 0.6, joint
-    for name, low, high in (("hair", 0.5, 1.1), ("lips", -0.9, -0.4)):
+    for name, low, high in (("hair", 0.7, 1.3), ("lips", -0.9, -0.4)):
         eyes = person.skin[person.picks[[1, 2]], 1].mean()
         unit = person.skin[person.picks[11], 1] - eyes
         at = (skin[part == PARTS.index(name), 1] - eyes) / unit
-        assert low < np.percentile(at, 75) < high
+        assert low < np.percentile(at, 99) < high
     assert (skin[part == PARTS.index("lips"), 2] > person.rest[15, 2]).all()
     colours = [
         np.median(dressed.colours[dressed.part == i], axis=0)
