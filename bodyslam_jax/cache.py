@@ -61,7 +61,10 @@ def _package() -> bytes:
     """A hash of the package's source, and of the models and motion that ship."""
     root = Path(__file__).parent
     digest = hashlib.sha256()
-    for path in sorted([*root.rglob("*.py"), *root.rglob("*.npz")]):
+    kept = (
+        path for suffix in ("py", "npz", "onnx") for path in root.rglob(f"*.{suffix}")
+    )
+    for path in sorted(kept):
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.digest()
 

@@ -1,7 +1,6 @@
 """What `bodyslam doctor` says: versions, devices, codecs, where models were found."""
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import tempfile
@@ -9,9 +8,8 @@ from pathlib import Path
 
 _PACKAGES = (
     "bodyslam-jax jax jaxlib equinox optimistix lineax jaxlie jaxopt optax numpy scipy "
-    "opencv-python-headless trimesh matplotlib tyro"
+    "opencv-python-headless onnxruntime trimesh matplotlib tyro"
 ).split()
-_EXTRAS = {"detect": "onnxruntime"}
 _CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
 
 
@@ -19,11 +17,7 @@ def report() -> list[tuple[str, str]]:
     """Lines of `(what, finding)`; never raises because something is missing."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}")]
     rows += [(name, _version(name)) for name in _PACKAGES]
-    rows += [
-        (f"extra {extra}", "present" if importlib.util.find_spec(module) else "absent")
-        for extra, module in _EXTRAS.items()
-    ]
-    return rows + _devices() + _opencv() + _models()
+    return rows + _devices() + _opencv() + _networks() + _models()
 
 
 def _version(name: str) -> str:
@@ -48,6 +42,12 @@ def _opencv() -> list[tuple[str, str]]:
         (f"video writer {codec}", _can_write(codec, suffix))
         for codec, suffix in _CODECS.items()
     ]
+
+
+def _networks() -> list[tuple[str, str]]:
+    from bodyslam_jax import people
+
+    return [(f"network {name}", found) for name, found in people.network_status()]
 
 
 def _can_write(codec: str, suffix: str) -> str:

@@ -209,8 +209,11 @@ def estimate(
 ) -> Joint:
     """The paper's graph: two steps, then the optimum of everything.
 
-    **Raises:** as `prepare`.
+    **Raises:** as `prepare`, unless a detector looked at all images and found nobody.
     """
+    looked = sequence.seen is not None and sequence.keypoints is None
+    if looked and cameras.kind != "moving" and not len(bodies.present):
+        return without_anything(cameras)
     prepared = prepare(sequence, cameras, bodies, body, config)
     problem = prepared.problem
     solution, stage = solve_stage(problem, prepared.state, config, "joint")
@@ -247,6 +250,28 @@ def estimate(
         present=prepared.roots.present,
         status=solution.status,
         stages=(*prepared.stages, stage),
+    )
+
+
+def without_anything(cameras: Cameras) -> Joint:
+    """The estimate where the camera did not move and nobody was found: cameras stay
+    where they are, and nothing has a size."""
+    frames = len(cameras.registered)
+    return Joint(
+        scale=1.0,
+        start=ScaleStart(),
+        scale_sigma=float("nan"),
+        shape_covariance=np.zeros((0, 10, 10)),
+        unobserved=(),
+        cameras=np.asarray(cameras.T_WC),
+        roots=np.zeros((0, frames, 4, 4)),
+        poses=np.zeros((0, frames, 23, 3)),
+        shapes=np.zeros((0, 10)),
+        landmarks=np.asarray(cameras.landmarks),
+        intrinsics=np.asarray(cameras.intrinsics),
+        present=np.zeros((0, frames), bool),
+        status="converged",
+        stages=(),
     )
 
 

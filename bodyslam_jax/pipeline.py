@@ -175,15 +175,46 @@ def _check_length(sequence: Sequence) -> None:
 def _detected(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
-    """The sequence with keypoints found in its images, if asked for and none given."""
-    if not config.detect or sequence.keypoints is not None:
+    """The sequence with people found in its images, if none of its keypoints are given.
+
+    Not where there are no images, nor where nobody is to be estimated and masks, or
+    tracks that are given, keep people out of the map.
+    """
+    if config.detect == "none" or sequence.keypoints is not None:
         return sequence
+    masked = sequence.masks is not None or sequence.tracks is not None
+    if sequence.frames is None or (masked and not config.people):
+        return sequence
+    if config.detect != "yolox":
+        return _tracked(sequence, config, cache, watch)
     key = fingerprint(sequence, config.detection)
     with watch("detection"):
         found = cache.stage(
             "detection", key, Detections, lambda: _detections(sequence, config)
         )
     return frontend.with_detections(sequence, found.split(), config.association)
+
+
+def _tracked(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """The same by the networks that ship."""
+    counter = Counter("detection", sequence.num_frames)
+    find = lambda: people.find_tracked(
+        frontend.frames(sequence),
+        sequence.fps,
+        config.detection,
+        config.association,
+        counter,
+    )
+    with watch("detection"):
+        key = fingerprint(sequence, config.detection, config.association)
+        found = cache.stage("detection", key, people.Found, find)
+    points, person = found.by_frame(sequence.num_frames)
+    sequence = _warned(sequence, found.warnings)
+    return frontend.with_detections(
+        sequence, points, config.association, person=person, seen=found.seen()
+    )
 
 
 @dataclasses.dataclass(frozen=True)

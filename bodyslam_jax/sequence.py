@@ -9,7 +9,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +61,19 @@ class Tracks:
 
 
 @dataclasses.dataclass(frozen=True)
+class Seen:
+    """Everybody whom a detector found in `t` frames, also who is not estimated: `n`
+    times somebody. They move, so that nothing of them belongs in the map."""
+
+    frame: Int[np.ndarray, " n"]
+    points: Float[np.ndarray, "n 25 3"]
+    """BODY_25: u px, v px, confidence."""
+    silhouettes: UInt8[np.ndarray, "t y x8"] | None = None
+    """Where people are at every fourth pixel of every fourth row, eight bits to a
+    byte, as `np.packbits` has them."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Sequence:
     """One input: `t` frames and whatever is known about them."""
 
@@ -79,6 +92,8 @@ class Sequence:
     picks: Int[np.ndarray, " t"] | None = None
     """Which frames of the video these are, if not all: its rate varied."""
     groundtruth: Path | None = None
+    seen: Seen | None = None
+    """All people in the images, for their masks."""
     warnings: tuple[str, ...] = ()
     """What was guessed or dropped while reading, for the report."""
 

@@ -10,19 +10,27 @@ from bodyslam_jax.config._check import NOT_NEGATIVE, SHARE, check
 class Detect:
     """Finding people and keypoints in the images, for who has no keypoints."""
 
+    search_interval: float = 0.33
+    """Time between two searches of the whole image by the networks that ship, s; in
+    between they look where people are expected."""
+    min_height: float = 40.0
+    """Height of people in the image below which they are masked, not estimated, px."""
     detector: str | None = None
-    """YOLOX of one's own, an ONNX file; by default YOLOX-S, fetched once."""
+    """For `yolox`: an own YOLOX, an ONNX file; by default YOLOX-S, fetched once."""
     pose: str | None = None
-    """RTMPose of one's own, an ONNX file; by default DWPose-L 384x288, fetched once."""
+    """For `yolox`: an own RTMPose; by default DWPose-L 384x288, fetched once."""
     min_score: float = 0.5
-    """Score of people that are looked at."""
+    """For `yolox`: score of people that are looked at."""
     max_overlap: float = 0.45
-    """Overlap of two boxes above which they are the same person."""
-    max_people: int = 4
+    """For `yolox`: overlap of two boxes above which they are the same person."""
+    max_people: int = 8
     """The largest ones in an image that are looked at."""
 
     def __post_init__(self):
-        check(self, {"min_score": SHARE, "max_overlap": SHARE})
+        check(
+            self,
+            {"min_score": SHARE, "max_overlap": SHARE, "min_height": NOT_NEGATIVE},
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,8 +19,9 @@ class Config:
     """Motion model's weights; without them the ones that ship."""
     people: bool = True
     """Whether people are estimated; if not, cameras and map stay without a unit."""
-    detect: bool = False
-    """Whether people's keypoints are looked for in the images, if none are given."""
+    detect: Literal["auto", "built-in", "yolox", "none"] = "auto"
+    """Which networks find people in the images where no keypoints are given: those that
+    ship (also `auto`), YOLOX and RTMPose, which are fetched once, or none."""
     offline: bool = False
     """Whether the network is never used: models must be there already."""
     overlay: bool = True

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bodyslam_jax.frontend._video import frames, list_images, picked
-from bodyslam_jax.sequence import Keypoints, Sequence
+from bodyslam_jax.sequence import Keypoints, Seen, Sequence
 
 # BODY_25 limbs and their half widths, of the person's height.
 _LIMBS = (
@@ -44,6 +44,8 @@ _BEYOND = (
     (13, 14, 0.25, 0.05),
 )
 _LEAST_CONFIDENCE = 0.05
+SILHOUETTE_STEP = 4
+"""Pixels between two of a silhouette (`Seen.silhouettes`)."""
 _MAX_GAP = 1.0
 """Time over which a person who is not detected is still masked, s."""
 
@@ -75,16 +77,33 @@ def person_masks(
                     f"{size[1]}x{size[0]} px."
                 )
             yield cv2.dilate(np.where(image > 0, 255, 0).astype(np.uint8), kernel)
-    elif sequence.keypoints is not None:
-        people = _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
+    elif sequence.keypoints is not None or sequence.seen is not None:
+        people = np.zeros((0, sequence.num_frames, 25, 3))
+        if sequence.keypoints is not None:
+            people = _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
         for k in range(sequence.num_frames):
             mask = np.zeros(size, dtype=np.uint8)
             for person in people:
                 draw_person(mask, person[k], margin)
+            if sequence.seen is not None:
+                _draw_seen(mask, sequence.seen, k, margin)
             yield mask
     else:
         for _ in range(sequence.num_frames):
             yield None
+
+
+def _draw_seen(mask: UInt8[np.ndarray, "y x"], seen: Seen, k: int, margin: float):
+    """Paints everybody whom a detector found in frame `k`."""
+    for index in np.flatnonzero(seen.frame == k):
+        draw_person(mask, seen.points[index], margin)
+    if seen.silhouettes is None:
+        return
+    small = np.unpackbits(seen.silhouettes[k], axis=1)
+    radius = max(1, round(margin * 0.25 * mask.shape[0] / SILHOUETTE_STEP))
+    small = cv2.dilate(small, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
+    large = small.repeat(SILHOUETTE_STEP, axis=0).repeat(SILHOUETTE_STEP, axis=1)
+    mask[large[: mask.shape[0], : mask.shape[1]] > 0] = 255
 
 
 def draw_person(

@@ -15,7 +15,14 @@ from bodyslam_jax.frontend._keypoints import Detections, read_detections
 from bodyslam_jax.frontend._numbering import gap_among
 from bodyslam_jax.frontend._pairing import pair
 from bodyslam_jax.frontend._video import VIDEO_SUFFIXES, Footage, list_images, look_at
-from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
+from bodyslam_jax.sequence import (
+    Bodies,
+    Intrinsics,
+    Keypoints,
+    Seen,
+    Sequence,
+    Tracks,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -77,24 +84,66 @@ def read_sequence(
 
 
 def with_detections(
-    sequence: Sequence, detections: Detections, config: Association = Association()
+    sequence: Sequence,
+    detections: Detections,
+    config: Association = Association(),
+    *,
+    person: list[np.ndarray] | None = None,
+    seen: Seen | None = None,
 ) -> Sequence:
     """The sequence with people made of what a detector found in each of its frames.
 
-    **Raises:** `ValueError` if nobody was found in any frame.
+    Where bodies are given, they say who is estimated: keypoints of others only keep
+    them out of the map.
+
+    Args:
+        person: for each frame who each detection is, where the detector says so.
+        seen: everybody, also whom `detections` leaves out; by default who is in it.
     """
+    seen = seen or _seen(detections)
+    sequence = dataclasses.replace(sequence, seen=seen)
     if not any(len(found) for found in detections):
-        raise ValueError(f"{sequence.name}: no person detected in any frame.")
-    people, warnings = associate(detections, config, sequence.fps)
+        text = "nobody was found in the images"
+        if sequence.bodies is None:
+            text += ": cameras and map only, and these without a unit"
+        return _warned(sequence, (f"{text}.",))
+    people, warnings = associate(detections, config, sequence.fps, person)
     bodies = sequence.bodies
     if bodies is not None:
+        count = len(bodies.present)
         people, bodies = pair(people, bodies, sequence.intrinsics)
-    return dataclasses.replace(
-        sequence,
-        keypoints=people,
-        bodies=bodies,
-        warnings=(*sequence.warnings, *warnings),
+        people, bodies, others = _with_body(people, bodies)
+        if others:
+            warnings = (*warnings, _OTHERS.format(others, count))
+    sequence = dataclasses.replace(sequence, keypoints=people, bodies=bodies)
+    return _warned(sequence, warnings)
+
+
+_OTHERS = "{} more people were found than the {} whose bodies are given: not estimated."
+
+
+def _warned(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
+    return dataclasses.replace(sequence, warnings=(*sequence.warnings, *warnings))
+
+
+def _seen(detections: Detections) -> Seen:
+    count = [len(found) for found in detections]
+    points = np.concatenate([np.zeros((0, 25, 3)), *detections])
+    return Seen(np.repeat(np.arange(len(count)), count), points)
+
+
+def _with_body(people: Keypoints, bodies: Bodies) -> tuple[Keypoints, Bodies, int]:
+    """Only people with a body, in the order of `pair`, and how many had none."""
+    kept = bodies.present.any(axis=1)
+    if not kept.any():
+        return people, bodies, 0
+    cut = dataclasses.replace(
+        bodies,
+        **{
+            n: getattr(bodies, n)[kept] for n in ("present", "poses", "shapes", "trans")
+        },
     )
+    return Keypoints(people.uv[kept], people.confidence[kept]), cut, int((~kept).sum())
 
 
 def _find_parts(path: Path) -> _Parts:
@@ -172,7 +221,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
             "the motion model, of 30, has to take them to."
         )
 
-    people = None
+    people, seen = None, None
     if parts.keypoints:
         detected = read_detections(
             parts.keypoints,
@@ -184,6 +233,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         )
         people, more = associate(detected.points, config, rate, detected.person)
         warnings += more
+        seen = _seen(detected.points)
     regressed = None
     if parts.bodies:
         regressed = read_bodies(
@@ -212,6 +262,7 @@ def _read_parts(path: Path, parts: _Parts, config: Association) -> Sequence:
         tracks=found_tracks,
         masks=parts.masks,
         groundtruth=parts.groundtruth,
+        seen=seen,
         warnings=tuple(warnings),
     )
     return sequence if picks is None else _thinned(sequence, picks)
@@ -271,11 +322,16 @@ def _thinned(sequence: Sequence, picks: np.ndarray) -> Sequence:
         _, landmark = np.unique(tracks.landmark[kept], return_inverse=True)
         frame = np.searchsorted(picks, tracks.frame[kept])
         tracks = Tracks(frame, landmark.astype(np.int64), tracks.uv[kept])
+    seen = sequence.seen
+    if seen is not None:
+        kept = np.isin(seen.frame, picks)
+        seen = Seen(np.searchsorted(picks, seen.frame[kept]), seen.points[kept])
     return dataclasses.replace(
         sequence,
         keypoints=cut(sequence.keypoints),
         bodies=cut(sequence.bodies),
         tracks=tracks,
+        seen=seen,
         picks=picks,
     )
 

@@ -1,0 +1,99 @@
+"""What somebody wears: the colours of trunk and thighs, to know people again by.
+
+The colours of a part are described by the cumulative histograms of L*, a* and b*.
+Their mean difference is the distance that colours must be moved by to turn one into
+the other (Wasserstein's), so little light more or less is a small distance, and means
+over time mean something.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+_BINS = 32
+_RANGES = ((0.0, 256.0), (64.0, 192.0), (64.0, 192.0))
+"""Of L*, a* and b* in OpenCV's 8 bits; clothes are rarely more colourful."""
+_GRID = 10
+"""Samples along each side of the trunk."""
+_LEAST = 25
+"""Samples within the image that a part must have."""
+SIZE = 2 * 3 * _BINS
+"""Numbers that describe one person."""
+_LIGHTNESS = 0.5
+"""Weight of L*, which light and shade change most."""
+
+
+def describe(
+    image: UInt8[np.ndarray, "y x 3"], points: Float[np.ndarray, "17 3"], least: float
+) -> Float[np.ndarray, " d"]:
+    """Cumulative histograms of a person's trunk and thighs; NaN where too little is
+    seen of a part.
+
+    Args:
+        image: BGR.
+        points: COCO keypoints, u px, v px, score.
+        least: score of keypoints that count.
+    """
+    found = np.full((2, 3, _BINS), np.nan)
+    for index, at in enumerate((_trunk(points, least), _thighs(points, least))):
+        column, row = np.round(at).astype(int).T
+        inside = (column >= 0) & (row >= 0)
+        inside &= (column < image.shape[1]) & (row < image.shape[0])
+        if inside.sum() < _LEAST:
+            continue
+        colours = image[row[inside], column[inside]][None]
+        lab = cv2.cvtColor(colours, cv2.COLOR_BGR2LAB)[0].astype(float)
+        for channel, (low, high) in enumerate(_RANGES):
+            place = np.clip((lab[:, channel] - low) / (high - low) * _BINS, 0, _BINS)
+            edges = np.arange(1, _BINS + 1)
+            found[index, channel] = (place[:, None] < edges).mean(0)
+    return found.ravel()
+
+
+def difference(a: Float[np.ndarray, " d"], b: Float[np.ndarray, " d"]) -> float:
+    """How far the colours of two descriptions are apart, in 8-bit steps of CIELAB; NaN
+    where no part is known of both."""
+    extent = np.array([high - low for low, high in _RANGES])
+    weight = np.array([_LIGHTNESS, 1.0, 1.0])
+    apart = np.abs(a - b).reshape(2, 3, _BINS).mean(-1) * extent * weight
+    parts = np.linalg.norm(apart, axis=1)
+    known = np.isfinite(parts)
+    return float(parts[known].mean()) if known.any() else float("nan")
+
+
+def mean_look(
+    looks: Float[np.ndarray, "n d"],
+) -> Float[np.ndarray, " d"]:
+    """The description of somebody who was seen `n` times; NaN where they never were."""
+    known = np.isfinite(looks)
+    total = np.where(known, looks, 0.0).sum(0)
+    count = known.sum(0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _trunk(points: np.ndarray, least: float) -> Float[np.ndarray, "m 2"]:
+    """Places within shoulders and hips, away from their edges."""
+    if not (points[[5, 6, 11, 12], 2] > least).all():
+        return np.zeros((0, 2))
+    left, right = points[[5, 11], None, :2], points[[6, 12], None, :2]
+    along = np.linspace(0.2, 0.8, _GRID)[:, None]
+    top, bottom = (
+        left[0] + along * (right - left)[0],
+        left[1] + along * (right - left)[1],
+    )
+    down = np.linspace(0.15, 0.9, _GRID)[:, None, None]
+    return (top + down * (bottom - top)).reshape(-1, 2)
+
+
+def _thighs(points: np.ndarray, least: float) -> Float[np.ndarray, "m 2"]:
+    """Places along both thighs, as wide as a third of one."""
+    found = [np.zeros((0, 2))]
+    for hip, knee in ((11, 13), (12, 14)):
+        if min(points[hip, 2], points[knee, 2]) <= least:
+            continue
+        bone = points[knee, :2] - points[hip, :2]
+        across = 0.08 * np.array([-bone[1], bone[0]])
+        along = np.linspace(0.2, 0.9, _GRID)[:, None, None] * bone
+        aside = np.linspace(-1, 1, 4)[None, :, None] * across
+        found.append((points[hip, :2] + along + aside).reshape(-1, 2))
+    return np.concatenate(found)

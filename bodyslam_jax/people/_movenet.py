@@ -1,0 +1,132 @@
+"""MoveNet MultiPose: up to six people and their 17 keypoints in a part of an image.
+
+The network takes any size whose sides are multiples of 32 and finds people who are
+about 40 to 250 px high in it, so a part of the image is scaled to suit whom it shows.
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+NUM_KEYPOINTS = 17
+"""COCO's, in its order: nose, eyes, ears, shoulders, elbows, wrists, hips, knees,
+ankles, left before right."""
+_MULTIPLE = 32
+_SHIFT = -0.25
+"""px of the network's input, added to `relative place x size`: half a pixel is from
+pixel edges to centres, and a quarter back is the network's own offset, from images and
+their mirror images (five clips, 545 keypoints; -0.27)."""
+_COINCIDENT = 0.05
+"""Distance of two keypoints that are the same one, of the person's size."""
+_SHARED = 4
+"""Keypoints that two detections of one person share at least."""
+
+Region = tuple[int, int, int, int]
+"""Left, top, right, bottom of a part of an image, px; the last two are outside it. It
+may reach beyond the image."""
+
+
+def find_people(
+    session: Any, image: UInt8[np.ndarray, "y x 3"], region: Region, longer: int
+) -> tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]:
+    """Keypoints (u px, v px, score) and a score of each person in a part of an image.
+
+    Args:
+        session: MoveNet.
+        image: BGR.
+        longer: the longer side of the region in the network's input, px.
+    """
+    canvas, scale = letterbox(image, region, longer)
+    rgb = canvas[..., ::-1].astype(np.int32)[None]
+    (raw,) = session.run(None, {session.get_inputs()[0].name: rgb})
+    points, score = decode(raw[0], canvas.shape[:2])
+    points[..., :2] = to_image(points[..., :2], region, scale)
+    return points, score
+
+
+def letterbox(
+    image: UInt8[np.ndarray, "y x 3"], region: Region, longer: int
+) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
+    """A part of an image at another scale, black where there is none.
+
+    **Returns:** the canvas, its sides the next multiples of 32, its content in the
+    upper left corner; and its pixels per pixel of the image.
+    """
+    left, top, right, bottom = region
+    width, height = right - left, bottom - top
+    scale = longer / max(width, height)
+    patch = np.zeros((height, width, 3), np.uint8)
+    x0, y0 = max(left, 0), max(top, 0)
+    x1, y1 = min(right, image.shape[1]), min(bottom, image.shape[0])
+    if x1 > x0 and y1 > y0:
+        patch[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    scaled = cv2.resize(patch, size, interpolation=how)
+    rows, columns = (-(-n // _MULTIPLE) * _MULTIPLE for n in scaled.shape[:2])
+    canvas = np.zeros((rows, columns, 3), np.uint8)
+    canvas[: scaled.shape[0], : scaled.shape[1]] = scaled
+    return canvas, scale
+
+
+def decode(
+    raw: Float[np.ndarray, "6 56"], size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "6 17 3"], Float[np.ndarray, " 6"]]:
+    """Keypoints (x px, y px, score) on the network's input of `size` (rows, columns),
+    and each person's score, from its output (y, x relative to the input, score)."""
+    yxs = raw[:, : 3 * NUM_KEYPOINTS].reshape(-1, NUM_KEYPOINTS, 3).astype(float)
+    rows, columns = size
+    x, y = yxs[..., 1] * columns + _SHIFT, yxs[..., 0] * rows + _SHIFT
+    return np.stack([x, y, yxs[..., 2]], axis=-1), raw[:, 55].astype(float)
+
+
+def to_image(
+    xy: Float[np.ndarray, "*n 2"], region: Region, scale: float
+) -> Float[np.ndarray, "*n 2"]:
+    """Pixels of the canvas of `letterbox` -> pixels of the image (centres at whole
+    numbers in both)."""
+    return (xy + 0.5) / scale - 0.5 + np.array(region[:2])
+
+
+def distinct(
+    points: Float[np.ndarray, "n 17 3"], score: Float[np.ndarray, " n"]
+) -> Int[np.ndarray, " k"]:
+    """Indices of detections, best first, of which no two are of the same person: who
+    shares four keypoints with a better one is that one again."""
+    kept: list[int] = []
+    for index in np.argsort(-score, kind="stable").tolist():
+        if all(not same_person(points[index], points[k]) for k in kept):
+            kept.append(index)
+    return np.array(kept, int)
+
+
+def same_person(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> bool:
+    """Whether two detections in one image share so many keypoints that they are of one
+    person. The face counts once: its five keypoints are close together."""
+    near = np.linalg.norm(a[:, :2] - b[:, :2], axis=1)
+    size = max(box_size(a), box_size(b), 1.0)
+    shared = (near < _COINCIDENT * size) & sure_points(a) & sure_points(b)
+    return int(shared[5:].sum() + shared[:5].any()) >= _SHARED
+
+
+def sure_points(points: Float[np.ndarray, "17 3"]) -> Bool[np.ndarray, " 17"]:
+    """Keypoints that say where a person is, by MoveNet's own score."""
+    return points[:, 2] > SURE
+
+
+SURE = 0.15
+
+
+def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
+    """Left, top, right, bottom (px) of a person's sure keypoints, of all if too few."""
+    sure = sure_points(points)
+    seen = points[sure if sure.sum() >= 2 else slice(None), :2]
+    return np.concatenate([seen.min(0), seen.max(0)])
+
+
+def box_size(points: Float[np.ndarray, "17 3"]) -> float:
+    """Longer side of that box, px."""
+    left, top, right, bottom = box(points)
+    return float(max(right - left, bottom - top))

@@ -1,0 +1,117 @@
+"""The two networks that ship, as sessions of onnxruntime.
+
+MoveNet MultiPose finds people and their 17 COCO keypoints in an image; BlazePose GHUM
+adds heels, toes and a mask to one person at a time. `assets/networks/MODEL_CARD.md`
+says where they come from and under which licence.
+"""
+
+import dataclasses
+import hashlib
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+_FOLDER = Path(__file__).parent / "assets" / "networks"
+_MOST_THREADS = 4
+"""Convolutions of this size gain nothing from more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """A network file of the package."""
+
+    name: str
+    sha256: str
+
+    @property
+    def path(self) -> Path:
+        return _FOLDER / self.name
+
+
+MOVENET = Network(
+    "movenet_multipose.onnx",
+    "20c7312bb9e30103d50077c6e7680e26411f07a9469db8b2bbb565f120eea817",
+)
+BLAZEPOSE = Network(
+    "blazepose_full.onnx",
+    "1f23f73d0cd62553051863e68309dd0c566fa20d43ae2821236c371d1fadf829",
+)
+NETWORKS = (MOVENET, BLAZEPOSE)
+
+
+def open_network(network: Network) -> Any:
+    """A session of one of the networks that ship, after its checksum was compared.
+
+    It uses the processor cores that this process may use, four at most, and none of
+    them while it waits.
+
+    **Raises:** `ValueError` if the file is missing or is not the one that was shipped,
+    or onnxruntime is not installed.
+    """
+    check_network(network)
+    return make_session(network.path)
+
+
+def check_network(network: Network) -> None:
+    """**Raises:** `ValueError` if the file is missing or its checksum is another."""
+    advice = "install bodyslam-jax again, or give keypoints/"
+    try:
+        digest = hashlib.sha256(network.path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ValueError(
+            f"{network.path}: cannot be read ({error.strerror}); expected the network "
+            f"that finds people: {advice}."
+        ) from error
+    if digest != network.sha256:
+        raise ValueError(
+            f"{network.path}: SHA-256 {digest[:12]}..., expected "
+            f"{network.sha256[:12]}...: {advice}."
+        )
+
+
+def network_status() -> list[tuple[str, str]]:
+    """Lines of (name, finding) for people, one for each network that ships."""
+    rows = []
+    for network in NETWORKS:
+        try:
+            open_network(network)
+        except ValueError as error:
+            rows.append((network.name, str(error)))
+        else:
+            rows.append((network.name, "runs; SHA-256 as shipped"))
+    return rows
+
+
+def make_session(path: Path) -> Any:
+    """An onnxruntime session of an ONNX file on the CPU.
+
+    **Raises:** `ValueError` if onnxruntime is missing or does not read the file.
+    """
+    try:
+        onnxruntime = importlib.import_module("onnxruntime")
+    except ImportError as error:
+        raise ValueError(
+            "detect: onnxruntime is not installed; `pip install onnxruntime`, or give "
+            "keypoints/ instead."
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = min(_available_cores(), _MOST_THREADS)
+    options.inter_op_num_threads = 1
+    # Threads that wait in a busy loop would take the cores from everything else.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # onnxruntime's own errors have no common public base
+        raise ValueError(
+            f"{path}: not a model that onnxruntime reads ({error})."
+        ) from error
+
+
+def _available_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
