@@ -12,6 +12,7 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import camera, export
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
+from bodyslam_jax.gravity import Upright
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.result import Result
@@ -32,6 +33,7 @@ def summarise(
     cameras: Cameras,
     joint: Joint,
     result: Result,
+    up: Upright,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """`summary.json`: what a person wants to know first, then everything else."""
