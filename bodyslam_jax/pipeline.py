@@ -172,6 +172,16 @@ def _check_length(sequence: Sequence) -> None:
         )
 
 
+def find_people(
+    sequence: Sequence, config: Config = Config(), cache: Cache = Cache(None)
+) -> Sequence:
+    """The sequence with people found in its images, as `run` finds them.
+
+    **Raises:** as `run`.
+    """
+    return _detected(sequence, config, cache, Stopwatch())
+
+
 def _detected(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:

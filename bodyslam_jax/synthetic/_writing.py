@@ -47,7 +47,11 @@ _DEMO_FRAMES = 105
 
 
 def write_sequence(
-    folder: Path, simulated: SimulatedSequence, *, tracks: bool = True
+    folder: Path,
+    simulated: SimulatedSequence,
+    *,
+    tracks: bool = True,
+    people: bool = True,
 ) -> Path:
     """Writes a sequence folder with its ground truth, whole or not at all.
 
@@ -59,12 +63,14 @@ def write_sequence(
     - `folder`: new, empty, or with an earlier simulation, whose files are replaced;
         others, such as a run in a folder below, are kept.
     - `tracks`: whether `tracks.npz` is written; without it tracks come from the video.
+    - `people`: whether keypoints and bodies are written; without them people are found
+        in the video.
 
     **Raises:** `ValueError` if `folder` holds something else or cannot be written.
     """
     folder = Path(folder)
     with _partial(folder, simulated.settings) as partial:
-        _write(partial, simulated, tracks)
+        _write(partial, simulated, tracks, people)
         _move(partial, folder, simulated.settings)
     return folder
 
@@ -100,6 +106,21 @@ def demo_scene(
     if simulated is None:
         simulated = simulate(settings)
     return write_sequence(folder, simulated, tracks=False)
+
+
+def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
+    """Renders a sequence to a folder with the video and the camera's calibration only,
+    so that people and tracks have to be found in the images; with the ground truth.
+
+    A film of the same settings that is there is kept.
+
+    **Raises:** as `write_sequence`.
+    """
+    settings = dataclasses.replace(simulated.settings, render=True)
+    if _earlier(Path(folder)) == dataclasses.asdict(settings):
+        return Path(folder)
+    simulated = dataclasses.replace(simulated, settings=settings)
+    return write_sequence(folder, simulated, tracks=False, people=False)
 
 
 def render(simulated: SimulatedSequence) -> Iterator[UInt8[np.ndarray, "rows cols 3"]]:
@@ -262,7 +283,9 @@ def _move(partial: Path, folder: Path, settings: Simulation) -> None:
     os.replace(partial / _MARK, folder / _MARK)
 
 
-def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
+def _write(
+    folder: Path, simulated: SimulatedSequence, tracks: bool, people: bool
+) -> None:
     width, height = simulated.size
     camera = {
         "model": "PINHOLE",
@@ -272,27 +295,8 @@ def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
         "fps": FPS,
     }
     (folder / "camera.json").write_text(json.dumps(camera))
-    _write_keypoints(folder / "keypoints", simulated)
-    bodies, person = _stacked([actor.bodies for actor in simulated.actors])
-    np.savez_compressed(
-        folder / "bodies.npz",
-        frame=bodies.frame,
-        person=person,
-        poses=bodies.poses,
-        betas=bodies.shapes,
-        trans=bodies.trans,
-        shapes_regressed=np.array(_shapes_regressed(simulated)),
-    )
-    np.savez_compressed(
-        folder / "bodies_weak_perspective.npz",
-        frame=bodies.frame,
-        person=person,
-        poses=bodies.poses_crop,
-        betas=bodies.shapes,
-        camera=bodies.camera,
-        bbox=bodies.box,
-        shapes_regressed=np.array(_shapes_regressed(simulated)),
-    )
+    if people:
+        _write_people(folder, simulated)
     if tracks:
         np.savez_compressed(
             folder / "tracks.npz",
@@ -318,6 +322,31 @@ def _write(folder: Path, simulated: SimulatedSequence, tracks: bool) -> None:
         write_video(folder / _FILM, render(simulated), FPS, simulated.size)
     settings = dataclasses.asdict(simulated.settings)
     (folder / _MARK).write_text(json.dumps(settings, indent=1))
+
+
+def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
+    """Keypoints and bodies as they are measured."""
+    _write_keypoints(folder / "keypoints", simulated)
+    bodies, person = _stacked([actor.bodies for actor in simulated.actors])
+    np.savez_compressed(
+        folder / "bodies.npz",
+        frame=bodies.frame,
+        person=person,
+        poses=bodies.poses,
+        betas=bodies.shapes,
+        trans=bodies.trans,
+        shapes_regressed=np.array(_shapes_regressed(simulated)),
+    )
+    np.savez_compressed(
+        folder / "bodies_weak_perspective.npz",
+        frame=bodies.frame,
+        person=person,
+        poses=bodies.poses_crop,
+        betas=bodies.shapes,
+        camera=bodies.camera,
+        bbox=bodies.box,
+        shapes_regressed=np.array(_shapes_regressed(simulated)),
+    )
 
 
 def _stacked(
