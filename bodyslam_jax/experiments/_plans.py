@@ -197,7 +197,7 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """From pixels alone beside simulated keypoints and bodies, all ten, both families."""
+    """Pixels alone beside simulated keypoints and bodies, all ten, both families."""
     jobs = _video.jobs(experiment, config, stages, ALL)
     return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
 

@@ -42,7 +42,7 @@ _TRUE = {c.key: f"true/{c.key}" for c in _FIGURES[11:16]}
 
 
 def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """`video.md` and `video.csv`: means, every sequence, and the detector's keypoints."""
+    """`video.md`, `video.csv`: means, every sequence, the detector's keypoints."""
     rows = [
         row | {"scale_error": None if row["scale"] is None else abs(1 - row["scale"])}
         for row in rows
