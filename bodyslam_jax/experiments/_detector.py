@@ -100,7 +100,7 @@ def _offset(error, R_CJ, seen, counted, *, mirrored: bool) -> dict[str, Any]:
         return {**row, "offset": [np.nan] * 3, "spread": np.nan}
     A, b = R_CJ[good, :2].reshape(-1, 3), error[good].reshape(-1)
     # Where a view never changes its depth is not seen: there it is taken to be small
-    ridge = 1e-2 * len(A) * np.eye(3)
+    ridge = 1e-3 * len(A) * np.eye(3)
     offset = np.linalg.solve(A.T @ A + ridge, A.T @ b)
     rest = b - A @ offset
     offset = offset * ([-1, 1, 1] if mirrored else 1)
