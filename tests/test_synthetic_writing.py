@@ -257,3 +257,17 @@ def test_the_same_seed_gives_the_same_film_and_another_another():
     np.testing.assert_array_equal(first, film(settings))
     other = film(dataclasses.replace(settings, seed=4))
     assert abs(first.astype(int) - other).mean() > 5
+
+
+def test_a_film_has_no_measurements_and_is_kept(simulated, tmp_path):
+    short = synthetic.simulate(dataclasses.replace(SETTINGS, length=3))
+    measured = synthetic.write_sequence(tmp_path / "a", short)
+    assert read_sequence(measured).keypoints is not None
+    folder = synthetic.film_scene(tmp_path / "a", short)  # replaces what was measured
+    sequence = read_sequence(folder)
+    assert sequence.keypoints is None and sequence.bodies is None
+    assert sequence.tracks is None and sequence.num_frames == 3
+    assert not (folder / "keypoints").exists()
+    before = (folder / "video.mp4").stat().st_mtime_ns
+    synthetic.film_scene(folder, short)
+    assert (folder / "video.mp4").stat().st_mtime_ns == before

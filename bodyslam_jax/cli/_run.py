@@ -59,6 +59,7 @@ def run(
 def demo(
     *,
     out: Path = Path("bodyslam_demo"),
+    from_pixels: bool = False,
     preset: Preset = "default",
     settings: Path | None = None,
     config: Flat = Config(),
@@ -67,6 +68,8 @@ def demo(
 
     Args:
         out: Run folder to write.
+        from_pixels: Find the walker in the images by the networks that ship, in place
+            of the keypoints and bodies that are simulated.
         preset: `paper` has the weights and the first-order schedule of the paper.
         settings: A config.yaml to start from, which prevails over a preset; options
             beside it prevail over both.
@@ -74,7 +77,9 @@ def demo(
     """
     from bodyslam_jax import pipeline
 
-    return _finish(pipeline.demo(out, config, first=_is_first()), out)
+    first = _is_first()
+    result = pipeline.demo(out, config, first=first, from_pixels=from_pixels)
+    return _finish(result, out)
 
 
 def _finish(result: Any, out: Path) -> int:

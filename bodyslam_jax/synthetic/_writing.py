@@ -92,20 +92,25 @@ def demo_settings(seed: int = 0) -> Simulation:
 
 
 def demo_scene(
-    folder: Path, seed: int = 0, simulated: SimulatedSequence | None = None
+    folder: Path,
+    seed: int = 0,
+    simulated: SimulatedSequence | None = None,
+    *,
+    people: bool = True,
 ) -> Path:
     """Renders the walker whom a camera goes along with.
 
     Writes a sequence folder without tracks, so that they come from the video. What is
     there of the same seed is kept. `simulated` is the demo's scene of that seed, if
-    there is one already.
+    there is one already. Without `people` there are neither keypoints nor bodies, so
+    that people come from the video, too.
     """
     settings = demo_settings(seed)
-    if _earlier(Path(folder)) == dataclasses.asdict(settings):
+    if _earlier(Path(folder)) == _mark(settings, False, people):
         return Path(folder)
     if simulated is None:
         simulated = simulate(settings)
-    return write_sequence(folder, simulated, tracks=False)
+    return write_sequence(folder, simulated, tracks=False, people=people)
 
 
 def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
@@ -117,7 +122,7 @@ def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
     **Raises:** as `write_sequence`.
     """
     settings = dataclasses.replace(simulated.settings, render=True)
-    if _earlier(Path(folder)) == dataclasses.asdict(settings):
+    if _earlier(Path(folder)) == _mark(settings, False, False):
         return Path(folder)
     simulated = dataclasses.replace(simulated, settings=settings)
     return write_sequence(folder, simulated, tracks=False, people=False)
@@ -275,6 +280,8 @@ def _move(partial: Path, folder: Path, settings: Simulation) -> None:
         if pattern != _FILM or was_rendered:
             for old in folder.glob(pattern):
                 old.unlink()
+    with contextlib.suppress(OSError):  # there is none, or it holds what is not ours
+        (folder / "keypoints").rmdir()
     for pattern in _OWN:
         for new in sorted(partial.glob(pattern)):
             place = folder / new.relative_to(partial)
@@ -320,8 +327,14 @@ def _write(
         )
     if simulated.settings.render:
         write_video(folder / _FILM, render(simulated), FPS, simulated.size)
-    settings = dataclasses.asdict(simulated.settings)
-    (folder / _MARK).write_text(json.dumps(settings, indent=1))
+    mark = _mark(simulated.settings, tracks, people)
+    (folder / _MARK).write_text(json.dumps(mark, indent=1))
+
+
+def _mark(settings: Simulation, tracks: bool, people: bool) -> dict[str, Any]:
+    """What a folder is of: settings, and which measurements it holds."""
+    measured = {"tracks": tracks, "people": people}
+    return {**dataclasses.asdict(settings), "measured": measured}
 
 
 def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
