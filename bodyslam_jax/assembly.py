@@ -4,13 +4,13 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import people
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
-from bodyslam_jax.gravity import find_stances, find_upright
+from bodyslam_jax.gravity import Upright, find_stances, find_upright
 from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.result import Result
 from bodyslam_jax.rotation import log
@@ -33,25 +33,22 @@ def assemble(
     """The optimum in a metric world whose y axis is up; standing feet are at y = 0."""
     T_WC = joint.cameras.copy()
     T_WC[:, :3, 3] *= joint.scale
-    rough = upright(T_WC, _trunks(T_WC, joint))
-    T_WC = rough @ T_WC
-    landmarks = joint.scale * joint.landmarks @ rough[:3, :3].T + rough[:3, 3]
     joints = _placed(sequence, config, body, joint, T_WC)[2]
-    found = find_upright(
-        (T_WC @ joint.roots)[..., :3, 1],
+    landmarks = joint.scale * joint.landmarks
+    turn, found = level(
+        T_WC,
+        T_WC @ joint.roots,
         joints[:, :, FEET],
         joint.present,
-        T_WC[:, :3, 3],
         landmarks if cameras.kind == "moving" else landmarks[:0],
         sequence.fps,
         people.without_bodies(sequence),
     )
-    turn = upright(T_WC, found.up)
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
     poses, trans, joints = _placed(sequence, config, body, joint, T_WC)
     if joint.present.any():
-        floor = _floor(body, joint, joints, sequence.fps)
+        floor = floor_height(body, joint.shapes, joints, joint.present, sequence.fps)
         for points in (T_WC[:, :3, 3], trans, joints, landmarks):
             points[..., 1] -= floor
     result = Result(
@@ -95,19 +92,23 @@ def _placed(
     return poses, trans, np.array(joints)
 
 
-def _floor(
+def floor_height(
     body: body_.BodyModel,
-    joint: Joint,
+    shapes: Float[np.ndarray, "h 10"],
     joints: Float[np.ndarray, "h t 24 3"],
+    present: Bool[np.ndarray, "h t"],
     fps: float,
 ) -> float:
-    """Height of what standing feet stand on, m; if none stand, of the lowest feet."""
-    sole = np.median([sole_height(body, shape) for shape in joint.shapes])
-    stances = find_stances(joints[:, :, FEET], joint.present, fps)
+    """Height of what standing feet stand on, m; if none stand, of the lowest feet.
+
+    `joints` are in a world whose y axis is up, m.
+    """
+    sole = np.median([sole_height(body, shape) for shape in shapes])
+    stances = find_stances(joints[:, :, FEET], present, fps)
     heights = np.concatenate([places[:, 1] for places in stances])
     if len(heights):
         return float(np.median(heights) - sole)
-    lowest = joints[joint.present][:, FEET, 1].min(axis=1)
+    lowest = joints[present][:, FEET, 1].min(axis=1)
     return float(np.quantile(lowest, 0.05) - sole)
 
 
@@ -132,13 +133,36 @@ def _smoothed(sequence, config, present, poses, pelvis):
     return poses, pelvis
 
 
-def _trunks(T_WC: Float[np.ndarray, "t 4 4"], joint: Joint) -> Float[np.ndarray, " 3"]:
-    """Where people's trunks point on average, or, without people, where the first
-    camera's top does: up, to begin with."""
+def level(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    T_WH: Float[np.ndarray, "h t 4 4"],
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    landmarks: Float[np.ndarray, "l 3"],
+    fps: float,
+    fitted: Bool[np.ndarray, " h"],
+) -> tuple[Float[np.ndarray, "4 4"], Upright]:
+    """The rigid motion to a world whose y axis is up, and how that is known.
+
+    Cues (see `find_upright`) are taken in a world that is roughly upright already: up
+    is there where people's trunks point on average, or, without people, where the first
+    camera's top does.
+    """
     up = -T_WC[0, :3, 1]
-    if joint.present.any():
-        up = (T_WC @ joint.roots)[joint.present][:, :3, 1].sum(axis=0)
-    return up / np.linalg.norm(up)
+    if present.any():
+        up = T_WH[present][:, :3, 1].sum(axis=0)
+    rough = upright(T_WC, up / np.linalg.norm(up))
+    at = lambda points: points @ rough[:3, :3].T + rough[:3, 3]
+    found = find_upright(
+        T_WH[..., :3, 1] @ rough[:3, :3].T,
+        at(feet),
+        present,
+        at(T_WC[:, :3, 3]),
+        at(landmarks),
+        fps,
+        fitted,
+    )
+    return upright(rough @ T_WC, found.up) @ rough, found
 
 
 def upright(

@@ -85,6 +85,10 @@ def demo(
 def _finish(result: Any, out: Path) -> int:
     for line in result.summary["headline"]:
         print(line)
+    for reason in result.summary["reasons"]:
+        print(
+            f"{reason['status']}: {reason['message']} What to do: {reason['advice']}."
+        )
     for warning in result.summary["warnings"]:
         print(f"warning: {warning}")
     print(f"{out / 'report.html'}")

@@ -11,6 +11,8 @@ from jaxtyping import Float
 HIPS, KNEES, ANKLES, FEET = (1, 2), (4, 5), (7, 8), (10, 11)
 PELVIS, NECK = 0, 12
 _PLAN = (0, 2)
+RUNNING = 2.2
+"""m/s. Faster than this no foot need be on the ground half of the time."""
 
 
 def knee_flexion(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, "t 2"]:
