@@ -446,10 +446,10 @@ def test_detection_without_what_it_needs(folder, command, tmp_path, monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     out = tmp_path / "run"
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    code, err = command("run", folder, "--detect", "--offline", "--out", out)
+    code, err = command("run", folder, "--detect", "yolox", "--offline", "--out", out)
     assert code == 1 and "onnxruntime is not installed" in err
     monkeypatch.setitem(sys.modules, "onnxruntime", object())
-    code, err = command("run", folder, "--detect", "--offline", "--out", out)
+    code, err = command("run", folder, "--detect", "yolox", "--offline", "--out", out)
     assert code == 1 and "yolox_s.onnx: not there, and offline is set" in err
     assert not out.exists()
 

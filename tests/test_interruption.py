@@ -151,8 +151,7 @@ def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path)
 def test_people_are_detected_where_nobody_gave_keypoints(
     sequence, tmp_path, monkeypatch
 ):
-    """`detect` with two networks that always say the same; found once, then kept."""
-    pytest.importorskip("onnxruntime", reason="extra `detect` is not installed")
+    """YOLOX and RTMPose that always say the same; found once, then kept."""
     raw = raw_output((40, 32, 20, 40, 0.9, 8))[None]
     x, y = np.zeros((1, 26, 96), np.float32), np.zeros((1, 26, 128), np.float32)
     joint = np.arange(26)
@@ -192,7 +191,7 @@ def test_people_are_detected_where_nobody_gave_keypoints(
 def _settings(folder: Path) -> Path:
     path = folder / "settings.yaml"
     lines = [f"  {n}: {folder / f}" for n, f in NETWORKS]
-    path.write_text("\n".join(["detect: true", "offline: true", "detection:", *lines]))
+    path.write_text("\n".join(["detect: yolox", "offline: true", "detection:", *lines]))
     return path
 
 

@@ -135,7 +135,6 @@ def test_an_own_model_that_is_not_there():
 
 def test_networks_that_always_say_the_same(tmp_path):
     """Both networks, run by onnxruntime: the person and the points that they say."""
-    pytest.importorskip("onnxruntime", reason="extra `detect` is not installed")
     raw = raw_output((40, 32, 20, 40, 0.9, 8))[None]
     detector = tmp_path / "detector.onnx"
     detector.write_bytes(constant_network((1, 3, *SIZE), {"output": raw}))

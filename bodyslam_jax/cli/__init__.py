@@ -31,7 +31,7 @@ from bodyslam_jax.config import MotionTraining
 
 
 def doctor() -> None:
-    """Versions, devices, BRISK, codecs, and where body models were looked for."""
+    """Versions, devices, BRISK, codecs, networks, and body models that were found."""
     from bodyslam_jax import doctor as _doctor
 
     rows = _doctor.report()
@@ -75,8 +75,8 @@ _ABOUT = {
     "bodyslam": """\
 Cameras, people and a map in metres, from a video that one moving camera took of people.
 
-Without any file: `bodyslam demo`. A video of your own: `bodyslam run VIDEO.mp4
---keypoints FOLDER --out RUN`. What a command takes: `bodyslam COMMAND --help`.""",
+Without any file: `bodyslam demo`. A video of your own: `bodyslam run VIDEO.mp4 --out
+RUN`. What a command takes: `bodyslam COMMAND --help`.""",
     "bodyslam body-model": "Body model files: SMPL-shaped, SMPL, SMPL-H, SMPL-X.",
     "bodyslam convert-dataset": "Sequence folders with ground truth from datasets.",
 }

@@ -13,7 +13,7 @@ class Detect:
     search_interval: float = 0.33
     """Time between two searches of the whole image by the networks that ship, s; in
     between they look where people are expected."""
-    min_height: float = 40.0
+    min_height: float = 50.0
     """Height of people in the image below which they are masked, not estimated, px."""
     detector: str | None = None
     """For `yolox`: an own YOLOX, an ONNX file; by default YOLOX-S, fetched once."""

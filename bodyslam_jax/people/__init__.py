@@ -3,10 +3,10 @@
 from bodyslam_jax.people._bodies import estimate_bodies as estimate_bodies
 from bodyslam_jax.people._bodies import nobody as nobody
 from bodyslam_jax.people._bodies import without_bodies as without_bodies
-from bodyslam_jax.people._built_in import Found as Found
 from bodyslam_jax.people._built_in import find_tracked as find_tracked
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
+from bodyslam_jax.people._found import Found as Found
 from bodyslam_jax.people._keypoint_errors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people._networks import network_status as network_status
 from bodyslam_jax.people._prepare import BodyNoise as BodyNoise

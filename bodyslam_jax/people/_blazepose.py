@@ -66,7 +66,7 @@ class Pose:
     z forward) as if the person were on the optical axis."""
 
 
-def square_around(points: Float[np.ndarray, "17 3"], least: float) -> Square | None:
+def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | None:
     """Where BlazePose is to look for a person with these COCO keypoints (u, v, score).
 
     Args:

@@ -12,18 +12,18 @@ from collections import deque
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.frontend import SILHOUETTE_STEP
 from bodyslam_jax.people import _blazepose, _movenet
 from bodyslam_jax.people._appearance import SIZE, describe
-from bodyslam_jax.people._detect import to_body25
+from bodyslam_jax.people._found import AGREES, Found, as_body25, find_feet
 from bodyslam_jax.people._linking import link, remarks
 from bodyslam_jax.people._movenet import Region, sure_points
 from bodyslam_jax.people._networks import BLAZEPOSE, MOVENET, open_network
+from bodyslam_jax.people._regions import behind, covered, regions, square_around
 from bodyslam_jax.people._tracking import Tracker, Tracklet, between, height
-from bodyslam_jax.sequence import Seen
 
 _COARSE, _SEARCH, _FINE = 320, 640, 1280
 """Longer side of the image in MoveNet's input, px: for people who fill the image, for
@@ -33,8 +33,6 @@ _FINE_EVERY = 3
 _LARGEST = 250.0
 """px of MoveNet's input: of larger people it makes several."""
 _SQUARE = 256
-_ROOM = 1.35
-"""Side of the square around an expected person, of their box."""
 _START, _CONTINUE, _SEEN = 0.22, 0.12, 0.1
 """MoveNet's score of a person who is new, who was expected there, and of whom nothing
 is to be in the map in any case. Without people it says 0.00 to 0.07."""
@@ -42,46 +40,14 @@ _SOONER = 3
 """Frames after a search until the next where somebody was lost."""
 _OVERLAP = 0.25
 """Share of a person's box that others may cover while its colours are the person's."""
+_LITTLE = 0.03
+"""How much there is to see of somebody who is estimated, at least: of what there is of
+the person who is seen best."""
 _PRESENCE = 0.5
-_AGREES = 0.12
-"""Distance of MoveNet's and BlazePose's ankle, and median of all keypoints, of the
-radius of the circle around a person, up to which they saw the same one."""
 _LEAST_FOR_FEET = 60.0
 """Height of people, px, below which BlazePose is of no use."""
-_FEET = ((21, 19, 11, 15), (24, 22, 14, 16))
-"""BODY_25's heel, big toe and ankle, COCO's ankle, of both sides."""
-
-
 _Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
 """COCO keypoints, and a score for each person."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """Everybody found in a video of `t` frames, one row per person and frame."""
-
-    frame: Int[np.ndarray, " n"]
-    points: Float[np.ndarray, "n 25 3"]
-    """BODY_25: u px, v px, confidence."""
-    person: Int[np.ndarray, " n"]
-    """Who it is, the best seen first; -1 for whom nothing is known but the place."""
-    silhouettes: UInt8[np.ndarray, "t y x8"]
-    """Masks of people at every `step`-th pixel, eight to a byte."""
-    warnings: tuple[str, ...]
-
-    def by_frame(self, num_frames: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """For each frame the keypoints (n, 25, 3) of the people that are known, and who
-        they are (n,)."""
-        known = self.person >= 0
-        frame, points, person = (
-            a[known] for a in (self.frame, self.points, self.person)
-        )
-        ends = np.searchsorted(frame, np.arange(1, num_frames))
-        return np.split(points, ends), np.split(person, ends)
-
-    def seen(self) -> Seen:
-        """Everybody, for the masks."""
-        return Seen(self.frame, self.points, self.silhouettes)
 
 
 @dataclasses.dataclass
@@ -89,7 +55,7 @@ class _Frame:
     """What was found in one image, and the image as long as it may be needed."""
 
     image: UInt8[np.ndarray, "y x 3"]
-    mask: Bool[np.ndarray, "y x"]
+    mask: Bool[np.ndarray, "r c"]
     """At every `SILHOUETTE_STEP`-th pixel, where people are."""
     known: dict[int, np.ndarray]
     """By number of the tracklet, COCO keypoints."""
@@ -128,6 +94,7 @@ class _Finder:
         self.movenet = open_network(MOVENET)
         self.blazepose = open_network(BLAZEPOSE)
         self.fps, self.settings, self.association = fps, settings, association
+        self.whom = settings.min_height, settings.max_people
         self.tracker = Tracker(fps, association.max_gap)
         self.interval = max(1, round(settings.search_interval * fps))
         self.next_search, self.last_search, self.searches = 0, -_SOONER, 0
@@ -141,19 +108,15 @@ class _Finder:
         size = tuple(-(-n // SILHOUETTE_STEP) for n in image.shape[:2])
         now = _Frame(image, np.zeros(size, bool), {}, [])
         expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
-        expected = [p for p in expected if height(p) >= self.settings.min_height]
-        expected.sort(key=height, reverse=True)
-        found = [
-            self._look(image, _square(points), _SQUARE)
-            for points in expected[: self.settings.max_people]
-        ]
+        found = [self._look(image, r, _SQUARE) for r in regions(expected, *self.whom)]
         if k >= self.next_search:
             found += self._search(image)
             self.last_search, self.next_search = k, k + self.interval
         points, score = _merged(found)
         looks = self._looks(image, points)
         known = len(self.tracker.tracklets)
-        who = self.tracker.update(k, points, looks, score >= _START)
+        clear = ~behind(points, score)
+        who = self.tracker.update(k, points, looks, clear, clear & (score >= _START))
         for row, number in zip(points, who.tolist(), strict=True):
             if number < 0:
                 now.others.append(row)
@@ -171,16 +134,22 @@ class _Finder:
     def result(self) -> Found:
         everybody = link(self.tracker.tracklets, self.fps)
         people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
+        people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
-        rows = [(frame, -1, _to_body25(points, None)) for frame, points in self.others]
+        rows = [(frame, -1, as_body25(points, None)) for frame, points in self.others]
         for tracklet in self.tracker.tracklets:
             who = number.get(tracklet.number, -1)
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
                 feet = self.feet.get((tracklet.number, frame))
-                rows.append((frame, who, _to_body25(points, feet)))
-            rows += [(frame, -1, _to_body25(p, None)) for frame, p in between(tracklet)]
+                rows.append((frame, who, as_body25(points, feet)))
+            rows += [(frame, -1, as_body25(p, None)) for frame, p in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
+        if len(everybody) > len(people):
+            warnings.append(
+                f"{len(everybody) - len(people)} more people, small or seen briefly, "
+                "are kept out of the map and not estimated."
+            )
         return Found(
             np.array([row[0] for row in rows], int),
             np.array([row[2] for row in rows]).reshape(-1, 25, 3),
@@ -218,7 +187,9 @@ class _Finder:
         points, score = _movenet.find_people(self.movenet, image, region, longer)
         scale = longer / max(region[2] - region[0], region[3] - region[1])
         sizes = np.array([_movenet.box_size(p) for p in points])
-        kept = (score >= _SEEN) & (sizes * scale <= _LARGEST)
+        kept = score >= _SEEN
+        if longer > _COARSE:
+            kept &= sizes * scale <= _LARGEST
         return points[kept], score[kept]
 
     def _looks(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -226,7 +197,7 @@ class _Finder:
         boxes = [_movenet.box(p) for p in points]
         looks = np.full((len(points), SIZE), np.nan)
         for i, row in enumerate(points):
-            others = [_covered(boxes[i], b) for j, b in enumerate(boxes) if j != i]
+            others = [covered(boxes[i], b) for j, b in enumerate(boxes) if j != i]
             if max(others, default=0.0) < _OVERLAP:
                 looks[i] = describe(image, row, _movenet.SURE)
         return looks
@@ -234,15 +205,15 @@ class _Finder:
     def _note(self, k: int, frame: _Frame, number: int, points: np.ndarray) -> None:
         """Somebody found in a frame: their feet and silhouette, too."""
         frame.known[number] = points
-        square = _blazepose.square_around(points, _movenet.SURE)
+        square = _blazepose.turned_square(points, _movenet.SURE)
         if square is None or height(points) < _LEAST_FOR_FEET:
             return
         pose = _blazepose.read_pose(self.blazepose, frame.image, square)
         apart = _blazepose.disagreement(pose, points)
         sure = sure_points(points)
-        if pose.presence < _PRESENCE or np.median(apart[sure]) > _AGREES:
+        if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
             return
-        self.feet[number, k] = _feet(pose, points, apart)
+        self.feet[number, k] = find_feet(pose, points, apart)
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= _blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 
@@ -251,7 +222,8 @@ class _Finder:
         tracklet = self.tracker.tracklets[number]
         for index, frame in reversed(self.recent):
             first = tracklet.points[0]
-            points, score = _merged([self._look(frame.image, _square(first), _SQUARE)])
+            near = self._look(frame.image, square_around(first), _SQUARE)
+            points, score = _merged([near])
             looks = self._looks(frame.image, points)
             cost = [
                 self.tracker.cost_before(tracklet, p, look)
@@ -281,49 +253,3 @@ def _merged(found: list[_Detections]) -> _Detections:
 def _presence(pieces: list[Tracklet]) -> float:
     """How much there is to see of somebody: confidence times size, over time."""
     return sum(height(p) * float(p[:, 2].sum()) for t in pieces for p in t.points)
-
-
-def _square(points: Float[np.ndarray, "17 3"]) -> Region:
-    """Where to look for a person who is expected at these places."""
-    box = _movenet.box(points)
-    x, y = (box[:2] + box[2:]) / 2
-    half = max(16.0, _ROOM * height(points) / 2)
-    left, top, side = round(x - half), round(y - half), round(2 * half)
-    return left, top, left + side, top + side
-
-
-def _covered(box: np.ndarray, other: np.ndarray) -> float:
-    """Share of a box (left, top, right, bottom) that another covers."""
-    low, high = np.maximum(box[:2], other[:2]), np.minimum(box[2:], other[2:])
-    area = max(float(np.prod(box[2:] - box[:2])), 1e-9)
-    return float(np.prod(np.maximum(high - low, 0))) / area
-
-
-def _feet(
-    pose: _blazepose.Pose, points: Float[np.ndarray, "17 3"], apart: np.ndarray
-) -> Float[np.ndarray, "4 3"]:
-    """Heel and big toe of both sides (u px, v px, confidence): nothing where the two
-    networks put the ankle elsewhere."""
-    feet = pose.landmarks[_blazepose.HEELS_AND_TOES].copy()
-    for side, (_, _, _, ankle) in enumerate(_FEET):
-        rows = slice(2 * side, 2 * side + 2)
-        share = confidence(points[ankle, 2]) * (apart[ankle] < _AGREES)
-        feet[rows, 2] *= share
-    return feet
-
-
-def _to_body25(
-    points: Float[np.ndarray, "17 3"], feet: Float[np.ndarray, "4 3"] | None
-) -> Float[np.ndarray, "25 3"]:
-    sure = np.column_stack([points[:, :2], confidence(points[:, 2])])
-    found = to_body25(sure)
-    if feet is not None:
-        for side, (heel, toe, _, _) in enumerate(_FEET):
-            found[heel], found[toe] = feet[2 * side], feet[2 * side + 1]
-        found[found[:, 2] <= 0] = 0.0
-    return found
-
-
-def confidence(score: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """MoveNet's score as a confidence in 0..1 that falls as the error grows."""
-    return np.clip((np.asarray(score, float) - 0.05) / 0.4, 0.0, 1.0)

@@ -1,7 +1,7 @@
 """People and keypoints from images: YOLOX finds boxes, RTMPose points in each box.
 
-Extra `detect` (onnxruntime). The models are fetched once to the user's cache and
-checked against their SHA-256; both are Apache-2.0:
+For who asks for them in place of the networks that ship (`_built_in`). The models are
+fetched once to the user's cache and checked against their SHA-256; both are Apache-2.0:
 
 - YOLOX-S (Ge et al., 2021), Megvii's own export;
 - DWPose-L (Yang et al., 2023), an RTMPose with 133 keypoints, of which the body's and
@@ -12,7 +12,6 @@ Everything but the networks is plain NumPy. Images are BGR, as OpenCV reads them
 
 import dataclasses
 import hashlib
-import importlib
 import logging
 import os
 import urllib.request
@@ -25,6 +24,7 @@ from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Detect
 from bodyslam_jax.frontend import BODY25_FROM
+from bodyslam_jax.people._networks import check_onnxruntime, make_session
 
 log = logging.getLogger(__name__)
 
@@ -255,22 +255,8 @@ def sample(
 
 
 def _session(own: str | None, model: Model, offline: bool) -> Any:
-    try:
-        onnxruntime = importlib.import_module("onnxruntime")
-    except ImportError as error:
-        raise ValueError(
-            "detect: onnxruntime is not installed; `pip install bodyslam-jax[detect]`, "
-            "or give keypoints/ instead."
-        ) from error
-    path = model_path(own, model, offline)
-    try:
-        return onnxruntime.InferenceSession(
-            str(path), providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:  # onnxruntime's own errors have no common public base
-        raise ValueError(
-            f"{path}: not a model that onnxruntime reads ({error})."
-        ) from error
+    check_onnxruntime()
+    return make_session(model_path(own, model, offline))
 
 
 def _fetch(model: Model, path: Path) -> None:

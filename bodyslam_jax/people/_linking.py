@@ -11,17 +11,20 @@ from itertools import pairwise
 import numpy as np
 
 from bodyslam_jax.people._appearance import difference, mean_look
-from bodyslam_jax.people._tracking import Tracklet, displacement, height
+from bodyslam_jax.people._tracking import GROWTH, Tracklet, displacement, height
 
 _NEAR = 1.0
 """s: gaps up to which the place in the image counts."""
-_REACH = 0.35
+_REACH = 0.2
 """How far from where they were expected people are seen again, of their height."""
 _REACH_PER_SECOND = 1.2
 _SAME_CLOTHES = 14.0
 """Difference of colours up to which a person seen again after a while is the same."""
 _CLOTHES_NEARBY = 22.0
 """The same, where the place fits too."""
+_JUMP = 3.0
+"""Distance, of the height, over which a detector may go from one person to another;
+beyond it somebody left, and somebody came."""
 _GROWTH = 2.0
 """Ratio of sizes before and after from which it is somebody else."""
 _ENDS = 20
@@ -75,7 +78,9 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
                 continue
             frame = first.frames[0]
             away = displacement(others[-1].expected(frame, fps), first.points[0])
-            where = f"{away:.1f} of their height away" if away < np.inf else "elsewhere"
+            if away > _JUMP:
+                continue
+            where = f"{away:.1f} of their height away"
             found.append(
                 f"person {number} begins in frame {frame}, {gap:.2g} s after person "
                 f"{other} was lost, {where}: taken for somebody else."
@@ -89,8 +94,9 @@ def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
     if gap <= 0:
         return np.inf
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
-    growth = abs(np.log(_size(a, last=True) / _size(b, last=False))) / np.log(_GROWTH)
+    growth = abs(np.log(_size(a, last=True) / _size(b, last=False)))
     seconds = gap / fps
+    growth /= np.log(_GROWTH if seconds > _NEAR else GROWTH)
     if seconds > _NEAR:
         clothes = looks / _SAME_CLOTHES if np.isfinite(looks) else np.inf
         return float(max(clothes, growth)) if max(clothes, growth) < 1 else np.inf

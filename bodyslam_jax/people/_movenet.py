@@ -20,7 +20,7 @@ pixel edges to centres, and a quarter back is the network's own offset, from ima
 their mirror images (five clips, 545 keypoints; -0.27)."""
 _COINCIDENT = 0.05
 """Distance of two keypoints that are the same one, of the person's size."""
-_SHARED = 4
+_SHARED = 3
 """Keypoints that two detections of one person share at least."""
 
 Region = tuple[int, int, int, int]
@@ -94,7 +94,7 @@ def distinct(
     points: Float[np.ndarray, "n 17 3"], score: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " k"]:
     """Indices of detections, best first, of which no two are of the same person: who
-    shares four keypoints with a better one is that one again."""
+    shares three keypoints with a better one is that one again."""
     kept: list[int] = []
     for index in np.argsort(-score, kind="stable").tolist():
         if all(not same_person(points[index], points[k]) for k in kept):

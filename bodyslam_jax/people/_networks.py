@@ -49,6 +49,7 @@ def open_network(network: Network) -> Any:
     **Raises:** `ValueError` if the file is missing or is not the one that was shipped,
     or onnxruntime is not installed.
     """
+    check_onnxruntime()
     check_network(network)
     return make_session(network.path)
 
@@ -88,13 +89,7 @@ def make_session(path: Path) -> Any:
 
     **Raises:** `ValueError` if onnxruntime is missing or does not read the file.
     """
-    try:
-        onnxruntime = importlib.import_module("onnxruntime")
-    except ImportError as error:
-        raise ValueError(
-            "detect: onnxruntime is not installed; `pip install onnxruntime`, or give "
-            "keypoints/ instead."
-        ) from error
+    onnxruntime = check_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(_available_cores(), _MOST_THREADS)
     options.inter_op_num_threads = 1
@@ -108,6 +103,17 @@ def make_session(path: Path) -> Any:
     except Exception as error:  # onnxruntime's own errors have no common public base
         raise ValueError(
             f"{path}: not a model that onnxruntime reads ({error})."
+        ) from error
+
+
+def check_onnxruntime() -> Any:
+    """The module. **Raises:** `ValueError` if it is not installed."""
+    try:
+        return importlib.import_module("onnxruntime")
+    except ImportError as error:
+        raise ValueError(
+            "detect: onnxruntime is not installed; `pip install onnxruntime`, or give "
+            "keypoints/ instead."
         ) from error
 
 

@@ -9,7 +9,7 @@ import dataclasses
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.people._appearance import difference, mean_look
@@ -24,12 +24,14 @@ _FADING = 0.5
 """Time constant with which an unseen person is taken to stop, s."""
 _SMOOTHING = 0.1
 """Time constant of the velocity's mean, s."""
-_GROWTH = 1.6
+GROWTH = 1.6
 """Ratio of sizes from which it is somebody else."""
 OTHER_CLOTHES = 30.0
 """Difference of colours (`_appearance.difference`) from which it is somebody else."""
 _RECENT = 45
 """Frames over which the look of a person is averaged."""
+_AWHILE = 3
+"""Frames after which somebody who is seen again must be in full view."""
 _FEWEST = 3
 """Keypoints that two detections must have in common to be compared."""
 _TRUNK = 0.3
@@ -112,11 +114,13 @@ class Tracker:
         frame: int,
         points: Float[np.ndarray, "n 17 3"],
         looks: Float[np.ndarray, "n d"],
-        may_start: np.ndarray,
+        may_return: Bool[np.ndarray, " n"],
+        may_start: Bool[np.ndarray, " n"],
     ) -> Int[np.ndarray, " n"]:
         """The number of the tracklet that each detection continues or begins.
 
         Args:
+            may_return: which detections may be somebody who was not seen for a while.
             may_start: which detections are sure enough to be somebody new; the others
                 get -1 if they continue nobody.
         """
@@ -129,6 +133,8 @@ class Tracker:
                     for t in alive
                 ]
             )
+            away = np.array([frame - t.frames[-1] for t in alive])
+            cost[(away > _AWHILE)[:, None] & ~may_return] = 1e3
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:
@@ -168,7 +174,7 @@ class Tracker:
 def _unlike(place: float, growth: float, clothes: float) -> float:
     """A cost below 1 only if each of the three may be: distance in what is within
     reach, ratio of sizes, difference of clothes (NaN is unknown)."""
-    growth = abs(float(np.log(growth))) / np.log(_GROWTH)
+    growth = abs(float(np.log(growth))) / np.log(GROWTH)
     clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
     if max(place, growth, clothes) >= 1:
         return 1e3

@@ -1,0 +1,149 @@
+"""Who is who: people who cross, hide, leave, return and jump, as made-up keypoints."""
+
+import numpy as np
+import pytest
+
+from bodyslam_jax.people._appearance import describe, difference, mean_look
+from bodyslam_jax.people._linking import link, remarks
+from bodyslam_jax.people._regions import behind, regions
+from bodyslam_jax.people._tracking import Tracker, between
+
+# COCO's 17 keypoints of somebody who stands, in units of the height.
+STANDING = np.array(
+    [(0.0, 0.08), (0.01, 0.06), (-0.01, 0.06), (0.03, 0.07), (-0.03, 0.07)]
+    + [(0.11, 0.18), (-0.11, 0.18), (0.14, 0.33), (-0.14, 0.33), (0.15, 0.46)]
+    + [(-0.15, 0.46), (0.07, 0.5), (-0.07, 0.5), (0.07, 0.73), (-0.07, 0.73)]
+    + [(0.07, 0.95), (-0.07, 0.95)]
+)
+HEIGHT = 200.0
+
+
+def standing(x, height=HEIGHT, y=100.0, score=0.8):
+    at = np.array([x, y]) + height * STANDING
+    return np.column_stack([at, np.full(17, score)])
+
+
+def clothes(share):
+    """The look of somebody all of one colour, as `describe` would give it."""
+    return np.tile((np.linspace(0, 1, 32) >= share).astype(float), 6)
+
+
+def follow(frames, fps=30.0, max_gap=0.7):
+    """People found in `frames`, lists of (truth, points, look), and remarks on them."""
+    tracker, truth = Tracker(fps, max_gap), {}
+    for k, found in enumerate(frames):
+        points = np.array([p for _, p, _ in found]).reshape(-1, 17, 3)
+        looks = np.array([look for *_, look in found]).reshape(len(found), 192)
+        sure = np.ones(len(found), bool)
+        who = tracker.update(k, points, looks, sure, sure)
+        for (name, *_), number in zip(found, who.tolist(), strict=True):
+            truth.setdefault(number, []).append((k, name))
+    people = link(tracker.tracklets, fps)
+    named = [sum((truth[t.number] for t in pieces), []) for pieces in people]
+    return named, remarks(people, fps, max_gap)
+
+
+def crossing(fps, speed, colours, hidden):
+    """Two people walk past each other, the one behind unseen while hidden."""
+    frames = []
+    noise = np.random.default_rng(0)
+    for k in range(round(3 * fps)):
+        x = 300 + speed * HEIGHT * (k / fps - 1.5) * np.array([1, -1])
+        found = []
+        for name, (at, height, colour) in enumerate(zip(x, (200, 180), colours)):
+            if name == 1 and abs(x[0] - x[1]) < hidden * HEIGHT:
+                continue
+            points = standing(at, height, y=120 if name else 100)
+            points[:, :2] += noise.normal(0, 2, (17, 2))
+            found.append((name, points, clothes(colour)))
+        frames.append(found)
+    return frames
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0])
+@pytest.mark.parametrize("speed", [0.5, 0.9])
+def test_people_who_cross_keep_their_identity(fps, speed):
+    people, _ = follow(crossing(fps, speed, (0.2, 0.7), hidden=0.3))
+    assert [{name for _, name in p} for p in people] in ([{0}, {1}], [{1}, {0}])
+
+
+@pytest.mark.parametrize("hidden", [0.2, 0.5])
+def test_people_alike_who_cross_do_not_become_each_other(hidden):
+    """Split, at most: nobody goes on as the other, who comes the other way."""
+    people, _ = follow(crossing(30.0, 0.7, (0.5, 0.5), hidden))
+    assert all(len({name for _, name in p}) == 1 for p in people)
+
+
+@pytest.mark.parametrize(("colour", "count"), [(0.3, 1), (0.8, 2)])
+def test_who_returns_is_known_by_their_clothes(colour, count):
+    walk = [[(0, standing(100 + 4 * k), clothes(0.3))] for k in range(30)]
+    back = [[(1, standing(500 - 4 * k), clothes(colour))] for k in range(30)]
+    people, said = follow(walk + [[]] * 60 + back)
+    assert len(people) == count
+    taken = "person 0: not seen from frame 30 to 89; taken for the same"
+    assert any(taken in text for text in said) == (count == 1)
+
+
+def test_who_is_hidden_for_a_moment_goes_on_without_remark():
+    walk = [[(0, standing(100 + 3 * k), clothes(0.3))] for k in range(60)]
+    walk[25:37] = [[]] * 12
+    people, said = follow(walk)
+    assert len(people) == 1 and not said
+
+
+@pytest.mark.parametrize("change", ["place", "clothes", "size"])
+def test_a_jump_is_somebody_else_and_is_said(change):
+    """From one frame to the next, as where a detector goes from one man to another."""
+    new = {"place": (420.0, 0.3, 200.0), "clothes": (182.0, 0.7, 200.0)}
+    x, colour, height = new.get(change, (182.0, 0.3, 380.0))
+    frames = [[(0, standing(100 + 2 * k), clothes(0.3))] for k in range(40)]
+    frames += [[(1, standing(x + 2 * k, height), clothes(colour))] for k in range(40)]
+    people, said = follow(frames)
+    assert [{name for _, name in p} for p in people] == [{0}, {1}]
+    assert "person 1 begins in frame 40" in said[0]
+    assert "taken for somebody else" in said[0]
+
+
+def test_a_gap_is_filled_on_a_line():
+    tracker = Tracker(30.0, 0.7)
+    yes = np.ones(1, bool)
+    for k in (0, 1, 5):
+        tracker.update(k, standing(100 + 2.0 * k)[None], clothes(0.3)[None], yes, yes)
+    (tracklet,) = tracker.tracklets
+    found = between(tracklet)
+    assert [frame for frame, _ in found] == [2, 3, 4]
+    np.testing.assert_allclose(found[1][1], standing(106.0))
+
+
+def test_nobody_new_begins_where_a_surer_person_stands():
+    points = np.array([standing(100), standing(115, 190), standing(400)])
+    assert behind(points, np.array([0.6, 0.3, 0.3])).tolist() == [False, True, False]
+
+
+def test_whoever_is_in_the_square_of_another_needs_none():
+    alone, pair, far = standing(900), standing(330, 190), standing(320, 40)
+    found = regions([standing(300), pair, far, alone], least=50.0, most=8)
+    assert len(found) == 2
+    for left, top, right, bottom in found:
+        assert right - left == bottom - top
+
+
+def test_colours_tell_people_apart_and_light_hardly_does():
+    rng = np.random.default_rng(0)
+    points = standing(100)
+
+    def wearing(colour):
+        image = np.zeros((400, 300, 3)) + colour + rng.normal(0, 8, (400, 300, 3))
+        return describe(image.clip(0, 255).astype(np.uint8), points, 0.15)
+
+    red, darker, blue = (
+        wearing([40, 40, 160]),
+        wearing([34, 34, 136]),
+        wearing([150, 60, 40]),
+    )
+    assert difference(red, wearing([40, 40, 160])) < 2
+    assert difference(red, darker) < 0.4 * difference(red, blue)
+    assert np.isnan(describe(np.zeros((10, 10, 3), np.uint8), points, 0.15)).all()
+    assert np.isnan(difference(red, np.full_like(red, np.nan)))
+    both = mean_look(np.stack([red, np.full_like(red, np.nan)]))
+    np.testing.assert_array_equal(both, red)
