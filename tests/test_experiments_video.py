@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import evaluation, synthetic
 from bodyslam_jax.body import KEYPOINT_NAMES, load_body_model
@@ -81,40 +80,6 @@ def test_who_is_not_found_and_what_is_something_else_is_counted(simulated):
     assert detection_figures(simulated, nobody)["found"] == 0.0
 
 
-def turned(result, R):
-    T = result.T_WC.copy()
-    T[:, :3] = R @ T[:, :3]
-    return dataclasses.replace(result, T_WC=T, joints=result.joints @ R.T)
-
-
-def test_gravity_error_is_the_tilt_and_no_turn_about_it(simulated):
-    truth = synthetic.as_truth(simulated)
-    tilt = Rotation.from_euler("yx", [70, 3.0], degrees=True).as_matrix()
-    assert _video.gravity_error(turned(truth, tilt), truth) == pytest.approx(3.0)
-    spin = Rotation.from_euler("y", 130, degrees=True).as_matrix()
-    assert _video.gravity_error(turned(truth, spin), truth) == pytest.approx(
-        0, abs=1e-5
-    )
-
-
-def test_first_person_is_known_by_the_place_in_the_image():
-    two = synthetic.simulate(
-        synthetic.Simulation(sequence="M2", length=20, seed=5, noise="none", people=2)
-    )
-    truth = synthetic.as_truth(two)
-    swapped = dataclasses.replace(
-        truth, joints=0.8 * truth.joints[::-1], present=truth.present[::-1]
-    )
-    T = truth.T_WC.copy()
-    T[:, :3, 3] *= 0.8  # a world of another size looks the same
-    assert _video.first_person(dataclasses.replace(swapped, T_WC=T), truth) == 1
-    alone = dataclasses.replace(
-        swapped, T_WC=T, present=swapped.present & [[True], [False]]
-    )
-    assert _video.first_person(alone, truth) is None
-    assert _video.leg_ratio(swapped, truth, 1) == pytest.approx(0.8)
-
-
 def test_difficulty_of_the_scenes_and_rows_of_the_plan(tmp_path):
     plan = PLANS["video"](Experiment(sequences=("E1", "D2")), Config(), tmp_path)
     assert [job.label for job in plan.jobs[:4]] == [
@@ -128,22 +93,22 @@ def test_difficulty_of_the_scenes_and_rows_of_the_plan(tmp_path):
 
 def test_tables_have_means_with_standard_errors(simulated, tmp_path):
     truth = synthetic.as_truth(simulated)
-    figures = _video._person_figures(truth, 0, 0.0)
-    assert 0 <= figures["lowest_p5"] < figures["lowest_p95"] < 0.15
-    assert figures["foot_speed"] < 0.4 and 5 < figures["straighter_knee"] < 40
+    pair = evaluation.associate(truth, truth, load_body_model())
+    same = evaluation.evaluate(*pair)
     detected = detection_figures(simulated, synthetic.as_sequence(simulated))
     rows = []
     for k, name in enumerate(("E1-room", "E2-room")):
         for which in _video.INPUTS:
             row = {"sequence": name, "input": which, "status": "ok"}
-            row |= {key: 0.04 + 0.01 * k for key in _video._ERRORS}
-            row |= {"gravity_error": 1.0, "size": 1.0} | figures
-            row |= {f"true/{key}": v for key, v in figures.items()}
+            row |= {key: float(same[key]) for key in _video.FIGURES} | {"size": 1.0}
+            row["h_ate_sim3"] = 0.04 + 0.01 * k
             if which == "pixels":
                 row |= detected
             rows.append(row)
     written = write_video(tmp_path, rows, about="Seed 5.")
     text = written[0].read_text()
+    knees = f"{np.degrees(float(same['knee'])):.1f} ± 0.0"
+    assert f"| knees, degrees | {' | '.join(4 * [knees])} |" in text
     assert "| H-ATE Sim(3), mm | 45.0 ± 5.0 | 45.0 ± 5.0 | 45.0 ± 5.0 | – |" in text
     assert "| left_knee" not in text and "| knee | 0.0 ± 0.0" in text
     assert "Seed 5." in text and len(written[1].read_text().splitlines()) == 7

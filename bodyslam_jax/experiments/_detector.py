@@ -9,6 +9,7 @@ from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.body._skeleton import KEYPOINT_JOINT, SURFACE_POINTS
 from bodyslam_jax.sequence import Sequence
 from bodyslam_jax.synthetic import SimulatedSequence
+from bodyslam_jax.synthetic._tracking import is_behind
 
 _TALLEST = 60.0
 """Height in the image, px, from which a person has to be found."""
@@ -21,16 +22,15 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
     """How often the first person is found, and how far off each keypoint is.
 
     `found` is the share of the frames in which the person is larger than 60 px and half
-    of the joints are in the image. `keypoints` has for each name: `offset`, the mean
-    error in the frame of the joint that it moves with (x to the left on the left side,
-    mirrored on the right, y up and z forward at rest), a constant fitted to the errors
-    in the image at the true depth; `spread`, the standard deviation of what remains in
-    the image; both shares of the stature; `seen`, the share of the frames found in
-    which it is given; `gross`, the share of these that is of something else.
+    of the joints are in the image with nothing in front. `keypoints` has for each name:
+    `offset`, the mean error in the frame of the joint that it moves with (x to the left
+    on the left side, mirrored on the right, y up and z forward at rest), a constant
+    fitted to the errors in the image at the true depth; `spread`, the standard deviation of what remains in
+    the image; both shares of the stature; `seen`, the share of the frames found and
+    with nothing in front of it in which it is given; `gross`, the share of these that
+    is of something else.
     """
-    exact, depth, R_CJ = _truth(simulated)
-    inside = ((exact >= 0) & (exact <= np.array(simulated.size) - 1)).all(axis=2)
-    inside &= depth > 0.1
+    exact, depth, R_CJ, inside = _truth(simulated)
     wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
     if found.keypoints is None or not wanted.any():
         return {"found": 0.0, "keypoints": {}}
@@ -41,7 +41,7 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
         "found": float(number[wanted].mean()),
         "keypoints": {
             name: _offset(
-                error[:, k], R_CJ[:, k], there[:, k] & inside[:, k], number & wanted,
+                error[:, k], R_CJ[:, k], there[:, k], inside[:, k], number & wanted,
                 mirrored=name.startswith("right"),
             )
             for k, name in enumerate(_NAMES)
@@ -50,7 +50,8 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
 
 
 def _truth(simulated: SimulatedSequence):
-    """Pixels and depths of BODY_25, and the frames of its joints in the camera."""
+    """Pixels and depths of BODY_25, frames of its joints in the camera, and which of
+    its points are in the image with neither furniture nor others in front."""
     person, walk = simulated.person, simulated.walk
     G, joints = person.joints(walk.poses, walk.pelvis)
     points = person.keypoints(G, joints)
@@ -58,8 +59,17 @@ def _truth(simulated: SimulatedSequence):
     p = np.einsum("tab,tkb->tka", R_CW, points - simulated.T_WC[:, None, :3, 3])
     depth = np.maximum(p[..., 2], 0.05)
     uv = p[..., :2] / depth[..., None] * simulated.intrinsics[:2]
+    uv = uv + simulated.intrinsics[2:]
+    free = ((uv >= 0) & (uv <= np.array(simulated.size) - 1)).all(axis=2)
+    free &= p[..., 2] > 0.1
+    for k, T in enumerate(simulated.T_WC):
+        free[k] &= ~simulated.room.is_hidden(T[:3, 3], points[k])
+    for other in simulated.others:
+        off = other.joints - simulated.T_WC[:, None, :3, 3]
+        q = np.einsum("tab,tjb->tja", R_CW, off)
+        free &= ~is_behind(p, q, simulated.intrinsics)
     leads = [_leader(name) for name in _NAMES]
-    return uv + simulated.intrinsics[2:], depth, R_CW[:, None] @ G[:, leads]
+    return uv, depth, R_CW[:, None] @ G[:, leads], free
 
 
 def _leader(name: str) -> int:
@@ -88,13 +98,13 @@ def _nearest(
     return uv[who, frame], there[who, frame] & near[:, None], near
 
 
-def _offset(error, R_CJ, seen, counted, *, mirrored: bool) -> dict[str, Any]:
+def _offset(error, R_CJ, given, in_view, counted, *, mirrored: bool) -> dict[str, Any]:
     """`detection_figures` of one keypoint; `error` in the image, of the stature."""
-    seen = seen & counted
+    seen = given & in_view & counted
     good = seen & (np.linalg.norm(error, axis=1) < _GROSS)
     row: dict[str, Any] = {
-        "seen": float(seen.sum() / max(counted.sum(), 1)),
-        "gross": float(1 - good.sum() / max(seen.sum(), 1)),
+        "seen": float(seen.sum() / max((counted & in_view).sum(), 1)),
+        "gross": float(1 - good.sum() / seen.sum()) if seen.any() else np.nan,
     }
     if good.sum() < 10:
         return {**row, "offset": [np.nan] * 3, "spread": np.nan}

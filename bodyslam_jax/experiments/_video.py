@@ -11,32 +11,26 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
 from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, frontend, pipeline, synthetic
 from bodyslam_jax.cache import Cache, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
-from bodyslam_jax.diagnostics import _posture as posture
 from bodyslam_jax.experiments._case import simulations
 from bodyslam_jax.experiments._detector import detection_figures
 from bodyslam_jax.experiments._jobs import COMPILE, Job, named
 from bodyslam_jax.experiments._journal import Row
-from bodyslam_jax.result import Result
+from bodyslam_jax.experiments._score import leg_of
 
 INPUTS = ("pixels", "keypoints", "bodies")
 FRAMES = 300
-_ERRORS = (
+FIGURES = (
     *("c_ate_se3", "c_ate_sim3", "h_ate_se3", "h_ate_sim3", "j_ate_se3", "j_ate_sim3"),
-    *("scale", "pa_mpjpe"),
+    *("scale", "pa_mpjpe", "gravity_error", *evaluation.FIGURES),
+    *(f"{name}_of_truth" for name in evaluation.FIGURES),
 )
-_PLAUSIBLE = ("foot_speed", "lowest_p5", "lowest_p95", "knee", "straighter_knee")
 FORM: dict[str, Any] = {
-    "input": str,
+    **dict.fromkeys((*FIGURES, "size"), float),
     "status": str,
-    **dict.fromkeys((*_ERRORS, *_PLAUSIBLE, "gravity_error", "size"), float),
-    **{f"true/{name}": float for name in _PLAUSIBLE},
 }
 """What a kept row must have, beside its sequence."""
 _SECONDS = 0.6
@@ -100,67 +94,9 @@ def video_row(
     if which == "bodies":
         sequence = dataclasses.replace(sequence, bodies=measured.bodies)
     result = pipeline.run(sequence, config, cache=cache)
-    truth = synthetic.as_truth(simulated)
-    errors = evaluation.evaluate(result, truth, body)
-    row |= {name: float(errors[name]) for name in _ERRORS}
-    row |= {f"true/{k}": v for k, v in _person_figures(truth, 0, 0).items()}
-    h = first_person(result, truth)
-    nothing = dict.fromkeys(_PLAUSIBLE, np.nan)
-    row |= nothing if h is None else _person_figures(result, h, 0)
-    row["size"] = np.nan if h is None else leg_ratio(result, truth, h)
-    row["gravity_error"] = gravity_error(result, truth)
+    pair = evaluation.associate(result, synthetic.as_truth(simulated), body)
+    errors = evaluation.evaluate(*pair)
+    row |= {name: float(errors[name]) for name in FIGURES}
+    row["size"] = float(leg_of(pair[0]) / leg_of(pair[1]))
     row["status"] = result.summary["status"]
     return row
-
-
-def first_person(result: Result, truth: Result) -> int | None:
-    """Who of the estimated people is the truth's first: by where they are in the image,
-    which neither size nor depth changes."""
-    direction = lambda r, h: _to_camera(r, r.joints[h, :, 0])
-    true, best = direction(truth, 0), (0.1, None)
-    for h in range(len(result.joints)):
-        both = result.present[h] & truth.present[0]
-        if both.any():
-            away = np.linalg.norm(direction(result, h) - true, axis=1)[both]
-            best = min(best, (float(np.median(away)), h), key=lambda one: one[0])
-    return best[1]
-
-
-def _to_camera(result: Result, points: Float[np.ndarray, "t 3"]):
-    """Where points are in the image of a camera of focal length 1."""
-    off = points - result.T_WC[:, :3, 3]
-    p = np.einsum("tba,tb->ta", result.T_WC[:, :3, :3], off)
-    return p[:, :2] / np.where(abs(p[:, 2:]) < 1e-3, 1e-3, p[:, 2:])
-
-
-def _person_figures(result: Result, h: int, floor: float) -> dict[str, float]:
-    """Feet and knees of a person in a world with y up and the floor at `floor`."""
-    seen = result.joints[h][result.present[h]]
-    fps = 1 / float(np.median(np.diff(result.timestamps)))
-    low = seen[:, [*posture.FEET, *posture.ANKLES], 1].min(axis=1) - floor
-    knee = posture.knee_flexion(seen)
-    return {
-        "foot_speed": float(np.median(posture.lower_foot_speed(seen, fps))),
-        "lowest_p5": float(np.percentile(low, 5)),
-        "lowest_p95": float(np.percentile(low, 95)),
-        "knee": float(knee.mean()),
-        "straighter_knee": float(knee.min(axis=1).mean()),
-    }
-
-
-def gravity_error(result: Result, truth: Result) -> float:
-    """Angle between the result's up and the true one, degrees: worlds are turned onto
-    each other by the cameras' orientations."""
-    turn = np.einsum("tab,tcb->ac", truth.T_WC[:, :3, :3], result.T_WC[:, :3, :3])
-    U, _, Vt = np.linalg.svd(turn)
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return float(np.degrees(np.arccos(np.clip(R[1, 1], -1, 1))))
-
-
-def leg_ratio(result: Result, truth: Result, h: int) -> float:
-    """Length of the legs over the true length."""
-    leg = lambda joints: sum(
-        np.linalg.norm(joints[:, a] - joints[:, b], axis=1).mean()
-        for a, b in ((1, 4), (4, 7), (2, 5), (5, 8))
-    )
-    return float(leg(result.joints[h][result.present[h]]) / leg(truth.joints[0]))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.evaluation import FIGURES
 from bodyslam_jax.experiments._tables import (
     MM,
     Column,
@@ -18,6 +19,7 @@ from bodyslam_jax.experiments._tables import (
 from bodyslam_jax.experiments._video import INPUTS
 
 _CM = 100.0
+_DEGREES = math.degrees(1.0)
 _FIGURES = (
     Column("found, % of frames", "found", 100.0, 0),
     Column("C-ATE SE(3), mm", "c_ate_se3", MM),
@@ -27,17 +29,18 @@ _FIGURES = (
     Column("J-ATE SE(3), mm", "j_ate_se3", MM),
     Column("J-ATE Sim(3), mm", "j_ate_sim3", MM),
     Column("scale (truth per estimate)", "scale", digits=3),
-    Column("\\|1 - scale\\|", "scale_error", digits=3),
+    Column("|1 - scale|", "scale_error", digits=3),
     Column("leg / true leg", "size", digits=3),
     Column("PA-MPJPE, mm", "pa_mpjpe", MM),
     Column("standing foot, m/s", "foot_speed", digits=2),
-    Column("lowest point over the ground, 5th percentile, cm", "lowest_p5", _CM),
-    Column("95th percentile, cm", "lowest_p95", _CM),
-    Column("knees, degrees", "knee"),
-    Column("straighter knee, degrees", "straighter_knee"),
-    Column("gravity error, degrees", "gravity_error", digits=2),
+    Column("lowest point over the ground, 5th percentile, cm", "feet_low", _CM),
+    Column("95th percentile, cm", "feet_high", _CM),
+    Column("knees, degrees", "knee", _DEGREES),
+    Column("straighter knee, degrees", "straighter_knee", _DEGREES),
+    Column("joints' acceleration, m/s²", "joint_acceleration"),
+    Column("gravity error, degrees", "gravity_error", _DEGREES, 2),
 )
-_TRUE = {c.key: f"true/{c.key}" for c in _FIGURES[11:16]}
+_TRUE = {name: f"{name}_of_truth" for name in FIGURES}
 """Figures that the truth has as well."""
 
 
@@ -56,9 +59,8 @@ def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "else, people are found by the networks that ship; `keypoints`: simulated "
         "keypoints, noise as above; `bodies`: these and bodies as of a regressor. "
         "Means over sequences ± their standard errors. Errors are means over frames; "
-        "knees and feet are the first person's, the lowest point is the lowest of "
-        "ankles and toes, the standing foot the lower of both in each frame "
-        "(horizontal, median).",
+        "the lowest point is the lowest of ankles and toes, the standing foot the "
+        "lower of both in each frame (horizontal, median).",
     )
     families = dict.fromkeys(row["sequence"].split("-")[1] for row in rows)
     for family in families:
@@ -69,7 +71,7 @@ def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         columns = [Column("sequence", "sequence"), Column("input", "input"), *_FIGURES]
         columns.append(Column("status", "status"))
         text += f"## Family `{family}`: every sequence\n\n{markdown(columns, own)}\n"
-    text += f"## The detector's keypoints\n\n{_keypoints(rows)}"
+    text += f"## The detector's keypoints\n\n{keypoint_table(rows)}"
     write_text(out / "video.md", text)
     columns = [Column("sequence", "sequence"), Column("input", "input"), *_FIGURES]
     columns += [Column(f"true {c.title}", _TRUE[c.key], c.factor, c.digits)
@@ -85,7 +87,7 @@ def _summary(rows: Sequence[Row]) -> str:
     lines = []
     for figure in _FIGURES:
         of = lambda which, f=figure: [r.get(f.key) for r in rows if r["input"] == which]
-        line: Row = {"what": figure.title.replace("\\|", "|")}
+        line: Row = {"what": figure.title}
         line |= {which: _mean(of(which), figure) for which in INPUTS}
         if figure.key in _TRUE:
             once = {r["sequence"]: r[_TRUE[figure.key]] for r in rows}
@@ -109,7 +111,7 @@ def _mean(values: Sequence[float | None], column: Column) -> str | None:
     return text + (f" ({missing} without)" if missing else "")
 
 
-def _keypoints(rows: Sequence[Row]) -> str:
+def keypoint_table(rows: Sequence[Row]) -> str:
     """Mean offsets of both sides together, % of the stature."""
     found = [row["keypoints"] for row in rows if row.get("keypoints")]
     if not found:
