@@ -25,10 +25,10 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
     of the joints are in the image with nothing in front. `keypoints` has for each name:
     `offset`, the mean error in the frame of the joint that it moves with (x to the left
     on the left side, mirrored on the right, y up and z forward at rest), a constant
-    fitted to the errors in the image at the true depth; `spread`, the standard deviation of what remains in
-    the image; both shares of the stature; `seen`, the share of the frames found and
-    with nothing in front of it in which it is given; `gross`, the share of these that
-    is of something else.
+    fitted to the errors in the image at the true depth; `spread`, the standard
+    deviation of what remains in the image; both shares of the stature; `seen`, the
+    share of the frames found and with nothing in front of it in which it is given;
+    `gross`, the share of these that is of something else.
     """
     exact, depth, R_CJ, inside = _truth(simulated)
     wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
