@@ -199,6 +199,16 @@ def _check_length(sequence: Sequence) -> None:
         )
 
 
+def find_people(
+    sequence: Sequence, config: Config = Config(), cache: Cache = Cache(None)
+) -> Sequence:
+    """The sequence with people found in its images, as `run` finds them.
+
+    **Raises:** as `run`.
+    """
+    return _detected(sequence, config, cache, Stopwatch())
+
+
 def _detected(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
@@ -368,13 +378,21 @@ def _seen(cameras: Cameras) -> Tracks:
     return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])
 
 
-def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result:
+def demo(
+    out: Path,
+    config: Config = Config(),
+    *,
+    first: bool = False,
+    from_pixels: bool = False,
+) -> Result:
     """Renders a walker whom a moving camera films, and runs everything on the images.
 
     The scene is written to `out/scene`, a sequence folder with its ground truth.
 
     Args:
         first: as for `run_to_folder`.
+        from_pixels: whether people are found in the images, in place of the keypoints
+            and bodies that are simulated.
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
@@ -392,10 +410,12 @@ def _demo(out: Path, config: Config, warnings: tuple[str, ...], first: bool) -> 
         body = body_.load_body_model(config.body_model)
         scene = synthetic.simulate(synthetic.demo_settings())
         measured, truth = synthetic.as_sequence(scene), synthetic.as_truth(scene)
+        if from_pixels:
+            measured = dataclasses.replace(measured, keypoints=None, bodies=None)
         rehearsal = rehearse(measured, body, config, truth)
     try:
         with watch("rendering"):
-            synthetic.demo_scene(folder, simulated=scene)
+            synthetic.demo_scene(folder, simulated=scene, people=not from_pixels)
             sequence = _warned(frontend.read_sequence(folder), warnings)
         cache = Cache(out / ".cache", describe(sequence))
         export.check_folder(out, cache.source, cache.owner())
