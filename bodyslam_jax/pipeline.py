@@ -400,10 +400,16 @@ def demo(
     cache = Cache(out / ".cache", {"name": _SCENE})
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):
-        return _demo(out, config, warnings, first)
+        return _demo(out, config, warnings, first, from_pixels)
 
 
-def _demo(out: Path, config: Config, warnings: tuple[str, ...], first: bool) -> Result:
+def _demo(
+    out: Path,
+    config: Config,
+    warnings: tuple[str, ...],
+    first: bool,
+    from_pixels: bool,
+) -> Result:
     folder, rehearsal, watch = out / _SCENE, Rehearsal(), Stopwatch()
     scene = None
     if first:
