@@ -186,8 +186,8 @@ def _check_people(sequence: Sequence, config: Config) -> None:
         return
     raise ValueError(
         f"{sequence.name}: neither keypoints nor bodies, nor images to find people "
-        "in (or --detect none), so nobody to estimate; give one of them, or leave people "
-        "out with --no-people."
+        "in (or --detect none), so nobody to estimate; give one of them, or leave "
+        "people out with --no-people."
     )
 
 

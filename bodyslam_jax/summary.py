@@ -190,8 +190,8 @@ def _missing(result: Result, cameras: Cameras) -> list[Reason]:
                 "people",
                 "there are no people: cameras and map have no unit.",
                 "at least one person",
-                "give keypoints of a detector that sees them (--keypoints), or a metric "
-                "camera path",
+                "give keypoints of a detector that sees them (--keypoints), or a "
+                "metric camera path",
             )
         )
     within = cameras.within
