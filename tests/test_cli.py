@@ -2,12 +2,14 @@ import importlib.metadata
 import os
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 from body_cases import make_raw, write
 
 from bodyslam_jax import cli, doctor
+from bodyslam_jax.cli import _run as commands
 from bodyslam_jax.config import Config
 
 
@@ -222,3 +224,20 @@ def test_how_to_compile_is_set_once_where_it_is_known(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.2.3")
     cli._compile_quickly()
     assert os.environ["XLA_FLAGS"] == ""
+
+
+@pytest.mark.parametrize("status, code", [("ok", 0), ("doubtful", 3), ("failed", 3)])
+def test_what_makes_a_result_doubtful_is_printed(capsys, tmp_path, status, code):
+    reason = {
+        "name": "knee",
+        "message": "knees are bent by 60 degrees.",
+        "figure": 60.0,
+    }
+    reason |= {"status": status, "advice": "look at the overlay"}
+    summary = {"status": status, "headline": [f"walk: {status}"], "warnings": []}
+    summary["reasons"] = [] if status == "ok" else [reason]
+    assert commands._finish(types.SimpleNamespace(summary=summary), tmp_path) == code
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"walk: {status}"
+    told = f"{status}: knees are bent by 60 degrees. What to do: look at the overlay."
+    assert (told in lines) == (status != "ok")

@@ -43,7 +43,16 @@ def _walk(num=90, fps=30.0, people=1):
 
 
 SUMMARY = {
-    "status": "scale is not observable",
+    "status": "doubtful",
+    "reasons": [
+        {
+            "status": "doubtful",
+            "name": "standing_foot_speed",
+            "message": "person 0: the lower foot moves at 0.62 m/s, expected < 0.4.",
+            "advice": "look at the overlay",
+            "figure": 0.62,
+        }
+    ],
     "input": {"name": "<script>alert(1)</script>", "width": 640, "height": 480},
     "warnings": ["focal length guessed & refined"],
     "scale": {"value": 2.0, "sigma": 0.05},
@@ -75,7 +84,8 @@ def test_says_what_was_found(tmp_path, body):
     page = _write(tmp_path, dataclasses.replace(_walk(), summary=SUMMARY), body)
     text = _text(page)
     for words in (
-        "scale is not observable",
+        "doubtful",
+        "moves at 0.62 m/s, expected &lt; 0.4. look at the overlay.",
         "3.6 m",  # 3 s at 1.2 m/s
         "1.20 m/s",
         f"{100 * facts.stature(body, np.zeros(10)):.0f} ± 2 cm",

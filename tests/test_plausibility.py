@@ -152,11 +152,16 @@ def test_keypoints_that_are_another_persons_are_doubted():
     size = np.full(60, 200.0)
     error[rng.random(error.shape) < 0.1] = 150.0
     error[rng.random(error.shape) < 0.2] = np.nan
-    assert figures.keypoint_misfit(error, size, FPS) < 3
+    doubted = lambda error: judge(
+        PERSON_CHECKS, {"keypoint_misfit": figures.keypoint_misfit(error, size, FPS)}
+    )
+    assert doubted(error) == []
+    assert doubted(4 * error) == []  # noise, however large
     error[20:24] = 30.0  # too short
-    assert figures.keypoint_misfit(error, size, FPS) < 3
+    assert doubted(error) == []
     error[30:45] = 30.0
     assert figures.keypoint_misfit(error, size, FPS) == pytest.approx(15.0)
+    assert len(doubted(error)) == 1
     error[:] = np.nan
     assert np.isnan(figures.keypoint_misfit(error, size, FPS))
 

@@ -1,8 +1,7 @@
 """Figures of one person's posture, feet and motion, from the joints alone.
 
 All take SMPL's joints in metres in a world whose y axis is up, of frames that follow
-one another. The first group is defined as in the gait laboratory's reports; each is
-NaN where the person does not do what the figure is about.
+one another.
 """
 
 import numpy as np

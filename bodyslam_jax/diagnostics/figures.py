@@ -18,6 +18,8 @@ _FEWEST = 15
 _FLOOR = 1.0
 """m that standing feet must be apart for the slope under them."""
 
+_STANDS_OUT = 2.2
+
 
 def person_figures(
     joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
@@ -93,7 +95,8 @@ def keypoint_misfit(
     in the image, where it is worst for a third of a second.
 
     `error` is NaN where nothing is measured; of a frame the median counts, of the third
-    of a second too, so that outliers do not.
+    of a second too, so that outliers do not. NaN where it is nowhere `_STANDS_OUT`
+    times as large as mostly: noise is no other person.
     """
     known = np.isfinite(error).sum(axis=1) >= 5
     frames = np.flatnonzero(known)
@@ -101,9 +104,9 @@ def keypoint_misfit(
     if len(frames) < n:
         return np.nan
     share = 100 * np.nanmedian(error[frames], axis=1) / np.maximum(size[frames], 1e-6)
-    return float(
-        np.median(np.lib.stride_tricks.sliding_window_view(share, n), -1).max()
-    )
+    lasting = np.median(np.lib.stride_tricks.sliding_window_view(share, n), axis=-1)
+    worst = float(lasting.max())
+    return worst if worst > _STANDS_OUT * np.median(share) else np.nan
 
 
 def _goes_on_foot(

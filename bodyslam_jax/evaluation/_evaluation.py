@@ -121,10 +121,9 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
-    true_up = plausibility.up_axis(truth.joints, truth.present)
-    values["gravity_error"] = plausibility.gravity_error(
-        estimate.T_WC, truth.T_WC, camera_valid, true_up
-    )
+    true_up, known = plausibility.up_axis(truth.joints, truth.present)
+    tilt = plausibility.gravity_error(estimate.T_WC, truth.T_WC, camera_valid, true_up)
+    values["gravity_error"] = jnp.where(known, tilt, jnp.nan)
     people: dict[str, Array] = {}
     if truth.present.shape[0]:
         per_person = jax.vmap(_person_errors, (0,) * 6 + (None,) * 4)

@@ -14,7 +14,7 @@ from bodyslam_jax.evaluation._metrics import norm, only
 _HIPS, _KNEES, _ANKLES, _FEET = (np.array([i, i + 1]) for i in (1, 4, 7, 10))
 _LOWEST = np.array([7, 8, 10, 11])
 _PELVIS, _NECK = 0, 12
-_UPRIGHT = np.cos(np.radians(35.0))
+_UPRIGHT = float(np.cos(np.radians(35.0)))
 """People's trunks are this near an axis of the world, if that is up."""
 Y = np.array([0.0, 1.0, 0.0])
 """Up in a result."""
@@ -22,15 +22,17 @@ Y = np.array([0.0, 1.0, 0.0])
 
 def up_axis(
     joints: Float[Array, "h t 24 3"], present: Bool[Array, "h t"]
-) -> Float[Array, " 3"]:
-    """The axis of the world that is up: the one along which trunks point on average;
-    NaN if none is within 35 degrees of that, or nobody is there."""
+) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
+    """The axis of the world that is up, the one along which trunks point on average,
+    and whether that is known: it is within 35 degrees of that, and somebody is there.
+    """
     trunk = jnp.where(present[..., None], joints[..., _NECK, :] - joints[..., 0, :], 0)
     total = jnp.sum(trunk, (0, 1))
     largest = jnp.argmax(jnp.abs(total))
-    axis = jnp.zeros(3, joints.dtype).at[largest].set(jnp.sign(total[largest]))
+    sign = jnp.where(total[largest] < 0, -1, 1).astype(joints.dtype)
+    axis = jnp.zeros(3, joints.dtype).at[largest].set(sign)
     known = jnp.abs(total[largest]) > _UPRIGHT * norm(total)
-    return jnp.where(known, axis, jnp.nan)
+    return axis, known
 
 
 def gravity_error(
@@ -42,7 +44,8 @@ def gravity_error(
     """Mean angle between up in the estimate, y, and in the truth, seen from the camera,
     rad: no alignment has a part in it. NaN without cameras."""
     T, true_T = (
-        jnp.where(valid[:, None, None], x, jnp.eye(4)) for x in (T_WC, true_T_WC)
+        jnp.where(valid[:, None, None], x, jnp.eye(4, dtype=x.dtype))
+        for x in (T_WC, true_T_WC)
     )
     up = T[:, 1, :3]
     true_up_C = jnp.einsum("tji,j->ti", true_T[:, :3, :3], true_up)
@@ -110,5 +113,5 @@ def _quantile(
 ) -> Float[Array, ""]:
     """Of what counts; NaN if nothing does, or if a number that counts is none."""
     broken = jnp.any(jnp.isnan(x) & valid)
-    found = jnp.nanquantile(jnp.where(valid, x, jnp.nan), share)
+    found = jnp.nanquantile(jnp.where(valid, x, jnp.nan), jnp.asarray(share, x.dtype))
     return jnp.where(broken, jnp.nan, found)
