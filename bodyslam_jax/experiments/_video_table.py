@@ -100,7 +100,8 @@ def _summary(rows: Sequence[Row]) -> str:
 
 def _mean(values: Sequence[float | None], column: Column) -> str | None:
     """`43.7 ± 6.7`; how many had no such figure, if any."""
-    numbers = np.array([v for v in values if v is not None], float) * column.factor
+    known = [v for v in values if v is not None and math.isfinite(v)]
+    numbers = np.array(known, float) * column.factor
     if not len(numbers):
         return None
     d = column.digits
