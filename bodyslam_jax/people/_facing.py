@@ -17,6 +17,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
 
+from bodyslam_jax.people._path import cheapest_states
+from bodyslam_jax.people._sides import ARMS, LEGS
+
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 """About H's y axis."""
 _PRIOR = 3.0
@@ -39,8 +42,6 @@ _MEDIAN_OF_THREE = 1.538
 """Median length of a vector with three normal components of deviation 1."""
 _MEDIAN_OF_TWO = 1.386
 """Median squared length of one with two."""
-_ARMS = ((2, 5), (3, 6), (4, 7))
-_LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,25 +78,7 @@ def find_turned(
     begins = _continuity(orientation, gap)
     # Costs of being turned, less those of being as given.
     turned = independent * (_PRIOR + evidence)
-    return Facing(_cheapest(turned, begins), noise)
-
-
-def _cheapest(
-    turned: Float[np.ndarray, " f"], changes: Float[np.ndarray, " g"]
-) -> Bool[np.ndarray, " f"]:
-    """States (f,) that minimise the sum of `turned` where they are true and of
-    `changes` where they change."""
-    total = np.array([0.0, turned[0]])
-    came_from = np.zeros((len(turned), 2), int)
-    for k in range(1, len(turned)):
-        through = total[:, None] + changes[k - 1] * (1 - np.eye(2))
-        came_from[k] = np.argmin(through, axis=0)
-        total = through.min(axis=0) + [0.0, turned[k]]
-    state = np.empty(len(turned), int)
-    state[-1] = np.argmin(total)
-    for k in range(len(turned) - 1, 0, -1):
-        state[k - 1] = came_from[k, state[k]]
-    return state.astype(bool)
+    return Facing(cheapest_states(turned, begins), noise)
 
 
 def _continuity(
@@ -147,7 +130,7 @@ def _keypoint_evidence(
     noise = max(1.0, float(np.sqrt(np.median(residual**2) / _MEDIAN_OF_TWO)))
     cost = 0.5 * _robust(plain / noise, scale)
     total = np.sum(cost, axis=-1)
-    for half in (_ARMS, _LEGS):
+    for half in (ARMS, LEGS):
         here = np.array(half)
         other = here[:, ::-1]
         there = predicted[:, :, other] - uv[:, None, here]

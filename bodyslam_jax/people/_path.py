@@ -5,7 +5,7 @@ against how far the joints would have to jump between frames.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 _JOINT_SPEED = 1.2
 """m/s: how fast joints move about the pelvis, roughly."""
@@ -68,3 +68,21 @@ def _jump(
     cosine = np.einsum("aij,bij->ab", orientation[k - 1], orientation[k])
     turn = np.arccos(np.clip((cosine - 1) / 2, -1, 1)) / (_TURN_SPEED * gap[k - 1])
     return 0.5 * (_INDEPENDENT_JOINTS * squared + turn**2)
+
+
+def cheapest_states(
+    turned: Float[np.ndarray, " f"], changes: Float[np.ndarray, " g"]
+) -> Bool[np.ndarray, " f"]:
+    """States (f,) that minimise the sum of `turned` where they are true and of
+    `changes` where they change."""
+    total = np.array([0.0, turned[0]])
+    came_from = np.zeros((len(turned), 2), int)
+    for k in range(1, len(turned)):
+        through = total[:, None] + changes[k - 1] * (1 - np.eye(2))
+        came_from[k] = np.argmin(through, axis=0)
+        total = through.min(axis=0) + [0.0, turned[k]]
+    state = np.empty(len(turned), int)
+    state[-1] = np.argmin(total)
+    for k in range(len(turned) - 1, 0, -1):
+        state[k - 1] = came_from[k, state[k]]
+    return state.astype(bool)
