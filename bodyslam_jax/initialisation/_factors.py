@@ -1,5 +1,7 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -82,12 +84,22 @@ def people_factors(
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
+        keypoints, _ = people.unexchanged(sequence.keypoints, sequence.fps)
+        sequence = dataclasses.replace(sequence, keypoints=keypoints)
+        pixel = people.as_body_keypoints(
+            keypoints,
+            roots,
+            people.without_bodies(sequence),
+            sequence.intrinsics,
+            body,
+            sequence.fps,
+        ).uv
         # What lasts counts less, but an outlier is as far away as ever.
         loss = weights.keypoint_loss / _inflation(sequence, weights)
         factors.append(
             graph.JointReprojection(
                 body=body,
-                pixel=jnp.asarray(sequence.keypoints.uv, float),
+                pixel=jnp.asarray(pixel, float),
                 sigma=jnp.asarray(keypoint_sigma(sequence, roots, weights)),
                 loss=graph.GemanMcClure(jnp.asarray(loss)),
             )

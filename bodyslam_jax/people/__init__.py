@@ -3,6 +3,7 @@
 from bodyslam_jax.people._bodies import estimate_bodies as estimate_bodies
 from bodyslam_jax.people._bodies import nobody as nobody
 from bodyslam_jax.people._bodies import without_bodies as without_bodies
+from bodyslam_jax.people._definitions import as_body_keypoints as as_body_keypoints
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._keypoint_errors import keypoint_sigma as keypoint_sigma
@@ -12,3 +13,4 @@ from bodyslam_jax.people._prepare import prepare_bodies as prepare_bodies
 from bodyslam_jax.people._roots import Roots as Roots
 from bodyslam_jax.people._roots import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people._roots import roots_from_bodies as roots_from_bodies
+from bodyslam_jax.people._sides import unexchanged as unexchanged
