@@ -42,8 +42,9 @@ def as_body_keypoints(
     """Keypoints where the detector would have put them, had it the body's definitions.
 
     Of the people `chosen`, whose bodies were fitted to these keypoints; others and
-    frames without a body stay as they are. The offsets are those of the fit: linear
-    regression, robust and regularised as there, on what the bodies leave of keypoints.
+    frames without a body stay as they are. Offsets are a robust linear regression on
+    what the bodies leave of the keypoints, with `_skeleton`'s deviations as a prior;
+    frames whose errors are alike count once.
     """
     uv = keypoints.uv.copy()
     skeleton = make_skeleton(body, 0.0)  # the graph's
@@ -56,8 +57,6 @@ def as_body_keypoints(
         sigma = keypoint_sigma(keypoints, intrinsics, int(h))[where]
         sigma = in_pixels(sigma, focal / depth)
         alike = max(1.0, settings.correlation_time * fps)
-        evidence = np.sum(np.isfinite(sigma).any(axis=1)) / alike
-        prior = max(1.0, evidence / settings.shape_frames)
         shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
         angles = roots.body_pose[h, where, :21].reshape(-1, 63)
         rows = (T_CH[:, :3, :3], T_CH[:, :3, 3], angles, uv[h, where])
@@ -65,7 +64,7 @@ def as_body_keypoints(
         last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
         silent = np.full((length, 25), np.inf)
         sigma = np.concatenate([sigma * np.sqrt(alike), silent])
-        numbers = (*map(last, rows), sigma, shape, prior, settings.robust_scale)
+        numbers = (*map(last, rows), sigma, shape, settings.robust_scale)
         arrays = (jnp.asarray(a, skeleton.offset.dtype) for a in numbers)
         shift = np.asarray(_shift(skeleton, camera, *arrays), float)
         uv[h, where] -= shift[: len(where)]
@@ -82,7 +81,6 @@ def _shift(
     uv: Float[Array, "t 25 2"],
     sigma: Float[Array, "t 25"],
     shape: Float[Array, " s"],
-    prior: Float[Array, ""],
     scale: Float[Array, ""],
 ) -> Float[Array, "t 25 2"]:
     """How far the detector's definitions move each keypoint in the image, px."""
@@ -103,7 +101,7 @@ def _shift(
         weighted = whitened * weight[..., None, None]
         hessian = jnp.einsum("tkci,tkcj->ij", weighted, whitened)
         right = jnp.einsum("tkci,tkc->i", weighted, residual)
-        return jnp.linalg.solve(hessian + prior * jnp.eye(len(right)), right)
+        return jnp.linalg.solve(hessian + jnp.eye(len(right)), right)
 
     start = jnp.zeros(jac.shape[-1], jac.dtype)
     return jac @ jax.lax.fori_loop(0, _ROUNDS, fit, start)
