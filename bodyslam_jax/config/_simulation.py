@@ -26,6 +26,17 @@ class Simulation:
     """Errors of the regressed bodies."""
     track_noise: Literal["none", "low", "real"] | None = None
     """Errors of the tracked points."""
+    keypoint_errors: float = 1.0
+    """Factor on the size of keypoints' errors."""
+    body_errors: float = 1.0
+    """Factor on errors of regressed postures and orientations that last."""
+    body_jitter: float = 1.0
+    """Factor on how much these errors change from frame to frame (accelerations)."""
+    outliers: float | None = None
+    """Share of keypoints that lie somewhere else; without it that of the errors."""
+    exchanged: float | None = None
+    """Share of frames in which left and right of arms or legs are exchanged; without it
+    that of the errors."""
     feet_and_face: bool = True
     """Whether keypoints have BODY_25's feet and face, or the 15 others only."""
     detector_bias: float = 0.0

@@ -13,6 +13,11 @@ from bodyslam_jax.config import Association
 from bodyslam_jax.frontend._keypoints import Detections
 from bodyslam_jax.sequence import Keypoints
 
+_EXCHANGED = np.array(
+    [0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11]
+    + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
+)
+"""BODY_25 with left and right exchanged."""
 _SEEN = 0.05
 """Confidence from which a keypoint counts in comparing people."""
 
@@ -153,8 +158,15 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
     if not both.any():
         return np.inf
     size = max(_size(points), _size(expected), 1.0)
-    # The median forgives a swapped or lost limb, which a mean would not.
-    distance = np.median(np.linalg.norm((points - expected)[both, :2], axis=-1)) / size
+    # The median forgives a swapped or lost limb, which a mean would not; whoever is
+    # named left for right in all of them is the same person, too.
+    other = points[_EXCHANGED]
+    crossed = (other[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    away = lambda p, seen: np.median(np.linalg.norm((p - expected)[seen, :2], axis=-1))
+    distance = away(points, both)
+    if crossed.any():
+        distance = min(distance, away(other, crossed))
+    distance = distance / size
     gap = frame - person.frame
     reach = 0.2 + 0.02 * (gap - 1)
     ratio = _size(points) / max(_size(expected), 1.0)

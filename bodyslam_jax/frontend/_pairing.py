@@ -31,7 +31,10 @@ def pair(
                 away = np.linalg.norm(
                     keypoints.uv[i, both, _MID_HIP] - pixel[both], axis=-1
                 )
-                size = np.ptp(keypoints.uv[i, both][..., 1], axis=-1).clip(20)
+                # Of the keypoints that are seen: what is missing lies at 0.
+                seen = keypoints.confidence[i, both] > 0
+                v = np.where(seen, keypoints.uv[i, both][..., 1], np.nan)
+                size = (np.nanmax(v, axis=-1) - np.nanmin(v, axis=-1)).clip(20)
                 cost[i, j] = np.median(away / size) - 1e-3 * np.sqrt(both.sum())
     rows, columns = linear_sum_assignment(cost)
     matched = {

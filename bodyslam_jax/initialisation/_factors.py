@@ -1,5 +1,6 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -162,11 +163,21 @@ def people_factors(
     factors: list[graph.AbstractFactor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
+        keypoints, _ = people.unexchanged(sequence.keypoints, sequence.fps)
+        sequence = dataclasses.replace(sequence, keypoints=keypoints)
+        pixel = people.as_body_keypoints(
+            keypoints,
+            roots,
+            people.without_bodies(sequence),
+            sequence.intrinsics,
+            body,
+            sequence.fps,
+        ).uv
         sigma = keypoint_sigma(sequence, roots, weights)
         factors.append(
             graph.JointReprojection(
                 body=body,
-                pixel=jnp.asarray(sequence.keypoints.uv, float),
+                pixel=jnp.asarray(pixel, float),
                 sigma=jnp.asarray(sigma),
                 loss=_keypoint_loss(sequence, sigma, weights),
             )

@@ -9,6 +9,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._fit import fit_bodies
 from bodyslam_jax.people._prepare import prepare_bodies
+from bodyslam_jax.people._sides import unexchanged
 from bodyslam_jax.sequence import Bodies, Keypoints, Sequence
 
 
@@ -18,6 +19,8 @@ def estimate_bodies(
     """A regressor's bodies, cleaned; of people without any, bodies fitted to their
     keypoints; else nobody."""
     camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
+    if keypoints is not None:
+        keypoints, _ = unexchanged(keypoints, fps)
     if sequence.bodies is None:
         if keypoints is None:
             return nobody(sequence.num_frames)

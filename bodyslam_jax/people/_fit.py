@@ -192,8 +192,11 @@ def _start(
         sigma_px[chosen],
         jax.tree.map(lambda a: a[chosen], lifted),
     )
-    costs = costs + depth_costs(depth[chosen], joints)
-    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps)
+    # Each keypoint's half squared distance is 1 on average if errors are as said.
+    count = np.isfinite(sigma_px[chosen]).sum(axis=1)
+    noise = max(1.0, float(np.sqrt(np.median(costs.min(axis=1) / count))))
+    costs = costs + noise**2 * depth_costs(depth[chosen], joints)
+    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps, noise)
     fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
     broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST

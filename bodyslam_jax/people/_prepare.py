@@ -17,12 +17,12 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.people._facing import HALF_TURN, find_turned
 from bodyslam_jax.people._keypoint_errors import (
     in_pixels,
     keypoint_sigma,
     pixels_per_metre,
 )
-from bodyslam_jax.people._path import best_path
 from bodyslam_jax.people._roots import Roots, bodies_from_roots, roots_from_bodies
 from bodyslam_jax.people._rotations import matrices, slerp, vectors
 from bodyslam_jax.people._skeleton import (
@@ -39,11 +39,6 @@ _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
 """Regressors draw shapes to the mean, by 0.5 to 0.8 with an error of 0.3, of which this
 is about the best linear estimate."""
-_FLIP_COST = 3.0
-"""What it costs to believe that a regressor took front for back (-log odds)."""
-_KEYPOINT_INDEPENDENCE = 0.1
-"""Share of the keypoints' evidence that counts for or against a flip: their errors and
-the posture's are the same for many frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,11 +155,10 @@ def _place_person(
     """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
     dtype = skeleton.offset.dtype
     T_CH = roots.T_CH[person, where]
-    about = T_CH[:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])  # half a turn about H's y
-    turned = np.stack([T_CH[:, :3, :3], about], axis=1)
+    both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ HALF_TURN], axis=1)
     angles = roots.body_pose[person, where, :21].reshape(-1, 63)
     depth_sigma = settings.depth_error * T_CH[:, 2, 3]
-    rows = (turned, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
+    rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
     length = -len(where) % _BUCKET
     padded = [
         jnp.asarray(np.concatenate([a, np.repeat(a[-1:], length, axis=0)]), dtype)
@@ -174,13 +168,12 @@ def _place_person(
     camera = jnp.asarray(intrinsics.params, dtype)
     scale = jnp.asarray(settings.robust_scale, dtype)
     found = _place_bodies(skeleton, camera, shape, scale, *padded)
-    position, cost, joints = (np.asarray(a[: len(where)], float) for a in found)
-
-    costs = _KEYPOINT_INDEPENDENCE * cost
-    costs[:, 1] += _FLIP_COST * _KEYPOINT_INDEPENDENCE
-    path = best_path(costs, joints, turned, where / fps)
-    each = np.arange(len(where))
-    return turned[each, path], _smooth(position[each, path], where, fps, settings)
+    position, predicted = (np.asarray(a[: len(where)], float) for a in found)
+    facing = find_turned(
+        T_CH[:, :3, :3], where / fps, predicted, uv, sigma, settings.robust_scale
+    )
+    each, state = np.arange(len(where)), facing.turned.astype(int)
+    return both[each, state], _smooth(position[each, state], where, fps, settings)
 
 
 @jit_once
@@ -195,13 +188,13 @@ def _place_bodies(
     uv: Float[Array, "t 25 2"],
     sigma: Float[Array, "t 25"],
     depth_sigma: Float[Array, " t"],
-) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2"], Float[Array, "t 2 24 3"]]:
+) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2 25 2"]]:
     """Pelvis of each frame for either orientation, by robust Gauss--Newton.
 
-    **Returns:** positions in C, costs, and joints about the pelvis in C.
+    **Returns:** positions in C, and keypoints of the body there, px.
     """
 
-    def one(R, joints, points, start, uv, sigma, depth_sigma):
+    def one(R, points, start, uv, sigma, depth_sigma):
         rotated = points @ R.T
         # Without keypoints nothing but the regressor's own place is known.
         across = jnp.where(jnp.any(sigma < jnp.inf), 3.0, 0.01).astype(start.dtype)
@@ -222,12 +215,11 @@ def _place_bodies(
             return moved.at[2].max(DEPTH_FLOOR)
 
         p = jax.lax.fori_loop(0, _PLACING_STEPS, step, start)
-        value, _ = robust(jnp.sum(residuals(p) ** 2, -1), scale)
-        return p, 0.5 * jnp.sum(value), joints @ R.T
+        return p, project(intrinsics, rotated + p)
 
     def frame(R, angles, *rest):
-        joints, points = place_points(skeleton, angles, shape)
-        return jax.vmap(lambda R: one(R, joints, points, *rest))(R)
+        _, points = place_points(skeleton, angles, shape)
+        return jax.vmap(lambda R: one(R, points, *rest))(R)
 
     return jax.vmap(frame)(orientation, angles, position, uv, sigma, depth_sigma)
 

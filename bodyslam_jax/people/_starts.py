@@ -31,6 +31,8 @@ from bodyslam_jax.people._terms import (
 NUM_HEADINGS = 8
 _POSTURES_PER_HEADING = 2
 _KEPT = 6
+_SAME = 0.06
+"""m, root mean square of joints: ends that are closer are the same."""
 _FIRST_STEPS, _LAST_STEPS = 5, 10
 _FRAME_BATCH, _DESCENT_BATCH = 32, 256
 
@@ -54,7 +56,7 @@ def fit_frames(
     best = best + by_heading.shape[2] * np.arange(NUM_HEADINGS)[:, None]
     guess = np.full((frames, 1), value.shape[1] - 1)
     fits = _take(starts, np.concatenate([best.reshape(frames, -1), guess], axis=1))
-    for steps in (_FIRST_STEPS, _LAST_STEPS):
+    for steps, same in ((_FIRST_STEPS, 2 * _SAME), (_LAST_STEPS, _SAME)):
         count = fits.latent.shape[1]
         flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), fits)
         repeated = jax.tree.map(
@@ -65,16 +67,31 @@ def fit_frames(
             _descend, _DESCENT_BATCH, (scene, limit), flat, *repeated
         )
         fits = jax.tree.map(lambda a: a.reshape(frames, count, *a.shape[1:]), flat)
-        order = np.argsort(value.reshape(frames, count), axis=1)[:, :_KEPT]
-        fits, value, joints = _take(
-            (
-                fits,
-                value.reshape(frames, count),
-                joints.reshape(frames, count, 24, 3),
-            ),
-            order,
+        value, joints = (
+            a.reshape(frames, count, *a.shape[1:]) for a in (value, joints)
         )
+        chosen = _best_distinct(value, joints, same)
+        fits, value, joints = _take((fits, value, joints), chosen)
     return fits, value, joints
+
+
+def _best_distinct(
+    value: Float[np.ndarray, "f n"], joints: Float[np.ndarray, "f n 24 3"], same: float
+) -> Int[np.ndarray, "f s"]:
+    """The best ends of each frame that are not the same, cheapest first; again the same
+    where there are no others."""
+    row = np.arange(len(value))
+    chosen = []
+    again = np.zeros(value.shape, int)  # how often an end like this has been chosen
+    for _ in range(_KEPT):
+        best = np.lexsort((value, again), axis=1)[:, 0]
+        away = np.mean(np.sum((joints - joints[row, best][:, None]) ** 2, -1), -1)
+        again = again + (away < same**2)
+        again[row, best] = _KEPT + 1
+        chosen.append(best)
+    order = np.stack(chosen, axis=1)
+    cheapest = np.argsort(np.take_along_axis(value, order, axis=1), axis=1)
+    return np.take_along_axis(order, cheapest, axis=1)
 
 
 def _batched(function: Callable[..., Any], size: int, shared: Any, *rows: Any) -> Any:

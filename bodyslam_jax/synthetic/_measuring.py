@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import KEYPOINT_SPREAD
+from bodyslam_jax.config import Simulation
 from bodyslam_jax.synthetic._posing import Person
 
 
@@ -79,6 +80,39 @@ NOISE = {
     ),
 }
 """`real` is what published systems do, `low` about a third of it."""
+
+
+def noise_of_keypoints(settings: Simulation) -> Noise:
+    """The errors that these settings ask for."""
+    noise = NOISE[settings.keypoint_noise or settings.noise]
+    share = settings.keypoint_errors * noise.keypoint_share
+    rates = {"outlier_rate": settings.outliers, "swap_rate": settings.exchanged}
+    given = {name: rate for name, rate in rates.items() if rate is not None}
+    return dataclasses.replace(noise, keypoint_share=share, **given)
+
+
+def noise_of_bodies(settings: Simulation) -> Noise:
+    """The same for regressed bodies.
+
+    Second differences of an autoregression have the variance (1 - ρ)(6 - 2ρ) of its
+    own, of white noise 6: less jitter is a slower error, more is white noise added.
+    """
+    noise = NOISE[settings.body_noise or settings.noise]
+    lasting, jitter = settings.body_errors, settings.body_jitter
+    rho = noise.posture_correlation
+    added = np.sqrt(max(jitter**2 - 1, 0.0) * (1 - rho) * (6 - 2 * rho) / 6)
+    white = lambda own, drift: float(np.hypot(own, added * drift))
+    return dataclasses.replace(
+        noise,
+        posture_bias=lasting * noise.posture_bias,
+        posture_drift=lasting * noise.posture_drift,
+        root_drift=lasting * noise.root_drift,
+        posture_correlation=1 - min(jitter, 1.0) ** 2 * (1 - rho),
+        posture_white=white(noise.posture_white, noise.posture_drift),
+        root_white=white(noise.root_white, noise.root_drift),
+        depth_white=max(jitter, 1.0) * noise.depth_white,
+    )
+
 
 _HANDS_FEET = np.isin(np.arange(24), (7, 8, 10, 11, 20, 21, 22, 23))
 

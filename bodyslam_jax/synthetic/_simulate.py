@@ -23,6 +23,8 @@ from bodyslam_jax.synthetic._measuring import (
     NOISE,
     Regressed,
     detect_keypoints,
+    noise_of_bodies,
+    noise_of_keypoints,
     regress_bodies,
 )
 from bodyslam_jax.synthetic._posing import Person
@@ -150,6 +152,12 @@ def simulate(
         raise ValueError(f"length {num_frames}: a sequence needs 2 frames or more.")
     if settings.seed is not None and settings.seed < 0:
         raise ValueError(f"seed {settings.seed}: expected 0 or more.")
+    for name in ("keypoint_errors", "body_errors", "body_jitter"):
+        if not 0 <= (factor := getattr(settings, name)) < np.inf:
+            raise ValueError(f"{name} {factor}: expected 0 or more.")
+    for name in ("outliers", "exchanged"):
+        if (share := getattr(settings, name)) is not None and not 0 <= share < 1:
+            raise ValueError(f"{name} {share}: expected a share, 0 to 1.")
     if not np.isfinite(settings.detector_bias):
         raise ValueError(
             f"detector bias {settings.detector_bias}: expected a finite number."
@@ -244,7 +252,6 @@ def measure(
 ) -> SimulatedSequence:
     """Measures what is true; `streams` are for keypoints, bodies and tracks of the
     first person, those of the `others` are their own."""
-    level = lambda own: NOISE[own or settings.noise]
     R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
     to_camera = lambda x: np.einsum("tab,tjb->tja", R_CW, x - centre[:, None])
     everyone = [(person, walk), *others]
@@ -264,7 +271,7 @@ def measure(
             if i != h:
                 hidden |= is_behind(points_C, joints_C[i], INTRINSICS)
         keypoints = detect_keypoints(
-            points_C, joints_C[h], INTRINSICS, SIZE, level(settings.keypoint_noise),
+            points_C, joints_C[h], INTRINSICS, SIZE, noise_of_keypoints(settings),
             key, hidden,
         )  # fmt: skip
         if not settings.feet_and_face:
@@ -275,11 +282,12 @@ def measure(
         poses_C[:, 0] = root.as_rotvec()
         bodies = regress_bodies(
             body, poses_C, joints_C[h, :, 0], keypoints, INTRINSICS,
-            level(settings.body_noise), reg,
+            noise_of_bodies(settings), reg,
         )  # fmt: skip
         actors.append(Actor(body, own, joints, keypoints, bodies))
     tracks, landmarks = track_points(
-        room, T_WC, joints_C, INTRINSICS, SIZE, level(settings.track_noise), streams[2],
+        room, T_WC, joints_C, INTRINSICS, SIZE,
+        NOISE[settings.track_noise or settings.noise], streams[2],
         life=HANDLING[settings.sequence[0]].track_life,
     )  # fmt: skip
     return SimulatedSequence(
