@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax import (
     accuracy,
+    diagnostics,
     evaluation,
     export,
     frontend,
@@ -115,7 +116,7 @@ def _run(
     model = motion.load_motion_model(config.motion_model)
     if config.people:  # now, before minutes are spent
         motion.check_compatible(model, body, model.fps)
-    sequence = _detected(sequence, config, cache, watch)
+    sequence = diagnostics.reconcile(_detected(sequence, config, cache, watch), body)
     cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
     key = fingerprint(sequence, config)
     sequence = people.select_people(sequence, config.person)
@@ -198,6 +199,16 @@ def _check_length(sequence: Sequence) -> None:
         )
 
 
+def find_people(
+    sequence: Sequence, config: Config = Config(), cache: Cache = Cache(None)
+) -> Sequence:
+    """The sequence with people found in its images, as `run` finds them.
+
+    **Raises:** as `run`.
+    """
+    return _detected(sequence, config, cache, Stopwatch())
+
+
 def _detected(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
@@ -237,10 +248,17 @@ def _tracked(
         key = fingerprint(sequence, config.detection, config.association)
         found = cache.stage("detection", key, people.Found, find)
     points, person = found.by_frame(sequence.num_frames)
-    sequence = _warned(sequence, found.warnings)
-    return frontend.with_detections(
-        sequence, points, config.association, person=person, seen=found.seen()
+    sequence = frontend.with_detections(
+        _warned(sequence, found.warnings),
+        points,
+        config.association,
+        person=person,
+        seen=found.seen(),
     )
+    if sequence.keypoints is None:
+        return sequence
+    keypoints = people.with_depths(sequence.keypoints, found, sequence.intrinsics)
+    return dataclasses.replace(sequence, keypoints=keypoints)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -360,13 +378,21 @@ def _seen(cameras: Cameras) -> Tracks:
     return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])
 
 
-def demo(out: Path, config: Config = Config(), *, first: bool = False) -> Result:
+def demo(
+    out: Path,
+    config: Config = Config(),
+    *,
+    first: bool = False,
+    from_pixels: bool = False,
+) -> Result:
     """Renders a walker whom a moving camera films, and runs everything on the images.
 
     The scene is written to `out/scene`, a sequence folder with its ground truth.
 
     Args:
         first: as for `run_to_folder`.
+        from_pixels: whether people are found in the images, in place of the keypoints
+            and bodies that are simulated.
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
@@ -384,10 +410,12 @@ def _demo(out: Path, config: Config, warnings: tuple[str, ...], first: bool) -> 
         body = body_.load_body_model(config.body_model)
         scene = synthetic.simulate(synthetic.demo_settings())
         measured, truth = synthetic.as_sequence(scene), synthetic.as_truth(scene)
+        if from_pixels:
+            measured = dataclasses.replace(measured, keypoints=None, bodies=None)
         rehearsal = rehearse(measured, body, config, truth)
     try:
         with watch("rendering"):
-            synthetic.demo_scene(folder, simulated=scene)
+            synthetic.demo_scene(folder, simulated=scene, people=not from_pixels)
             sequence = _warned(frontend.read_sequence(folder), warnings)
         cache = Cache(out / ".cache", describe(sequence))
         export.check_folder(out, cache.source, cache.owner())

@@ -41,6 +41,9 @@ class Keypoints:
     """Pixels; 0 where there is none."""
     confidence: Float[np.ndarray, "h t 25"]
     """0 is missing; larger is surer. Detectors do not agree on what 1 means."""
+    depth: Float[np.ndarray, "h t 25"] | None = None
+    """How far behind the middle of the hips a network takes them to be, m; 0 where it
+    says nothing. Coarse: it tells which limb is in front."""
 
 
 @dataclasses.dataclass(frozen=True)

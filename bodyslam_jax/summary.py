@@ -12,6 +12,9 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import camera, export
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
+from bodyslam_jax.diagnostics import figures, plausibility
+from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS, Reason
+from bodyslam_jax.gravity import Upright
 from bodyslam_jax.initialisation import ScaleStart
 from bodyslam_jax.outcome import Cameras, Joint
 from bodyslam_jax.result import Result
@@ -21,8 +24,9 @@ _CUES_APART = 1.25
 """Factor between the sizes that motion and ground tell, from which a line says so."""
 _MOST = 0.5
 """Share of the frames that are used, from which a result is one of the video."""
-_GROUND_DOUBT, _GROUND_DISTRUST = 1.15, 1.4
-"""Factors between the map's size and that of the people on its ground."""
+_GROUND_DOUBT = 1.15
+"""Factor between the map's size and that of the people on its ground, from which a
+line says so."""
 
 
 def summarise(
@@ -32,18 +36,11 @@ def summarise(
     cameras: Cameras,
     joint: Joint,
     result: Result,
+    up: Upright,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """`summary.json`: what a person wants to know first, then everything else."""
     warnings = [*sequence.warnings, *cameras.warnings, *joint.unobserved]
-    status = "ok"
-    metric = bool(np.isfinite(cameras.path_scale))
-    if not joint.present.any() and not metric:
-        status = "no people: cameras and map have no unit"
-    elif not np.isfinite(result.T_WC).all():
-        status = "failed"
-    elif cameras.kind == "failed":
-        status = "camera motion not found: people are placed as if it stood still"
     if cameras.kind != "moving" and joint.present.any():
         warnings.append(
             "metric size comes from the body alone: the camera's path gives none."
@@ -63,9 +60,6 @@ def summarise(
             f"frames {used[0]} to {used[-1]} of {len(within)} are used: nothing tells "
             "where the camera was in the others."
         )
-    if status == "ok" and within.mean() < _MOST:
-        used = np.flatnonzero(within)
-        status = f"only frames {used[0]} to {used[-1]} of {len(within)} are used"
     ground = export.ground_scale(result) if cameras.kind == "moving" else None
     off = max(ground, 1 / ground) if ground else 1.0
     if off > _GROUND_DOUBT:
@@ -75,8 +69,6 @@ def summarise(
             "they stand on something else."
         )
         warnings.append(text)
-        if status == "ok" and off > _GROUND_DISTRUST:
-            status = "not to be trusted: people do not stand on the ground of the map"
     way = export.camera_facts(result, within)
     # NaN, where covariances were not computed, stays NaN.
     scale_sigma = float(np.maximum(joint.scale_sigma, apart / 2 * result.scale))
@@ -98,6 +90,12 @@ def summarise(
                 "stature_sigma_m": sigma,
             }
         )
+    reasons = _missing(result, cameras)
+    if not any(reason.fatal for reason in reasons):
+        reasons += _implausible(
+            sequence, body, cameras, joint, result, up, scale_sigma, off, persons
+        )
+    status = plausibility.status_of(reasons)
     headline = [
         f"{sequence.name}: {status}",
         f"camera: {way.distance:.2f} m{_known_to(scale_sigma / result.scale, cameras)} "
@@ -123,6 +121,7 @@ def summarise(
         headline.append(text)
     return {
         "status": status,
+        "reasons": [reason.to_dict() for reason in reasons],
         "headline": headline,
         "warnings": warnings,
         "input": {
@@ -158,6 +157,90 @@ def summarise(
         "settings": dataclasses.asdict(config),
         "versions": versions(),
     }
+
+
+def _missing(result: Result, cameras: Cameras) -> list[Reason]:
+    """What there is no result without, or only a part of one."""
+    found = []
+    if not np.isfinite(result.T_WC).all() or not np.isfinite(result.joints).all():
+        found.append(
+            Reason(
+                "not_finite",
+                "the estimate is not a number.",
+                "finite numbers",
+                "leave out inputs one by one: bodies, masks, the camera file",
+                fatal=True,
+            )
+        )
+    if cameras.kind == "failed":
+        found.append(
+            Reason(
+                "camera_motion",
+                "the camera's motion is not found: people are placed as if it stood "
+                "still.",
+                "a camera path",
+                "give a video with more texture and less blur, or person masks",
+                fatal=True,
+            )
+        )
+    metric = np.isfinite(cameras.path_scale)
+    if not result.present.any() and not metric:
+        found.append(
+            Reason(
+                "people",
+                "there are no people: cameras and map have no unit.",
+                "at least one person",
+                "give keypoints of a detector that sees them (--keypoints), or a metric "
+                "camera path",
+            )
+        )
+    within = cameras.within
+    if within.mean() < _MOST:
+        used = np.flatnonzero(within)
+        found.append(
+            Reason(
+                "frames_used",
+                f"only frames {used[0]} to {used[-1]} of {len(within)} are used.",
+                f"at least {100 * _MOST:.0f} % of the frames",
+                "cut the video where the shot changes and run the parts",
+                figure=float(within.mean()),
+            )
+        )
+    return found
+
+
+def _implausible(
+    sequence: Sequence,
+    body: body_.BodyModel,
+    cameras: Cameras,
+    joint: Joint,
+    result: Result,
+    up: Upright,
+    scale_sigma: float,
+    ground: float,
+    persons: list[dict[str, Any]],
+) -> list[Reason]:
+    """What no person, camera or ground is like."""
+    fps, found = sequence.fps, []
+    walking = False
+    misfits = _misfits(sequence, body, joint)
+    for h, there in enumerate(result.present):
+        told = figures.person_figures(result.joints[h], there, fps)
+        walking |= "trunk_lean" in told
+        if there.any():
+            told["stature"] = told["short_stature"] = persons[h]["stature_m"]
+            told["keypoint_misfit"] = misfits[h]
+        found += plausibility.judge(PERSON_CHECKS, told, h)
+    told = {"floors_apart": figures.floors_apart(result.joints, result.present, fps)}
+    if walking:
+        told["up_against_trunks"] = np.degrees(up.trunks)
+        told["slope_of_ground"] = np.degrees(up.ground)
+    if cameras.kind == "moving" and result.present.any():
+        told |= figures.camera_figures(result.T_WC[cameras.within], fps)
+        told["scale_sigma"] = 100 * scale_sigma / result.scale
+        told["scale_cues_apart"] = float(np.exp(cues_apart(joint.start)))
+        told["ground_under_feet"] = ground
+    return found + plausibility.judge(WORLD_CHECKS, told)
 
 
 def _known_to(share: float, cameras: Cameras) -> str:
@@ -292,16 +375,39 @@ def per_frame(
         found["inliers"] = inliers.astype(float).tolist()
         found["reprojection_px"] = _means(tracks.frame[keep], length[keep], t)
     if sequence.keypoints is not None and joint.present.any():
-        shapes = jnp.asarray(joint.shapes)[:, None]
-        p_H = _keypoints(body, jnp.asarray(joint.poses), shapes)
-        turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
-        p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
-        error = np.asarray(camera.project(intrinsics, p_C)) - sequence.keypoints.uv
-        length = np.linalg.norm(error, axis=-1)
+        uv = _projected_keypoints(body, joint)
+        length = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
         seen = (sequence.keypoints.confidence > 0) & joint.present[..., None]
         frame = np.broadcast_to(np.arange(t)[:, None], length.shape)
         found["keypoint_px"] = _means(frame[seen], length[seen], t)
     return found
+
+
+def _projected_keypoints(
+    body: body_.BodyModel, joint: Joint
+) -> Float[np.ndarray, "h t 25 2"]:
+    """Where the keypoints of the estimated bodies are in the images, px."""
+    shapes = jnp.asarray(joint.shapes)[:, None]
+    p_H = _keypoints(body, jnp.asarray(joint.poses), shapes)
+    turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
+    p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
+    return np.asarray(camera.project(jnp.asarray(joint.intrinsics), p_C))
+
+
+def _misfits(sequence: Sequence, body: body_.BodyModel, joint: Joint) -> list[float]:
+    """Worst distance of each person's keypoints from the body, of its size; NaN where
+    there are no keypoints."""
+    if sequence.keypoints is None or not joint.present.any():
+        return [np.nan] * len(joint.present)
+    uv = _projected_keypoints(body, joint)
+    error = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
+    seen = (sequence.keypoints.confidence > 0.3) & joint.present[..., None]
+    error = np.where(seen, error, np.nan)
+    size = np.linalg.norm(np.ptp(uv, axis=2), axis=-1)
+    return [
+        figures.keypoint_misfit(*one, sequence.fps)
+        for one in zip(error, size, strict=True)
+    ]
 
 
 def _means(frame: np.ndarray, value: np.ndarray, num_frames: int) -> list[float | None]:

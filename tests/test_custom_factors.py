@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 import bodyslam_jax.graph as g
 from bodyslam_jax import solver
+from bodyslam_jax.graph._padding import Masked
 
 T = 7
 """Frames: the solver rounds them up to 10."""
@@ -164,7 +165,7 @@ def test_what_is_not_defined_in_added_frames_is_not_evaluated_there():
     factor = Speed(jnp.arange(float(T)) / 30.0, jnp.ones((T, 3)))
     plain = factor.cost(state)
     padded = g.pad_factor(factor, state, 3)
-    assert isinstance(padded, g.Masked)
+    assert isinstance(padded, Masked)
     longer = g.extend_state(state, 3)
     cost = lambda factor, state: factor.cost(state)
     value, slope = eqx.filter_jit(eqx.filter_value_and_grad(cost))(padded, longer)

@@ -32,7 +32,7 @@ from bodyslam_jax.experiments._case import simulations
 from bodyslam_jax.experiments._journal import Journal, fits
 from bodyslam_jax.experiments._plans import PLANS
 from bodyslam_jax.experiments._problems import with_scale
-from bodyslam_jax.experiments._score import NAMES
+from bodyslam_jax.experiments._score import NAMES, PLAUSIBLE
 from bodyslam_jax.experiments._structure import shake
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
@@ -361,6 +361,7 @@ def _made_up(label):
     row |= {"status": "converged", "seconds": 9.0}
     for method in experiments.METHODS:
         row |= {f"{method}/{name}": 0.0125 for name in NAMES} | {f"{method}/scale": 0.8}
+    row |= {f"full/{name}": 0.5 for name in PLAUSIBLE}
     circle = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]]).tolist()
     names = ("truth", "no_mm", "full")
     paths = {f"{k}/{n}": circle for k in ("camera", "human") for n in names}

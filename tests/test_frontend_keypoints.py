@@ -81,7 +81,7 @@ def test_two_files_of_one_frame_are_refused(tmp_path):
         (range(1, 21), 20, True, 1, False),
         (range(50, 70), 20, True, 50, False),
         (range(5, 21), 20, False, 1, False),  # 20 is beyond, if counted from 0
-        (range(15), 20, True, 0, False),
+        (range(15), 20, True, 0, True),  # or every n-th, numbered anew
         (range(1, 20), 20, True, 1, True),  # or number 0 has been deleted
         ([k for k in range(1, 20) if k % 7], 30, True, 0, True),  # some are deleted
         (range(1, 20), 20, False, 0, True),  # or the last image has nobody

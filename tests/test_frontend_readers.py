@@ -469,7 +469,7 @@ def _tool_files() -> dict[str, tuple[str, dict]]:
                 0: {
                     "pose": poses,
                     "betas": betas,
-                    "trans": trans,
+                    "trans": _refocused(trans, 80.0),  # the diagonal
                     "pose_world": poses,
                     "frame_ids": frame,
                 }
@@ -490,7 +490,7 @@ def _tool_files() -> dict[str, tuple[str, dict]]:
             "t.npy",
             {
                 "pred_rotmat": matrices,
-                "pred_trans": trans[:, None],
+                "pred_trans": _refocused(trans, 80.0)[:, None],
                 "pred_shape": betas,
                 "frame": frame,
             },

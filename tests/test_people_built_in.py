@@ -12,7 +12,7 @@ from bodyslam_jax import frontend, people, pipeline, synthetic
 from bodyslam_jax.cache import Cache
 from bodyslam_jax.config import Config, Detect, Simulation
 from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.people import _blazepose, _found, _movenet, _networks
+from bodyslam_jax.people import _blazepose, _depths, _found, _movenet, _networks
 from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence
 
 FRAMES = 12
@@ -243,6 +243,31 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     away = _blazepose.disagreement(pose, points)
     np.testing.assert_allclose(away[sure], 0, atol=1e-4)
     np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
+
+
+def test_depths_tell_which_leg_is_in_front():
+    """Of two fits that explain the keypoints alike, mirrored in depth."""
+    depth = np.zeros((1, 25))
+    depth[0, [10, 13, 11, 14]] = [0.2, -0.2, 0.35, -0.3]  # the right leg is behind
+    joints = np.zeros((1, 2, 24, 3))
+    joints[0, 0, [5, 4, 8, 7], 2] = [0.22, -0.15, 0.4, -0.4]
+    joints[0, 1] = -joints[0, 0]
+    right, wrong = _depths.depth_costs(depth, joints)[0]
+    assert right < 0.2 and wrong > right + 2
+    np.testing.assert_array_equal(_depths.depth_costs(0 * depth, joints), 0)
+
+
+def test_depths_are_those_of_the_person_and_their_ray(scene, found):
+    whole = with_people(scene[1], found)
+    keypoints = people.with_depths(whole.keypoints, found, whole.intrinsics)
+    said = found.relative[:, [10, 13]].any(axis=-1)
+    assert said.mean() > 0.8
+    np.testing.assert_array_equal(keypoints.depth[0][:, [10, 13]] != 0, said)
+    # Seen far to the left of the axis, what is to a person's right is before them.
+    params = np.array([1.0, 1.0, 1e4, *whole.intrinsics.params[3:]])
+    camera = dataclasses.replace(whole.intrinsics, params=params)
+    turned = people.with_depths(whole.keypoints, found, camera).depth[0]
+    np.testing.assert_allclose(turned[:, 10], found.relative[:, 10, 0], atol=0.1)
 
 
 def test_feet_of_somebody_else_are_left_out():

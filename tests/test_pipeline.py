@@ -94,13 +94,11 @@ def test_nothing_to_estimate_from_is_an_error():
         pipeline.run(bare)
 
 
-def test_upright_puts_the_trunk_up_and_keeps_distances():
+def test_upright_turns_a_direction_up_and_keeps_distances():
     rng = np.random.default_rng(0)
     T_WC = np.tile(np.eye(4), (5, 1, 1))
     T_WC[:, :3, 3] = rng.normal(size=(5, 3))
-    T_WH = np.tile(np.eye(4), (1, 5, 1, 1))
-    T_WH[..., :3, 1] = np.array([0.6, 0.0, 0.8])
-    turn = assembly.upright(T_WC, T_WH, np.ones((1, 5), bool))
+    turn = assembly.upright(T_WC, np.array([0.6, 0.0, 0.8]))
     np.testing.assert_allclose(turn[:3, :3] @ [0.6, 0.0, 0.8], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)

@@ -14,6 +14,7 @@ import scenes
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.graph import _memory
+from bodyslam_jax.graph._padding import Masked
 from bodyslam_jax.solver._padding import pad
 from bodyslam_jax.solver._solve import method_of, run
 
@@ -438,7 +439,7 @@ def test_added_frames_weigh_nothing_to_any_factor():
     for name, factor in factors.items():
         if isinstance(factor, g.AbstractFrameFactor):
             padded = g.pad_factor(factor, state, 2)
-            assert not isinstance(padded, g.Masked), name
+            assert not isinstance(padded, Masked), name
             found, expected = padded.cost(longer), factor.cost(state)
             np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=name)
             checked += 1

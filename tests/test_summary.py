@@ -65,22 +65,29 @@ def test_the_summary_says_who_and_what_is_left_out():
     nobody = np.zeros_like(joint.present)
     joint = dataclasses.replace(joint, cameras=moved, status="ran out of steps")
 
-    def found(joint, first, last):
+    def found(joint, first, last, kind="moving"):
         cameras = rehearsal._cameras(sequence)
         located = (np.arange(15) >= first) & (np.arange(15) <= last)
-        cameras = dataclasses.replace(cameras, kind="moving", registered=located)
+        cameras = dataclasses.replace(cameras, kind=kind, registered=located)
         return assemble(sequence, config, body, cameras, joint, {}).summary
 
+    # These people fit no keypoints, which is told as well.
+    about = {"people", "frames_used"}
+    names = lambda told: [r["name"] for r in told["reasons"] if r["name"] in about]
     whole = found(joint, 0, 14)
-    assert whole["status"] == "ok" and whole["frames_used"] == [0, 14]
+    assert names(whole) == []
+    assert whole["frames_used"] == [0, 14]
     assert any("may not be the best: ran out of steps" in w for w in whole["warnings"])
     # Seven of fourteen steps are half of the way.
     part = found(joint, 0, 7)
-    assert part["status"] == "ok" and "camera: 1.5" in part["headline"][1]
+    assert names(part) == [] and "camera: 1.5" in part["headline"][1]
     assert "camera: 3.0" in whole["headline"][1]
     assert part["frames_used"] == [0, 7]
     short = found(joint, 9, 14)
-    assert short["status"] == "only frames 9 to 14 of 15 are used"
+    assert short["status"] == "doubtful" and names(short) == ["frames_used"]
+    assert "9 to 14 of 15 are used" in short["reasons"][0]["message"]
+    lost = found(joint, 0, 14, "failed")
+    assert lost["status"] == "failed" and lost["reasons"][0]["name"] == "camera_motion"
     empty = found(dataclasses.replace(joint, present=nobody), 0, 14)
     assert any("person 0 is left out" in w for w in empty["warnings"])
     assert not any("person 0" in line for line in empty["headline"])
@@ -88,7 +95,8 @@ def test_the_summary_says_who_and_what_is_left_out():
     assert whole["people"][0]["stature_m"] > 1
     unknown = dataclasses.replace(joint, present=nobody, scale_sigma=np.inf)
     empty = found(unknown, 0, 14)
-    assert "no people" in empty["status"]
+    assert empty["status"] == "doubtful" and names(empty) == ["people"]
+    assert "no people" in empty["reasons"][0]["message"]
     assert " m, of no known size, in" in empty["headline"][1]
     assert any("frames 0 to 7 of 15 are used" in w for w in part["warnings"])
     assert not any("are used" in w for w in whole["warnings"])

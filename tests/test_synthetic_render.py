@@ -1,19 +1,35 @@
 """Pictures agree with the geometry that they are made from."""
 
 import copy
+import dataclasses
 
 import cv2
 import numpy as np
 import pytest
 
 from bodyslam_jax.body import load_body_model
+from bodyslam_jax.synthetic._outfit import PARTS, Figure, Outfit, dress
 from bodyslam_jax.synthetic._posing import Person
-from bodyslam_jax.synthetic._render import Renderer, rasterise, write_video
+from bodyslam_jax.synthetic._raster import rasterise
+from bodyslam_jax.synthetic._render import Renderer, write_video
 from bodyslam_jax.synthetic._room import Box, Room, furnish, landmarks_on
 from bodyslam_jax.synthetic._scene import look_at, walk
+from bodyslam_jax.synthetic._shutter import Shutter, cameras_at
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 SIZE = (640, 480)
+
+
+def naked(person):
+    """A figure whose outline is the body's own."""
+    part = np.zeros(len(person.skin), int)
+    colours = np.full((len(part), 3), 120.0)
+    return Figure(person, Outfit(), part, colours, np.ones(3), np.zeros((2, 2, 2)))
+
+
+def still(renderer, T_WC, *people):
+    """What a camera sees of people who stand still."""
+    return renderer.frame(T_WC[None], 0, [(v, 0 * v, 0 * v) for v in people])
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +46,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def renderer(room, person):
-    return Renderer(room, person, INTRINSICS, SIZE, np.random.default_rng(0))
+    return Renderer(room, [naked(person)], INTRINSICS, SIZE, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +70,7 @@ def project(T_WC, points):
 
 def test_depth_is_that_of_the_nearest_surface(room, renderer):
     T = camera([-1.0, 1.5, -3.0], [0.3, 0.8, 1.0])
-    inverse, _, _ = renderer._room(T)
+    inverse, _, _ = renderer._room(T[None])
     rng = np.random.default_rng(1)
     points, normals = landmarks_on(room.faces(), 20.0, rng)
     uv, z = project(T, points)
@@ -73,7 +89,7 @@ def test_depth_is_that_of_the_nearest_surface(room, renderer):
 
 def test_every_pixel_of_a_room_is_filled(renderer):
     for target in ([3.0, 0.2, 0.0], [0.0, 2.8, 1.0], [-3.0, 1.0, -4.0]):
-        inverse, _, _ = renderer._room(camera([0.2, 1.5, -1.0], target))
+        inverse, _, _ = renderer._room(camera([0.2, 1.5, -1.0], target)[None])
         # Walls are at most 9 m away; the background's inverse depth is 0.001
         assert inverse.min() > 0.1
 
@@ -81,7 +97,8 @@ def test_every_pixel_of_a_room_is_filled(renderer):
 def test_body_is_drawn_where_its_keypoints_are(renderer, posed):
     vertices, keypoints, _ = posed
     T = camera([0.5, 1.4, -3.0], [0.0, 0.9, 0.3])
-    image, mask = renderer.frame(T, vertices)
+    image, who = still(renderer, T, vertices)
+    mask = who == 1
     uv, _ = project(T, keypoints)
     at = uv.round().astype(int)
     # Points on the skin may lie just outside of the outline
@@ -98,7 +115,7 @@ def test_furniture_hides_the_body(renderer, posed):
     free = copy.copy(renderer)
     free.surfaces = renderer.surfaces[:6]  # the walls alone
     T = camera([1.5, 1.4, 3.8], [0.0, 0.8, 0.3])  # over the box
-    whole, part = free.frame(T, posed[0])[1], renderer.frame(T, posed[0])[1]
+    whole, part = (still(r, T, posed[0])[1] == 1 for r in (free, renderer))
     assert 0.3 * whole.sum() < part.sum() < 0.9 * whole.sum()
     assert not (part & ~whole).any()
 
@@ -108,28 +125,160 @@ def test_nearest_triangle_wins_and_back_faces_do_not_show():
     depth = np.array([0.5, 0.5, 0.5, 0.8, 0.8, 0.8])
     faces = np.array([[0, 1, 2], [3, 4, 5]])
     background = np.full((20, 20), 0.1)
-    pixel, face = rasterise(uv, depth, faces, background)
-    assert (face == 1).all() and 40 < len(pixel) < 70
-    assert len(np.unique(pixel)) == len(pixel)
-    _, face = rasterise(uv, depth, np.array([[0, 1, 2], [3, 5, 4]]), background)
-    assert (face == 0).all()
-    assert not len(rasterise(uv, depth, faces, np.full((20, 20), 0.9))[0])
+    hits = rasterise(uv, depth, faces, background)
+    assert (hits.face == 1).all() and 40 < len(hits.pixel) < 70
+    assert len(np.unique(hits.pixel)) == len(hits.pixel)
+    # The corners' weights say where in the triangle a pixel is
+    at = (hits.weights[:, :, None] * uv[faces[hits.face]]).sum(axis=1)
+    row, column = np.divmod(hits.pixel, 20)
+    np.testing.assert_allclose(at, np.stack([column, row], axis=1), atol=1e-9)
+    np.testing.assert_allclose(hits.inverse, 0.8)
+    hits = rasterise(uv, depth, np.array([[0, 1, 2], [3, 5, 4]]), background)
+    assert (hits.face == 0).all()
+    assert not len(rasterise(uv, depth, faces, np.full((20, 20), 0.9)).pixel)
 
 
 def test_person_behind_the_camera_is_not_drawn(renderer, posed):
-    _, mask = renderer.frame(camera([0, 1.4, -1.0], [0, 1.0, -3.5]), posed[0])
-    assert not mask.any()
+    _, who = still(renderer, camera([0, 1.4, -1.0], [0, 1.0, -3.5]), posed[0])
+    assert not who.any()
 
 
 def test_images_have_corners_for_a_front_end(renderer, posed):
     T = camera([0.5, 1.5, -3.0], [0.0, 0.9, 0.3])
-    image, mask = renderer.frame(T, posed[0])
+    image, who = still(renderer, T, posed[0])
+    mask = who == 1
     found = cv2.BRISK_create(20, 3).detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     at = np.array([p.pt for p in found]).astype(int)
     static = ~mask[at[:, 1], at[:, 0]]
     cells = np.unique((at[static] // 80) @ [1, 8])
     assert static.sum() > 300
     assert len(cells) >= 40  # of 48
+
+
+def test_who_is_nearer_hides_who_is_behind(room, person, posed):
+    vertices = posed[0]
+    both = [naked(person), naked(person)]
+    r = Renderer(room, both, INTRINSICS, SIZE, np.random.default_rng(0))
+    T = camera([0.0, 1.4, -3.0], [0.0, 0.9, 0.0])
+    near = vertices - [0, 0, 1.0]
+    for people, first in (((vertices, near), 2), ((near, vertices), 1)):
+        who = still(r, T, *people)[1]
+        alone = still(r, T, people[first - 1], vertices - [0, 0, 50.0])[1] == 1
+        if first == 2:
+            alone = still(r, T, vertices - [0, 0, 50.0], people[1])[1] == 2
+        assert (who == first).sum() == alone.sum()
+        assert 0 < (who == 3 - first).sum() < 0.7 * alone.sum()
+
+
+def test_rows_of_a_rolling_shutter_are_seen_from_where_the_camera_is_then(
+    room, person, posed
+):
+    shutter = Shutter(readout=0.03)
+    make = lambda s: Renderer(
+        room, [naked(person)], INTRINSICS, SIZE, np.random.default_rng(0), s
+    )
+    rolling, ideal = make(shutter), make(Shutter())
+    eyes = np.array([[0.2, 1.4, -3.2], [0.3, 1.42, -3.1], [0.45, 1.4, -3.05]])
+    aims = np.array([[-0.1, 0.9, 0.3], [0.1, 0.9, 0.3], [0.4, 0.95, 0.3]])
+    T = look_at(eyes, aims)
+    v = posed[0]
+    moving = (v, np.tile([0.03, 0.0, 0.01], (len(v), 1)), 0 * v)
+    times = shutter.row_times(SIZE[1])
+    assert times.mean() == pytest.approx(0.0, abs=1e-12)
+    assert times[-1] - times[0] == pytest.approx(0.03 * 479 / 480)
+    who = rolling.frame(T, 1, [moving])[1]
+    depth = rolling._room(cameras_at(T, 1, times, 30.0))[0]
+    still_who = ideal.frame(T, 1, [moving])[1]
+    differs = 0
+    for row in range(110, 400, 29):
+        now = cameras_at(T, 1, times[row : row + 1], 30.0)
+        at = v + 30.0 * times[row] * moving[1]
+        exact = still(ideal, now[0], at)[1][row]
+        assert abs(who[row] - exact).sum() <= 2  # a pixel on the edge of a triangle
+        np.testing.assert_allclose(depth[row], ideal._room(now)[0][row], rtol=1e-4)
+        differs += abs(still_who[row] - exact).sum()
+    assert differs > 60  # and an ideal camera sees something else
+
+
+def test_motion_blur_is_as_long_as_the_motion_during_the_exposure(room, person, posed):
+    bright = dataclasses.replace(
+        naked(person), colours=np.full((len(person.skin), 3), 600.0)
+    )
+    make = lambda s: Renderer(
+        room, [bright], INTRINSICS, SIZE, np.random.default_rng(0), s
+    )
+    T = camera([0.0, 1.4, -3.0], [0.0, 1.4, 0.3])
+    v = posed[0]
+    step = np.tile([0.12, 0.0, 0.0], (len(v), 1))  # 3.6 m/s to the side
+    away = v - [0, 0, 50.0]  # behind the camera
+    head = np.s_[:, v[:, 1].argmax()]
+    widths = []
+    for exposure in (0.0, 0.016):
+        r = make(Shutter(exposure))
+        image = r.frame(T[None], 0, [(v, step, 0 * v)])[0].astype(float)
+        empty = r.frame(T[None], 0, [(away, 0 * v, 0 * v)])[0]
+        seen = abs(image - empty).max(axis=2) > 10
+        top = int(project(T, v[head[1]][None])[0][0, 1])
+        widths.append(seen[top + 12 : top + 24, 150:490].sum(axis=1).mean())
+    depth = project(T, v)[1][v[:, 1].argmax()]
+    length = 3.6 * 0.016 * 525 / depth
+    count = min(np.ceil(length / 2), 6)  # images in which the motion is sampled
+    assert widths[1] - widths[0] == pytest.approx(length * (1 - 1 / count), abs=2.0)
+    assert length > 7
+
+
+@pytest.fixture(scope="module")
+def dressed(person):
+    outfit = Outfit(sleeves=0.4, hair="short")
+    return dress(person, np.random.default_rng(4), outfit)
+
+
+def test_parts_of_a_dressed_person_have_their_own_colours(person, dressed):
+    """Where a joint is tells what is worn there."""
+    used = np.unique(dressed.person.faces)
+    skin, part = dressed.person.skin[used], dressed.part[used]
+    names = {
+        **{3: "shirt", 6: "shirt", 1: "trousers", 4: "trousers", 10: "shoes"},
+        **{20: "skin", 22: "skin"},
+    }
+    part = np.where(part == PARTS.index("sole"), PARTS.index("shoes"), part)
+    for joint, name in names.items():
+        near = np.linalg.norm(skin - person.rest[joint], axis=1).argsort()[:40]
+        assert (part[near] == PARTS.index(name)).mean() > 0.6, joint
+    for name, low, high in (("hair", 0.7, 1.3), ("lips", -0.9, -0.4)):
+        eyes = person.skin[person.picks[[1, 2]], 1].mean()
+        unit = person.skin[person.picks[11], 1] - eyes
+        at = (skin[part == PARTS.index(name), 1] - eyes) / unit
+        assert low < np.percentile(at, 99) < high
+    assert (skin[part == PARTS.index("lips"), 2] > person.rest[15, 2]).all()
+    colours = [
+        np.median(dressed.colours[dressed.part == i], axis=0)
+        for i in range(len(PARTS))
+        if (dressed.part == i).any()
+    ]
+    apart = np.linalg.norm(np.array(colours)[:, None] - colours, axis=2)
+    assert (apart + 1e3 * np.eye(len(colours))).min() > 8
+
+
+def test_clothes_change_the_outline_and_not_where_the_feet_stand(person):
+    wide = Outfit(skirt=0.6, looseness=1.5, hair="long")
+    figure = dress(person, np.random.default_rng(1), wide)
+    assert figure.person.skin[:, 1].min() == pytest.approx(
+        person.skin[:, 1].min(), abs=0.006
+    )
+    np.testing.assert_array_equal(figure.person.rest, person.rest)
+    knee = person.rest[4, 1]
+    at_knee = lambda p: np.ptp(p[abs(p[:, 1] - knee - 0.1) < 0.03][:, 2])
+    assert at_knee(figure.person.skin) > at_knee(person.skin) + 0.03
+    np.testing.assert_allclose(figure.person.weights.sum(axis=1), 1, atol=1e-6)
+    assert figure.person.faces.max() < len(figure.person.skin)
+
+
+def test_outfits_differ_and_a_seed_gives_the_same_again(person):
+    figures = [dress(person, np.random.default_rng(k)) for k in (1, 1, 2, 3)]
+    np.testing.assert_array_equal(figures[0].colours, figures[1].colours)
+    np.testing.assert_array_equal(figures[0].person.skin, figures[1].person.skin)
+    assert len({repr(f.outfit) for f in figures}) == 3
 
 
 @pytest.mark.parametrize("is_hall", [False, True])

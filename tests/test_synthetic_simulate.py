@@ -250,3 +250,51 @@ def test_motion_of_ones_own_and_bad_motion(tmp_path):
         synthetic.simulate(dataclasses.replace(own, motion=str(still)))
     with pytest.raises(ValueError, match="2 frames"):
         synthetic.simulate(Simulation(length=1))
+
+
+def test_a_second_person_is_true_and_measured_and_changes_nothing_of_the_first():
+    one, two = simulated(noise="low"), simulated(noise="low", people=2)
+    np.testing.assert_array_equal(one.joints, two.joints)
+    np.testing.assert_array_equal(one.T_WC, two.T_WC)
+    truth = synthetic.as_truth(two)
+    assert truth.joints.shape == (2, FRAMES, 24, 3)
+    first, second = truth.joints
+    assert np.linalg.norm(first - second, axis=-1).min() > 0.15  # nobody in nobody
+    assert np.abs(truth.betas[0] - truth.betas[1]).max() > 0.3
+    assert abs(second[:, [10, 11], 1].min(axis=1)).max() < 0.2  # on the same floor
+    measured = synthetic.as_sequence(two)
+    uv, confidence = measured.keypoints.uv[1], measured.keypoints.confidence[1]
+    there = confidence > 0
+    assert there.any(axis=1).mean() > 0.3
+    points = two.others[0].person.keypoints(
+        *two.others[0].person.joints(
+            two.others[0].walk.poses, two.others[0].walk.pelvis
+        )
+    )
+    error = np.linalg.norm(uv - pixels(to_camera(two, points)), axis=-1)
+    assert np.median(error[there]) < 6
+
+
+def test_furniture_in_the_way_hides_keypoints_and_leaves_the_ways_free():
+    free, full = simulated(noise="none"), simulated(noise="none", hiding=True)
+    np.testing.assert_array_equal(free.joints, full.joints)
+    assert len(full.room.boxes) > len(free.room.boxes)
+    seen = [s.keypoints[1] > 0 for s in (free, full)]
+    assert (seen[1] & ~seen[0]).sum() == 0
+    assert 0.005 < 1 - seen[1].mean() / seen[0].mean() < 0.5
+    points = true_keypoints(full)
+    for k in range(0, FRAMES, 20):
+        hidden = full.room.is_hidden(full.T_WC[k, :3, 3], points[k])
+        np.testing.assert_array_equal(seen[1][k], seen[0][k] & ~hidden)
+    ways = np.concatenate([full.joints[:, 0], full.T_WC[:, :3, 3]])
+    for box in full.room.boxes:
+        local = (ways - box.centre) @ box.axes
+        assert (abs(local) - box.half)[:, [0, 2]].max(axis=1).min() > 0.3
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"people": 0}, {"people": 9}, {"exposure": -0.1}, {"readout": 0.5}]
+)
+def test_what_cannot_be_filmed_is_said(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} .*expected"):
+        synthetic.simulate(Simulation(length=10, **wrong))

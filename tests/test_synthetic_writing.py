@@ -232,3 +232,42 @@ def test_demo_scene_is_a_sequence_with_a_video(tmp_path):
     assert (folder / "video.mp4").stat().st_mtime_ns == before
     assert synthetic.demo_scene(folder, seed=1) == folder
     assert (folder / "video.mp4").stat().st_mtime_ns != before
+
+
+def test_two_people_are_written_and_read(tmp_path):
+    two = synthetic.simulate(dataclasses.replace(SETTINGS, people=2, noise="low"))
+    folder = synthetic.write_sequence(tmp_path / "two", two)
+    truth = read_groundtruth(folder, load_body_model())
+    np.testing.assert_allclose(truth.joints, synthetic.as_truth(two).joints, atol=1e-12)
+    found = read_sequence(folder)
+    assert found.bodies.present.shape == (2, 40)
+    people = [
+        json.loads(p.read_text())["people"] for p in (folder / "keypoints").iterdir()
+    ]
+    assert max(map(len, people)) == 2
+    # and one person again leaves none of the second
+    synthetic.write_sequence(folder, synthetic.simulate(SETTINGS))
+    assert len(read_groundtruth(folder, load_body_model()).joints) == 1
+
+
+def test_the_same_seed_gives_the_same_film_and_another_another():
+    settings = dataclasses.replace(SETTINGS, length=3, people=2)
+    film = lambda s: np.stack(list(synthetic.render(synthetic.simulate(s))))
+    first = film(settings)
+    np.testing.assert_array_equal(first, film(settings))
+    other = film(dataclasses.replace(settings, seed=4))
+    assert abs(first.astype(int) - other).mean() > 5
+
+
+def test_a_film_has_no_measurements_and_is_kept(simulated, tmp_path):
+    short = synthetic.simulate(dataclasses.replace(SETTINGS, length=3))
+    measured = synthetic.write_sequence(tmp_path / "a", short)
+    assert read_sequence(measured).keypoints is not None
+    folder = synthetic.film_scene(tmp_path / "a", short)  # replaces what was measured
+    sequence = read_sequence(folder)
+    assert sequence.keypoints is None and sequence.bodies is None
+    assert sequence.tracks is None and sequence.num_frames == 3
+    assert not (folder / "keypoints").exists()
+    before = (folder / "video.mp4").stat().st_mtime_ns
+    synthetic.film_scene(folder, short)
+    assert (folder / "video.mp4").stat().st_mtime_ns == before

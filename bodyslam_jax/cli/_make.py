@@ -12,7 +12,9 @@ import tyro
 from bodyslam_jax.cli._types import Flat, Input, Preset
 from bodyslam_jax.config import Config, Experiment, MotionTraining, Simulation
 
-_Experiment = Literal["table1", "scale", "landmarks", "motion", "ablation", "weights"]
+_Experiment = Literal[
+    "table1", "scale", "landmarks", "motion", "ablation", "weights", "video"
+]
 log = logging.getLogger(__name__)
 
 

@@ -60,6 +60,7 @@ def run(
 def demo(
     *,
     out: Path = Path("bodyslam_demo"),
+    from_pixels: bool = False,
     preset: Preset = "default",
     settings: Path | None = None,
     config: Flat = Config(),
@@ -68,6 +69,8 @@ def demo(
 
     Args:
         out: Run folder to write.
+        from_pixels: Find the walker in the images by the networks that ship, in place
+            of the keypoints and bodies that are simulated.
         preset: `paper` has the paper's weights, motion network and first-order steps.
         settings: A config.yaml to start from, which prevails over a preset; options
             beside it prevail over both.
@@ -75,12 +78,18 @@ def demo(
     """
     from bodyslam_jax import pipeline
 
-    return _finish(pipeline.demo(out, config, first=_is_first()), out)
+    first = _is_first()
+    result = pipeline.demo(out, config, first=first, from_pixels=from_pixels)
+    return _finish(result, out)
 
 
 def _finish(result: Any, out: Path) -> int:
     for line in result.summary["headline"]:
         print(line)
+    for reason in result.summary["reasons"]:
+        print(
+            f"{reason['status']}: {reason['message']} What to do: {reason['advice']}."
+        )
     for warning in result.summary["warnings"]:
         print(f"warning: {warning}")
     print(f"{out / 'report.html'}")

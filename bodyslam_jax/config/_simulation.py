@@ -30,8 +30,16 @@ class Simulation:
     """Whether keypoints have BODY_25's feet and face, or the 15 others only."""
     detector_bias: float = 0.0
     """0: keypoints are SMPL's joints; 1: hips, neck and shoulders as COCO has them."""
+    people: int = 1
+    """Walkers in the scene, 1 to 3; the camera is on the first."""
+    hiding: bool = False
+    """Whether furniture stands in the way of the camera's view for some of the time."""
     render: bool = False
     """Whether a video is rendered."""
+    exposure: float = 0.008
+    """Of a rendered image, s; what moves meanwhile is blurred."""
+    readout: float = 0.0
+    """By how much the last row of a rendered image is later than the first, s."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -38,6 +38,8 @@ from bodyslam_jax.evaluation._metrics import (
 )
 from bodyslam_jax.evaluation._metrics import trajectory_error as trajectory_error
 from bodyslam_jax.evaluation._metrics import world_mpjpe as world_mpjpe
+from bodyslam_jax.evaluation._plausibility import FIGURES as FIGURES
+from bodyslam_jax.evaluation._plausibility import up_axis as up_axis
 from bodyslam_jax.evaluation._readers import read_groundtruth as read_groundtruth
 from bodyslam_jax.evaluation._readers import read_result as read_result
 from bodyslam_jax.evaluation._readers import read_tum as read_tum

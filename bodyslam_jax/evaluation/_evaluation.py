@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.evaluation import _metrics as metrics
+from bodyslam_jax.evaluation import _plausibility as plausibility
 from bodyslam_jax.evaluation._alignment import Alignment, align, is_point
 
 PELVIS = 0
@@ -114,12 +115,19 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
     error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
     `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then. An
     estimated one that does not move at all has no scale and no Sim(3) either.
+
+    `gravity_error` and the figures of module `_plausibility` take y for up in the
+    estimate, as it is in a result.
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
+    true_up = plausibility.up_axis(truth.joints, truth.present)
+    values["gravity_error"] = plausibility.gravity_error(
+        estimate.T_WC, truth.T_WC, camera_valid, true_up
+    )
     people: dict[str, Array] = {}
     if truth.present.shape[0]:
-        per_person = jax.vmap(_person_errors, (0, 0, 0, 0, 0, 0, None, None, None))
+        per_person = jax.vmap(_person_errors, (0,) * 6 + (None,) * 4)
         people = per_person(
             estimate.joints,
             truth.joints,
@@ -130,6 +138,7 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
             estimate,
             truth,
             camera_valid,
+            true_up,
         )
         counts = estimate.present & truth.present
         broken = jnp.zeros(len(counts), bool)
@@ -216,6 +225,7 @@ def _person_errors(
     estimate: Trajectories,
     truth: Trajectories,
     camera_valid: Bool[Array, " t"],
+    true_up: Float[Array, " 3"],
 ) -> dict[str, Array]:
     valid = present & true_present
     dtype = true_joints.dtype
@@ -281,4 +291,8 @@ def _person_errors(
     )
     values |= _both("jitter", metrics.jitter(joints, valid, estimate.fps))
     values |= _both("jitter_of_truth", metrics.jitter(true_joints, valid, truth.fps))
+    up = jnp.asarray(plausibility.Y, dtype)
+    own = plausibility.posture_figures(joints, valid, up, estimate.fps)
+    theirs = plausibility.posture_figures(true_joints, valid, true_up, truth.fps)
+    values |= own | {f"{name}_of_truth": value for name, value in theirs.items()}
     return values | _both("foot_sliding", metrics.foot_sliding(feet, true_feet, valid))

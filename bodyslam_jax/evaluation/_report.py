@@ -46,6 +46,19 @@ ROWS: tuple[tuple[str, str, str, float], ...] = (
     ("jitter", "jitter", "10 m/s³", 0.1),
     ("jitter_of_truth", "jitter of the truth", "10 m/s³", 0.1),
     ("foot_sliding", "foot sliding per frame", "mm", _MM),
+    ("gravity_error", "gravity error", "deg", _DEGREES),
+    *(
+        (f"{name}{of}", f"{label}{whose}", unit, factor)
+        for name, label, unit, factor in (
+            ("foot_speed", "standing foot's speed, median", "m/s", 1.0),
+            ("feet_low", "feet over the ground, 5th percentile", "mm", _MM),
+            ("feet_high", "feet over the ground, 95th percentile", "mm", _MM),
+            ("joint_acceleration", "joints' acceleration, median", "m/s²", 1.0),
+            ("knee", "knees' bend", "deg", _DEGREES),
+            ("straighter_knee", "straighter knee's bend", "deg", _DEGREES),
+        )
+        for of, whose in (("", ""), ("_of_truth", ", truth"))
+    ),
 )
 """Name, label, unit of the report, factor from SI."""
 

@@ -9,7 +9,7 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import motion
 from bodyslam_jax.cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.config import Config, Experiment, Simulation
-from bodyslam_jax.experiments import _ablation, _reports
+from bodyslam_jax.experiments import _ablation, _reports, _video
 from bodyslam_jax.experiments._about import about
 from bodyslam_jax.experiments._case import Case, simulations
 from bodyslam_jax.experiments._comparison import compare_methods
@@ -21,6 +21,7 @@ from bodyslam_jax.experiments._scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments._structure import landmark_ablation
 from bodyslam_jax.experiments._table1 import FORM, write_table1
 from bodyslam_jax.experiments._variants import FULL, VARIANTS
+from bodyslam_jax.experiments._video_table import write_video
 from bodyslam_jax.experiments._weights import Learned, Trial, learn_weights, make_trial
 
 ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
@@ -196,6 +197,12 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
     return Plan(jobs, write)
 
 
+def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Pixels alone beside simulated keypoints and bodies, all ten, both families."""
+    jobs = _video.jobs(experiment, config, stages, ALL)
+    return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
+
+
 PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
     "table1": table1,
     "scale": scale,
@@ -203,4 +210,5 @@ PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
     "motion": motion_model,
     "ablation": ablation,
     "weights": weights,
+    "video": video,
 }

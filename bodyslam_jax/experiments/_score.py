@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax import evaluation, graph
+from bodyslam_jax import assembly, evaluation, graph
 from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.result import Result
@@ -20,6 +20,11 @@ NAMES = (
     "scale",
 )
 """Errors of the paper's table 1: mean over frames, m; `scale` is truth per estimate."""
+PLAUSIBLE = (
+    "gravity_error",
+    *(f"{name}{whose}" for name in evaluation.FIGURES for whose in ("", "_of_truth")),
+)
+"""Whether people slide, float or crouch: rad, m, s; without the result's low pass."""
 _FEET = (7, 10, 8, 11)
 _FRAMES = 100
 """Numbers of frames are rounded up to this, so that lengths share what is compiled."""
@@ -78,10 +83,12 @@ def score(
 ) -> dict[str, float]:
     """`errors` of one state as plain numbers, compiled once for many lengths.
 
-    `leg_ratio` is the length of the first person's legs over what it should be.
+    `leg_ratio` is the length of the first person's legs over what it should be; beside
+    it stand the figures named in `PLAUSIBLE`.
     """
     frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
     estimate = trajectories(state, body, present, registered, truth.fps)
+    estimate = _upright(estimate, state, body)
     found = _errors(
         evaluation.pad_frames(estimate, frames), evaluation.pad_frames(truth, frames)
     )
@@ -98,4 +105,39 @@ def leg_of(people: Trajectories) -> Float[Array, ""]:
     return jnp.sqrt((bones**2).sum(-1)).sum() / 2
 
 
-_errors = eqx.filter_jit(errors)
+def _upright(
+    estimate: Trajectories, state: graph.State, body: BodyModel
+) -> Trajectories:
+    """The same in a world whose y axis is up and whose floor is at y = 0."""
+    present, fps = np.asarray(estimate.present), float(estimate.fps)
+    if not present.any():
+        return estimate
+    T_WC, joints = np.asarray(estimate.T_WC), np.asarray(estimate.joints)
+    turn, _ = assembly.level(
+        T_WC,
+        np.asarray(graph.world_from_root(state)),
+        joints[:, :, assembly.FEET],
+        present,
+        np.asarray(state.scale * state.landmarks),
+        fps,
+        np.zeros(len(present), bool),
+    )
+    at = lambda points: np.asarray(points) @ turn[:3, :3].T + turn[:3, 3]
+    floor = assembly.floor_height(
+        body, np.asarray(state.shapes), at(joints), present, fps
+    )
+    turn[1, 3] -= floor
+    return Trajectories(
+        T_WC=jnp.asarray(turn @ T_WC),
+        camera_valid=estimate.camera_valid,
+        joints=jnp.asarray(at(joints)),
+        present=estimate.present,
+        feet=jnp.asarray(at(estimate.feet)),
+        fps=estimate.fps,
+    )
+
+
+@eqx.filter_jit
+def _errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
+    found = evaluation.evaluate_trajectories(estimate, truth)
+    return {name: found[name] for name in (*NAMES, *PLAUSIBLE)}

@@ -1,5 +1,6 @@
 """The paper's table 1 of finished rows, the paper's own figures beside ours."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from bodyslam_jax.experiments import _figures as figures
 from bodyslam_jax.experiments import _paper as paper
 from bodyslam_jax.experiments._comparison import METHODS
-from bodyslam_jax.experiments._score import NAMES
+from bodyslam_jax.experiments._score import NAMES, PLAUSIBLE
 from bodyslam_jax.experiments._tables import (
     MM,
     Column,
@@ -28,6 +29,7 @@ _PATH = [[float]]
 FORM: dict[str, Any] = {
     **dict.fromkeys(_NUMBERS, float),
     **{f"{method}/{name}": float for method in METHODS for name in NAMES},
+    **{f"full/{name}": float for name in PLAUSIBLE},
     "status": str,
     "paths": {
         f"{what}/{name}": _PATH
@@ -49,6 +51,23 @@ _BEHIND = [
     Column("steps", "steps", digits=0),
     Column("status", "status"),
 ]
+_DEGREES = 180 / math.pi
+_PLAUSIBLE = [
+    Column("gravity error, degrees", "full/gravity_error", _DEGREES, 2),
+    *(
+        Column(f"{title}{of}", f"full/{name}{whose}", factor, digits)
+        for title, name, factor, digits in (
+            ("standing foot, m/s", "foot_speed", 1.0, 2),
+            ("feet over the ground, 5th percentile, mm", "feet_low", MM, 0),
+            ("feet, 95th percentile, mm", "feet_high", MM, 0),
+            ("joints' acceleration, m/s²", "joint_acceleration", 1.0, 1),
+            ("knees, degrees", "knee", _DEGREES, 1),
+            ("straighter knee, degrees", "straighter_knee", _DEGREES, 1),
+        )
+        for of, whose in (("", ""), (", truth", "_of_truth"))
+    ),
+]
+"""Whether the full estimate's people slide, float or crouch."""
 
 
 def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
@@ -65,6 +84,7 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         add(", after SE(3)", [*_beside("se3"), *_scales()])
         add(", after Sim(3)", _beside("sim3"))
         add(": behind it", _BEHIND)
+        add(": gravity, feet and knees, before smoothing", _PLAUSIBLE)
         for method, meaning in baselines.items():
             add(f": {meaning}", [*_errors(method), _scale(method)])
     head = intro(
@@ -80,7 +100,9 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     columns = [_SEQUENCE, *_beside("se3"), *_beside("sim3"), *_scales()]
     for method in baselines:
         columns += [*_errors(method, f" {method}"), _scale(method, f" {method}")]
-    write_text(out / "table1.csv", to_csv([*columns, *_BEHIND], rows, about))
+    write_text(
+        out / "table1.csv", to_csv([*columns, *_BEHIND, *_PLAUSIBLE], rows, about)
+    )
     figures.draw_table(out / "table1.png", rows, papers, about)
     figures.draw_paths(out / "table1_paths.png", rows, about)
     return [*written, out / "table1.png", out / "table1_paths.png"]

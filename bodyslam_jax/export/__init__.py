@@ -6,6 +6,7 @@ from bodyslam_jax.export._facts import person_facts as person_facts
 from bodyslam_jax.export._facts import stature as stature
 from bodyslam_jax.export._gait import Gait as Gait
 from bodyslam_jax.export._gait import gait as gait
+from bodyslam_jax.export._gait import gait_of_joints as gait_of_joints
 from bodyslam_jax.export._ground import ground_scale as ground_scale
 from bodyslam_jax.export._lock import locked as locked
 from bodyslam_jax.export._meshes import write_bvh as write_bvh

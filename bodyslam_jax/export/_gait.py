@@ -79,8 +79,23 @@ def gait(result: Result, person: int) -> Gait | None:
     if not stretches:
         return None
     run = max(stretches, key=lambda run: run.stop - run.start)
-    joints, fps = result.joints[person, run], frame_rate(result)
-    period = _period(_spread(joints, result.poses[person, run, :3]))
+    ahead = Rotation.from_rotvec(result.poses[person, run, :3]).as_matrix()[:, :, 2]
+    return _steps(result.joints[person, run], ahead, frame_rate(result))
+
+
+def gait_of_joints(joints: Float[np.ndarray, "t 24 3"], fps: float) -> Gait | None:
+    """How somebody walks of whom only the joints are known, m, y up.
+
+    Forward is at right angles to the line from the right hip to the left one. `None`
+    as for `gait`.
+    """
+    return _steps(joints, np.cross(joints[:, 1] - joints[:, 2], _UP), fps)
+
+
+def _steps(
+    joints: Float[np.ndarray, "t 24 3"], ahead: Float[np.ndarray, "t 3"], fps: float
+) -> Gait | None:
+    period = _period(_spread(joints, ahead))
     if period is None:
         return None
     bones = [np.diff(joints[:, leg], axis=1) for leg in _LEGS]
@@ -92,10 +107,9 @@ def gait(result: Result, person: int) -> Gait | None:
 
 
 def _spread(
-    joints: Float[np.ndarray, "t 24 3"], turn: Float[np.ndarray, "t 3"]
+    joints: Float[np.ndarray, "t 24 3"], ahead: Float[np.ndarray, "t 3"]
 ) -> Float[np.ndarray, " t"]:
     """How far the left ankle is before the right one, along the ground, m."""
-    ahead = Rotation.from_rotvec(turn).as_matrix()[:, :, 2]
     ahead = ahead - (ahead @ _UP)[:, None] * _UP
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     return ((joints[:, 7] - joints[:, 8]) * ahead).sum(axis=1)

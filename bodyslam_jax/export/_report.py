@@ -40,6 +40,7 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     source = summary.get("input") or {}
     name = source.get("name") if isinstance(source, dict) else str(source)
     sections = [
+        _reasons(summary.get("reasons") or []),
         cards(result, summary, camera, people, body),
         _warnings(summary.get("warnings") or []),
         errors_section(summary.get("errors") or {}),
@@ -108,6 +109,19 @@ def _warnings(warnings: Sequence[str]) -> str:
         return ""
     items = "".join(f"<li>{html.escape(str(w))}</li>" for w in warnings)
     return f'<section class="warnings"><h2>Warnings</h2><ul>{items}</ul></section>'
+
+
+def _reasons(reasons: Sequence[dict[str, Any]]) -> str:
+    """Why the result is not to be trusted, and what to do, before anything of it."""
+    if not reasons:
+        return ""
+    items = "".join(
+        f"<li>{html.escape(str(r.get('message')))} "
+        f"<em>{html.escape(str(r.get('advice', '')))}.</em></li>"
+        for r in reasons
+    )
+    title = "Why this is not to be trusted"
+    return f'<section class="warnings"><h2>{title}</h2><ul>{items}</ul></section>'
 
 
 def _figure(svg: str, caption: str, kind: str = "full") -> str:

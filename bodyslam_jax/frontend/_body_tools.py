@@ -36,6 +36,7 @@ from bodyslam_jax.frontend._declared_size import factor_to
 from bodyslam_jax.frontend._perspective import turn_to_camera
 from bodyslam_jax.frontend._rows import Rows, Video
 from bodyslam_jax.frontend._slahmr import from_slahmr, is_slahmr
+from bodyslam_jax.frontend._tool_focal import DEFAULT_FOCAL, default_focal
 
 
 def from_spin(data: dict, video: Video) -> Rows:
@@ -81,8 +82,10 @@ def from_vibe(data: dict, video: Video) -> Rows:
 
 
 def from_wham(data: dict, video: Video) -> Rows:
-    """WHAM: `{person: {...}}`; `pose`, `trans` are in the camera (`_world` is not)."""
+    """WHAM: `{person: {...}}`; `pose`, `trans` are in the camera (`_world` is not), of
+    which the file does not say the focal length."""
     rows = []
+    focal = default_focal("WHAM", video)
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
         poses = numbers_of(one, "pose", (-1, 72))
         n = len(poses)
@@ -92,10 +95,17 @@ def from_wham(data: dict, video: Video) -> Rows:
                 np.full(n, number),
                 poses,
                 betas_of(one, "betas", n),
-                numbers_of(one, "trans", (n, 3)),
+                _of_default(numbers_of(one, "trans", (n, 3)), focal, video),
             )
         )
     return join(rows)
+
+
+def _of_default(trans: np.ndarray, focal: float, video: Video) -> np.ndarray:
+    """Bodies of a camera of that focal length (px) about the image's middle."""
+    return refocused(
+        trans, np.full(len(trans), focal), middle(video.camera), video.camera
+    )
 
 
 def from_phalp(data: dict, video: Video) -> Rows:
@@ -133,10 +143,7 @@ def from_phalp(data: dict, video: Video) -> Rows:
         raise Unfit("no body in any frame")
     stacked = [np.asarray(a, dtype=np.float64) for a in (poses, betas, trans, box)]
     poses, betas, trans, box = stacked
-    focal = np.full(
-        len(frame), 5000 / 256 * max(video.camera.width, video.camera.height)
-    )
-    trans = refocused(trans, focal, middle(video.camera), video.camera)
+    trans = _of_default(trans, DEFAULT_FOCAL["4D-Humans"](video.camera), video)
     root = turn_to_camera(poses[:, :3], box, video.camera)
     poses = np.concatenate([root, poses[:, 3:]], axis=-1)
     return Rows(np.asarray(frame), np.asarray(person), poses, betas, trans)
@@ -170,6 +177,8 @@ def from_tram(data: dict, video: Video) -> Rows:
             data.get("img_center", middle(video.camera)), dtype=np.float64
         )
         trans = refocused(trans, focal, center, video.camera)
+    else:
+        trans = _of_default(trans, default_focal("TRAM", video), video)
     return Rows(
         frames_of(data, "frame", n, video.num_frames),
         np.zeros(n, dtype=np.int64),
@@ -189,6 +198,8 @@ def from_gvhmr(data: dict, video: Video) -> Rows:
         K = np.broadcast_to(numbers_of(data, "K_fullimg", None), (n, 3, 3))
         K = at_size(K, video)
         trans = refocused(trans, focals(K), K[:, :2, 2], video.camera)
+    else:
+        trans = _of_default(trans, default_focal("GVHMR", video), video)
     poses = np.concatenate(
         [root, numbers_of(body, "body_pose", (n, 63)), np.zeros((n, 6))], -1
     )

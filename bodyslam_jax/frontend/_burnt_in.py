@@ -5,9 +5,9 @@ or hand that carries the camera give tracks that are long, strong and wrong. A p
 that stays at its pixel may also be far away, or straight ahead of a camera that goes
 forward, and everything stays where the camera stands. So a point is told by the motion
 of the others: a rotation, or an essential matrix, is fitted to those that move, and a
-point that stays where neither lets it stay, in most pairs of frames in which it is seen,
-is burnt in. Where the camera only translates, a point that stays is one at infinity, and
-is left alone.
+point that stays where neither lets it stay, in most pairs of frames in which it is
+seen, is burnt in. Where the camera only translates, any point may stay that is at
+infinity, and is left alone.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from bodyslam_jax.sequence import Intrinsics, Tracks
 
 STILL = 0.5
 """Displacement up to which a point may be still in images of 1280 px, px."""
-_GAPS = (6, 15, 30)
+_GAPS = (6, 15, 30, 60)
 """Frames between the two of a pair."""
 _MOST_ANCHORS = 300
 _TIMES_STILL = 4.0
@@ -36,14 +36,16 @@ _FEWEST_TELLING = (3, 0.1)
 fewer may be an instant in which something crosses before a camera that stands."""
 _SHARE_INCONSISTENT = 0.4
 """Of the pairs in which a point is still: a point of the scene fits nearly always."""
+_FEWEST_ALWAYS, _MEAN_ALWAYS = 6, 0.7
+"""Pairs of a point, and its mean distance in the same unit, that contradict as well."""
 _TOLERANCE = 3.0
 """Distance from what the motion of the others allows, of their own robust scatter and
 of `STILL`, from which a point contradicts it."""
 _CELLS = 8
 """Along the longer side: the motion of the camera is seen all over the image."""
-_LEAST_COVER = 0.4
-"""Cells that move over cells that only stay: less may be traffic before a camera that
-stands still."""
+_LEAST_COVER, _LEAST_ROWS = 1.0, 3
+"""Cells that move over cells that only stay, and rows and columns that move: less may
+be traffic before a camera that stands still."""
 _AROUND = 15
 """Frames before and after a burnt-in point in which its place is masked."""
 
@@ -72,7 +74,7 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
     num = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
     tested, against = np.zeros(num, np.int64), np.zeros(num, np.int64)
     stays, pairs = np.zeros(num, np.int64), np.zeros(num, np.int64)
-    telling = resting = 0
+    total, telling, resting = np.zeros(num), 0, 0
     size = (intrinsics.width, intrinsics.height)
     limit = max(still_limit(size), 2.5 * noise_of(tracks))
     by_frame = _by_frame(tracks, num_frames)
@@ -101,9 +103,11 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
         telling += 1
         tested[ids[still]] += 1
         against[ids[still]] += away[still] > _TOLERANCE
-    burnt = (against >= _FEWEST_INCONSISTENT) & (
-        against >= _SHARE_INCONSISTENT * tested
-    )
+        total[ids[still]] += np.minimum(away[still], _TOLERANCE)
+    often = against >= np.maximum(_FEWEST_INCONSISTENT, _SHARE_INCONSISTENT * tested)
+    # Or by less, but all the time: a camera held by hand may turn by a little only.
+    always = (tested >= _FEWEST_ALWAYS) & (total > _MEAN_ALWAYS * tested)
+    burnt = often | always
     burnt &= telling >= max(_FEWEST_TELLING[0], _FEWEST_TELLING[1] * resting)
     # Tracks that stay for a while only, as where two objects cross, are of the scene.
     burnt &= stays >= 0.5 * pairs
@@ -130,8 +134,8 @@ def without_burnt_in(
 
 def burnt_in_warning(share: float) -> str:
     return (
-        f"{100 * share:.0f} % of the followed points stay at their pixel while the scene "
-        "moves (text, a logo or a part of the vehicle?): left out."
+        f"{100 * share:.0f} % of the followed points stay at their pixel while the "
+        "scene moves (text, a logo or a part of the vehicle?): left out."
     )
 
 
@@ -243,6 +247,8 @@ def _covers(
     cell = max(size) / _CELLS
     cells = lambda rows: {tuple(c) for c in (uv[rows] // cell).astype(int).tolist()}
     moving, staying = cells(movers), cells(still)
+    if min(len({cell[i] for cell in moving}) for i in (0, 1)) < _LEAST_ROWS:
+        return False
     return len(moving) >= max(4, _LEAST_COVER * len(staying - moving))
 
 

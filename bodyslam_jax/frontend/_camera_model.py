@@ -101,8 +101,8 @@ def zoom_warning(zoom: Float[np.ndarray, " t"]) -> str:
     ratio = np.exp(zoom[high] - zoom[low])
     return (
         f"the camera zooms: the focal length of frame {high} is {ratio:.2f} times that "
-        f"of frame {low}; undone in points and keypoints, and intrinsics are those of "
-        "the images with the zoom undone."
+        f"of frame {low}, as the tracks have it; undone in points and keypoints, and "
+        "intrinsics are those of the images with the zoom undone."
     )
 
 
@@ -183,7 +183,7 @@ def _improved(
 def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
     """Whether as many observations fit as before, as well as before."""
     explained = lambda r: np.count_nonzero(r.inlier)
-    return (
+    return bool(
         again.kind == found.kind
         and again.registered.sum() >= found.registered.sum()
         and explained(again) >= 0.97 * explained(found)
@@ -193,10 +193,10 @@ def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
 
 def _doubt(lens: Lens) -> str:
     return (
-        "the tracks do not fit one camera with square pixels and no distortion: zoom by "
-        f"{np.exp(lens.zoom_range):.2f}, fx/fy {np.exp(lens.aspect):.2f}, k1 "
-        f"{lens.radial:.2f} fit {100 * lens.gain:.0f} % better, but make no better map; "
-        "not used."
+        "the tracks do not fit one camera as it is known: a zoom by "
+        f"{np.exp(lens.zoom_range):.2f}, fx/fy times {np.exp(lens.aspect):.2f} and k1 "
+        f"{lens.radial:+.2f} lower their error by {100 * lens.gain:.0f} %, but make no "
+        "better map: not used."
     )
 
 

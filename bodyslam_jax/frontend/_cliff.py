@@ -14,6 +14,7 @@ from bodyslam_jax.frontend._body_parts import (
 )
 from bodyslam_jax.frontend._numbering import Unfit
 from bodyslam_jax.frontend._rows import Rows, Video
+from bodyslam_jax.frontend._tool_focal import default_focal
 
 
 def from_cliff(data: dict, video: Video) -> Rows:
@@ -34,7 +35,9 @@ def from_cliff(data: dict, video: Video) -> Rows:
     trans = numbers_of(data, "global_t", (n, 3))
     if "focal_l" in data:
         focal = np.broadcast_to(np.ravel(numbers_of(data, "focal_l", None)), (n,))
-        trans = refocused(trans, focal, middle(video.camera), video.camera)
+    else:
+        focal = np.full(n, default_focal("CLIFF", video))
+    trans = refocused(trans, focal, middle(video.camera), video.camera)
     person = tell_apart(frame, trans, video)
     _, which, count = np.unique(person, return_inverse=True, return_counts=True)
     least = video.frames_in(video.config.min_duration)

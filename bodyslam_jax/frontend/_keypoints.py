@@ -14,6 +14,7 @@ from bodyslam_jax.frontend._arrange import arranged
 from bodyslam_jax.frontend._declared_size import Size, factor_to, scaled
 from bodyslam_jax.frontend._keypoint_files import read_json, read_npz, read_openpose
 from bodyslam_jax.frontend._numbering import Unfit, Warn, frames_of_names
+from bodyslam_jax.frontend._turned import turned_back
 
 _log = logging.getLogger(__name__)
 
@@ -133,7 +134,9 @@ def _to_pixels(
         points[..., :2] = scaled(points[..., :2], factor)
     at = points[points[..., 2] > _SURE][:, :2]
     outside = ((at < 0) | (at > size)).any(axis=-1)
-    if len(at) and outside.mean() > 0.3:
+    if (turned := turned_back(points, sure, size, warn)) is not None:
+        points[..., :2] = turned
+    elif len(at) and outside.mean() > 0.3:
         raise ValueError(
             f"{path}: {100 * outside.mean():.0f} % of the keypoints outside the image "
             f"of {size[0]}x{size[1]} px: of another video?"

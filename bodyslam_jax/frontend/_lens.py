@@ -107,21 +107,18 @@ def examine_lens(
         # What one of them explains alone is not shared out between all.
         sigma = max(error / 1.18, pixel / 5)
         gain = fit.cost(plain, sigma) - fit.cost(found, sigma)
+        singles = []
         for which in (slice(1, 2), slice(2, 3), slice(3, None)):
-            single = fit.alone(which)
-            one, its_error, its_spread = single.solve(plain, pixel / 5, free=True)
-            its_gain = fit.cost(plain, sigma) - fit.cost(one, sigma)
-            if its_spread is not None and its_gain > _SHARE * gain:
-                found, error, spread, gain = (
-                    one,
-                    its_error,
-                    its_spread,
-                    its_gain / _SHARE,
-                )
-    basis = _basis(np.arange(len(registered)), frames[0], frames[-1], fit.knots)
+            one, *rest = fit.alone(which).solve(plain, pixel / 5, free=True)
+            singles.append((fit.cost(plain, sigma) - fit.cost(one, sigma), one, *rest))
+        best = max(singles, key=lambda single: single[0])
+        if best[0] > _SHARE * gain and best[3] is not None:
+            _, found, error, spread = best
+    ends = int(frames[0]), int(frames[-1])
+    basis = _basis(np.arange(len(registered)), *ends, fit.knots)
     zoom = basis @ found.lens[3:]
-    low, high = int(np.argmin(fit.basis @ found.lens[3:])), 0
-    high = int(np.argmax(fit.basis @ found.lens[3:]))
+    shown = fit.basis @ found.lens[3:]
+    low, high = int(np.argmin(shown)), int(np.argmax(shown))
     change = np.concatenate([np.zeros(3), fit.basis[high] - fit.basis[low]])
     sigma = np.sqrt(np.diag(spread))
     return Lens(

@@ -153,6 +153,14 @@ def _first(
             f"{what} of frames {first} to {last}, but the video has {num_frames} frames"
         )
     if first == 0:
+        if complete and unbroken:
+            warn(
+                f"{what} numbered 0 to {last} for {num_frames} frames: taken as "
+                "counted "
+                f"from 0, the first {len(numbers)}; but what writes every frame that "
+                "it "
+                "sees has been given fewer, perhaps every n-th."
+            )
         return 0
     # Whoever lists every image would have listed number 0, but some have been deleted
     # where there are gaps.

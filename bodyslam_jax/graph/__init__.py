@@ -22,7 +22,6 @@ from bodyslam_jax.graph._layout import Layout as Layout
 from bodyslam_jax.graph._layout import make_layout as make_layout
 from bodyslam_jax.graph._layout import round_up as round_up
 from bodyslam_jax.graph._ordering import CHUNK as CHUNK
-from bodyslam_jax.graph._padding import Masked as Masked
 from bodyslam_jax.graph._padding import extend as extend
 from bodyslam_jax.graph._padding import extend_state as extend_state
 from bodyslam_jax.graph._padding import pad_factor as pad_factor

@@ -5,6 +5,7 @@ from bodyslam_jax.people._bodies import nobody as nobody
 from bodyslam_jax.people._bodies import select_people as select_people
 from bodyslam_jax.people._bodies import without_bodies as without_bodies
 from bodyslam_jax.people._built_in import find_tracked as find_tracked
+from bodyslam_jax.people._depths import with_depths as with_depths
 from bodyslam_jax.people._detect import detect_people as detect_people
 from bodyslam_jax.people._fit import fit_bodies as fit_bodies
 from bodyslam_jax.people._found import Found as Found

@@ -26,7 +26,8 @@ def estimate_bodies(
     (others,) = np.nonzero(without_bodies(sequence))
     if keypoints is None or not len(others):
         return found
-    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others])
+    depth = None if keypoints.depth is None else keypoints.depth[others]
+    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
     fitted = fit_bodies(seen, camera, body, fps, settings)
     for name in ("present", "poses", "shapes", "trans"):
         getattr(found, name)[others] = getattr(fitted, name)
@@ -52,7 +53,8 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
         raise ValueError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
     index = list(dict.fromkeys(people))
     if keypoints is not None:
-        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index])
+        depth = None if keypoints.depth is None else keypoints.depth[index]
+        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index], depth)
     if bodies is not None:
         bodies = dataclasses.replace(
             bodies,

@@ -18,7 +18,13 @@ from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.frontend import SILHOUETTE_STEP
 from bodyslam_jax.people import _blazepose, _movenet
 from bodyslam_jax.people._appearance import SIZE, describe
-from bodyslam_jax.people._found import AGREES, Found, as_body25, find_feet
+from bodyslam_jax.people._found import (
+    AGREES,
+    Found,
+    as_body25,
+    find_feet,
+    find_relative,
+)
 from bodyslam_jax.people._linking import link, remarks
 from bodyslam_jax.people._movenet import Region, sure_points
 from bodyslam_jax.people._networks import BLAZEPOSE, MOVENET, open_network
@@ -43,6 +49,8 @@ _OVERLAP = 0.25
 _LITTLE = 0.03
 """How much there is to see of somebody who is estimated, at least: of what there is of
 the person who is seen best."""
+_BRIEF = 0.2
+"""s: who is seen for less is masked without a word, as it may be nobody."""
 _PRESENCE = 0.5
 _LEAST_FOR_FEET = 60.0
 """Height of people, px, below which BlazePose is of no use."""
@@ -101,6 +109,7 @@ class _Finder:
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
         """By tracklet and frame: heel and big toe of both sides (4, 3)."""
+        self.relative: dict[tuple[int, int], np.ndarray] = {}
         self.others: list[tuple[int, np.ndarray]] = []
         self.masks: list[np.ndarray] = []
 
@@ -136,24 +145,30 @@ class _Finder:
         people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
-        rows = [(frame, -1, as_body25(points, None)) for frame, points in self.others]
+        unknown = np.zeros((25, 3))
+        alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
+        rows = [alone(*other) for other in self.others]
         for tracklet in self.tracker.tracklets:
             who = number.get(tracklet.number, -1)
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
-                feet = self.feet.get((tracklet.number, frame))
-                rows.append((frame, who, as_body25(points, feet)))
-            rows += [(frame, -1, as_body25(p, None)) for frame, p in between(tracklet)]
+                key = tracklet.number, frame
+                body = as_body25(points, self.feet.get(key))
+                rows.append((frame, who, body, self.relative.get(key, unknown)))
+            rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
-        if len(everybody) > len(people):
+        seen = [sum(len(t.frames) for t in pieces) for pieces in everybody]
+        others = sum(n >= _BRIEF * self.fps for n in seen) - len(people)
+        if others > 0:
             warnings.append(
-                f"{len(everybody) - len(people)} more people, small or seen briefly, "
-                "are kept out of the map and not estimated."
+                f"{others} more people, small or seen briefly, are kept out of the map "
+                "and not estimated."
             )
         return Found(
             np.array([row[0] for row in rows], int),
             np.array([row[2] for row in rows]).reshape(-1, 25, 3),
             np.array([row[1] for row in rows], int),
+            np.array([row[3] for row in rows]).reshape(-1, 25, 3),
             np.stack(self.masks),
             tuple(warnings),
         )
@@ -214,6 +229,7 @@ class _Finder:
         if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
             return
         self.feet[number, k] = find_feet(pose, points, apart)
+        self.relative[number, k] = find_relative(pose)
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= _blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 

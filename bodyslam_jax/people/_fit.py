@@ -18,6 +18,7 @@ from scipy.ndimage import median_filter
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people._chain import Chain, ChainProblem, Ties, solve_chain
+from bodyslam_jax.people._depths import depth_costs
 from bodyslam_jax.people._keypoint_errors import (
     find_present,
     in_pixels,
@@ -71,8 +72,11 @@ def fit_bodies(
         if not present.any():
             log.warning("person %d has too few keypoints in every frame", h)
             continue
+        depth = np.zeros(sigma.shape)
+        if keypoints.depth is not None:
+            depth = keypoints.depth[h]
         fitted, chain = _fit_person(
-            scene, keypoints.uv[h], sigma, present, fps, settings
+            scene, keypoints.uv[h], sigma, depth, present, fps, settings
         )
         roots.present[h] = present
         roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
@@ -104,6 +108,7 @@ def _fit_person(
     scene: Scene,
     uv: Float[np.ndarray, "t 25 2"],
     sigma: Float[np.ndarray, "t 25"],
+    depth: Float[np.ndarray, "t 25"],
     present: np.ndarray,
     fps: float,
     settings: PeopleFit,
@@ -114,7 +119,7 @@ def _fit_person(
     uv, sigma = uv[fitted], sigma[fitted]
     lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
-    start, cuts = _start(scene, uv, sigma_px, lifted, fps, settings)
+    start, cuts = _start(scene, uv, sigma_px, depth[fitted], lifted, fps, settings)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
@@ -166,6 +171,7 @@ def _start(
     scene: Scene,
     uv: np.ndarray,
     sigma_px: np.ndarray,
+    depth: np.ndarray,
     lifted: Lifted,
     fps: float,
     settings: PeopleFit,
@@ -186,6 +192,7 @@ def _start(
         sigma_px[chosen],
         jax.tree.map(lambda a: a[chosen], lifted),
     )
+    costs = costs + depth_costs(depth[chosen], joints)
     path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps)
     fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps

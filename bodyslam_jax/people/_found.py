@@ -20,6 +20,11 @@ _CONFIDENCES = (0.0, 0.1, 0.2, 0.5, 0.8, 1.0)
 _FEET = ((21, 19, 11, 15), (24, 22, 14, 16))
 """BODY_25's heel, big toe and ankle, COCO's ankle, of both sides."""
 
+_LANDMARK = np.array(
+    [0, -1, 12, 14, 16, 11, 13, 15, -1, 24, 26, 28, 23, 25, 27] + [-1] * 10
+)
+"""BlazePose's landmark of each of BODY_25, of those that are joints."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Found:
@@ -30,6 +35,9 @@ class Found:
     """BODY_25: u px, v px, confidence."""
     person: Int[np.ndarray, " n"]
     """Who it is, the best seen first; -1 for whom nothing is known but the place."""
+    relative: Float[np.ndarray, "n 25 3"]
+    """Places about the middle of the hips, m, as if on the optical axis (x right, y
+    down, z forward), from BlazePose; 0 where unknown."""
     silhouettes: UInt8[np.ndarray, "t y x8"]
     """Masks of people at every `step`-th pixel, eight to a byte."""
     warnings: tuple[str, ...]
@@ -47,6 +55,11 @@ class Found:
     def seen(self) -> Seen:
         """Everybody, for the masks."""
         return Seen(self.frame, self.points, self.silhouettes)
+
+
+def find_relative(pose: _blazepose.Pose) -> Float[np.ndarray, "25 3"]:
+    """BlazePose's landmarks in metres, in BODY_25's order; 0 for those it has not."""
+    return np.where((_LANDMARK >= 0)[:, None], pose.world[_LANDMARK], 0.0)
 
 
 def find_feet(

@@ -13,5 +13,6 @@ from bodyslam_jax.synthetic._writing import as_truth as as_truth
 from bodyslam_jax.synthetic._writing import check_folder as check_folder
 from bodyslam_jax.synthetic._writing import demo_scene as demo_scene
 from bodyslam_jax.synthetic._writing import demo_settings as demo_settings
+from bodyslam_jax.synthetic._writing import film_scene as film_scene
 from bodyslam_jax.synthetic._writing import render as render
 from bodyslam_jax.synthetic._writing import write_sequence as write_sequence

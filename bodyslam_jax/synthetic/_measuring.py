@@ -110,11 +110,13 @@ def detect_keypoints(
     size: tuple[int, int],
     noise: Noise,
     rng: np.random.Generator,
+    hidden_by_others: Bool[np.ndarray, "t 25"] | None = None,
 ) -> tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]:
     """Pixels and confidences of BODY_25 keypoints at `p_C` in the camera frame.
 
     Confidence falls with how wrong the detector is likely to be there and then:
-    occluded joints and bad moments err more and are less sure. Missing is 0 0 0.
+    occluded joints and bad moments err more and are less sure. Missing is 0 0 0, as is
+    what furniture or another person hides.
     """
     t = len(p_C)
     exact = project(p_C, intrinsics)
@@ -151,6 +153,8 @@ def detect_keypoints(
     lost = lost | (rng.random((t, 25)) < 0.25 * noise.outlier_rate * trouble)
     outside = ((uv < 0) | (uv > np.array(size) - 1)).any(axis=2) | (p_C[..., 2] < 0.1)
     gone = lost | outside
+    if hidden_by_others is not None:
+        gone |= hidden_by_others
     return np.where(gone[:, :, None], 0.0, uv), np.where(gone, 0.0, confidence)
 
 

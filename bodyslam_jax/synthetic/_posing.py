@@ -19,6 +19,7 @@ class Person:
     def __init__(self, body: BodyModel, shape: Float[np.ndarray, "10"]):
         array = lambda x: np.asarray(x, np.float64)
         self.shape = shape
+        self._body = body
         self._joint_template = array(body.joint_template)
         self._joint_shape_dirs = array(body.joint_shape_dirs)
         self.rest = self.rest_joints(shape)
@@ -33,6 +34,10 @@ class Person:
         ):
             self.weights[rows, joint] += weight
         self.picks = np.asarray(body.picks)
+
+    def of_shape(self, shape: Float[np.ndarray, "10"]) -> "Person":
+        """Another person of the same body model."""
+        return Person(self._body, shape)
 
     def rest_joints(
         self, shape: Float[np.ndarray, "*b 10"]

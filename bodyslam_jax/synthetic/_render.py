@@ -1,83 +1,182 @@
-"""Pictures of the room and the walker, quick enough for films, in NumPy and OpenCV.
+"""Pictures of the room and the people in it, quick enough for films, in NumPy and cv2.
 
 Every rectangle is cast against all pixels of its outline's bounding box: inverse depth
-and texture coordinates are linear in the pixel there, so hidden surfaces and the near
-plane take one comparison. All textures lie, at every resolution, in one image, so that
-a frame is looked up at once. The body's small triangles go through a z-buffer.
+and texture coordinates are linear along each row there, so hidden surfaces and the near
+plane take one comparison, and each row may have a camera of its own (rolling shutter).
+All textures lie, at every resolution, in one image, so that a frame is looked up at
+once. The bodies' small triangles go through a z-buffer.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from bodyslam_jax.synthetic._posing import Person
+from bodyslam_jax.motion import FPS
+from bodyslam_jax.synthetic._atlas import LEVELS, pack, pyramid
+from bodyslam_jax.synthetic._outfit import Figure
+from bodyslam_jax.synthetic._raster import rasterise, vertex_normals
 from bodyslam_jax.synthetic._room import Room, Surface, texture_size
+from bodyslam_jax.synthetic._shutter import Shutter, cameras_at
 from bodyslam_jax.synthetic._texture import make_texture
 
 _NEAR = 0.05
-_LEVELS = 7
-_SHRINK = np.float32(0.5) ** np.arange(_LEVELS, dtype=np.float32)
+_SHRINK = np.float32(0.5) ** np.arange(LEVELS, dtype=np.float32)
 """Of texture coordinates, level by level."""
-_BORDER = 2
 _TEXELS = 130.0
 """Texels a metre: a camera of 525 px sees them one to one from 4 m."""
-_LIGHT = np.array([0.35, 0.85, 0.4])
-_LIGHT /= np.linalg.norm(_LIGHT)
-_SPOT = 9
-"""Width of the discs that a shadow is made of, px."""
 _NOISE = 1.5
-"""Standard deviation of the image noise, grey levels."""
+"""Standard deviation of the image noise at medium grey, grey levels."""
+_MOST_INSTANTS = 6
+"""Images that make up one with motion blur."""
+_BLUR_STEP = 2.0
+"""Motion between two of them that is not seen as a step, px."""
+
+Moving = tuple[
+    Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]
+]
+"""Vertices at a frame, their first and second difference, as `_shutter.around`, m."""
 
 
 class Renderer:
-    """A room and a person in it, ready to be seen from anywhere."""
+    """A room and people in it, ready to be seen from anywhere."""
 
     def __init__(
         self,
         room: Room,
-        person: Person,
+        figures: Sequence[Figure],
         intrinsics: Float[np.ndarray, "4"],
         size: tuple[int, int],
         rng: np.random.Generator,
+        shutter: Shutter = Shutter(),
     ):
-        self.person = person
+        self.figures = figures
         self.intrinsics = intrinsics
         self.size = size
+        self.shutter = shutter
         self.surfaces = room.faces()
         self.extents = [texture_size(s, _TEXELS) for s in self.surfaces]
         textures = [
             make_texture(rng, int(h), int(w), s.kind, _TEXELS)
             for s, (h, w) in zip(self.surfaces, self.extents, strict=True)
         ]
+        azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(45, 75))
+        self.light = np.array(
+            [
+                np.cos(height) * np.cos(azimuth),
+                np.sin(height),
+                np.cos(height) * np.sin(azimuth),
+            ]
+        )
+        """Unit vector to the lamp."""
+        self.ambient = rng.uniform(0.4, 0.6)
+        self.gain = rng.uniform(0.9, 1.1) * rng.uniform(0.95, 1.05, 3)
         lit = [
-            _lit(texture, surface)
+            _lit(texture, surface, self.light)
             for texture, surface in zip(textures, self.surfaces, strict=True)
         ]
-        self.atlas, self.places = _pack([_pyramid(t) for t in lit])
-        self.colours = clothes(rng, person)
+        self.atlas, self.places = pack([pyramid(t) for t in lit])
         noise = _NOISE * rng.standard_normal((size[1] + 64, size[0] + 64, 1))
-        self.noise = np.repeat(noise, 3, axis=2).round().astype(np.int16)
+        noise = noise + 0.4 * _NOISE * rng.standard_normal((*noise.shape[:2], 3))
+        self.noise = noise.astype(np.float32)
         self.rng = rng
 
     def frame(
-        self,
-        T_WC: Float[np.ndarray, "4 4"],
-        vertices: Float[np.ndarray, "v 3"],
-    ) -> tuple[UInt8[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """The image (BGR) from camera `T_WC`, and where the person is in it."""
-        inverse_depth, image, floor = self._room(T_WC)
-        self._shadow(image, floor, T_WC, vertices)
-        mask = self._body(image, inverse_depth, T_WC, vertices)
+        self, T_WC: Float[np.ndarray, "t 4 4"], k: int, people: Sequence[Moving]
+    ) -> tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]:
+        """Image `k` (BGR) of a camera's path, and which person is seen where.
+
+        The second value is 0 for none and h + 1 for person h, in the middle of the
+        exposure.
+        """
+        count = self._instants(T_WC, k, people)
+        rows = self.shutter.row_times(self.size[1])
+        times = self.shutter.instants(count)
+        image = np.zeros((self.size[1], self.size[0], 3), np.float32)
+        who = np.zeros(image.shape[:2], int)
+        normals = [
+            vertex_normals(moving[0], figure.person.faces)
+            for moving, figure in zip(people, self.figures, strict=True)
+        ]
+        for i, offset in enumerate(times):
+            when = rows + offset if self.shutter.readout else np.array([offset])
+            seen, mask = self._instant(
+                cameras_at(T_WC, k, when, FPS), when, people, normals
+            )
+            image += seen
+            if i == count // 2:
+                who = mask
+        image *= (self.gain / count).astype(np.float32)
         y, x = self.rng.integers(0, 64, 2)
         width, height = self.size
-        noisy = image + self.noise[y : y + height, x : x + width]
-        return np.clip(noisy, 0, 255).astype(np.uint8), mask
+        noise = self.noise[y : y + height, x : x + width]
+        # Photons come at random: noise grows with the root of what is seen.
+        image += noise * np.sqrt(np.maximum(image + 20, 0) / 148)
+        return np.clip(image, 0, 255).astype(np.uint8), who
 
-    def _room(self, T_WC):
+    def _instants(self, T_WC, k: int, people: Sequence[Moving]) -> int:
+        """How many images make up one of that exposure."""
+        span = self.shutter.exposure
+        if span == 0:
+            return 1
+        ends = np.array([-span / 2, span / 2])
+        cameras = cameras_at(T_WC, k, ends, FPS)
+        turn = (np.trace(cameras[0, :3, :3].T @ cameras[1, :3, :3]) - 1) / 2
+        moved = [np.arccos(np.clip(turn, -1, 1)) * self.intrinsics[0]]
+        for moving in people:
+            sample = tuple(term[::97] for term in moving)
+            uv = [
+                self._project(cameras[i : i + 1], ends[i : i + 1], sample)
+                for i in range(2)
+            ]
+            near = (uv[0][:, 2] > _NEAR) & (uv[1][:, 2] > _NEAR)
+            way = np.linalg.norm(uv[1][near, :2] - uv[0][near, :2], axis=1)
+            moved.append(np.percentile(way, 90) if len(way) else 0.0)
+        return int(np.clip(np.ceil(max(moved) / _BLUR_STEP), 1, _MOST_INSTANTS))
+
+    def _instant(self, T, when, people, normals):
+        """An image without noise from the cameras of all rows, or one for all."""
+        inverse_depth, image, floor = self._room(T)
+        for moving in people:
+            self._shadow(image, floor, T, when, moving)
+        who = np.zeros(inverse_depth.shape, int)
+        for h, moving in enumerate(people):
+            self._body(image, inverse_depth, who, T, when, h, moving, normals[h])
+        for h in range(len(people)):
+            _soften(image, who == h + 1)
+        return image, who
+
+    def _project(
+        self,
+        T: Float[np.ndarray, "n 4 4"],
+        when: Float[np.ndarray, " n"],
+        moving: Moving,
+    ) -> Float[np.ndarray, "v 3"]:
+        """Pixel and depth of moving points, each as the row sees it on which it is."""
+        here, first, second = moving
+        at = lambda tau: here + tau * first + tau**2 / 2 * second
+        focal, centre = self.intrinsics[:2], self.intrinsics[2:]
+        depth = lambda p: np.where(abs(p[:, 2:]) < 1e-6, 1e-6, p[:, 2:])
+        middle = len(T) // 2
+        R, eye = T[middle, :3, :3], T[middle, :3, 3]
+        p = (at(FPS * when[middle]) - eye) @ R
+        uv = p[:, :2] / depth(p) * focal + centre
+        for _ in range(2 if len(T) > 1 else 0):  # A row's share of the motion is small.
+            row = np.clip(uv[:, 1], 0, len(T) - 1)
+            low = np.minimum(row.astype(int), len(T) - 2)
+            share = (row - low)[:, None]
+            blend = lambda x: (
+                x[low] + share.reshape(-1, *[1] * (x.ndim - 1)) * (x[low + 1] - x[low])
+            )
+            off = at(FPS * blend(when)[:, None]) - blend(T[:, :3, 3])
+            p = np.einsum("va,vab->vb", off, blend(T[:, :3, :3]))
+            uv = p[:, :2] / depth(p) * focal + centre
+        return np.concatenate([uv, p[:, 2:]], axis=1)
+
+    def _room(self, T):
         """Inverse depth, colours and which pixels are floor."""
         width, height = self.size
         best = np.full((height, width), 1e-3, np.float32)
@@ -86,12 +185,12 @@ class Renderer:
         floor = np.zeros((height, width), bool)
         fx, fy, cx, cy = self.intrinsics
         K_inv = np.array([[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]])
-        R, eye = T_WC[:3, :3], T_WC[:3, 3]
+        R, eye = T[:, :3, :3], T[:, :3, 3]
         for i, surface in enumerate(self.surfaces):
             distance = (eye - surface.origin) @ surface.normal
-            if distance <= 1e-6:
+            if distance.min() <= 1e-6:
                 continue
-            box = self._outline(surface, R, eye)
+            box = self._outline(surface, T)
             if box is None:
                 continue
             left, top, right, bottom = box
@@ -99,16 +198,18 @@ class Renderer:
             # coordinate u = (eye - origin).eu + z d.eu, so u/z is linear in d too.
             h, w = self.extents[i]
             rays = R @ K_inv
-            c = -(surface.normal @ rays) / distance
+            c = -(surface.normal @ rays) / distance[:, None]
             axis_u = surface.edge_u * (w / (surface.edge_u @ surface.edge_u))
             axis_v = surface.edge_v * (h / (surface.edge_v @ surface.edge_v))
             off = eye - surface.origin
-            a = axis_u @ rays + (off @ axis_u) * c
-            b = axis_v @ rays + (off @ axis_v) * c
+            a = axis_u @ rays + (off @ axis_u)[:, None] * c
+            b = axis_v @ rays + (off @ axis_v)[:, None] * c
             x = np.arange(left, right, dtype=np.float32)
-            y = np.arange(top, bottom, dtype=np.float32)[:, None]
+            y = np.arange(top, bottom)[:, None]
+            own = np.s_[top:bottom] if len(T) > 1 else np.s_[:]
             linear = lambda k: (
-                np.float32(k[0]) * x + (np.float32(k[1]) * y + np.float32(k[2]))
+                k[own, :1].astype(np.float32) * x
+                + (k[own, 1:2] * y + k[own, 2:]).astype(np.float32)
             )
             inverse = linear(c)
             z = 1 / np.maximum(inverse, np.float32(1e-3))
@@ -120,9 +221,10 @@ class Renderer:
             within = np.flatnonzero(hit)
             z, u, v = (part.take(within) for part in (z, u, v))
             # A pixel has `texels z^3` of them; a level further down has a quarter.
-            texels = abs(np.linalg.det(np.stack([a, b, c])))
+            middle = len(T) // 2
+            texels = abs(np.linalg.det(np.stack([a, b, c])[:, middle]))
             level = np.zeros(len(z), np.intp)
-            for k in range(1, _LEVELS):
+            for k in range(1, LEVELS):
                 level += z > (4.0 ** (k - 1) / texels) ** (1 / 3)
             shrink = _SHRINK.take(level)
             place_x, place_y = self.places[i].T
@@ -135,225 +237,101 @@ class Renderer:
         image = cv2.remap(self.atlas, map_x, map_y, cv2.INTER_LINEAR)
         return best, image.astype(np.float32), floor
 
-    def _outline(self, surface: Surface, R, eye):
-        """Bounding box, px, of what is in front of the near plane; or `None`."""
-        corners = [surface.origin + a * surface.edge_u + b * surface.edge_v
-                   for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]  # fmt: skip
-        p = (np.array(corners) - eye) @ R
+    def _outline(self, surface: Surface, T):
+        """Bounding box, px, of what is in front of the near plane; or `None`.
+
+        With cameras of rows it holds for all of them, with a margin.
+        """
+        corners = np.array(
+            [surface.origin + a * surface.edge_u + b * surface.edge_v
+             for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        )  # fmt: skip
         kept = []
-        for start, end in zip(p, np.roll(p, -1, axis=0), strict=True):
-            if start[2] > _NEAR:
-                kept.append(start)
-            if (start[2] > _NEAR) != (end[2] > _NEAR):
-                kept.append(
-                    start + (end - start) * ((_NEAR - start[2]) / (end[2] - start[2]))
-                )
+        for camera in T[:: max(1, (len(T) - 1) // 2)]:
+            p = (corners - camera[:3, 3]) @ camera[:3, :3]
+            for start, end in zip(p, np.roll(p, -1, axis=0), strict=True):
+                if start[2] > _NEAR:
+                    kept.append(start)
+                if (start[2] > _NEAR) != (end[2] > _NEAR):
+                    cut = (_NEAR - start[2]) / (end[2] - start[2])
+                    kept.append(start + (end - start) * cut)
         if not kept:
             return None
         p = np.array(kept)
+        margin = 0 if len(T) == 1 else 8
         uv = p[:, :2] / p[:, 2:] * self.intrinsics[:2] + self.intrinsics[2:]
-        low = np.clip(np.floor(uv.min(axis=0)), 0, self.size).astype(int)
-        high = np.clip(np.ceil(uv.max(axis=0)) + 1, 0, self.size).astype(int)
+        low = np.clip(np.floor(uv.min(axis=0)) - margin, 0, self.size).astype(int)
+        high = np.clip(np.ceil(uv.max(axis=0)) + 1 + margin, 0, self.size).astype(int)
         return None if (high <= low).any() else (*low, *high)
 
-    def _shadow(self, image, floor, T_WC, vertices) -> None:
-        """Darkens the floor where the light that comes from above does not reach."""
-        where = vertices - _LIGHT * (vertices[:, 1:2] / _LIGHT[1])
-        p = (where[::7] - T_WC[:3, 3]) @ T_WC[:3, :3]
-        if p[:, 2].min() < 0.2:
+    def _shadow(self, image, floor, T, when, moving: Moving) -> None:
+        """Darkens the floor where the lamp's light does not reach."""
+        flat = np.eye(3) - np.outer([0, 1, 0], self.light / self.light[1])
+        uv = self._project(T, when, tuple(term[::7] @ flat for term in moving))
+        if uv[:, 2].min() < 0.2:
             return
-        uv = p[:, :2] / p[:, 2:] * self.intrinsics[:2] + self.intrinsics[2:]
-        pixel = uv.round().astype(int) + _SPOT
+        # A shadow is made of discs that overlap: about 7 cm on the floor
+        spot = int(np.clip(0.07 * self.intrinsics[0] / np.median(uv[:, 2]), 3, 41)) | 1
+        pixel = uv[:, :2].round().astype(int) + spot
         width, height = self.size
-        dark = np.zeros((height + 2 * _SPOT, width + 2 * _SPOT), np.uint8)
+        dark = np.zeros((height + 2 * spot, width + 2 * spot), np.uint8)
         inside = (pixel >= 0) & (pixel < dark.shape[::-1])
         column, row = pixel[inside.all(axis=1)].T
         dark[row, column] = 255
-        centre = (_SPOT // 2, _SPOT // 2)
-        disc = np.zeros((_SPOT, _SPOT), np.uint8)
-        cv2.circle(disc, centre, _SPOT // 2, 1, -1)
-        dark = cv2.dilate(dark, disc)[_SPOT:-_SPOT, _SPOT:-_SPOT]
-        soft = cv2.GaussianBlur(dark, (0, 0), 3.0)
-        x, y, w, h = cv2.boundingRect(soft)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
+        x, y, w, h = cv2.boundingRect(dark)
+        x, y = max(x - 2 * spot, 0), max(y - 2 * spot, 0)
+        part = np.s_[y : y + h + 4 * spot, x : x + w + 4 * spot]
+        dark[part] = cv2.GaussianBlur(cv2.dilate(dark[part], disc), (0, 0), spot / 3)
+        dark = dark[spot:-spot, spot:-spot]
+        x, y, w, h = cv2.boundingRect(dark)
         part = np.s_[y : y + h, x : x + w]
-        share = soft[part].astype(np.float32) * floor[part]
-        image[part] *= (1 - (0.45 / 255) * share)[:, :, None]
+        share = dark[part].astype(np.float32) * floor[part]
+        image[part] *= (1 - (0.55 / 255) * share)[:, :, None]
 
-    def _body(self, image, inverse_depth, T_WC, vertices) -> Bool[np.ndarray, "r c"]:
-        """Draws the mesh with smooth shading; the pixels that are the person's."""
-        p = (vertices - T_WC[:3, 3]) @ T_WC[:3, :3]
-        mask = np.zeros(inverse_depth.shape, bool)
-        if p[:, 2].min() < _NEAR:
-            return mask
-        uv = p[:, :2] / p[:, 2:] * self.intrinsics[:2] + self.intrinsics[2:]
-        faces = self.person.faces
-        normal = vertex_normals(vertices, faces)
-        light = 0.45 + 0.65 * np.clip(normal @ _LIGHT, 0, 1) + 0.08 * normal[:, 1]
-        colour = self.colours * light[:, None]
-        pixel, face = rasterise(uv, 1 / p[:, 2], faces, inverse_depth)
-        a, b, c = (colour[faces[face, k]] for k in range(3))
-        image.reshape(-1, 3)[pixel] = (a + b + c) / 3
-        mask.reshape(-1)[pixel] = True
-        # A camera has no hard edges: soften the outline by one pixel.
-        grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
-        inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
-        rim = grown != inner
-        rows, columns = np.nonzero(grown)
-        if len(rows):
-            part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-            soft = cv2.GaussianBlur(image[part], (3, 3), 0.7)
-            image[part][rim[part]] = soft[rim[part]]
-        return mask
+    def _body(self, image, inverse_depth, who, T, when, h, moving, normal) -> None:
+        """Draws a person with smooth shading, in front of what is behind."""
+        figure = self.figures[h]
+        uv = self._project(T, when, moving)
+        if uv[:, 2].min() < _NEAR:
+            return
+        hits = rasterise(uv[:, :2], 1 / uv[:, 2], figure.person.faces, inverse_depth)
+        if not len(hits.pixel):
+            return
+        lamp = np.clip(normal @ self.light, 0, 1)
+        bright = self.ambient + (1.15 - self.ambient) * lamp + 0.1 * normal[:, 1]
+        corners = bright[figure.person.faces[hits.face]]
+        light = (corners * hits.weights).sum(axis=1, keepdims=True)
+        size = 1 / hits.inverse / self.intrinsics[0]
+        image.reshape(-1, 3)[hits.pixel] = light * figure.albedo(hits, size)
+        inverse_depth.reshape(-1)[hits.pixel] = hits.inverse
+        who.reshape(-1)[hits.pixel] = h + 1
 
 
-def rasterise(
-    uv: Float[np.ndarray, "v 2"],
-    inverse: Float[np.ndarray, " v"],
-    faces: Int[np.ndarray, "f 3"],
-    inverse_depth: Float[np.ndarray, "rows cols"],
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Flat pixel numbers and the face that is seen there, in front of what there is.
-
-    Triangles are small, so each tries all pixels of its bounding box; those of equal
-    box size go together.
-    """
-    rows, columns = inverse_depth.shape
-    a, b, c = (uv[faces[:, k]] for k in range(3))
-    edge1, edge2 = b - a, c - a
-    area = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
-    low = np.ceil(np.minimum(np.minimum(a, b), c)).astype(np.int64)
-    high = np.floor(np.maximum(np.maximum(a, b), c)).astype(np.int64)
-    low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
-    # Counter-clockwise seen from outside, which an image with y down turns round.
-    size = high - low + 1
-    seen = (area < -1e-12) & (size[:, 0] > 0) & (size[:, 1] > 0)
-    extent = np.maximum(size[:, 0], size[:, 1])
-    pixels, owners, depths = [], [], []
-    side = 1
-    while seen.any():
-        now = np.flatnonzero(seen & (extent <= side))
-        seen[now] = False
-        if len(now):
-            step = np.arange(side)
-            x = (low[now, 0, None, None] + step).astype(float)
-            y = (low[now, 1, None, None] + step[:, None]).astype(float)
-            x, y = np.broadcast_arrays(x, y)
-            dx = x - a[now, 0, None, None]
-            dy = y - a[now, 1, None, None]
-            e1, e2 = edge1[now, :, None, None], edge2[now, :, None, None]
-            scale = 1 / area[now, None, None]
-            s = (dx * e2[:, 1] - dy * e2[:, 0]) * scale
-            t = (dy * e1[:, 0] - dx * e1[:, 1]) * scale
-            hit = (s >= 0) & (t >= 0) & (s + t <= 1) & (x < columns) & (y < rows)
-            which, i, j = np.nonzero(hit)
-            first, second, third = inverse[faces[now[which]]].T
-            s, t = s[which, i, j], t[which, i, j]
-            pixels.append((low[now[which], 1] + i) * columns + low[now[which], 0] + j)
-            owners.append(now[which])
-            depths.append(first + s * (second - first) + t * (third - first))
-        side *= 2
-    if not pixels:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    pixel, owner = np.concatenate(pixels), np.concatenate(owners)
-    depth = np.concatenate(depths)
-    front = depth > inverse_depth.reshape(-1)[pixel]
-    pixel, owner, depth = pixel[front], owner[front], depth[front]
-    order = np.lexsort((-depth, pixel))
-    pixel, owner = pixel[order], owner[order]
-    first = np.flatnonzero(np.diff(pixel, prepend=-1))
-    return pixel[first], owner[first]
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "v 3"]:
-    """Unit normals, the area-weighted mean of those of the faces around."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    of_face = np.cross(b - a, c - a)
-    normal = np.stack(
-        [
-            sum(
-                np.bincount(faces[:, k], of_face[:, i], len(vertices)) for k in range(3)
-            )
-            for i in range(3)
-        ],
-        axis=1,
+def _soften(image: Float[np.ndarray, "r c 3"], mask: Bool[np.ndarray, "r c"]) -> None:
+    """A camera has no hard edges: softens an outline by one pixel, in place."""
+    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+    if not w:
+        return
+    x, y, w, h = max(x - 2, 0), max(y - 2, 0), w + 4, h + 4
+    part, small = (
+        image[y : y + h, x : x + w],
+        mask[y : y + h, x : x + w].astype(np.uint8),
     )
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    square = np.ones((3, 3), np.uint8)
+    rim = cv2.dilate(small, square) != cv2.erode(small, square)
+    soft = cv2.GaussianBlur(part, (3, 3), 0.7)
+    part[rim] = soft[rim]
 
 
-def clothes(rng: np.random.Generator, person: Person) -> Float[np.ndarray, "v 3"]:
-    """Colours (BGR) of a shirt, trousers, shoes, skin and hair, by nearest joint."""
-    joint = person.weights.argmax(axis=1)
-    skin = np.array([110, 140, 190.0]) * rng.uniform(0.5, 1.15)
-    shirt = rng.uniform(60, 190) + rng.uniform(-45, 45, 3)
-    trousers = rng.uniform(35, 110) + rng.uniform(-20, 20, 3)
-    shoes = rng.uniform(25, 80) + rng.uniform(-10, 10, 3)
-    hair = rng.uniform(15, 70) * np.array([0.7, 0.85, 1.0])
-    colour = np.tile(skin, (len(joint), 1))
-    colour[np.isin(joint, (3, 6, 9, 13, 14, 16, 17))] = shirt
-    colour[np.isin(joint, (0, 1, 2, 4, 5))] = trousers
-    colour[np.isin(joint, (7, 8, 10, 11))] = shoes
-    top = person.rest[15] + [0, 0.02, 0]
-    on_head = (joint == 15) & (
-        (person.skin[:, 1] > top[1] + 0.11) | (person.skin[:, 2] < top[2] - 0.03)
-    )
-    colour[on_head] = hair
-    stripes = np.isin(joint, (3, 6, 9)) & (np.floor(person.skin[:, 1] / 0.05) % 2 > 0)
-    colour[stripes] *= rng.uniform(0.6, 0.9)
-    return colour
-
-
-def _lit(texture: UInt8[np.ndarray, "h w 3"], surface: Surface) -> np.ndarray:
+def _lit(
+    texture: UInt8[np.ndarray, "h w 3"], surface: Surface, to_light: np.ndarray
+) -> UInt8[np.ndarray, "h w 3"]:
     """The texture under a lamp: sides differ in brightness."""
     light = {"floor": 1.0, "ceiling": 0.85}.get(surface.kind)
     if light is None:
-        light = 0.8 + 0.25 * float(surface.normal @ _LIGHT)
+        light = 0.8 + 0.25 * float(surface.normal @ to_light)
     return np.clip(texture * np.float32(light), 0, 255).astype(np.uint8)
-
-
-def _pyramid(texture: UInt8[np.ndarray, "h w 3"]) -> list[np.ndarray]:
-    levels = [texture]
-    while len(levels) < _LEVELS:
-        h, w = levels[-1].shape[:2]
-        size = (max(w // 2, 1), max(h // 2, 1))
-        levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))
-    return levels
-
-
-def _pack(
-    pyramids: list[list[np.ndarray]],
-) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "n levels 2"]]:
-    """All images in one, on shelves, and where the origin of each is in it (x, y)."""
-    padded = [
-        (i, k, _bordered(image))
-        for i, levels in enumerate(pyramids)
-        for k, image in enumerate(levels)
-    ]
-    padded.sort(key=lambda item: -item[2].shape[0])
-    # OpenCV looks up images of up to 32767 rows and columns only: keep it square.
-    texels = sum(image.shape[0] * image.shape[1] for _, _, image in padded)
-    width = max(*(image.shape[1] for _, _, image in padded), int(texels**0.5))
-    places = np.zeros((len(pyramids), _LEVELS, 2), np.float32)
-    x = y = shelf = 0
-    where = []
-    for i, k, image in padded:
-        h, w = image.shape[:2]
-        if x + w > width:
-            x, y, shelf = 0, y + shelf, 0
-        where.append((x, y))
-        places[i, k] = x + _BORDER, y + _BORDER
-        x, shelf = x + w, max(shelf, h)
-    atlas = np.zeros((y + shelf, width, 3), np.uint8)
-    for (x, y), (_, _, image) in zip(where, padded, strict=True):
-        atlas[y : y + image.shape[0], x : x + image.shape[1]] = image
-    return atlas, places
-
-
-def _bordered(image: np.ndarray) -> np.ndarray:
-    """With its edge repeated, so that bilinear look-up never sees a neighbour."""
-    b = _BORDER
-    return cv2.copyMakeBorder(image, b, b, b, b, cv2.BORDER_REPLICATE)
 
 
 def write_video(

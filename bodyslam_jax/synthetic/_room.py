@@ -4,12 +4,17 @@ World: y up, floor at y = 0, metres.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _CLEARANCE = 0.35
 """Free space that furniture leaves around people and camera, m."""
+
+_CUPBOARD = ((0.25, 0.3, 0.2), (0.5, 0.42, 0.3))
+_PILLAR = ((0.12, 0.9, 0.12), (0.25, 1.1, 0.25))
+"""Half of the least and the largest width, height and depth, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +149,46 @@ def furnish(
         if all(_apart(box, other) for other in boxes):
             boxes.append(box)
     return Room(walls, tuple(boxes))
+
+
+def put_in_the_way(
+    room: Room,
+    people: Sequence[Float[np.ndarray, "t 3"]],
+    camera: Float[np.ndarray, "t 3"],
+    rng: np.random.Generator,
+    *,
+    most_hidden: float = 0.35,
+) -> Room:
+    """The room with up to three more pieces that hide people for a while.
+
+    They are low cupboards, which hide legs, and pillars; they stand between the camera
+    and the first person, in nobody's way, and hide that person's feet for no more than
+    a share `most_hidden` of the time.
+    """
+    ways = np.concatenate([*people, camera])[::3, [0, 2]]
+    pelvis = people[0]
+    placed = 0
+    for _ in range(400):
+        k = int(rng.integers(len(camera)))
+        at = camera[k] + rng.uniform(0.4, 0.85) * (pelvis[k] - camera[k])
+        low, high = _CUPBOARD if rng.random() < 0.6 else _PILLAR
+        half = rng.uniform(low, high)
+        at[1] = half[1]
+        box = Box(at, half, rng.uniform(0, np.pi))
+        if _gap(box, ways) < _CLEARANCE or not all(_apart(box, b) for b in room.boxes):
+            continue
+        more = Room(room.walls, (*room.boxes, box))
+        feet = pelvis[::3] * [1, 0, 1] + [0, 0.1, 0]
+        hidden = [
+            more.is_hidden(c, p[None])[0]
+            for c, p in zip(camera[::3], feet, strict=True)
+        ]
+        if np.mean(hidden) > most_hidden:
+            continue
+        room, placed = more, placed + 1
+        if placed == 3:
+            break
+    return room
 
 
 def _gap(box: Box, points: Float[np.ndarray, "l 2"]) -> float:

@@ -27,7 +27,7 @@ _BORDER = 3.0
 def track_points(
     room: Room,
     T_WC: Float[np.ndarray, "t 4 4"],
-    joints_C: Float[np.ndarray, "t 24 3"],
+    joints_C: Float[np.ndarray, "h t 24 3"],
     intrinsics: Float[np.ndarray, "4"],
     size: tuple[int, int],
     noise: Noise,
@@ -38,7 +38,7 @@ def track_points(
 ) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
     """About `wanted` tracks a frame, spread over the image, and where their points are.
 
-    A track ends when its point leaves the image or gets behind furniture or the person,
+    A track ends when its point leaves the image or gets behind furniture or a person,
     and by chance after `life` frames on average; a point found again is a new track, as
     a front end would not know. Tracks of a single frame are dropped.
     """
@@ -60,7 +60,8 @@ def track_points(
                 rng.choice(some, _TRIED, replace=False), alive[seen[alive[:, 1]], 1]
             )
         some = some[~room.is_hidden(eye, points[some])]
-        some = some[~_behind_person(uv[some], p_C[some, 2], joints_C[k], intrinsics)]
+        for body in joints_C[:, k]:
+            some = some[~_behind_person(uv[some], p_C[some, 2], body, intrinsics)]
         seen[:] = False
         seen[some] = True
         alive = alive[seen[alive[:, 1]] & (rng.random(len(alive)) > 1 / life)]
@@ -96,6 +97,21 @@ def _spread(uv, candidates, strength, taken, size, wanted):
     rank = np.empty(len(order), int)
     rank[by_cell] = np.arange(len(order)) - first
     return order[np.argsort(filled[cell] + rank, kind="stable")[:wanted]]
+
+
+def is_behind(
+    points_C: Float[np.ndarray, "t n 3"],
+    joints_C: Float[np.ndarray, "t 24 3"],
+    intrinsics: Float[np.ndarray, "4"],
+) -> Bool[np.ndarray, "t n"]:
+    """Whether a person with these joints hides points, all in the camera frame."""
+    uv = project(points_C, intrinsics)
+    return np.stack(
+        [
+            _behind_person(uv[k], points_C[k, :, 2], joints_C[k], intrinsics)
+            for k in range(len(points_C))
+        ]
+    )
 
 
 def _behind_person(uv, depth, joints_C, intrinsics) -> Bool[np.ndarray, " n"]:

@@ -1,0 +1,97 @@
+"""Figures of one person's posture, feet and motion, from the joints alone.
+
+All take SMPL's joints in metres in a world whose y axis is up, of frames that follow
+one another. The first group is defined as in the gait laboratory's reports; each is
+NaN where the person does not do what the figure is about.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+HIPS, KNEES, ANKLES, FEET = (1, 2), (4, 5), (7, 8), (10, 11)
+PELVIS, NECK = 0, 12
+_PLAN = (0, 2)
+RUNNING = 2.2
+"""m/s. Faster than this no foot need be on the ground half of the time."""
+
+
+def knee_flexion(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, "t 2"]:
+    """Angle between thigh and shin, left and right; 0 is straight; degrees."""
+    hip, knee, ankle = (joints[:, list(of)] for of in (HIPS, KNEES, ANKLES))
+    return _angle(knee - hip, ankle - knee)
+
+
+def hip_over_ankle(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
+    """Height of the hips over the lower ankle, as a share of the leg's length."""
+    hip = joints[:, list(HIPS), 1].mean(axis=1)
+    leg = _length(joints[:, 1] - joints[:, 4]) + _length(joints[:, 4] - joints[:, 7])
+    return (hip - joints[:, list(ANKLES), 1].min(axis=1)) / np.maximum(leg, 1e-6)
+
+
+def trunk_lean(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
+    """Angle of the line from the pelvis to the neck with the vertical, degrees."""
+    trunk = joints[:, NECK] - joints[:, PELVIS]
+    return _angle(trunk, np.broadcast_to([0.0, 1.0, 0.0], trunk.shape))
+
+
+def lower_foot_speed(
+    joints: Float[np.ndarray, "t 24 3"], fps: float
+) -> Float[np.ndarray, " u"]:
+    """Horizontal speed of the lower foot's toe joint, frame by frame, m/s."""
+    feet = joints[:, list(FEET)]
+    moved = _length(np.diff(feet[..., _PLAN], axis=0)) * fps
+    return moved[np.arange(len(moved)), feet[:-1, :, 1].argmin(axis=1)]
+
+
+def joint_acceleration(
+    joints: Float[np.ndarray, "t 24 3"], fps: float
+) -> Float[np.ndarray, " u"]:
+    """Second difference of every joint in the world, m/s², in one row."""
+    return _length(np.diff(joints, n=2, axis=0)).ravel() * fps**2
+
+
+def turning_rate(
+    joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
+) -> Float[np.ndarray, " u"]:
+    """How fast the line between the hips turns about the vertical, degrees a second.
+
+    It is the turn within `over` seconds, less than half a turn.
+    """
+    side = joints[:, HIPS[0]] - joints[:, HIPS[1]]
+    heading = np.arctan2(side[:, 0], side[:, 2])
+    n = max(1, round(over * fps))
+    if len(heading) <= n:
+        return np.zeros(0)
+    turn = heading[n:] - heading[:-n]
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    return np.abs(np.degrees(turn)) * fps / n
+
+
+def speed_change(
+    joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
+) -> Float[np.ndarray, " u"]:
+    """By how much the pelvis' velocity over the ground changes from one stretch of
+    `over` seconds to the next, m/s."""
+    n = max(1, round(over * fps))
+    place = joints[:, PELVIS][:, _PLAN]
+    if len(place) <= 2 * n:
+        return np.zeros(0)
+    return _length(place[2 * n :] - 2 * place[n:-n] + place[: -2 * n]) * fps / n
+
+
+def pelvis_speed(
+    joints: Float[np.ndarray, "t 24 3"], fps: float, over: float = 0.5
+) -> Float[np.ndarray, " u"]:
+    """Of the pelvis over the ground, over `over` seconds, m/s."""
+    place = joints[:, PELVIS][:, _PLAN]
+    n = max(1, min(round(over * fps), len(place) - 1))
+    return _length(place[n:] - place[:-n]) * fps / n
+
+
+def _length(x: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(x, axis=-1)
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    cosine = (a * b).sum(-1) / np.maximum(_length(a) * _length(b), 1e-9)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

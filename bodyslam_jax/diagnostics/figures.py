@@ -1,0 +1,142 @@
+"""What is judged of a result: figures by name, each NaN where it does not apply."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.diagnostics import _posture as posture
+from bodyslam_jax.export import gait_of_joints
+from bodyslam_jax.gravity import find_stances
+
+_WALKING = (0.7, posture.RUNNING)
+"""Median speeds over the ground of who goes on foot and does not run, m/s."""
+_STEP = 0.35
+"""Legs: who takes such steps regularly walks, however slowly."""
+_MOMENT = 0.2
+"""s, in which nobody turns round or changes direction at a run."""
+_FEWEST = 15
+"""Frames, of one stretch, from which posture and motion are judged."""
+_FLOOR = 1.0
+"""m that standing feet must be apart for the slope under them."""
+
+
+def person_figures(
+    joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
+) -> dict[str, float]:
+    """One person's posture, feet and motion; y is up, in m.
+
+    Medians and means are over all stretches of frames in which the person is there,
+    extremes over each of them: nothing is a difference across a gap.
+    """
+    runs = [joints[run] for run in _runs(present) if run.stop - run.start >= _FEWEST]
+    if not runs:
+        return {}
+    every = np.concatenate(runs)
+    joined = lambda figure, *args: np.concatenate([figure(x, *args) for x in runs])
+    speed = joined(posture.pelvis_speed, fps)
+    knee = posture.knee_flexion(every)
+    found = {
+        "speed": float(np.percentile(speed, 95)),
+        "joint_acceleration": float(np.median(joined(posture.joint_acceleration, fps))),
+        "turn": float(joined(posture.turning_rate, fps, _MOMENT).max()),
+        "velocity_jump": float(joined(posture.speed_change, fps, _MOMENT).max()),
+    }
+    if speed.mean() < posture.RUNNING:
+        sliding = joined(posture.lower_foot_speed, fps)
+        found["standing_foot_speed"] = float(np.median(sliding))
+    if _goes_on_foot(runs, speed, fps):
+        found |= {
+            "knee": float(knee.mean()),
+            "straighter_knee": float(knee.min(axis=1).mean()),
+            "hip_over_ankle": float(posture.hip_over_ankle(every).mean()),
+            "trunk_lean": float(posture.trunk_lean(every).mean()),
+            "turn_of_walker": found["turn"],
+            "velocity_jump_of_walker": found["velocity_jump"],
+        }
+        found |= _ground_under_feet(joints, present, fps)
+    return found
+
+
+def camera_figures(T_WC: Float[np.ndarray, "t 4 4"], fps: float) -> dict[str, float]:
+    """The camera's speed (m/s), acceleration (m/s²) and turning (degrees/s), each over
+    a tenth of a second, so that noise of single frames counts less."""
+    n = max(1, round(0.1 * fps))
+    place, turn = T_WC[:, :3, 3], T_WC[:, :3, :3]
+    if len(place) <= 2 * n:
+        return {}
+    moved = np.linalg.norm(place[n:] - place[:-n], axis=1) * fps / n
+    bent = place[2 * n :] - 2 * place[n:-n] + place[: -2 * n]
+    trace = np.einsum("tij,tij->t", turn[:-n], turn[n:])
+    angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    return {
+        "camera_speed": float(np.percentile(moved, 95)),
+        "camera_acceleration": float(
+            np.linalg.norm(bent, axis=1).max() * (fps / n) ** 2
+        ),
+        "camera_turning": float(angle.max() * fps / n),
+    }
+
+
+def floors_apart(
+    joints: Float[np.ndarray, "h t 24 3"], present: Bool[np.ndarray, "h t"], fps: float
+) -> float:
+    """Greatest difference between the heights at which people stand, m; NaN if fewer
+    than two do."""
+    stances = find_stances(joints[:, :, list(posture.FEET)], present, fps)
+    heights = [np.median(places[:, 1]) for places in stances if len(places)]
+    return float(np.ptp(heights)) if len(heights) > 1 else np.nan
+
+
+def keypoint_misfit(
+    error: Float[np.ndarray, "t k"], size: Float[np.ndarray, " t"], fps: float
+) -> float:
+    """Keypoints' distance from the body that is to explain them, % of the person's size
+    in the image, where it is worst for a third of a second.
+
+    `error` is NaN where nothing is measured; of a frame the median counts, of the third
+    of a second too, so that outliers do not.
+    """
+    known = np.isfinite(error).sum(axis=1) >= 5
+    frames = np.flatnonzero(known)
+    n = max(3, round(fps / 3))
+    if len(frames) < n:
+        return np.nan
+    share = 100 * np.nanmedian(error[frames], axis=1) / np.maximum(size[frames], 1e-6)
+    return float(
+        np.median(np.lib.stride_tricks.sliding_window_view(share, n), -1).max()
+    )
+
+
+def _goes_on_foot(
+    runs: list[np.ndarray], speed: Float[np.ndarray, " u"], fps: float
+) -> bool:
+    """Whether somebody walks: regular steps, or a walker's speed most of the time."""
+    slow, fast = _WALKING
+    if slow < np.median(speed) < fast:
+        return True
+    steps = gait_of_joints(max(runs, key=len), fps)
+    return steps is not None and steps.step > _STEP and bool(speed.mean() < fast)
+
+
+def _ground_under_feet(
+    joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
+) -> dict[str, float]:
+    """How standing feet rise along the way, degrees, and scatter about that, m."""
+    feet = joints[None, :, list(posture.FEET)]
+    (stances,) = find_stances(feet, present[None], fps)
+    if len(stances) < 3:
+        return {}
+    height = stances[:, 1] - np.median(stances[:, 1])
+    flat = stances[:, [0, 2]] - stances[:, [0, 2]].mean(axis=0)
+    along = flat @ np.linalg.svd(flat, full_matrices=False)[2][0]
+    found = {}
+    if np.ptp(along) > _FLOOR:
+        rise = float(np.polyfit(along, height, 1)[0])
+        found["ground_slope"] = float(np.degrees(np.arctan(abs(rise))))
+        height = height - rise * along
+    found["feet_off_ground"] = float(np.ptp(np.percentile(height, [5, 95])))
+    return found
+
+
+def _runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
+    return [slice(a, b) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,325 @@
+"""Can a result be true? Figures of people, cameras and ground against what there is.
+
+`CHECKS` is the one table of thresholds. Those of people are from motion capture, cut
+in pieces of 3 to 5 s, and from simulated sequences, on both of which at most 2 % of
+the pieces are wrongly doubted (`benchmarks/plausibility.md` has all figures,
+`tools/plausibility_thresholds.py` makes them). A result that passes can be true; one
+that does not is `doubtful`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+Status = Literal["ok", "doubtful", "failed"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One figure, and from where on nobody believes it."""
+
+    name: str
+    what: str
+    """What the figure is, as the subject of a sentence."""
+    unit: str
+    limit: float
+    advice: str
+    """What to do."""
+    source: str
+    """Where the threshold comes from."""
+    below: bool = False
+    """Whether figures below the limit are doubted, not those above."""
+
+    def fails(self, figure: float) -> bool:
+        """Of NaN nothing is said."""
+        return figure < self.limit if self.below else figure > self.limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Reason:
+    """Why a result is doubted, or is none: an entry of `reasons` in `summary.json`."""
+
+    name: str
+    message: str
+    """In plain words, with figure and expectation."""
+    expected: str
+    advice: str
+    figure: float | None = None
+    unit: str = ""
+    person: int | None = None
+    fatal: bool = False
+    """Whether nothing of the result is to be used."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is written; what does not apply is left out."""
+        plain = dataclasses.asdict(self)
+        plain["status"] = "failed" if plain.pop("fatal") else "doubtful"
+        return {k: v for k, v in plain.items() if v is not None and v != ""}
+
+
+_FIT = "look at the overlay: keypoints, focal length or scale are off"
+_MOCAP = "motion capture"
+_GROUND = (
+    "if the ground is not like that, give the focal length (camera.json), or look at "
+    "the overlay: sizes and depths are off"
+)
+_IDENTITY = (
+    "look at the overlay there: keypoints may jump from one person to another, or "
+    "front and back be confused; give keypoints with track ids, or cut the video there"
+)
+_CAMERA = (
+    "if no vehicle carries the camera, look at the scene: tracks follow moving things, "
+    "or scale is off; give person masks or a video with more texture"
+)
+PERSON_CHECKS: tuple[Check, ...] = (
+    Check(
+        "standing_foot_speed",
+        "speed of the lower foot (its toe joint, median)",
+        "m/s",
+        0.4,
+        "positions from frame to frame are not to be trusted: better keypoints, a "
+        "known focal length, or a regressor's bodies (--bodies) help",
+        "given; motion capture, who does not run: median 0.09, 99 % below 0.36",
+    ),
+    Check(
+        "feet_off_ground",
+        "range of heights at which standing feet are, beside a slope",
+        "m",
+        0.12,
+        "the person floats or sinks: " + _GROUND,
+        _MOCAP + ", who walks: 99 % below 0.07, on uneven terrain 0.15",
+    ),
+    Check(
+        "ground_slope",
+        "slope of the ground under standing feet",
+        "degrees",
+        6.0,
+        "the person rises or sinks along the way: " + _GROUND,
+        _MOCAP + ", who walks: at most 5; streets rarely exceed 6",
+    ),
+    Check(
+        "knee",
+        "bend of both knees while walking (mean)",
+        "degrees",
+        52.0,
+        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
+        _MOCAP + ", who walks: 98 % below 48, soccer 51",
+    ),
+    Check(
+        "straighter_knee",
+        "bend of the straighter knee while walking (mean)",
+        "degrees",
+        44.0,
+        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
+        _MOCAP + ", who walks: 98 % below 40, soccer 43",
+    ),
+    Check(
+        "hip_over_ankle",
+        "height of the hips over the ankle, of the leg's length, while walking",
+        "",
+        0.84,
+        "people crouch who do not: " + _FIT,
+        _MOCAP + ", who walks: at least 0.85",
+        below=True,
+    ),
+    Check(
+        "trunk_lean",
+        "lean of the trunk while walking (mean)",
+        "degrees",
+        18.0,
+        "nobody walks so: " + _FIT,
+        _MOCAP + ", who walks: 99 % below 18",
+    ),
+    Check(
+        "turn_of_walker",
+        "fastest turn of somebody who walks",
+        "degrees/s within 0.2 s",
+        500.0,
+        _IDENTITY,
+        _MOCAP + ", who walks: at most 170; dancing on the way 500",
+    ),
+    Check(
+        "turn",
+        "fastest turn",
+        "degrees/s within 0.2 s",
+        600.0,
+        _IDENTITY,
+        _MOCAP + ": at most 500, in a pirouette",
+    ),
+    Check(
+        "velocity_jump_of_walker",
+        "greatest change of speed of somebody who walks",
+        "m/s within 0.2 s",
+        1.8,
+        _IDENTITY,
+        _MOCAP + ", who walks: at most 1.4",
+    ),
+    Check(
+        "velocity_jump",
+        "greatest change of speed",
+        "m/s within 0.2 s",
+        2.8,
+        _IDENTITY,
+        _MOCAP + ": at most 1.9, in a jump",
+    ),
+    Check(
+        "joint_acceleration",
+        "acceleration of joints (median)",
+        "m/s²",
+        22.0,
+        "the person trembles: " + _FIT,
+        _MOCAP + ": at most 18, in a run",
+    ),
+    Check(
+        "speed",
+        "speed (95th percentile)",
+        "m/s",
+        10.0,
+        "nobody runs as fast: the frame rate, the focal length or scale is off",
+        "sprinters reach 10 to 12 m/s",
+    ),
+    Check(
+        "stature",
+        "stature",
+        "m",
+        2.2,
+        "the scale, the frame rate or the body model is off",
+        "one adult in a million is taller",
+    ),
+    Check(
+        "short_stature",
+        "stature",
+        "m",
+        0.9,
+        "the scale or the body model is off; children younger than three are no "
+        "shape of the body model",
+        "adults and children from three years",
+        below=True,
+    ),
+    Check(
+        "keypoint_misfit",
+        "greatest distance of keypoints from the body, for a third of a second",
+        "% of the person's size in the image",
+        8.0,
+        _IDENTITY,
+        "simulated sequences: at most 3",
+    ),
+)
+WORLD_CHECKS: tuple[Check, ...] = (
+    Check(
+        "floors_apart",
+        "difference between the heights at which people stand",
+        "m",
+        0.35,
+        "if they do not stand on different floors, sizes of people are off: check the "
+        "focal length, or give their bodies (--bodies)",
+        "a step or kerb is lower; simulated people are within 0.1",
+    ),
+    Check(
+        "up_against_trunks",
+        "angle between up, as the ground tells it, and people's trunks",
+        "degrees",
+        7.5,
+        "gravity and ground contradict the people: if the ground is not a hill, "
+        "postures or focal length are off",
+        "ten simulated sequences: 0.7 to 5",
+    ),
+    Check(
+        "slope_of_ground",
+        "slope of the ground against people's trunks",
+        "degrees",
+        6.0,
+        "gravity and ground contradict the people: if the ground is not a hill, "
+        "postures or focal length are off",
+        "streets rarely exceed 6",
+    ),
+    Check(
+        "camera_speed",
+        "speed of the camera (95th percentile)",
+        "m/s",
+        10.0,
+        _CAMERA,
+        "nobody runs as fast; simulated cameras at most 2.6",
+    ),
+    Check(
+        "camera_acceleration",
+        "acceleration of the camera over 0.1 s (greatest)",
+        "m/s²",
+        30.0,
+        _CAMERA,
+        "simulated hand-held cameras: at most 7",
+    ),
+    Check(
+        "camera_turning",
+        "turning of the camera over 0.1 s (fastest)",
+        "degrees/s",
+        600.0,
+        _CAMERA,
+        "simulated hand-held cameras: at most 70; whipping pans 400",
+    ),
+    Check(
+        "scale_sigma",
+        "standard error of all lengths",
+        "%",
+        20.0,
+        "sizes are hardly known: a known focal length, more steps, the ground in view "
+        "or a regressor's bodies (--bodies) help",
+        "people differ by 5 to 6 %",
+    ),
+    Check(
+        "scale_cues_apart",
+        "factor between the sizes that people's motion and the ground tell",
+        "",
+        1.25,
+        "postures, focal length, frame rate or ground are off: look at both",
+        "simulated sequences: at most 1.2",
+    ),
+    Check(
+        "ground_under_feet",
+        "factor between the size of the map and that of the people on its ground",
+        "",
+        1.4,
+        "people do not stand on the ground of the map: scale, postures or focal "
+        "length are off, or they stand on something else",
+        "simulated sequences: at most 1.1",
+    ),
+)
+
+
+def judge(
+    checks: tuple[Check, ...],
+    figures: Mapping[str, float],
+    person: int | None = None,
+) -> list[Reason]:
+    """A reason for each figure that nobody believes; figures may be missing or NaN."""
+    found = []
+    for check in checks:
+        figure = figures.get(check.name, np.nan)
+        if not check.fails(figure):
+            continue
+        unit = check.unit and f" {check.unit}"
+        bound = "at least" if check.below else "at most"
+        expected = f"{bound} {check.limit:g}{unit}"
+        whose = "" if person is None else f"person {person}: "
+        found.append(
+            Reason(
+                name=check.name,
+                message=f"{whose}{check.what} is {figure:.3g}{unit}, expected "
+                f"{expected}.",
+                expected=expected,
+                advice=check.advice,
+                figure=float(figure),
+                unit=check.unit,
+                person=person,
+            )
+        )
+    return found
+
+
+def status_of(reasons: list[Reason]) -> Status:
+    """What all of it comes to."""
+    if any(reason.fatal for reason in reasons):
+        return "failed"
+    return "doubtful" if reasons else "ok"

@@ -1,0 +1,69 @@
+"""When a pixel is exposed: the camera and the people around the time of a frame.
+
+Between frames everything moves quadratically in time through three frames. A frame's
+time is the middle of the exposure of its middle row, so that neither a long exposure
+nor a rolling shutter shifts what is seen in time on the whole.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+
+@dataclasses.dataclass(frozen=True)
+class Shutter:
+    """How long each row is exposed, and how much later the last row is than the first.
+
+    Zeros are an ideal camera, whose whole image is of one instant.
+    """
+
+    exposure: float = 0.0
+    """s"""
+    readout: float = 0.0
+    """s"""
+
+    def row_times(self, rows: int) -> Float[np.ndarray, " rows"]:
+        """Middle of each row's exposure relative to the frame's time, s."""
+        return self.readout * ((np.arange(rows) + 0.5) / rows - 0.5)
+
+    def instants(self, count: int) -> Float[np.ndarray, " {count}"]:
+        """Times within the exposure at which light is gathered, evenly, s."""
+        return self.exposure * ((np.arange(count) + 0.5) / count - 0.5)
+
+
+def around(
+    values: Float[np.ndarray, "t n d"], k: int
+) -> tuple[
+    Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]
+]:
+    """Value, first and second difference of a series at frame `k`, a frame apart.
+
+    At an end the motion goes on evenly.
+    """
+    here = values[k]
+    last, first = len(values) - 1, 0
+    before = values[k - 1] if k > first else 2 * here - values[min(k + 1, last)]
+    after = values[k + 1] if k < last else 2 * here - before
+    return here, (after - before) / 2, after - 2 * here + before
+
+
+def cameras_at(
+    T_WC: Float[np.ndarray, "t 4 4"], k: int, when: Float[np.ndarray, " n"], fps: float
+) -> Float[np.ndarray, "n 4 4"]:
+    """Camera poses at times `when` (s) relative to frame `k`.
+
+    The rotation is that of frame `k` times the exponential of a quadratic.
+    """
+    window = T_WC[max(k - 1, 0) : k + 2]
+    own = min(k, 1)
+    R = Rotation.from_matrix(window[:, :3, :3])
+    turned = (R[own].inv() * R).as_rotvec()
+    tau = (when * fps)[:, None]
+    move = lambda terms: terms[0] + tau * terms[1] + tau**2 / 2 * terms[2]
+    out = np.tile(np.eye(4), (len(tau), 1, 1))
+    turn = Rotation.from_rotvec(move(around(turned[:, None], own)))
+    out[:, :3, :3] = (R[own] * turn).as_matrix()
+    out[:, :3, 3] = move(around(window[:, None, :3, 3], own))
+    return out

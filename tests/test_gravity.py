@@ -1,0 +1,144 @@
+"""Up and standing feet, from made walkers whose up is known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.gravity import feet_plane, find_stances, find_upright, standing_feet
+
+FPS = 30.0
+NOTHING = np.zeros((0, 3))
+
+
+def walker(path, *, floor=lambda x, z: 0.0 * x, period=30, fps=FPS):
+    """Toe joints of somebody whose feet stand by turns along `path` (t, 2), m."""
+    t = len(path)
+    feet = np.zeros((t, 2, 3))
+    for side in range(2):
+        starts = np.arange(-side * period // 2, t + period, period)
+        for a in starts:  # stands for 60 % of the period, swings for the rest
+            stop = a + round(0.6 * period)
+            now, then = np.clip([a, a + period], 0, t - 1)
+            for k in range(max(a, 0), min(a + period, t)):
+                s = np.clip((k - stop) / (a + period - stop), 0, 1)
+                s = s * s * (3 - 2 * s)
+                xz = (1 - s) * path[now] + s * path[then]
+                feet[k, side, [0, 2]] = xz
+                feet[k, side, 1] = floor(*xz) + 0.12 * np.sin(np.pi * s)
+    return feet[None]
+
+
+def way(t=240, speed=1.2, bend=1.0):
+    angle = bend * np.linspace(0, 2, t)
+    step = speed / FPS * np.column_stack([np.sin(angle), np.cos(angle)])
+    return np.cumsum(step, axis=0) + [0.0, 4.0]
+
+
+def cues(feet, lean, landmarks=NOTHING, *, fitted=True):
+    h, t = feet.shape[:2]
+    trunks = np.broadcast_to(
+        Rotation.from_rotvec(np.radians(lean)).apply([0.0, 1.0, 0.0]), (h, t, 3)
+    )
+    eyes = np.broadcast_to([0.0, 1.5, 0.0], (t, 3))
+    present = np.ones((h, t), bool)
+    return trunks, feet, present, eyes, landmarks, FPS, np.full(h, fitted)
+
+
+def off(up):
+    return np.degrees(np.arccos(np.clip(up[1], -1, 1)))
+
+
+def test_a_foot_stands_while_it_is_on_the_ground():
+    feet = walker(way())[0]
+    stands, lower = standing_feet(feet, np.array([0.0, 1.0, 0.0]), FPS)
+    assert 0.7 < stands.mean() < 1.0
+    height = feet[np.arange(len(feet)), lower, 1]
+    assert height[stands].max() < 0.04
+    # Also seen at another rate, and of somebody whose feet never stand nothing is.
+    assert abs(standing_feet(feet[::2], np.eye(3)[1], 15.0)[0].mean() - 0.85) < 0.15
+    sliding = feet + np.arange(len(feet))[:, None, None] * [0.05, 0, 0]
+    assert standing_feet(sliding, np.eye(3)[1], FPS)[0].mean() < 0.2
+    assert not standing_feet(feet[:1], np.eye(3)[1], FPS)[0].any()
+
+
+def test_each_stance_is_one_place():
+    feet = walker(way(t=150))
+    (places,) = find_stances(feet, np.ones((1, 150), bool), FPS)
+    # Half a period of 30 frames apart, in 150 frames.
+    assert 8 <= len(places) <= 12
+    np.testing.assert_allclose(places[:, 1], 0, atol=0.02)
+    nobody = find_stances(feet, np.zeros((1, 150), bool), FPS)
+    assert [len(one) for one in nobody] == [0]
+
+
+@pytest.mark.parametrize(
+    "lean, left", [((6.0, 0, 0), 0.2), ((0, 0, 4.0), 0.5), ((-5.0, 0, 2.0), 0.25)]
+)
+def test_standing_feet_correct_trunks_that_all_lean(lean, left):
+    """All but the share `left`; a lean across the view may be the floor's slope."""
+    found = find_upright(*cues(walker(way()), lean))
+    assert off(found.up) < left * np.linalg.norm(lean)
+    assert np.degrees(found.trunks) > (1 - left) * np.linalg.norm(lean)
+    assert found.sigma < np.radians(3.0)
+
+
+def test_the_ground_of_the_map_corrects_them_where_nobody_walks():
+    rng = np.random.default_rng(0)
+    still = np.zeros((1, 90, 2, 3)) + [0.0, 0.0, 4.0]
+    floor = np.column_stack(
+        [rng.uniform(-3, 3, 400), rng.normal(0, 0.02, 400), rng.uniform(2, 8, 400)]
+    )
+    alone = find_upright(*cues(still, (5.0, 0, 0)))
+    assert off(alone.up) == pytest.approx(5.0, abs=0.1)
+    found = find_upright(*cues(still, (5.0, 0, 0), floor))
+    assert off(found.up) < 1.0
+    # A table top is no ground: people do not stand on it.
+    table = find_upright(*cues(still, (5.0, 0, 0), floor + [0, 0.8, 0]))
+    assert off(table.up) == pytest.approx(5.0, abs=0.1)
+
+
+def test_on_a_hill_up_stays_where_trunks_point():
+    hill = lambda x, z: np.tan(np.radians(12.0)) * z
+    feet = walker(way(bend=0.3), floor=hill)
+    found = find_upright(*cues(feet, (0.0, 0, 0), fitted=False))
+    assert off(found.up) < 6.0
+    assert np.degrees(found.ground) > 5.0
+    # Bodies that were fitted to keypoints may be what is wrong: less is sure.
+    loose = find_upright(*cues(feet, (0.0, 0, 0), fitted=True))
+    assert loose.sigma > np.radians(2.5)
+
+
+def test_trunks_count_more_across_the_view_than_along_it():
+    """The same wrong slope of the ground, once along the view and once across it."""
+    along = walker(way(), floor=lambda x, z: 0.07 * z)
+    across = walker(way(), floor=lambda x, z: 0.07 * x)
+    tilts = [find_upright(*cues(feet, (0.0, 0, 0))).up for feet in (along, across)]
+    assert abs(tilts[0][2]) > abs(tilts[1][0])
+
+
+def test_people_of_wrong_size_do_not_tilt_the_floor():
+    """A man who is made 5 % too small floats; he is further away as well."""
+    near, far = walker(way(bend=2.0)), walker(way(bend=2.0) + [0.0, 3.0])
+    stances = find_stances(
+        np.concatenate([near, far + [0, 0.1, 0]]), np.ones((2, 240), bool), FPS
+    )
+    plane = feet_plane(stances, 0.08)
+    assert np.degrees(np.linalg.norm(plane.gradient)) < 0.7
+    assert feet_plane([stances[0][:2]], 0.08) is None
+
+
+def test_without_people_the_ground_of_the_map_is_level():
+    rng = np.random.default_rng(0)
+    floor = np.column_stack(
+        [rng.uniform(-3, 3, 400), rng.normal(0, 0.02, 400), rng.uniform(2, 8, 400)]
+    )
+    turn = Rotation.from_rotvec(np.radians([8.0, 0, 0]))
+    eyes = turn.apply(np.tile([0.0, 1.5, 0.0], (20, 1)))
+    nobody = np.zeros((0, 20), bool)
+    empty = np.zeros((0, 20, 3)), np.zeros((0, 20, 2, 3)), nobody, eyes
+    found = find_upright(*empty, turn.apply(floor), FPS, np.zeros(0, bool))
+    np.testing.assert_allclose(found.up, turn.apply([0.0, 1, 0]), atol=0.01)
+    assert np.isnan(found.trunks)
+    found = find_upright(*empty, NOTHING, FPS, np.zeros(0, bool))
+    np.testing.assert_array_equal(found.up, [0.0, 1, 0])
+    assert np.isinf(found.sigma)

@@ -1,0 +1,183 @@
+"""What can be true is not doubted; what cannot is, and for the right reason."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax import synthetic
+from bodyslam_jax.config import Simulation
+from bodyslam_jax.diagnostics import figures
+from bodyslam_jax.diagnostics.plausibility import (
+    PERSON_CHECKS,
+    WORLD_CHECKS,
+    Reason,
+    judge,
+    status_of,
+)
+
+FPS = 30.0
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Somebody who really walked, and a camera that goes along."""
+    return synthetic.as_truth(
+        synthetic.simulate(
+            Simulation(sequence="M1", family="follow", length=120, seed=5, noise="none")
+        )
+    )
+
+
+@pytest.fixture
+def walk(truth):
+    return truth.joints[0].copy()
+
+
+def doubts(joints, present=None, fps=FPS):
+    """Names of what is doubted of one person."""
+    if present is None:
+        present = np.ones(len(joints), bool)
+    found = judge(PERSON_CHECKS, figures.person_figures(joints, present, fps), 0)
+    return {reason.name for reason in found}
+
+
+def test_who_really_walked_is_believed(truth, walk):
+    assert doubts(walk) == set()
+    assert doubts(walk[::2], fps=15.0) == set()
+    # Also with a centimetre of noise that lasts, and in any place.
+    rng = np.random.default_rng(0)
+    slow = np.repeat(rng.normal(0, 0.01, (24, 1, 3)), 5, axis=0)
+    assert doubts(walk + slow + [3.0, 0.0, -2.0]) == set()
+    camera = figures.camera_figures(truth.T_WC, FPS)
+    assert judge(WORLD_CHECKS, camera) == []
+
+
+def test_frames_in_which_somebody_is_absent_are_no_jump(walk):
+    present = np.ones(len(walk), bool)
+    present[40:70] = False
+    walk[40:70] = 0.0
+    walk[70:] += [2.0, 0.0, 0.0]
+    assert doubts(walk, present) == set()
+    assert doubts(walk, np.zeros(len(walk), bool)) == set()
+    present[:] = False
+    present[:5] = True
+    assert doubts(walk, present) == set()
+
+
+def test_feet_that_slide_are_doubted(walk):
+    drift = np.arange(len(walk))[:, None, None] / FPS * [0.6, 0.0, 0.0]
+    assert "standing_foot_speed" in doubts(walk + drift)
+    slow = drift / 6
+    assert doubts(walk + slow) == set()
+
+
+def test_whoever_floats_or_sinks_is_doubted(walk):
+    along = walk[:, :1] - walk[:1, :1]
+    gone = np.linalg.norm(along, axis=-1, keepdims=True)
+    rising = walk + gone * [0.0, np.tan(np.radians(8.0)), 0.0]
+    assert "ground_slope" in doubts(rising)
+    swaying = walk.copy()
+    time = np.arange(len(walk))[:, None] / FPS
+    swaying[..., 1] += 0.12 * np.sin(2 * np.pi * time / 3.0)
+    assert "feet_off_ground" in doubts(swaying)
+
+
+def test_whoever_crouches_is_doubted(walk):
+    """Thighs turned forward and shins back, so that knees bend by 30 degrees more."""
+    crouched = walk.copy()
+    side = walk[:, 1] - walk[:, 2]
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    bend = np.radians(30.0)
+    for hip, knee, ankle, foot in ((1, 4, 7, 10), (2, 5, 8, 11)):
+        up = Rotation.from_rotvec(-bend * side)
+        down = Rotation.from_rotvec(bend * side / 2)
+        crouched[:, knee] = walk[:, hip] + up.apply(walk[:, knee] - walk[:, hip])
+        crouched[:, ankle] = crouched[:, knee] + down.apply(
+            walk[:, ankle] - walk[:, knee]
+        )
+        crouched[:, foot] = crouched[:, ankle] + walk[:, foot] - walk[:, ankle]
+    assert {"knee", "straighter_knee"} <= doubts(crouched)
+    leaning = Rotation.from_rotvec([np.radians(25.0), 0, 0])
+    bowed = walk.copy()
+    for joint in (3, 6, 9, *range(12, 24)):
+        bowed[:, joint] = walk[:, 0] + leaning.apply(walk[:, joint] - walk[:, 0])
+    assert "trunk_lean" in doubts(bowed)
+
+
+def test_whoever_becomes_another_in_a_moment_is_doubted(walk):
+    other = walk.copy()
+    half = len(walk) // 2
+    about = walk[half, 0]
+    turn = Rotation.from_rotvec([0.0, np.pi * 0.9, 0.0])
+    there = (walk[half:] - about).reshape(-1, 3)
+    other[half:] = about + turn.apply(there).reshape(-1, 24, 3)
+    assert "turn_of_walker" in doubts(other)
+    jumping = walk.copy()
+    jumping[half:] += [0.8, 0.0, 0.0]
+    assert "velocity_jump_of_walker" in doubts(jumping)
+    trembling = walk + np.random.default_rng(0).normal(0, 0.02, walk.shape)
+    assert "joint_acceleration" in doubts(trembling)
+
+
+def test_speeds_of_nobody_are_doubted(walk):
+    assert "speed" in doubts(walk * 8.0)
+    for stature, names in ((1.7, set()), (2.4, {"stature"}), (0.8, {"short_stature"})):
+        told = {"stature": stature, "short_stature": stature}
+        assert {r.name for r in judge(PERSON_CHECKS, told)} == names
+
+
+def test_a_camera_that_moves_as_no_hand_does_is_doubted(truth):
+    jumped = truth.T_WC.copy()
+    jumped[60:, 0, 3] += 1.0
+    names = {r.name for r in judge(WORLD_CHECKS, figures.camera_figures(jumped, FPS))}
+    assert "camera_acceleration" in names
+    turned = truth.T_WC.copy()
+    turn = Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix()
+    turned[60:, :3, :3] = turned[60:, :3, :3] @ turn
+    names = {r.name for r in judge(WORLD_CHECKS, figures.camera_figures(turned, FPS))}
+    assert names == {"camera_turning"}
+    assert figures.camera_figures(truth.T_WC[:3], FPS) == {}
+
+
+def test_people_on_different_floors_are_doubted(walk):
+    present = np.ones((2, len(walk)), bool)
+    apart = figures.floors_apart(np.stack([walk, walk + [0, 0.5, 0]]), present, FPS)
+    assert apart == pytest.approx(0.5, abs=1e-9)
+    assert np.isnan(figures.floors_apart(walk[None], present[:1], FPS))
+
+
+def test_keypoints_that_are_another_persons_are_doubted():
+    rng = np.random.default_rng(0)
+    error = np.abs(rng.normal(0, 3.0, (60, 25)))
+    size = np.full(60, 200.0)
+    error[rng.random(error.shape) < 0.1] = 150.0
+    error[rng.random(error.shape) < 0.2] = np.nan
+    assert figures.keypoint_misfit(error, size, FPS) < 3
+    error[20:24] = 30.0  # too short
+    assert figures.keypoint_misfit(error, size, FPS) < 3
+    error[30:45] = 30.0
+    assert figures.keypoint_misfit(error, size, FPS) == pytest.approx(15.0)
+    error[:] = np.nan
+    assert np.isnan(figures.keypoint_misfit(error, size, FPS))
+
+
+def test_a_reason_says_what_is_expected_and_what_to_do():
+    (reason,) = judge(PERSON_CHECKS, {"standing_foot_speed": 0.62}, 1)
+    assert "person 1" in reason.message and "0.62 m/s" in reason.message
+    assert reason.expected == "at most 0.4 m/s" and reason.advice
+    written = reason.to_dict()
+    assert written["figure"] == 0.62 and written["person"] == 1
+    assert written["status"] == "doubtful"
+    fatal = Reason("x", "nothing is found.", "something", "look", fatal=True)
+    assert fatal.to_dict()["status"] == "failed" and "figure" not in fatal.to_dict()
+    assert status_of([]) == "ok"
+    assert status_of([reason]) == "doubtful"
+    assert status_of([reason, fatal]) == "failed"
+
+
+def test_every_check_has_a_name_of_its_own_and_says_where_it_is_from():
+    checks = (*PERSON_CHECKS, *WORLD_CHECKS)
+    assert len({check.name for check in checks}) == len(checks)
+    for check in checks:
+        assert check.source and check.advice and not check.advice.endswith(".")
+        assert not check.fails(np.nan) and not check.fails(check.limit)
