@@ -186,8 +186,8 @@ def _check_people(sequence: Sequence, config: Config) -> None:
         return
     raise ValueError(
         f"{sequence.name}: neither keypoints nor bodies, nor images to find people "
-        "in (or --detect none), so nobody to estimate; give one of them, or leave people "
-        "out with --no-people."
+        "in (or --detect none), so nobody to estimate; give one of them, or leave "
+        "people out with --no-people."
     )
 
 
@@ -400,10 +400,16 @@ def demo(
     cache = Cache(out / ".cache", {"name": _SCENE})
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):
-        return _demo(out, config, warnings, first)
+        return _demo(out, config, warnings, first, from_pixels)
 
 
-def _demo(out: Path, config: Config, warnings: tuple[str, ...], first: bool) -> Result:
+def _demo(
+    out: Path,
+    config: Config,
+    warnings: tuple[str, ...],
+    first: bool,
+    from_pixels: bool,
+) -> Result:
     folder, rehearsal, watch = out / _SCENE, Rehearsal(), Stopwatch()
     scene = None
     if first:
