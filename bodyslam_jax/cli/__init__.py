@@ -88,7 +88,6 @@ def main() -> None:
         # Closed, as daemons have it: what would be printed goes nowhere.
         sys.stdout = open(os.devnull, "w")
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    logging.getLogger("jax").setLevel(logging.WARNING)
     argv = sys.argv[1:]
     commands, prog = _COMMANDS, "bodyslam"
     if argv and argv[0] in _GROUPS:
@@ -198,6 +197,8 @@ def _prepare_jax() -> None:
         import jax
         import jax.numpy
 
+    # Not before: JAX makes the level that it finds when it is imported XLA's, too.
+    logging.getLogger("jax").setLevel(logging.WARNING)
     gc.set_threshold(_COLLECT_AFTER)
     return_memory()
     jax.config.update("jax_enable_x64", True)

@@ -24,7 +24,8 @@ _BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
     """A float64 array, of the shape given (-1: any length).
 
-    What is not finite in it stays: the bodies that it is of are left out at the end.
+    What is not finite in it becomes NaN: the bodies that it is of are left out at the
+    end.
     """
     if not isinstance(data, dict) or key not in data:
         raise Unfit(f"no `{key}`")
@@ -32,6 +33,7 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
         array = np.asarray(data[key], dtype=np.float64)
     except (TypeError, ValueError):
         raise Unfit(f"`{key}` does not hold numbers") from None
+    array = np.where(np.isfinite(array), array, np.nan)
     if shape is not None:
         fits = array.ndim == len(shape) and all(
             want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
