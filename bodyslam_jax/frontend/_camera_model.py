@@ -22,7 +22,7 @@ from bodyslam_jax.sequence import Intrinsics, Tracks
 
 _log = logging.getLogger(__name__)
 
-_ROUNDS = 3
+_ROUNDS = 2
 _SIGMAS = 5.0
 """Standard deviations from which a deviation is believed."""
 _GIVEN_SIGMAS, _GIVEN_GAIN = 10.0, 0.1

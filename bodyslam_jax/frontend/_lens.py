@@ -25,7 +25,7 @@ _FOCAL, _ASPECT, _RADIAL, _KNOT = 0.2, 0.4, 0.5, 0.5
 """Standard deviations of what may be beforehand."""
 _CAUCHY = 2.0
 """Scale of the loss, in standard deviations of an observation."""
-_ITERATIONS = 25
+_ITERATIONS = 45
 _DOUBT = 3.0
 """Standard deviations from which it is asked which deviation it is."""
 _SHARE = 0.75
@@ -100,17 +100,18 @@ def examine_lens(
     )
     # On the same footing: adjusted as long without a lens, then with one.
     plain, plain_error, _ = fit.solve(start, pixel / 5, free=False)
-    found, error, spread = fit.solve(plain, pixel / 5, free=True)
+    focal, _, _ = fit.alone(slice(0, 1)).solve(plain, pixel / 5, free=True)
+    found, error, spread = fit.solve(focal, pixel / 5, free=True)
     if spread is None:
         return None
     if (np.abs(found.lens[1:]) > _DOUBT * np.sqrt(np.diag(spread))[1:]).any():
         # What one of them explains alone is not shared out between all.
         sigma = max(error / 1.18, pixel / 5)
-        gain = fit.cost(plain, sigma) - fit.cost(found, sigma)
+        gain = fit.cost(focal, sigma) - fit.cost(found, sigma)
         singles = []
         for which in (slice(1, 2), slice(2, 3), slice(3, None)):
-            one, *rest = fit.alone(which).solve(plain, pixel / 5, free=True)
-            singles.append((fit.cost(plain, sigma) - fit.cost(one, sigma), one, *rest))
+            one, *rest = fit.alone(which).solve(focal, pixel / 5, free=True)
+            singles.append((fit.cost(focal, sigma) - fit.cost(one, sigma), one, *rest))
         best = max(singles, key=lambda single: single[0])
         if best[0] > _SHARE * gain and best[3] is not None:
             _, found, error, spread = best
