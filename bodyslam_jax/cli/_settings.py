@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import inspect
 import itertools
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     if not isinstance(found, dict):
         raise ValueError(f"{where}: found {found!r}, expected settings by name.")
     known = {field.name for field in dataclasses.fields(base)}
+    hints = typing.get_type_hints(type(base))
     changes = {}
     for name, value in found.items():
         if name not in known:
@@ -58,17 +60,18 @@ def _merged(found: Any, base: Any, where: str) -> Any:
                 f"{where}: no setting `{name}`; expected one of {sorted(known)}."
             )
         old = getattr(base, name)
+        kind = hints[name]
+        if type(value) is int and float in (kind, *typing.get_args(kind)):
+            value = float(value)
         if dataclasses.is_dataclass(old):
             value = _merged(value, old, f"{where}: {name}")
         elif isinstance(old, tuple) and isinstance(value, list):
             value = tuple(value)
         elif old is not None and value is not None and type(value) is not type(old):
-            if not (isinstance(old, float) and type(value) is int):
-                raise ValueError(
-                    f"{where}: {name}: found {value!r}, expected "
-                    f"{type(old).__name__} as in {old!r}."
-                )
-            value = float(value)
+            raise ValueError(
+                f"{where}: {name}: found {value!r}, expected {type(old).__name__} as "
+                f"in {old!r}."
+            )
         changes[name] = value
     try:
         return dataclasses.replace(base, **changes)
