@@ -168,6 +168,7 @@ def test_keypoints_that_are_another_persons_are_doubted():
 
 def test_a_reason_says_what_is_expected_and_what_to_do():
     (reason,) = judge(PERSON_CHECKS, {"standing_foot_speed": 0.62}, 1)
+    assert judge(WORLD_CHECKS, {"slope_of_ground": np.degrees(np.array(0.01))}) == []
     assert "person 1" in reason.message and "0.62 m/s" in reason.message
     assert reason.expected == "at most 0.4 m/s" and reason.advice
     written = reason.to_dict()

@@ -296,7 +296,7 @@ def judge(
     """A reason for each figure that nobody believes; figures may be missing or NaN."""
     found = []
     for check in checks:
-        figure = figures.get(check.name, np.nan)
+        figure = float(figures.get(check.name, np.nan))
         if not check.fails(figure):
             continue
         unit = check.unit and f" {check.unit}"
@@ -310,7 +310,7 @@ def judge(
                 f"{expected}.",
                 expected=expected,
                 advice=check.advice,
-                figure=float(figure),
+                figure=figure,
                 unit=check.unit,
                 person=person,
             )
