@@ -43,6 +43,7 @@ def assemble(
         landmarks if cameras.kind == "moving" else landmarks[:0],
         sequence.fps,
         people.without_bodies(sequence),
+        config.gravity,
     )
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
@@ -141,15 +142,19 @@ def level(
     landmarks: Float[np.ndarray, "l 3"],
     fps: float,
     fitted: Bool[np.ndarray, " h"],
+    gravity: tuple[float, ...] = (),
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
     """The rigid motion to a world whose y axis is up, and how that is known.
 
     Cues (see `find_upright`) are taken in a world that is roughly upright already: up
-    is there where people's trunks point on average, or, without people, where the first
-    camera's top does.
+    is there where a measurement has it (`gravity`: the direction in which things fall,
+    in the first camera's axes), else where people's trunks point on average, or,
+    without people, where the first camera's top does.
     """
     up = -T_WC[0, :3, 1]
-    if present.any():
+    if gravity:
+        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
+    elif present.any():
         up = T_WH[present][:, :3, 1].sum(axis=0)
     rough = upright(T_WC, up / np.linalg.norm(up))
     at = lambda points: points @ rough[:3, :3].T + rough[:3, 3]
@@ -161,6 +166,7 @@ def level(
         at(landmarks),
         fps,
         fitted,
+        np.array([0.0, 1.0, 0.0]) if gravity else None,
     )
     return upright(rough @ T_WC, found.up) @ rough, found
 

@@ -24,6 +24,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.config import GRAVITY_SIGMA
 from bodyslam_jax.ground import find_ground
 
 _DEGREE = np.pi / 180
@@ -109,6 +110,7 @@ def find_upright(
     landmarks: Float[np.ndarray, "l 3"],
     fps: float,
     fitted: Bool[np.ndarray, " h"],
+    known: Float[np.ndarray, " 3"] | None = None,
 ) -> Upright:
     """Up by all cues there are, in a frame whose y axis is roughly up.
 
@@ -118,6 +120,7 @@ def find_upright(
         eyes: centres of the camera, m.
         landmarks: points of the map, m; none where the camera did not move.
         fitted: whether a person's body was fitted to keypoints, not regressed.
+        known: up as an accelerometer has it, to `GRAVITY_SIGMA`.
     """
     told = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps)
@@ -126,6 +129,8 @@ def find_upright(
     planes.append(map_plane(landmarks, eyes, stances))
     ground = _fused([plane for plane in planes if plane is not None])
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
+    if known is not None:
+        told, worse = _with_known(told, known), 0.0
     tilt, slope, sigma = _combined(told, ground, worse)
     up = np.array([tilt[0], 1.0, tilt[1]])
     up /= np.linalg.norm(up)
@@ -135,6 +140,16 @@ def find_upright(
         trunks=np.nan if told is None else float(np.linalg.norm(told[0] - tilt)),
         ground=float(np.arctan(np.linalg.norm(slope))),
     )
+
+
+def _with_known(told, up):
+    """Trunks and a measurement of up, as one: a small tilt and its covariance, rad²."""
+    tilt, weight = up[[0, 2]] / up[1], np.eye(2) / GRAVITY_SIGMA**2
+    if told is None:
+        return tilt, np.linalg.inv(weight)
+    trunk = np.linalg.inv(told[1])
+    covariance = np.linalg.inv(trunk + weight)
+    return covariance @ (trunk @ told[0] + weight @ tilt), covariance
 
 
 def _trunks(trunks, present, eyes, feet, fps, fitted):

@@ -142,3 +142,22 @@ def test_without_people_the_ground_of_the_map_is_level():
     found = find_upright(*empty, NOTHING, FPS, np.zeros(0, bool))
     np.testing.assert_array_equal(found.up, [0.0, 1, 0])
     assert np.isinf(found.sigma)
+
+
+def test_a_measured_gravity_holds_on_a_hill():
+    """Where trunks and the ground disagree, an accelerometer decides."""
+    hill = lambda x, z: np.tan(np.radians(12.0)) * z
+    feet = walker(way(bend=0.3), floor=hill)
+    given = cues(feet, (4.0, 0, 0), fitted=True)
+    found = find_upright(*given, known=np.array([0.0, 1.0, 0.0]))
+    assert off(found.up) < 1.5 < off(find_upright(*given).up)
+    assert found.sigma < np.radians(1.1)
+    assert np.degrees(found.ground) > 9.0
+    # Alone it is as sure as it is said to be.
+    nobody = np.zeros((0, 20), bool)
+    empty = np.zeros((0, 20, 3)), np.zeros((0, 20, 2, 3)), nobody, np.zeros((20, 3))
+    alone = find_upright(
+        *empty, NOTHING, FPS, np.zeros(0, bool), np.array([0.1, 1.0, 0.0])
+    )
+    np.testing.assert_allclose(alone.up[:2], np.array([0.1, 1.0]) / 1.01**0.5)
+    assert alone.sigma == pytest.approx(np.radians(1.0))
