@@ -8,6 +8,7 @@ from bodyslam_jax.frontend._geometry import fit_rotation, unit_rays
 
 _FOLLOWED = 0.05
 """Share of the points that even a quick motion leaves."""
+_MOST_LOST = 0.3
 _LEAP = 10.0, 0.08
 """Times the usual displacement, and displacement at depth 1, that is none of a hand."""
 
@@ -44,7 +45,9 @@ def find_jumps(views: Views, num_frames: int, min_shared: int) -> list[int]:
         np.median(step[into == k]) if followed[k] else 0.0 for k in range(1, num_frames)
     ]
     leap = _LEAP[0] * np.median(typical) if typical else 0.0
-    lost |= np.asarray(typical) > max(leap, _LEAP[1])
+    far = np.asarray(typical) / max(leap, _LEAP[1])
+    # Half as far will do where most points are lost as well.
+    lost |= (far > 1) | ((far > 0.5) & (followed[1:] < _MOST_LOST * fewest))
     return (np.flatnonzero(lost) + 1).tolist()
 
 
