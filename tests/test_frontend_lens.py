@@ -1,4 +1,4 @@
-"""What tracks say of the lens: zoom, shape of pixels, distortion, and a second motion."""
+"""What tracks say of the lens: zoom, pixels, distortion; and of a second motion."""
 
 import dataclasses
 
@@ -139,3 +139,19 @@ def test_traffic_is_warned_of_and_a_scene_alone_is_not():
     crowded = reconstruct(both, CAMERA, 60)
     assert second_motion(tracks, alone, CAMERA) is None
     assert "move together" in (second_motion(both, crowded, CAMERA) or "")
+
+
+def test_a_cut_within_one_scene_is_said():
+    tracks, _ = scene("sideways", seed=3)
+    # The same points are seen beyond the cut, as after it they are found again.
+    beyond = tracks.frame >= 45
+    kept = beyond | (tracks.frame < 30)
+    fresh = tracks.landmark.max() + 1
+    late = beyond & (tracks.frame < 48)  # not found again at once
+    landmark = np.where(late, tracks.landmark + fresh, tracks.landmark)
+    frame = np.where(beyond, tracks.frame - 15, tracks.frame)
+    _, landmark = np.unique(landmark[kept], return_inverse=True)
+    cut = Tracks(frame[kept], landmark, tracks.uv[kept])
+    found = reconstruct(cut, CAMERA, 45)
+    assert any("cut" in text and "30" in text for text in found.warnings)
+    assert not reconstruct(tracks, CAMERA, 60).warnings

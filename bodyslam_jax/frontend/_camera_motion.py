@@ -6,6 +6,12 @@ from jaxtyping import Bool, Float, Int
 from bodyslam_jax.frontend._bundle import Views
 from bodyslam_jax.frontend._geometry import fit_rotation, unit_rays
 
+_FOLLOWED = 0.05
+"""Share of the points that even a quick motion leaves."""
+_MOST_LOST = 0.3
+_LEAP = 10.0, 0.08
+"""Times the usual displacement, and displacement at depth 1, that is none of a hand."""
+
 
 def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
     """First frames of shots: 0, and those that share too few points with the last."""
@@ -18,6 +24,31 @@ def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
     np.add.at(links, frame[1:][same] + 1, -1)
     shared = np.cumsum(links)[:num_frames]
     return [0] + [k for k in range(1, num_frames) if shared[k] < min_shared]
+
+
+def find_jumps(views: Views, num_frames: int, min_shared: int) -> list[int]:
+    """Frames to which almost no point is followed from the frame before, though both
+    have many, or all leap many times as far as from frame to frame elsewhere: a cut,
+    also where points are found again beyond it."""
+    followed = np.zeros(num_frames, dtype=np.int64)
+    ordered = np.lexsort((views.frame, views.landmark))
+    frame, landmark = views.frame[ordered], views.landmark[ordered]
+    on = (landmark[1:] == landmark[:-1]) & (frame[1:] == frame[:-1] + 1)
+    np.add.at(followed, frame[1:][on], 1)
+    count = np.bincount(frame, minlength=num_frames)
+    fewest = np.minimum(count[1:], count[:-1])
+    lost = (fewest >= 2 * min_shared) & (followed[1:] < _FOLLOWED * fewest)
+    xy = views.xy[ordered]
+    step = np.linalg.norm(xy[1:] - xy[:-1], axis=-1)[on]
+    into = frame[1:][on]
+    typical = [
+        np.median(step[into == k]) if followed[k] else 0.0 for k in range(1, num_frames)
+    ]
+    leap = _LEAP[0] * np.median(typical) if typical else 0.0
+    far = np.asarray(typical) / max(leap, _LEAP[1])
+    # Half as far will do where most points are lost as well.
+    lost |= (far > 1) | ((far > 0.5) & (followed[1:] < _MOST_LOST * fewest))
+    return (np.flatnonzero(lost) + 1).tolist()
 
 
 def choose_keyframes(

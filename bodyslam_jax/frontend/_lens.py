@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.frontend._bundle import Scene, Views, sum_by
 
-_MOST_FRAMES, _MOST_POINTS = 36, 500
+_MOST_FRAMES, _MOST_POINTS = 26, 300
 _FEWEST_POINTS = 40
 _FRAMES_A_KNOT = 15
 _MOST_KNOTS = 8

@@ -13,6 +13,7 @@ from bodyslam_jax.frontend._calibration import as_opencv, rays
 from bodyslam_jax.frontend._camera_motion import (
     choose_keyframes,
     find_cuts,
+    find_jumps,
     rotation_error,
     rotations_only,
     stillness,
@@ -199,7 +200,15 @@ def _longest_shot(
     lengths = np.subtract(ends, starts)
     best = int(np.argmax(lengths))
     if len(starts) == 1:
-        return 0, num_frames - 1, ()
+        jumps = find_jumps(views, num_frames, min_shared)
+        if not jumps:
+            return 0, num_frames - 1, ()
+        at = ", ".join(str(k) for k in jumps[:4])
+        text = (
+            f"a cut at frame {at}, beyond which the same scene is seen again: cameras "
+            "are located on both sides, but people are not followed across it."
+        )
+        return 0, num_frames - 1, (text,)
     first, last = starts[best], ends[best] - 1
     if first == last:
         return first, last, ()
