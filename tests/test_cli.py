@@ -241,3 +241,14 @@ def test_what_makes_a_result_doubtful_is_printed(capsys, tmp_path, status, code)
     assert lines[0] == f"walk: {status}"
     told = f"{status}: knees are bent by 60 degrees. What to do: look at the overlay."
     assert (told in lines) == (status != "ok")
+
+
+def test_a_gpu_that_is_not_there_is_no_traceback(monkeypatch, capsys):
+    def none(kind):
+        raise RuntimeError(f"no {kind}")
+
+    monkeypatch.setattr("jax.devices", none)
+    monkeypatch.setattr(sys, "argv", ["bodyslam", "run", "x", "--device", "gpu"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert "--device gpu: JAX sees no GPU" in str(end.value)

@@ -104,6 +104,7 @@ def main() -> None:
         }
         if argv and not any(flag in argv for flag in ("-h", "--help")):
             _prepare_jax()
+            _choose_device(option(argv, "--device"))
         code = _call(commands, prog, argv)
     except BrokenPipeError:
         # Whoever read our output has left, as in `bodyslam ... | head`: no error, and
@@ -208,6 +209,27 @@ def _prepare_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _choose_device(device: str | None) -> None:
+    """Has JAX compute there.
+
+    **Raises:** `ValueError` if a GPU is asked for and JAX sees none.
+    """
+    if device is None:
+        return
+    import jax
+
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    if device == "gpu":
+        try:
+            jax.config.update("jax_default_device", jax.devices("gpu")[0])
+        except RuntimeError:
+            raise ValueError(
+                "--device gpu: JAX sees no GPU; install its build for one "
+                "(pip install 'jax[cuda13]'), or leave the option out."
+            ) from None
 
 
 @contextlib.contextmanager

@@ -26,6 +26,8 @@ class Config(Known):
     ship (also `auto`), YOLOX and RTMPose, which are fetched once, or none."""
     offline: bool = False
     """Whether the network is never used: models must be there already."""
+    device: Literal["cpu", "gpu"] | None = None
+    """Where it is computed; without it where JAX finds best, a GPU if there is one."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
     uncertainty: bool = True
