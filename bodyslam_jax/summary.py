@@ -210,9 +210,7 @@ def _missing(result: Result, cameras: Cameras) -> list[Reason]:
     return found
 
 
-def _scale_unknown(
-    result: Result, cameras: Cameras, start: ScaleStart
-) -> list[Reason]:
+def _scale_unknown(result: Result, cameras: Cameras, start: ScaleStart) -> list[Reason]:
     """Where nothing tells how large the map is, although there are people in it."""
     if cameras.kind != "moving" or not result.present.any():
         return []

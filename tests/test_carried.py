@@ -35,7 +35,9 @@ def made(moves, says, noise=0.0):
     roots[0, :, 2, 3] = 4.0
     roots[..., :3, 3] += rng.normal(0, noise, (1, T, 3))
     state = eqx.tree_at(
-        lambda s: (s.cameras, s.roots), state, (jnp.asarray(cameras), jnp.asarray(roots))
+        lambda s: (s.cameras, s.roots),
+        state,
+        (jnp.asarray(cameras), jnp.asarray(roots)),
     )
     step = np.zeros((T, 3))
     step[:, 0] = says / FPS

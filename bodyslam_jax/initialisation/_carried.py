@@ -79,9 +79,17 @@ def _compare(
 
 def lines_of_carried(found: dict[int, tuple[float, float]]) -> tuple[str, ...]:
     """A line for each of those people, for the report."""
-    return tuple(
-        f"person {h} moves at {moves:.1f} m/s where the posture says {says:.1f}: on a "
-        "treadmill, on wheels or carried, or sizes are off by as much; the person's "
-        "steps have no part in the estimate."
-        for h, (moves, says) in found.items()
-    )
+    lines = []
+    for h, (moves, says) in found.items():
+        line = (
+            f"person {h} moves at {moves:.1f} m/s where the posture says {says:.1f}: "
+            "on a treadmill, on wheels or carried, or sizes are off by as much; the "
+            "person's steps have no part in the estimate."
+        )
+        if moves > says:
+            line += (
+                " Feet that are above the ground, as on a bicycle, make all lengths "
+                "too small."
+            )
+        lines.append(line)
+    return tuple(lines)
