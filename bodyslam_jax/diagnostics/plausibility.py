@@ -95,7 +95,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "% of the person's",
         50.0,
         _CARRIED,
-        _MOCAP + ", who gets on: at most 26",
+        _MOCAP + ", who gets on: at most 19",
     ),
     Check(
         "step_short_of_reach",
