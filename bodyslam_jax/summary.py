@@ -264,6 +264,7 @@ def _implausible(
         if there.any():
             told["stature"] = told["short_stature"] = persons[h]["stature_m"]
             told["keypoint_misfit"] = misfits[h]
+            told["turned_from_body"] = _turned(sequence, joint, h)
         found += plausibility.judge(PERSON_CHECKS, told, h)
     told = {"floors_apart": figures.floors_apart(result.joints, result.present, fps)}
     if walking:
@@ -428,6 +429,16 @@ def _projected_keypoints(
     turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
     p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
     return np.asarray(camera.project(jnp.asarray(joint.intrinsics), p_C))
+
+
+def _turned(sequence: Sequence, joint: Joint, person: int) -> float:
+    """How far a person is turned from the body given; NaN where none is."""
+    if sequence.bodies is None:
+        return np.nan
+    both = sequence.bodies.present[person] & joint.present[person]
+    given = sequence.bodies.poses[person, both, :3]
+    turn = joint.roots[person, both, :3, :3]
+    return figures.turned_from_body(np.asarray(turn), np.asarray(given, float))
 
 
 def _misfits(sequence: Sequence, body: body_.BodyModel, joint: Joint) -> list[float]:

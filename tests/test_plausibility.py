@@ -105,6 +105,25 @@ def test_a_child_taken_for_an_adult_is_doubted_where_steps_are_quick(walk):
     assert doubts(walk) == set()
 
 
+def test_whoever_is_turned_from_the_body_given_is_doubted():
+    rng = np.random.default_rng(0)
+    given = Rotation.random(40, rng=rng)
+    noise = Rotation.from_rotvec(rng.normal(0, 0.15, (40, 3)))
+
+    def doubted(degrees):
+        turn = Rotation.from_rotvec([np.radians(degrees), 0.0, 0.0])
+        found = (given * noise * turn).as_matrix()
+        figure = figures.turned_from_body(found, given.as_rotvec())
+        return figure, judge(PERSON_CHECKS, {"turned_from_body": figure}) != []
+
+    assert doubted(5.0) == (pytest.approx(5.0, abs=3.0), False)
+    assert doubted(20.0) == (pytest.approx(20.0, abs=3.0), True)
+    # Front and back are no matter of degrees.
+    assert not doubted(175.0)[1]
+    few = figures.turned_from_body(given.as_matrix()[:5], given.as_rotvec()[:5])
+    assert np.isnan(few)
+
+
 def test_up_is_told_from_where_the_image_has_its_top(truth):
     assert figures.up_in_image(truth.T_WC) < 30
     for angle, axis in ((90.0, 2), (90.0, 0), (180.0, 2)):

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.diagnostics import _posture as posture
 from bodyslam_jax.export import Gait, gait_of_joints
@@ -19,6 +20,9 @@ _FLOOR = 1.0
 """m that standing feet must be apart for the slope under them."""
 
 _STANDS_OUT = 2.2
+
+_FRONT_OR_BACK = 90.0
+"""degrees from which an orientation is another reading of the image, no error."""
 
 _STRIDE = 0.45
 """Legs: who reaches so far with each step goes somewhere, or is on a treadmill."""
@@ -95,6 +99,23 @@ def camera_figures(T_WC: Float[np.ndarray, "t 4 4"], fps: float) -> dict[str, fl
 def up_in_image(T_WC: Float[np.ndarray, "t 4 4"]) -> float:
     """Angle between up and the direction to the top of the image, degrees (median)."""
     return float(np.degrees(np.median(np.arccos(np.clip(-T_WC[:, 1, 1], -1, 1)))))
+
+
+def turned_from_body(
+    turn: Float[np.ndarray, "t 3 3"], given: Float[np.ndarray, "t 3"]
+) -> float:
+    """By how much a person is turned, in all frames alike, from the body that was
+    given, degrees.
+
+    `turn` is the estimated orientation in the camera's frame, `given` (axis-angle,
+    rad) the regressor's, of the frames that have both. NaN where there are few, or
+    where they differ as front and back do: that is mended elsewhere.
+    """
+    if len(turn) < _FEWEST:
+        return np.nan
+    apart = Rotation.from_rotvec(given).inv() * Rotation.from_matrix(turn)
+    angle = float(np.degrees(np.linalg.norm(np.median(apart.as_rotvec(), axis=0))))
+    return angle if angle < _FRONT_OR_BACK else np.nan
 
 
 def floors_apart(
