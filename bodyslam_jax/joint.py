@@ -46,6 +46,8 @@ class Prepared:
     """Whether the camera's path has a scale to be found."""
     stages: tuple[dict, ...]
     """What was solved on the way, for the report."""
+    warnings: tuple[str, ...] = ()
+    """Lines for the report."""
 
 
 def prepare(
@@ -85,6 +87,7 @@ def prepare(
     shared = np.where(fitted, weights.fitted_step_error, weights.step_error)
     told = shared[roots.present.any(axis=1)] if roots.present.any() else shared
     stages = []
+    carried: dict[int, tuple[float, float]] = {}
     factors = []
     if moving:
         sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
@@ -121,7 +124,12 @@ def prepare(
         there = roots.present & cameras.registered
         walked = lambda seen, state: [
             initialisation.motion_factor(
-                seen, state.shapes, body, weights, shared_error=shared
+                seen,
+                state.shapes,
+                body,
+                weights,
+                shared_error=shared,
+                without=carried,
             ),
             *initialisation.optional_factors(
                 state, seen, there, sequence.fps, body, weights
@@ -146,13 +154,21 @@ def prepare(
         stages.append(stage)
         seen = predict(predictor, state)
         if moving:
-            start = initialisation.scale_start(
+            start_of = lambda without: initialisation.scale_start(
                 state,
                 seen,
                 contact,
                 shared_error=float(told.min()),
                 path=cameras.path_scale,
+                without=without,
             )
+            start = start_of(())
+            others = start.without_motion()
+            if np.isfinite(others.standard_error):
+                carried = initialisation.carried(
+                    state, seen, there, others.value, sequence.fps
+                )
+                start = start_of(carried) if carried else start
             log.info(
                 "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
                 *(start.value, start.standard_error),
@@ -160,6 +176,8 @@ def prepare(
                 *(start.ground, start.ground_error),
             )
             state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
+        else:
+            carried = initialisation.carried(state, seen, there, 1.0, sequence.fps)
         factors += walked(seen, state)
     elif moving and np.isfinite(cameras.path_scale):
         start = ScaleStart(
@@ -176,7 +194,8 @@ def prepare(
         if anybody and weights.posture_predicted:
             problem = problem.with_prediction({"body_pose": seen.body_pose})
         problem = dataclasses.replace(problem, motion=None)
-    return Prepared(problem, state, start, roots, moving, tuple(stages))
+    warnings = initialisation.lines_of_carried(carried)
+    return Prepared(problem, state, start, roots, moving, tuple(stages), warnings)
 
 
 def motion_predictor(
@@ -266,7 +285,10 @@ def estimate(
             if spread is None
             else np.asarray(spread.shapes)
         ),
-        unobserved=tuple(f"not well determined: {line}" for line in unobserved),
+        unobserved=(
+            *prepared.warnings,
+            *(f"not well determined: {line}" for line in unobserved),
+        ),
         cameras=np.asarray(best.cameras),
         roots=np.asarray(best.roots),
         poses=np.asarray(best.poses),

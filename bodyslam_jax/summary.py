@@ -71,7 +71,8 @@ def summarise(
         warnings.append(text)
     way = export.camera_facts(result, within)
     # NaN, where covariances were not computed, stays NaN.
-    scale_sigma = float(np.maximum(joint.scale_sigma, apart / 2 * result.scale))
+    scale_sigma = np.maximum(abs(joint.scale_sigma), apart / 2 * abs(result.scale))
+    scale_sigma = float(scale_sigma)
     persons = []
     for h in range(len(result.poses)):
         facts = export.person_facts(result, h)
@@ -90,7 +91,7 @@ def summarise(
                 "stature_sigma_m": sigma,
             }
         )
-    reasons = _missing(result, cameras)
+    reasons = _missing(result, cameras) + _scale_unknown(result, cameras, joint.start)
     if not any(reason.fatal for reason in reasons):
         reasons += _implausible(
             sequence, body, cameras, joint, result, up, scale_sigma, off, persons
@@ -209,6 +210,39 @@ def _missing(result: Result, cameras: Cameras) -> list[Reason]:
     return found
 
 
+def _scale_unknown(result: Result, cameras: Cameras, start: ScaleStart) -> list[Reason]:
+    """Where nothing tells how large the map is, although there are people in it."""
+    if cameras.kind != "moving" or not result.present.any():
+        return []
+    advice = (
+        "give a camera path in metres, or see that the ground is in view; people who "
+        "are carried, on wheels or in the air tell no size of the scene"
+    )
+    if result.scale <= 0:
+        return [
+            Reason(
+                "scale_sign",
+                f"the scale of the map comes out as {result.scale:.3g}: people move "
+                "against what their posture says.",
+                "a scale above 0",
+                advice,
+                figure=float(result.scale),
+                fatal=True,
+            )
+        ]
+    if np.isfinite(start.standard_error):
+        return []
+    return [
+        Reason(
+            "scale_unknown",
+            "neither people's motion nor the ground under their feet tells how large "
+            "the scene is.",
+            "people who walk, or stand on ground that is in view",
+            advice,
+        )
+    ]
+
+
 def _implausible(
     sequence: Sequence,
     body: body_.BodyModel,
@@ -230,14 +264,17 @@ def _implausible(
         if there.any():
             told["stature"] = told["short_stature"] = persons[h]["stature_m"]
             told["keypoint_misfit"] = misfits[h]
+            told["turned_from_body"] = _turned(sequence, joint, h)
         found += plausibility.judge(PERSON_CHECKS, told, h)
     told = {"floors_apart": figures.floors_apart(result.joints, result.present, fps)}
     if walking:
         told["up_against_trunks"] = np.degrees(up.trunks)
         told["slope_of_ground"] = np.degrees(up.ground)
+    elif result.present.any():
+        told["up_in_image"] = figures.up_in_image(result.T_WC[cameras.within])
     if cameras.kind == "moving" and result.present.any():
         told |= figures.camera_figures(result.T_WC[cameras.within], fps)
-        told["scale_sigma"] = 100 * scale_sigma / result.scale
+        told["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         told["scale_cues_apart"] = float(np.exp(cues_apart(joint.start)))
         told["ground_under_feet"] = ground
     return found + plausibility.judge(WORLD_CHECKS, told)
@@ -392,6 +429,16 @@ def _projected_keypoints(
     turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
     p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
     return np.asarray(camera.project(jnp.asarray(joint.intrinsics), p_C))
+
+
+def _turned(sequence: Sequence, joint: Joint, person: int) -> float:
+    """How far a person is turned from the body given; NaN where none is."""
+    if sequence.bodies is None:
+        return np.nan
+    both = sequence.bodies.present[person] & joint.present[person]
+    given = sequence.bodies.poses[person, both, :3]
+    turn = joint.roots[person, both, :3, :3]
+    return figures.turned_from_body(np.asarray(turn), np.asarray(given, float))
 
 
 def _misfits(sequence: Sequence, body: body_.BodyModel, joint: Joint) -> list[float]:

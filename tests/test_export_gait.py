@@ -53,6 +53,9 @@ def test_steps_are_counted_and_measured(stilts):
     assert found.step == pytest.approx(step / found.leg)
     swing = found.frequency * np.sqrt(found.leg / 9.81)
     assert found.slowness == pytest.approx(step / found.leg / swing / 1.7)
+    # Sines swing by 0.5 rad to either side, both legs in turn.
+    assert found.reach == pytest.approx(2 * np.sin(0.5), rel=0.03)
+    assert found.step_over_reach == pytest.approx(found.step / found.reach)
 
 
 def test_a_walk_is_too_fast_where_its_frame_rate_is_twice_the_true_one(walk):

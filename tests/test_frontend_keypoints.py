@@ -261,3 +261,32 @@ def test_pixels_are_left_as_they_are(tmp_path):
     found, said = read(tmp_path / "k.npz")
     np.testing.assert_array_equal(np.concatenate(found.points), points)
     assert said == []
+
+
+def test_whoever_is_half_hidden_for_a_while_stays_the_same_person():
+    """Three keypoints are left, beside somebody who is seen whole."""
+    few = np.argsort(person()[:, 1])[:3]
+    frames = []
+    for k in range(30):
+        one, other = person(k, 60), person(k, 200)
+        if 10 <= k < 20:
+            hidden = np.setdiff1d(np.arange(25), few if k % 2 else few[:1])
+            one[hidden] = 0.0
+        frames.append(np.stack([one, other][:: 1 if k % 3 else -1]))
+    people, said = associate(frames, Association(), 30.0)
+    assert people.confidence.shape[0] == 2 and said == ()
+    assert (people.confidence > 0).any(axis=2).all()
+    first = people.uv[:, :, few[0], 0] - [2 * k for k in range(30)]
+    assert np.ptp(first, axis=1).max() < 1e-9
+
+
+def test_whoever_is_half_as_large_is_somebody_else():
+    frames = []
+    for k in range(40):
+        uvc = person(k)
+        if k >= 20:
+            uvc[:, :2] = 0.45 * (uvc[:, :2] - uvc[:, :2].mean(0)) + uvc[:, :2].mean(0)
+        frames.append(uvc[None])
+    people, said = associate(frames, Association(), 30.0)
+    assert people.confidence.shape[0] == 2
+    assert any("may be person" in line for line in said)

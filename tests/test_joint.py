@@ -54,7 +54,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
 ):
     told = []
 
-    def motion_factor(*_, shared_error):
+    def motion_factor(*_, shared_error, **__):
         told.append(float(shared_error[0]))
 
     def scale_start(*_, shared_error, **__):
@@ -84,6 +84,41 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     )
     assert told == [share] * 3  # of people alone, of the first scale, of everything
     assert float(prepared.state.scale) == pytest.approx(2)
+
+
+def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
+    monkeypatch,
+):
+    told = []
+
+    def motion_factor(*_, without, **__):
+        told.append(("term", list(without)))
+
+    def scale_start(*_, without, **__):
+        told.append(("scale", list(without)))
+        return ScaleStart(motion=2.0, motion_error=0.1, **cue)
+
+    monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
+    monkeypatch.setattr(initialisation, "scale_start", scale_start)
+    monkeypatch.setattr(initialisation, "carried", lambda *_: {0: (1.2, 0.1)})
+    monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
+    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
+    empty = functools.partial(graph.make_problem, ())
+    monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
+    monkeypatch.setattr(joint, "predict", lambda *_: None)
+    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    body = load_body_model(dtype=jnp.float64)
+    prepare = lambda: joint.prepare(
+        _sequence(_bodies()), _cameras(), _bodies(), body, Config()
+    )
+    cue = {}
+    assert prepare().warnings == ()
+    assert told == [("term", []), ("scale", []), ("term", [])]
+    told.clear()
+    cue = {"ground": 3.0, "ground_error": 0.1}
+    (line,) = prepare().warnings
+    assert "person 0 moves at 1.2 m/s" in line
+    assert told == [("term", []), ("scale", []), ("scale", [0]), ("term", [0])]
 
 
 def test_only_keypoints_tell_the_place_better_than_a_regressor_does():

@@ -71,6 +71,69 @@ def test_feet_that_slide_are_doubted(walk):
     assert doubts(walk + slow) == set()
 
 
+def test_whoever_steps_on_the_spot_is_doubted(walk):
+    """As on a treadmill: the middle of the path is taken away."""
+    time = np.arange(len(walk)) / FPS
+    gone = np.array([np.polyval(np.polyfit(time, x, 1), time) for x in walk[:, 0].T]).T
+    still = walk - (gone - gone[0])[:, None] * [1.0, 0.0, 1.0]
+    names = doubts(still)
+    assert "step_short_of_reach" in names and "gliding" not in names
+    # A scale that is far too small looks alike.
+    small = walk - 0.6 * (gone - gone[0])[:, None] * [1.0, 0.0, 1.0]
+    assert "step_short_of_reach" in doubts(small)
+
+
+def test_whoever_is_carried_on_is_doubted(walk):
+    """A moving walkway, which makes the walker as fast as a runner; and somebody who
+    rolls along without a step."""
+    time = np.arange(len(walk)) / FPS
+    way = (walk[-1, 0] - walk[0, 0]) * [1.0, 0.0, 1.0]
+    way /= np.linalg.norm(way)
+    onward = walk + time[:, None, None] * 1.0 * way
+    assert "step_beyond_reach" in doubts(onward)
+    rolling = np.repeat(walk[:1], len(walk), axis=0) + 3.0 * time[:, None, None] * way
+    assert doubts(rolling) == {"gliding"}
+    slowly = np.repeat(walk[:1], len(walk), axis=0) + 1.2 * time[:, None, None] * way
+    assert {"gliding", "standing_foot_speed"} <= doubts(slowly)
+
+
+def test_a_child_taken_for_an_adult_is_doubted_where_steps_are_quick(walk):
+    """All lengths are too large by the same factor: only time tells."""
+    child = walk * 1.1 / 1.7
+    quick = np.sqrt(1.7 / 1.1) * 1.25
+    assert "quick_steps" in doubts(child * 1.7 / 1.1, fps=FPS * quick)
+    assert doubts(walk) == set()
+
+
+def test_whoever_is_turned_from_the_body_given_is_doubted():
+    rng = np.random.default_rng(0)
+    given = Rotation.random(40, rng=rng)
+    noise = Rotation.from_rotvec(rng.normal(0, 0.15, (40, 3)))
+
+    def doubted(degrees):
+        turn = Rotation.from_rotvec([np.radians(degrees), 0.0, 0.0])
+        found = (given * noise * turn).as_matrix()
+        figure = figures.turned_from_body(found, given.as_rotvec())
+        return figure, judge(PERSON_CHECKS, {"turned_from_body": figure}) != []
+
+    assert doubted(5.0) == (pytest.approx(5.0, abs=3.0), False)
+    assert doubted(20.0) == (pytest.approx(20.0, abs=3.0), True)
+    # Front and back are no matter of degrees.
+    assert not doubted(175.0)[1]
+    few = figures.turned_from_body(given.as_matrix()[:5], given.as_rotvec()[:5])
+    assert np.isnan(few)
+
+
+def test_up_is_told_from_where_the_image_has_its_top(truth):
+    assert figures.up_in_image(truth.T_WC) < 30
+    for angle, axis in ((90.0, 2), (90.0, 0), (180.0, 2)):
+        turn = Rotation.from_rotvec(np.radians(angle) * np.eye(3)[axis]).as_matrix()
+        turned = truth.T_WC.copy()
+        turned[:, :3, :3] = turned[:, :3, :3] @ turn
+        told = {"up_in_image": figures.up_in_image(turned)}
+        assert [r.name for r in judge(WORLD_CHECKS, told)] == ["up_in_image"]
+
+
 def test_whoever_floats_or_sinks_is_doubted(walk):
     along = walk[:, :1] - walk[:1, :1]
     gone = np.linalg.norm(along, axis=-1, keepdims=True)

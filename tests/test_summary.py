@@ -102,6 +102,25 @@ def test_the_summary_says_who_and_what_is_left_out():
     assert not any("are used" in w for w in whole["warnings"])
 
 
+def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
+    made = synthetic.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    joint = rehearsal._joint(sequence)
+    cameras = dataclasses.replace(rehearsal._cameras(sequence), kind="moving")
+
+    def told(**changes):
+        one = dataclasses.replace(joint, **changes)
+        found = assemble(sequence, config, body, cameras, one, {}).summary
+        about = [r["name"] for r in found["reasons"] if r["name"].startswith("scale_")]
+        return found["status"], about
+
+    known = ScaleStart(motion=2.0, motion_error=0.1)
+    assert told(start=known, scale_sigma=0.05)[1] == []
+    assert told(start=ScaleStart(), scale_sigma=0.05)[1] == ["scale_unknown"]
+    turned = told(start=known, scale=-3.0, scale_sigma=-0.1)
+    assert turned == ("failed", ["scale_sign"])
+
+
 def test_steps_that_are_too_slow_for_people_are_told(monkeypatch):
     made = synthetic.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()

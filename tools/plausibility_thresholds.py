@@ -10,6 +10,7 @@ all. The tables stand in `benchmarks/plausibility.md`.
 """
 
 import argparse
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,8 +19,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import camera, motion, synthetic
-from bodyslam_jax.config import Simulation
+from bodyslam_jax import (
+    camera,
+    graph,
+    initialisation,
+    joint,
+    motion,
+    people,
+    synthetic,
+)
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.diagnostics import figures
 from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS
 
@@ -81,6 +90,42 @@ def simulated(number: int) -> Iterator[tuple[str, dict[str, float]]]:
             yield f"{settings.sequence}-{settings.family}", found
 
 
+def carried_of(paths: list[Path], frames: int = 90) -> tuple[int, list[str]]:
+    """Of how many pieces of motion capture, filmed by a camera that stands still, and
+    of which the motion model's steps would be left out."""
+    body = body_.load_body_model()
+    made = synthetic.as_sequence(synthetic.simulate(Simulation(length=frames), body))
+    there = np.ones((1, frames), bool)
+    roots = people.roots_from_bodies(made.bodies, body)
+    roots = dataclasses.replace(roots, present=there)
+    predictor = joint.motion_predictor(made, roots, body, Config())
+    still = jnp.asarray(np.tile(np.eye(4), (frames, 1, 1)))
+    number, found = 0, []
+    clips = (clip for path in paths for clip in motion.read_motion(path))
+    for clip in (clip for clip in clips if not clip.phase):
+        joints, poses = place(clip), np.reshape(clip.poses, (-1, 24, 3)).astype(float)
+        at = np.round(np.arange(frames) * clip.fps / made.fps).astype(int)
+        for start in range(0, len(joints) - at[-1], at[-1] + 1):
+            T_WH = np.tile(np.eye(4), (1, frames, 1, 1))
+            rows = start + at
+            T_WH[0, :, :3, :3] = Rotation.from_rotvec(poses[rows, 0]).as_matrix()
+            T_WH[0, :, :3, 3] = joints[rows, 0]
+            state = graph.State(
+                scale=jnp.asarray(1.0),
+                cameras=still,
+                roots=jnp.asarray(T_WH),
+                poses=jnp.asarray(poses[None, rows, 1:]),
+                shapes=jnp.zeros((1, 10)),
+                landmarks=jnp.zeros((1, 3)),
+                intrinsics=jnp.asarray(made.intrinsics.params),
+            )
+            seen = joint.predict(predictor, state)
+            number += 1
+            if initialisation.carried(state, seen, there, 1.0, made.fps):
+                found.append(clip.name)
+    return number, found
+
+
 def project(body, truth, sequence) -> np.ndarray:
     """The true body's keypoints in the images, px."""
     p_W = body_.keypoints(
@@ -126,11 +171,15 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("clips", type=Path, nargs="*")
     parser.add_argument("--simulations", type=int, default=10)
+    parser.add_argument("--steps", action="store_true", help="also who is carried")
     options = parser.parse_args()
     for seconds in SECONDS:
         rows = [row for path in options.clips for row in pieces(path, seconds)]
         if rows:
             print(f"## Motion capture, pieces of {seconds:g} s\n\n{table(rows)}\n")
+    if options.steps:
+        number, names = carried_of(options.clips)
+        print(f"Steps left out: {len(names)} of {number} pieces {names}\n")
     if options.simulations:
         rows = list(simulated(options.simulations))
         print(f"## Simulated sequences\n\n{table(rows)}")

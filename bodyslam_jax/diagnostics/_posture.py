@@ -42,6 +42,15 @@ def lower_foot_speed(
     return moved[np.arange(len(moved)), feet[:-1, :, 1].argmin(axis=1)]
 
 
+def slower_foot_speed(
+    joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
+) -> Float[np.ndarray, " u"]:
+    """Horizontal speed of the slower of the two feet, over `over` seconds, m/s."""
+    n = max(1, min(round(over * fps), len(joints) - 1))
+    feet = joints[:, list(FEET)][..., _PLAN]
+    return _length(feet[n:] - feet[:-n]).min(axis=1) * fps / n
+
+
 def joint_acceleration(
     joints: Float[np.ndarray, "t 24 3"], fps: float
 ) -> Float[np.ndarray, " u"]:

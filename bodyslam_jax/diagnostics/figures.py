@@ -2,9 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.diagnostics import _posture as posture
-from bodyslam_jax.export import gait_of_joints
+from bodyslam_jax.export import Gait, gait_of_joints
 from bodyslam_jax.gravity import find_stances
 
 _WALKING = (0.7, posture.RUNNING)
@@ -19,6 +20,18 @@ _FLOOR = 1.0
 """m that standing feet must be apart for the slope under them."""
 
 _STANDS_OUT = 2.2
+
+_FRONT_OR_BACK = 90.0
+"""degrees from which an orientation is another reading of the image, no error."""
+
+_STRIDE = 0.45
+"""Legs: who reaches so far with each step goes somewhere, or is on a treadmill."""
+_WALKS = (0.8, 1.4)
+"""Steps over their reach, of who walks: at least one foot is on the ground."""
+_RUNNERS_STEPS = 2.4
+"""Steps a second from which they may be a run's, between which no foot stands."""
+_GETS_ON = 0.8
+"""m/s from which feet have to stand, one after the other."""
 
 
 def person_figures(
@@ -42,10 +55,15 @@ def person_figures(
         "turn": float(joined(posture.turning_rate, fps, _MOMENT).max()),
         "velocity_jump": float(joined(posture.speed_change, fps, _MOMENT).max()),
     }
+    if speed.mean() > _GETS_ON:
+        slower = joined(posture.slower_foot_speed, fps, _MOMENT / 2)
+        found["gliding"] = float(100 * np.percentile(slower, 25) / speed.mean())
+    steps = gait_of_joints(max(runs, key=len), fps)
+    found |= _strides(steps)
     if speed.mean() < posture.RUNNING:
         sliding = joined(posture.lower_foot_speed, fps)
         found["standing_foot_speed"] = float(np.median(sliding))
-    if _goes_on_foot(runs, speed, fps):
+    if _goes_on_foot(steps, speed):
         found |= {
             "knee": float(knee.mean()),
             "straighter_knee": float(knee.min(axis=1).mean()),
@@ -76,6 +94,28 @@ def camera_figures(T_WC: Float[np.ndarray, "t 4 4"], fps: float) -> dict[str, fl
         ),
         "camera_turning": float(angle.max() * fps / n),
     }
+
+
+def up_in_image(T_WC: Float[np.ndarray, "t 4 4"]) -> float:
+    """Angle between up and the direction to the top of the image, degrees (median)."""
+    return float(np.degrees(np.median(np.arccos(np.clip(-T_WC[:, 1, 1], -1, 1)))))
+
+
+def turned_from_body(
+    turn: Float[np.ndarray, "t 3 3"], given: Float[np.ndarray, "t 3"]
+) -> float:
+    """By how much a person is turned, in all frames alike, from the body that was
+    given, degrees.
+
+    `turn` is the estimated orientation in the camera's frame, `given` (axis-angle,
+    rad) the regressor's, of the frames that have both. NaN where there are few, or
+    where they differ as front and back do: that is mended elsewhere.
+    """
+    if len(turn) < _FEWEST:
+        return np.nan
+    apart = Rotation.from_rotvec(given).inv() * Rotation.from_matrix(turn)
+    angle = float(np.degrees(np.linalg.norm(np.median(apart.as_rotvec(), axis=0))))
+    return angle if angle < _FRONT_OR_BACK else np.nan
 
 
 def floors_apart(
@@ -109,14 +149,24 @@ def keypoint_misfit(
     return worst if worst > _STANDS_OUT * np.median(share) else np.nan
 
 
-def _goes_on_foot(
-    runs: list[np.ndarray], speed: Float[np.ndarray, " u"], fps: float
-) -> bool:
+def _strides(steps: Gait | None) -> dict[str, float]:
+    """How far each step carries somebody, over how far it reaches."""
+    if steps is None or not steps.reach > _STRIDE:
+        return {}
+    figure = steps.step_over_reach
+    runner = steps.frequency > _RUNNERS_STEPS
+    beyond = "step_beyond_reach_of_runner" if runner else "step_beyond_reach"
+    found = {"step_short_of_reach": figure, beyond: figure}
+    if _WALKS[0] < figure < _WALKS[1]:
+        found["quick_steps"] = steps.frequency
+    return found
+
+
+def _goes_on_foot(steps: Gait | None, speed: Float[np.ndarray, " u"]) -> bool:
     """Whether somebody walks: regular steps, or a walker's speed most of the time."""
     slow, fast = _WALKING
     if slow < np.median(speed) < fast:
         return True
-    steps = gait_of_joints(max(runs, key=len), fps)
     return steps is not None and steps.step > _STEP and bool(speed.mean() < fast)
 
 

@@ -18,6 +18,10 @@ _EXCHANGED = np.array(
     + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
 )
 """BODY_25 with left and right exchanged."""
+_FEWEST, _MANY = 3, 8
+"""Keypoints from which sizes are compared, and are comparable."""
+_GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
+"""Ratio of sizes from which it is somebody else."""
 _SEEN = 0.05
 """Confidence from which a keypoint counts in comparing people."""
 
@@ -28,7 +32,10 @@ class _Person:
     frame: int
     """When they were last seen."""
     points: np.ndarray
+    """(25, 3): u px, v px, confidence; what is hidden has gone along with the rest."""
     velocity: np.ndarray
+    hidden: np.ndarray
+    """(25,): frames since each keypoint was last seen."""
 
     def predict(self, frame: int) -> np.ndarray:
         """Keypoints (25, 3) expected in `frame`; motion fades while unseen."""
@@ -37,12 +44,20 @@ class _Person:
         last[:, :2] += gap * self.velocity
         return last
 
-    def extend(self, frame: int, points: np.ndarray) -> None:
+    def extend(self, frame: int, points: np.ndarray, max_gap: int) -> None:
         gap = frame - self.frame
-        both = (points[:, 2] > _SEEN) & (self.points[:, 2] > _SEEN)
-        if both.any():
+        seen = points[:, 2] > _SEEN
+        both = seen & (self.points[:, 2] > _SEEN)
+        moved = self.velocity
+        if both.sum() >= _FEWEST:
             moved = np.median((points - self.points)[both, :2], axis=0) / gap
             self.velocity = 0.7 * self.velocity + 0.3 * moved
+        # Whoever is half hidden is still as large as before.
+        self.hidden = np.where(seen, 0, self.hidden + gap)
+        kept = ~seen & (self.points[:, 2] > _SEEN) & (self.hidden <= max_gap)
+        points = points.copy()
+        points[kept] = self.points[kept]
+        points[kept, :2] += gap * moved
         self.frame, self.points = frame, points
 
 
@@ -117,11 +132,12 @@ def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:
-                    alive[i].extend(frame, seen[j])
+                    alive[i].extend(frame, seen[j], max_gap)
                     who[j] = alive[i].number
         for j in np.flatnonzero(who < 0):
             who[j] = len(people)
-            people.append(_Person(len(people), frame, seen[j], np.zeros(2)))
+            unseen = np.zeros(len(seen[j]), int)
+            people.append(_Person(len(people), frame, seen[j], np.zeros(2), unseen))
         found.append(who)
     return found
 
@@ -169,10 +185,19 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
     distance = distance / size
     gap = frame - person.frame
     reach = 0.2 + 0.02 * (gap - 1)
-    ratio = _size(points) / max(_size(expected), 1.0)
-    if not 0.4 < ratio < 2.5:
+    if not _as_large(points, expected):
         return np.inf
     return float(0.7 * distance / reach + 0.3 * (1 - _overlap(points, expected)))
+
+
+def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether somebody may be as large as another, by the keypoints that both show."""
+    both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    if both.sum() < _FEWEST:
+        return True
+    most = _GROWTH if both.sum() >= _MANY else _GROWTH_OF_FEW
+    growth = _size(points[both]) / max(_size(expected[both]), 1.0)
+    return 1 / most < growth < most
 
 
 def _box(points: np.ndarray) -> np.ndarray:

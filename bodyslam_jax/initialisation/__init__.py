@@ -6,6 +6,8 @@ scale comes in closed form from the motion model, which is linear in s, and from
 ground under people's feet.
 """
 
+from bodyslam_jax.initialisation._carried import carried as carried
+from bodyslam_jax.initialisation._carried import lines_of_carried as lines_of_carried
 from bodyslam_jax.initialisation._factors import PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE
 from bodyslam_jax.initialisation._factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation._factors import landmark_sigma as landmark_sigma

@@ -1,7 +1,7 @@
 """The graph's error terms from what was measured (section 3.6 of the paper)."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -283,15 +283,19 @@ def motion_factor(
     weights: GraphWeights,
     *,
     shared_error: Float[np.ndarray, " h"] | float = 0.0,
+    without: Collection[int] = (),
 ) -> graph.HumanMotion:
     """The motion model's displacements, weighted by its own covariance, in lengths of
     the leg or, if the weights say so, in metres.
 
     `shared_error` is a share by which all of a person's steps may be wrong together:
-    they say no more of the scale than that allows, however many there are.
+    they say no more of the scale than that allows, however many there are. Of the
+    people in `without` they say nothing.
     """
     shared = jnp.broadcast_to(jnp.asarray(shared_error, shapes.dtype), len(shapes))
     step, whitening = _steps(seen, shapes, body, weights, shared[:, None, None, None])
+    if without:
+        whitening = whitening.at[np.array(list(without))].set(0.0)
     return graph.HumanMotion(
         translation=step,
         whitening=whitening,

@@ -1,6 +1,7 @@
 """The first scale in closed form: from how people move, and from where they stand."""
 
 import dataclasses
+from collections.abc import Collection
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,10 @@ class ScaleStart:
         errors = [self.motion_error, self.ground_error, self.path_error]
         return np.array(errors) ** -2.0
 
+    def without_motion(self) -> "ScaleStart":
+        """The same without the cue of people's motion."""
+        return dataclasses.replace(self, motion=1.0, motion_error=float("inf"))
+
     @property
     def value(self) -> float:
         """s; 1 if no cue says anything, so that the map stays in its own unit."""
@@ -70,14 +75,16 @@ def scale_start(
     *,
     shared_error: float = 0.0,
     path: float = float("nan"),
+    without: Collection[int] = (),
 ) -> ScaleStart:
     """The cues of scale: motion, the ground and a metric camera path if there are any.
 
     Args:
         shared_error: the share by which all steps may be wrong together.
         path: m per unit of the map, as the path has it; NaN without one.
+        without: people whose motion says nothing.
     """
-    start = _motion_scale(state, seen)
+    start = _motion_scale(state, seen, without)
     if np.isfinite(path):
         start = dataclasses.replace(start, path=path, path_error=PATH_SIGMA * path)
     error = float(np.hypot(start.motion_error, shared_error * start.motion))
@@ -127,13 +134,17 @@ def ground_contact(
 _scales = jit_once(lambda contact, state: contact.scales(state))
 
 
-def _motion_scale(state: graph.State, seen: motion.Prediction) -> ScaleStart:
+def _motion_scale(
+    state: graph.State, seen: motion.Prediction, without: Collection[int]
+) -> ScaleStart:
     """Robust regression of predicted on observed displacements, people averaged."""
     C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
     turn = C_WC @ state.roots[..., :3, :3]
     offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])
     found = []
     for h in range(len(state.roots)):
+        if h in without:
+            continue
         one = jax.tree.map(lambda x: x[h], seen)
         found.append(motion.scale_from_motion(one, turn[h], r_WC, offset[h]))
     usable = [f for f in found if np.isfinite(f.value) and f.value > 0]
