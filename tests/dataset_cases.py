@@ -76,7 +76,11 @@ def threedpw_data(world, num_people=2):
     T_CW, poses, trans, betas = world
     rng = np.random.default_rng(1)
     other = rng.normal(0, 0.3, (NUM, 72))
-    points = rng.uniform(5, 40, (NUM, 3, 18))
+    # COCO's 18 of a person who stands, as OpenPose orders them.
+    x = [40, 40, 32, 30, 30, 48, 50, 50, 36, 36, 36, 44, 44, 44, 38, 42, 36, 44]
+    y = [8, 14, 14, 22, 30, 14, 22, 30, 32, 44, 56, 32, 44, 56, 7, 7, 8, 8]
+    standing = np.array([x, y, np.ones(18)], float)
+    points = standing + rng.uniform(0, 1, (NUM, 3, 18)) * [[0.5], [0.5], [0.0]]
     points[2] = 0.0
     joints = rng.normal(0, 1, (NUM, 72))
     valid = np.array([1, 1, 1, 0, 1, 1])

@@ -186,6 +186,13 @@ def extra_factors(rng, state, seen=None):
             intrinsics=state.intrinsics[None], sigma=jnp.full((1, i), 20.0)
         ),
         g.SquarePixels(sigma=jnp.array([3.0])),
+        g.ScalePrior(scale=jnp.full(t, 1.6), sigma=jnp.full(t, jnp.inf).at[2].set(0.2)),
+        g.Stature(
+            template=jnp.asarray(1.7),
+            slope=0.05 * normal(10),
+            height=jnp.full((h, t), 1.8),
+            sigma=jnp.full((h, t), jnp.inf).at[:, 1].set(0.02),
+        ),
         g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
         g.RootSmoothness(sigma=late(h, t, skip=2), body=body),

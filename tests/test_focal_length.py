@@ -39,8 +39,7 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
     tracks, _ = scene("orbit", num=NUM)
     first = reconstruct(tracks, CAMERA, NUM)
     turning = dataclasses.replace(first, kind="rotation", error=error)
-    made = iter([first, turning])
-    monkeypatch.setattr(reconstruction, "_reconstruct", lambda *_: next(made))
+    monkeypatch.setattr(reconstruction, "_reconstruct", lambda *_: turning)
 
     def adjusted(cameras, sigma, config, guess):
         found = np.asarray(guess.params) * [0.9, 0.9, 1, 1]

@@ -34,7 +34,7 @@ from bodyslam_jax.motion._paper import PaperNetwork
 from bodyslam_jax.motion._predict import leg_length
 from bodyslam_jax.motion._rotations import matrix, vector
 from bodyslam_jax.motion._turning import straightened
-from bodyslam_jax.sequence import Intrinsics, Sequence
+from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -290,6 +290,7 @@ def test_weights_for_another_body_stop_a_run_at_its_door(
         frames=None,
         timestamps=np.arange(30) / 30,
         intrinsics=Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480),
+        keypoints=Keypoints(np.zeros((1, 30, 25, 2)), np.zeros((1, 30, 25))),
     )
     monkeypatch.setattr(frontend, "read_sequence", lambda *_, **__: sequence)
     monkeypatch.setattr(cli, "_prepare_jax", lambda: None)

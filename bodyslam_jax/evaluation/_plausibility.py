@@ -112,6 +112,8 @@ def _quantile(
     x: Float[Array, "*n"], valid: Bool[Array, "*#n"], share: float
 ) -> Float[Array, ""]:
     """Of what counts; NaN if nothing does, or if a number that counts is none."""
+    if not x.size:  # differences of one frame or two
+        return jnp.full((), jnp.nan, x.dtype)
     broken = jnp.any(jnp.isnan(x) & valid)
     found = jnp.nanquantile(jnp.where(valid, x, jnp.nan), jnp.asarray(share, x.dtype))
     return jnp.where(broken, jnp.nan, found)
