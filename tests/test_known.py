@@ -16,7 +16,7 @@ from bodyslam_jax import frontend, graph, initialisation, people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Known, Measured, Structure
 from bodyslam_jax.export import stature
-from bodyslam_jax.sequence import CameraPath, Keypoints, Sequence
+from bodyslam_jax.sequence import CameraPath, Keypoints, Sequence, Tracks
 
 
 def test_a_height_is_a_number_with_its_deviation_for_one_person_or_for_all():
@@ -223,6 +223,16 @@ def test_a_camera_on_a_tripod_is_not_looked_for():
     found = frontend.reconstruct(tracks, CAMERA, 20, Structure(), static=True)
     assert found.kind == "static"
     np.testing.assert_array_equal(found.T_WC, np.tile(np.eye(4), (20, 1, 1)))
+
+
+def test_before_a_bare_wall_a_tripod_will_do_and_a_path_is_refused():
+    rows = np.zeros(0, int)
+    nothing = Tracks(rows, rows, np.zeros((0, 2)))
+    found = frontend.reconstruct(nothing, CAMERA, 5, static=True)
+    assert found.kind == "static" and found.registered.all()
+    path = CameraPath(poses(5), np.ones(5, bool), True)
+    with pytest.raises(ValueError, match="0 sightings of points in 0 frames"):
+        frontend.reconstruct(nothing, CAMERA, 5, path=path)
 
 
 def a_person(frames=4):

@@ -100,7 +100,7 @@ def reconstruct(
     if path is not None:
         return _along(problem, path, config, refine)
     if static:
-        return _fixed(problem, np.ones(len(views.frame), bool), "static", None, ())
+        return _on_a_tripod(problem)
     first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
@@ -153,6 +153,20 @@ class _Problem:
     focal: float
 
 
+def _on_a_tripod(problem: _Problem) -> Reconstruction:
+    """A camera that is known to stand: located in every frame, points or none."""
+    if len(np.unique(problem.views.frame)) > 1:
+        every = np.ones(len(problem.views.frame), bool)
+        found = _fixed(problem, every, "static", None, ())
+    else:
+        found = _nothing(problem, "static", ())
+    return dataclasses.replace(
+        found,
+        T_WC=np.tile(np.eye(4), (problem.num_frames, 1, 1)),
+        registered=np.ones(problem.num_frames, bool),
+    )
+
+
 def _along(
     problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
 ) -> Reconstruction:
@@ -164,6 +178,14 @@ def _along(
     builder = Builder(problem.views, *size, problem.focal, config, refine)
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
+    if not len(tracked := np.unique(problem.views.frame)) or (
+        not grown.has_point.any() and len(problem.views.frame) < _TESTED
+    ):
+        raise ValueError(
+            f"camera path: {len(problem.views.frame)} sightings of points in "
+            f"{len(tracked)} frames, of which no map can be made along it; expected a "
+            "background with texture."
+        )
     share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
     if tested < _TESTED or share >= _EXPLAINED:
         return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
