@@ -26,23 +26,25 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodyslam_jax import frontend, synthetic
-from bodyslam_jax.cache import load, save
+from bodyslam_jax import io, sfm, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.sequence import Keypoints, Sequence, Tracks
+from bodyslam_jax.pipeline.stage_cache import load, save
+from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.types import Keypoints, Sequence, Tracks
 
 
 def simulated(folder: Path) -> Path:
     settings = Simulation(sequence="M1", family="follow", length=300, render=True)
-    return synthetic.write_sequence(folder, synthetic.simulate(settings), tracks=False)
+    return simulation.write_sequence(
+        folder, simulation.simulate(settings), tracks=False
+    )
 
 
 def extended(sequence: Sequence, num: int, folder: Path) -> Sequence:
     """The sequence there and back until it has `num` frames, as a video in `folder`."""
     have = sequence.num_frames
     order = np.abs((np.arange(num) + have - 1) % (2 * have - 2) - (have - 1))
-    images = [cv2.imencode(".png", i)[1] for i in frontend.frames(sequence)]
+    images = [cv2.imencode(".png", i)[1] for i in io.frames(sequence)]
     fps, path = sequence.fps, folder / "video.mp4"
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
@@ -64,7 +66,7 @@ def extended(sequence: Sequence, num: int, folder: Path) -> Sequence:
 
 
 def decode(sequence: Sequence, tracks: Tracks | None) -> None:
-    for _ in frontend.frames(sequence, gray=True):
+    for _ in io.frames(sequence, gray=True):
         pass
 
 
@@ -74,12 +76,12 @@ def masks(sequence: Sequence, tracks: Tracks | None) -> None:
 
 
 def track(sequence: Sequence, tracks: Tracks | None) -> Tracks:
-    return frontend.track(sequence)
+    return sfm.track(sequence)
 
 
-def structure(sequence: Sequence, tracks: Tracks | None) -> frontend.Reconstruction:
+def structure(sequence: Sequence, tracks: Tracks | None) -> sfm.Reconstruction:
     assert tracks is not None
-    return frontend.reconstruct(tracks, sequence.intrinsics, sequence.num_frames)
+    return sfm.reconstruct(tracks, sequence.intrinsics, sequence.num_frames)
 
 
 PARTS = {
@@ -102,7 +104,7 @@ def run(part: str, folder: Path) -> None:
     if isinstance(found, Tracks):
         save(file, found)
         said["note"] = f"{len(found.frame) / sequence.num_frames:.0f} points a frame"
-    if isinstance(found, frontend.Reconstruction):
+    if isinstance(found, sfm.Reconstruction):
         said["note"] = (
             f"{found.kind}, {found.registered.sum()} frames located, "
             f"{len(found.landmarks)} landmarks, {found.error:.2f} px"
@@ -125,7 +127,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         source = args.sequence or simulated(folder / "simulated")
-        sequence = dataclasses.replace(frontend.read_sequence(source), tracks=None)
+        sequence = dataclasses.replace(io.read_sequence(source), tracks=None)
         if args.frames and args.frames != sequence.num_frames:
             sequence = extended(sequence, args.frames, folder)
         save(folder / "sequence.npz", sequence)

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 BATCH, FRAMES, UPDATES = 4096, 1000, 3
-WALKS = Path(__file__).parents[1] / "bodyslam_jax/synthetic/assets/walking.npz"
+WALKS = Path(__file__).parents[1] / "bodyslam_jax/simulation/assets/walking.npz"
 SIZES = ((154, 1024, 1024, 1024), (1024, 1024, 1024, 3), (1024, 1024, 1024, 72))
 PRODUCTS = sum(a * b for part in SIZES for a, b in zip(part[:-1], part[1:]))
 
@@ -59,9 +59,8 @@ def in_jax(rounds):
         predict,
         read_motion,
     )
-    from bodyslam_jax.motion import _losses as losses
-    from bodyslam_jax.motion import _sampling as sampling
-    from bodyslam_jax.motion import _training as training
+    from bodyslam_jax.motion.training import losses, sampling
+    from bodyslam_jax.motion.training import train as training
 
     wait = jax.block_until_ready
     a = jnp.ones((4096, 1024), jnp.float32)

@@ -28,10 +28,10 @@ from solver_clock import timed
 from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights, Simulation
-from bodyslam_jax.experiments._case import make_case
-from bodyslam_jax.experiments._score import trajectories
-from bodyslam_jax.joint import COUPLED
+from bodyslam_jax.experiments.scenario import make_case
+from bodyslam_jax.experiments.scoring import trajectories
 from bodyslam_jax.motion import load_motion_model, make_clock, predict_between
+from bodyslam_jax.pipeline.joint_stage import COUPLED
 
 WAYS = ("frozen", "refreshed", "displacement", "full")
 WRONG = (0.8, 1.2)

@@ -19,9 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import graph, initialisation, motion, people, solver, synthetic
+from bodyslam_jax import (
+    graph,
+    initialisation,
+    motion,
+    people,
+    simulation,
+    solver,
+)
 from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
-from bodyslam_jax.joint import solve_stage
+from bodyslam_jax.pipeline.joint_stage import solve_stage
 
 MUTED = graph.RootSmoothness
 """Its weight is of the person's path in the world."""
@@ -29,21 +36,21 @@ MUTED = graph.RootSmoothness
 
 def draw(number, frames, family):
     """A simulated sequence: person, walk, camera and errors of its own."""
-    names = list(synthetic.LENGTH)
+    names = list(simulation.LENGTH)
     settings = Simulation(
         sequence=names[number % len(names)],
         family=family,
         length=frames,
         seed=zlib.crc32(f"person size {number}".encode()),
     )
-    return synthetic.simulate(settings, body_.load_body_model())
+    return simulation.simulate(settings, body_.load_body_model())
 
 
 def errors(simulated, weights):
     """Of the leg, as a share: the regressor's (its shrinkage undone), the estimate's,
     and the standard deviation that the covariance says."""
     body, config = body_.load_body_model(), Config()
-    sequence = synthetic.as_sequence(simulated)
+    sequence = simulation.as_sequence(simulated)
     bodies = people.estimate_bodies(sequence, body, PeopleFit())
     roots = people.roots_from_bodies(bodies, body)
     state = initialisation.first_state(

@@ -37,17 +37,17 @@ from solver_scene import make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, over_devices, solve
-from bodyslam_jax.solver._assembly import assemble
-from bodyslam_jax.solver._blocks import cast, sizes_of
-from bodyslam_jax.solver._chunks import factorise
-from bodyslam_jax.solver._curvature import curvature_of
-from bodyslam_jax.solver._landmarks import eliminate_landmarks
-from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._normal import Eliminated, damped, diagonals, solve_step
-from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._people import eliminate_people
-from bodyslam_jax.solver._tables import gather
-from bodyslam_jax.solver._window import window_of
+from bodyslam_jax.solver.block_cholesky import factorise
+from bodyslam_jax.solver.blocks import cast, sizes_of
+from bodyslam_jax.solver.elimination.person import eliminate_people
+from bodyslam_jax.solver.elimination.schur import eliminate_landmarks
+from bodyslam_jax.solver.front import window_of
+from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, solve_step
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.reduced_system import assemble
+from bodyslam_jax.solver.second_order import curvature_of
 
 
 def report(name, problem, truth, start, schedule, mixed, repeats):

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyslam_jax import frontend, pipeline, synthetic
+from bodyslam_jax import io, pipeline, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.experiments._detector import detection_figures
-from bodyslam_jax.experiments._video import filmed
-from bodyslam_jax.experiments._video_table import keypoint_table
+from bodyslam_jax.experiments.detector import detection_figures
+from bodyslam_jax.experiments.video import filmed
+from bodyslam_jax.experiments.video_table import keypoint_table
 
 
 def main() -> None:
@@ -34,10 +34,10 @@ def main() -> None:
                 seed=options.seed,
             )
         )
-        simulated = synthetic.simulate(settings)
+        simulated = simulation.simulate(settings)
         with tempfile.TemporaryDirectory() as folder:
-            film = synthetic.film_scene(Path(folder) / "film", simulated)
-            found = pipeline.find_people(frontend.read_sequence(film))
+            film = simulation.film_scene(Path(folder) / "film", simulated)
+            found = pipeline.find_people(io.read_sequence(film))
         row = detection_figures(simulated, found)
         people = 0 if found.keypoints is None else len(found.keypoints.uv)
         p = (simulated.joints - simulated.T_WC[:, None, :3, 3]) @ simulated.T_WC[

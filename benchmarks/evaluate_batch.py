@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from bodyslam_jax import evaluation
-from bodyslam_jax.result import Result
+from bodyslam_jax.types import Result
 
 
 def evaluate_pairs(pairs: list[tuple[Result, Result]]) -> evaluation.Evaluation:

@@ -6,7 +6,7 @@ from solver_scene import make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, marginals, solve
-from bodyslam_jax.solver._triangulation import tracks_of
+from bodyslam_jax.solver.retriangulation import tracks_of
 
 INLIERS = g.BlakeZisserman(4.5)
 """Of `robust` solutions' second half: what is no outlier keeps its weight."""

@@ -14,7 +14,7 @@ from solver_clock import reached, timed
 from solver_peers import LIMIT, NEAR, cost_of, note_of
 from solver_scene import make
 
-from bodyslam_jax.solver import Stage, _baselines, restrict, solve
+from bodyslam_jax.solver import Stage, baselines, restrict, solve
 
 CG_STEPS = 50
 """Of optimistix with conjugate gradients, at most."""
@@ -68,7 +68,7 @@ def joint_cg(problem, start, rtol):
     stage = Stage(max_steps=CG_STEPS, rtol=rtol)
 
     def run():
-        state, *_ = _baselines.optimistix_cg(problem, start, stage)
+        state, *_ = baselines.optimistix_cg(problem, start, stage)
         return float(cost_of(problem.follow(state), state))
 
     cost, _, seconds = timed(run, 1)
@@ -86,7 +86,7 @@ def joint_adam(problem, start, name):
         state, curves = start, []
         for stage in stages:
             held = restrict(problem, stage.free)
-            state, costs = _baselines.adam_curve(
+            state, costs = baselines.adam_curve(
                 held, state, stage, float(rate), decays=decays
             )
             curves.append(np.asarray(costs))

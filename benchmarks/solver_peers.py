@@ -15,7 +15,7 @@ from solver_clock import reached, timed
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.camera import MIN_DEPTH
+from bodyslam_jax.geometry.camera import MIN_DEPTH
 from bodyslam_jax.solver import Stage, solve
 
 NEAR = 1.001

@@ -10,7 +10,7 @@ import numpy as np
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
-from bodyslam_jax.camera import project
+from bodyslam_jax.geometry.camera import project
 
 INTRINSICS = np.array([900.0, 900.0, 640.0, 360.0])
 TRACK = 16.0

@@ -17,21 +17,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if TYPE_CHECKING:
     from bodyslam_jax.body import BodyModel as BodyModel
     from bodyslam_jax.body import load_body_model as load_body_model
-    from bodyslam_jax.result import Result as Result
-    from bodyslam_jax.sequence import Sequence as Sequence
+    from bodyslam_jax.types import Result as Result
+    from bodyslam_jax.types import Sequence as Sequence
 
 _HOME = {
     "BodyModel": "body",
     "MotionModel": "motion",
     "Problem": "graph",
-    "Result": "result",
-    "Sequence": "sequence",
+    "Result": "types",
+    "Sequence": "types",
     "State": "graph",
     "evaluate": "evaluation",
     "load_body_model": "body",
     "load_motion_model": "motion",
     "over_devices": "solver",
-    "read_sequence": "frontend",
+    "read_sequence": "io",
     "run": "pipeline",
     "solve": "solver",
 }

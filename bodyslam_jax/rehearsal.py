@@ -14,13 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import evaluation, export, initialisation, joint, people, view
-from bodyslam_jax.assembly import assemble
+from bodyslam_jax import evaluation, export, initialisation, people, view
 from bodyslam_jax.config import Config
-from bodyslam_jax.initialisation import ScaleStart
-from bodyslam_jax.outcome import Cameras, Joint
-from bodyslam_jax.result import Result
-from bodyslam_jax.sequence import Sequence, Tracks
+from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.pipeline.to_metric import assemble
+from bodyslam_jax.types import Cameras, Joint, Result, ScaleStart, Sequence, Tracks
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +82,9 @@ def _prediction(sequence: Sequence, body: body_.BodyModel, config: Config) -> No
     state = initialisation.first_state(
         cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
     )
-    joint.predict(joint.motion_predictor(sequence, roots, body, config), state)
+    joint_stage.predict(
+        joint_stage.motion_predictor(sequence, roots, body, config), state
+    )
 
 
 def _outcome(sequence: Sequence, body: body_.BodyModel, config: Config) -> Result:

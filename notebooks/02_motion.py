@@ -44,7 +44,7 @@ print(model.past, "past frames;", about["data"], "·", about["licence"])
 
 # %%
 clips = motion.read_motion(
-    Path(bs.__file__).parent / "synthetic" / "assets" / "walking.npz"
+    Path(bs.__file__).parent / "simulation" / "assets" / "walking.npz"
 )
 trials = motion.place(body, clips)
 trial = max(trials, key=lambda trial: len(trial.trans))

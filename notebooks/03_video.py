@@ -24,13 +24,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bodyslam_jax as bs
-from bodyslam_jax import evaluation, export, frontend, synthetic, view
+from bodyslam_jax import evaluation, export, io, simulation, view
 from bodyslam_jax.config import Config
 
 # %config InlineBackend.figure_formats = ["jpeg"]
 plt.rcParams["figure.dpi"] = 70
 jax.config.update("jax_enable_x64", True)
-source = synthetic.demo_scene(Path(tempfile.mkdtemp()) / "scene")
+source = simulation.demo_scene(Path(tempfile.mkdtemp()) / "scene")
 print(sorted(path.name for path in source.iterdir()))
 
 # %% [markdown]
@@ -57,7 +57,7 @@ for name in ("timestamps", "T_WC", "landmarks", "poses", "trans", "betas", "join
 body = bs.load_body_model()
 chosen = np.linspace(0, sequence.num_frames - 1, 4).astype(int)
 figure, axes = plt.subplots(1, 4, figsize=(14, 3))
-for k, image in enumerate(frontend.frames(sequence)):
+for k, image in enumerate(io.frames(sequence)):
     if k in chosen:
         axis = axes[np.flatnonzero(chosen == k)[0]]
         axis.imshow(view.draw_frame(image, result, body, k)[..., ::-1])

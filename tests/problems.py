@@ -11,14 +11,14 @@ from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
-from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import quick_options
+from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.kept import kept
-from bodyslam_jax.solver._blocks import mask_of, sizes_of
-from bodyslam_jax.solver._levenberg_marquardt import lifted
-from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._normal import damped, diagonals, eliminate, solve_step
-from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.levenberg_marquardt import lifted
+from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
 
 # One scene serves most tests, as shapes decide what is compiled.
 SEED = 2

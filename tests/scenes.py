@@ -9,7 +9,7 @@ import numpy as np
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
-from bodyslam_jax.camera import project
+from bodyslam_jax.geometry.camera import project
 
 INTRINSICS = np.array([600.0, 600.0, 320.0, 240.0])
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import accuracy
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.outcome import Cameras
-from bodyslam_jax.result import Result
-from bodyslam_jax.sequence import Tracks
+from bodyslam_jax.evaluation import before_after
+from bodyslam_jax.types import Cameras, Result, Tracks
 
 BODY = load_body_model()
 T = 30
@@ -70,8 +68,8 @@ def _cameras(kind: str = "moving") -> Cameras:
 
 def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
-    found = accuracy.errors(result, _cameras(), truth, BODY)
-    assert list(found) == [accuracy.ALONE, accuracy.JOINT]
+    found = before_after.errors(result, _cameras(), truth, BODY)
+    assert list(found) == [before_after.ALONE, before_after.JOINT]
     alone, joint = found.values()
     # In metres though the cameras are not: the truth's size is lent to them.
     assert alone["c_ate_sim3"] == pytest.approx(WOBBLE, rel=0.02)
@@ -85,7 +83,7 @@ def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
         assert alone[key] == "no scale"
     for key in ("h_ate_sim3", "w_mpjpe", "pa_mpjpe", "rte"):
         assert alone[key] == "no people"
-    first, second = accuracy.headline(found)
+    first, second = before_after.headline(found)
     assert "arbitrary scale: C-ATE, Sim(3) 19.9" in first and ";" not in first
     assert "in metres: C-ATE, SE(3) 4.9" in second and "H-ATE" in second
 
@@ -93,19 +91,23 @@ def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
 def test_a_run_without_people_has_no_metres_to_be_judged():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
     nobody = dataclasses.replace(result, present=np.zeros_like(result.present))
-    assert list(accuracy.errors(nobody, _cameras(), truth, BODY)) == [accuracy.ALONE]
+    assert list(before_after.errors(nobody, _cameras(), truth, BODY)) == [
+        before_after.ALONE
+    ]
 
 
 @pytest.mark.parametrize("kind", ["static", "rotation"])
 def test_a_camera_without_a_path_is_not_judged_alone(kind):
     truth = _result(_path(0.0))
-    assert list(accuracy.errors(truth, _cameras(kind), truth, BODY)) == [accuracy.JOINT]
+    assert list(before_after.errors(truth, _cameras(kind), truth, BODY)) == [
+        before_after.JOINT
+    ]
 
 
 def test_a_truth_without_cameras_judges_people_only():
     result = _result(_path(0.0))
     truth = dataclasses.replace(result, summary={"has_camera": False})
-    found = accuracy.errors(result, _cameras(), truth, BODY)
-    assert list(found) == [accuracy.JOINT]
-    (line,) = accuracy.headline(found)
+    found = before_after.errors(result, _cameras(), truth, BODY)
+    assert list(found) == [before_after.JOINT]
+    (line,) = before_after.headline(found)
     assert "C-ATE" not in line and "H-ATE" in line

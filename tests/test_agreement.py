@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 import bodyslam_jax as bs
 from bodyslam_jax import body as body_
-from bodyslam_jax import frontend
+from bodyslam_jax import io
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import reconcile
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 W, H, FOCAL = 640, 480, 525.0
 CAMERA = Intrinsics(np.array([FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2]), W, H)
@@ -494,7 +494,7 @@ def folder(tmp_path, uv, confidence, size=(W, H)):
 def test_fewer_files_than_frames_are_said(tmp_path):
     keypoints = sequence().keypoints
     path = folder(tmp_path, keypoints.uv[0, :25], keypoints.confidence[0, :25])
-    found = frontend.read_sequence(path)
+    found = io.read_sequence(path)
     assert (
         "numbered 0 to 24 for 60 frames: taken as counted from 0, the first 25"
         in said(found)
@@ -510,7 +510,7 @@ def test_keypoints_of_a_phones_video_as_it_is_stored(tmp_path, clockwise):
     u, v = shown[..., 0], shown[..., 1]
     stored = np.stack([W - 1 - v, u] if clockwise else [v, H - 1 - u], -1)
     path = folder(tmp_path, stored, keypoints.confidence[0], (H, W))
-    found = frontend.read_sequence(path)
+    found = io.read_sequence(path)
     np.testing.assert_allclose(found.keypoints.uv[0], shown, atol=1e-9)
     assert "before the video's rotation" in said(found)
 
@@ -524,6 +524,6 @@ def test_a_tools_own_focal_length_is_taken(tmp_path):
     far = (trans + J_0) * [1, 1, 800 / FOCAL] - J_0
     file = path / "wham_output.pkl"
     file.write_bytes(pickle.dumps({0: {**one, "trans": far, "pose_world": poses}}))
-    found = frontend.read_sequence(path, bodies=file)
+    found = io.read_sequence(path, bodies=file)
     np.testing.assert_allclose(found.bodies.trans[0], trans, atol=0.02)
     assert "its default of 800 px" in said(found) and "525 px" in said(found)

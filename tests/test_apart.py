@@ -13,11 +13,11 @@ from problems import make, structured_step
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import KEYPOINT_NAMES
-from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian, turning_joints
+from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
 from bodyslam_jax.solver import solve
-from bodyslam_jax.solver._apart import solve_apart
-from bodyslam_jax.solver._blocks import Linearisation
-from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver.apart import solve_apart
+from bodyslam_jax.solver.blocks import Linearisation
+from bodyslam_jax.solver.padding import pad
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

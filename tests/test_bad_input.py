@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyslam_jax import cli, people, reconstruction
+from bodyslam_jax import cli, people
+from bodyslam_jax.pipeline import sfm_stage
 
 NUM, WIDTH, HEIGHT = 8, 64, 48
 CAMERA = {
@@ -98,7 +99,7 @@ def command(monkeypatch, capsys, tmp_path):
 
     monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
     monkeypatch.setattr(people, "estimate_bodies", reached)
-    monkeypatch.setattr(reconstruction, "estimate", reached)
+    monkeypatch.setattr(sfm_stage, "estimate", reached)
 
     def run(*argv) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])

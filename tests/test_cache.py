@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyslam_jax import cache as cache_
-from bodyslam_jax.cache import Cache, fingerprint, load, save
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.sequence import Intrinsics, Sequence, Tracks
+from bodyslam_jax.pipeline import stage_cache
+from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint, load, save
+from bodyslam_jax.types import Intrinsics, Sequence, Tracks
 
 
 def _sequence() -> Sequence:
@@ -115,7 +115,7 @@ def test_fingerprint_sees_the_body_that_the_machine_has(tmp_path, monkeypatch):
     for content in (b"one", b"two"):
         (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
         monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(tmp_path))
-        file = cache_.body_model_file(None)
+        file = stage_cache.body_model_file(None)
         assert file == tmp_path / "SMPL_NEUTRAL.npz"
         found = fingerprint(Config())
         assert found != before
@@ -126,5 +126,5 @@ def test_fingerprint_sees_the_body_that_the_machine_has(tmp_path, monkeypatch):
 def test_fingerprint_sees_the_package(monkeypatch):
     """Another state of the source may compute something else."""
     before = fingerprint(1)
-    monkeypatch.setattr(cache_, "_package", lambda: b"edited")
+    monkeypatch.setattr(stage_cache, "_package", lambda: b"edited")
     assert fingerprint(1) != before

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from bodyslam_jax import camera
+from bodyslam_jax.geometry import camera
 
 PINHOLE = np.array([500.0, 510.0, 320.0, 240.0])
 DISTORTED = np.array([500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -2e-3])

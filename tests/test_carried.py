@@ -12,12 +12,12 @@ import scenes
 from bodyslam_jax import motion
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.initialisation import (
-    ScaleStart,
     carried,
     lines_of_carried,
     motion_factor,
     scale_start,
 )
+from bodyslam_jax.types import ScaleStart
 
 T, FPS, SCALE = 60, 20.0, 3.0
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from body_cases import make_raw, write
 
-from bodyslam_jax import cli, doctor
-from bodyslam_jax.cli import _run as commands
+from bodyslam_jax import cli
+from bodyslam_jax.cli import doctor
+from bodyslam_jax.cli import run as commands
 from bodyslam_jax.config import Config
 
 
@@ -196,7 +197,7 @@ def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
 def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
     import jax
 
-    from bodyslam_jax.cli import _run as commands
+    from bodyslam_jax.cli import run as commands
 
     kept = jax.config.jax_compilation_cache_dir
     caplog.set_level("INFO")

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from bodyslam_jax.cli._settings import read_settings
+from bodyslam_jax.cli.settings import read_settings
 from bodyslam_jax.config import (
     Association,
     Config,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 import bodyslam_jax.graph as g
 from bodyslam_jax import solver
-from bodyslam_jax.graph._padding import Masked
+from bodyslam_jax.graph.padding import Masked
 
 T = 7
 """Frames: the solver rounds them up to 10."""

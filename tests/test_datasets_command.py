@@ -20,7 +20,7 @@ from dataset_cases import (
 from test_cli import _run
 
 from bodyslam_jax import evaluation, export
-from bodyslam_jax.evaluation._datasets import read_truth
+from bodyslam_jax.evaluation.datasets import read_truth
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

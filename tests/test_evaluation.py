@@ -15,7 +15,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from bodyslam_jax import evaluation
 from bodyslam_jax.body import joints, keypoints, load_body_model
 from bodyslam_jax.evaluation import Trajectories
-from bodyslam_jax.result import Result
+from bodyslam_jax.types import Result
 
 NUM = 250
 """Frames: two chunks of 100 and a short one."""

@@ -23,7 +23,7 @@ from dataset_cases import (
 import bodyslam_jax as bs
 from bodyslam_jax import evaluation
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.evaluation._datasets import read_truth
+from bodyslam_jax.evaluation.datasets import read_truth
 
 pytestmark = pytest.mark.usefixtures("quick_compilation", "no_body_models")
 

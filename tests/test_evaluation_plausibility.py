@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import evaluation, synthetic
+from bodyslam_jax import evaluation, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.diagnostics import _posture as posture
+from bodyslam_jax.diagnostics import posture
 
 FPS = 30.0
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return synthetic.as_truth(
-        synthetic.simulate(
+    return simulation.as_truth(
+        simulation.simulate(
             Simulation(sequence="M1", family="follow", length=60, noise="none", seed=3)
         )
     )

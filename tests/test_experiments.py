@@ -16,24 +16,24 @@ import scenes
 from matplotlib.figure import Figure
 
 import bodyslam_jax.graph as g
-from bodyslam_jax import cli, experiments, motion, solver, synthetic
+from bodyslam_jax import cli, experiments, motion, simulation, solver
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import (
-    _ablation,
-    _about,
-    _figures,
-    _paper,
-    _plans,
-    _reports,
-    _tables,
-    _weights,
+    ablation,
+    figures,
+    paper,
+    plans,
+    provenance,
+    reports,
+    tables,
+    weights,
 )
-from bodyslam_jax.experiments._case import simulations
-from bodyslam_jax.experiments._journal import Journal, fits
-from bodyslam_jax.experiments._plans import PLANS
-from bodyslam_jax.experiments._problems import with_scale
-from bodyslam_jax.experiments._score import NAMES, PLAUSIBLE
-from bodyslam_jax.experiments._structure import shake
+from bodyslam_jax.experiments.plans import PLANS
+from bodyslam_jax.experiments.problems import with_scale
+from bodyslam_jax.experiments.row_cache import Journal, fits
+from bodyslam_jax.experiments.scenario import simulations
+from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBLE
+from bodyslam_jax.experiments.structural_landmarks import shake
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
 """Postures held: compiled in a few seconds."""
@@ -183,15 +183,15 @@ def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
     learn = lambda steps, **kw: experiments.learn_weights(
         trials, steps=steps, names=names, **kw
     )
-    monkeypatch.setattr(_weights, "error_and_gradient", _steep(calls := []))
+    monkeypatch.setattr(weights, "error_and_gradient", _steep(calls := []))
     whole = learn(6)
     assert len(calls) == 12 and (np.diff(whole.history) < 0).all()
 
     file = tmp_path / "stages" / "progress.npz"
-    monkeypatch.setattr(_weights, "error_and_gradient", _steep([], last=7))
+    monkeypatch.setattr(weights, "error_and_gradient", _steep([], last=7))
     with pytest.raises(KeyboardInterrupt):
         learn(6, progress=file)
-    monkeypatch.setattr(_weights, "error_and_gradient", _steep(calls := []))
+    monkeypatch.setattr(weights, "error_and_gradient", _steep(calls := []))
     rest = learn(6, progress=file)
     assert len(calls) == 6  # three steps were done
     np.testing.assert_array_equal(rest.history, whole.history)
@@ -245,36 +245,36 @@ def test_forms_of_rows():
 
 def test_tables_as_text():
     columns = [
-        _tables.Column("sequence", "sequence"),
-        _tables.Column("error, mm", "error", 1e3),
-        _tables.Column("|1 - s|", "scale", digits=3),
-        _tables.Column("status", "status"),
+        tables.Column("sequence", "sequence"),
+        tables.Column("error, mm", "error", 1e3),
+        tables.Column("|1 - s|", "scale", digits=3),
+        tables.Column("status", "status"),
     ]
     rows = [
         {"sequence": "E1", "error": 0.0443, "scale": 0.94, "status": "converged"},
         {"sequence": "E2", "error": 0.0508, "scale": None, "status": "converged"},
     ]
-    assert _tables.markdown(columns, rows, mean=True).splitlines() == [
+    assert tables.markdown(columns, rows, mean=True).splitlines() == [
         r"| sequence | error, mm | \|1 - s\| | status |",
         "| --- | --- | --- | --- |",
         "| E1 | 44.3 | 0.940 | converged |",
         "| E2 | 50.8 | – | converged |",
         "| **mean** | 47.5 |  |  |",
     ]
-    lines = _tables.to_csv(columns, rows).splitlines()
+    lines = tables.to_csv(columns, rows).splitlines()
     assert lines[1].split(",") == ["E1", "44.3", "0.94", "converged"]
-    told = _tables.to_csv(columns, rows, "seed 3").splitlines()
+    told = tables.to_csv(columns, rows, "seed 3").splitlines()
     assert told[0].endswith(",data") and told[2].endswith(",converged,seed 3")
 
 
 def test_papers_figures_are_the_papers():
-    row = _paper.table1_row("M3")
+    row = paper.table1_row("M3")
     assert row["no_mm/c_ate_se3"] == pytest.approx(0.3921)
     assert row["full/j_ate_sim3"] == pytest.approx(0.1719)
     assert row["no_mm/scale"] == 0.354 and row["full/scale"] == 0.985
-    mean = np.mean([_paper.table1_row(s)["full/c_ate_se3"] for s in _paper.TABLE1])
+    mean = np.mean([paper.table1_row(s)["full/c_ate_se3"] for s in paper.TABLE1])
     assert mean == pytest.approx(0.0837, abs=1e-4)  # what the issue quotes
-    third = np.array(list(_paper.STRUCTURE.values())).mean(axis=0)
+    third = np.array(list(paper.STRUCTURE.values())).mean(axis=0)
     np.testing.assert_allclose(third[2:], [158.662, 155.572], atol=1e-3)
 
 
@@ -294,7 +294,7 @@ def test_choice_of_sequences():
 def test_sequences_of_one_seed_are_not_copies_of_one_another():
     on = Experiment(seed=1, frames=2)
     settings = simulations(on, ("E1", "M1"), ("room", "follow"))
-    shapes = [synthetic.simulate(s).person.shape for s in settings]
+    shapes = [simulation.simulate(s).person.shape for s in settings]
     for i, shape in enumerate(shapes):
         assert all(np.abs(shape - other).max() > 0.1 for other in shapes[:i])
     assert simulations(on, ("E1", "M1"), ("room", "follow")) == settings
@@ -311,7 +311,7 @@ def test_seed_goes_for_what_is_shaken_too(tmp_path, monkeypatch):
         seeds.append(compute.keywords["seed"])
         return []
 
-    monkeypatch.setattr(_plans, "by_sequence", by_sequence)
+    monkeypatch.setattr(plans, "by_sequence", by_sequence)
     for seed in (None, 3):
         PLANS["landmarks"](Experiment(seed=seed), Config(), tmp_path)
     assert seeds == [0, 3]
@@ -434,7 +434,7 @@ def made_up(monkeypatch):
 def undrawn(monkeypatch):
     """Pictures take longer than all else."""
     for name in ("draw_table", "draw_paths"):
-        monkeypatch.setattr(_figures, name, lambda *given: None)
+        monkeypatch.setattr(figures, name, lambda *given: None)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -474,18 +474,18 @@ def test_what_is_not_finite_stays_missing(tmp_path, made_up):
 @pytest.mark.usefixtures("undrawn")
 def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
     named = lambda setting: setting and Path(setting)
-    monkeypatch.setattr(_about, "body_model_file", named)
-    plain = _about.about(Experiment(), Config())
+    monkeypatch.setattr(provenance, "body_model_file", named)
+    plain = provenance.about(Experiment(), Config())
     assert plain == "Simulated sequences, noise level `real`."
     weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
     config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
-    assert _about.about(Experiment(motion="walk.npz"), config) == (
+    assert provenance.about(Experiment(motion="walk.npz"), config) == (
         f"{plain} Not as by default: motion of `walk.npz`; `body_model` b.npz; "
         "`motion_model` m.npz; `weights.pixel_sigma` 2.0."
     )
     paper = dataclasses.replace(Config.paper(), motion_coupling="refreshed")
     told = "Not as by default: preset `paper`; `motion_coupling` refreshed."
-    assert _about.deviations(Experiment(), paper) == told
+    assert provenance.deviations(Experiment(), paper) == told
     on, _ = made_up
     for seed in (3, 4):
         again = dataclasses.replace(on, seed=seed)
@@ -518,11 +518,11 @@ def test_learning_weights_costs_a_compilation(tmp_path):
 
 
 def test_axes_of_figures(tmp_path):
-    assert _figures._log_mm([5.0, np.nan, 80.0]) == (1.0, 120.0)
-    assert _figures._log_mm([0.03, 2.0]) == pytest.approx((0.01, 10.0))
-    assert _figures._log_mm([np.nan, 0.0]) == (1.0, 10.0)
+    assert figures._log_mm([5.0, np.nan, 80.0]) == (1.0, 120.0)
+    assert figures._log_mm([0.03, 2.0]) == pytest.approx((0.01, 10.0))
+    assert figures._log_mm([np.nan, 0.0]) == (1.0, 10.0)
     axis = Figure().subplots()
-    _figures._draw_ratios(axis, np.arange(3), np.array([0.98, 7.3, np.nan]))
+    figures._draw_ratios(axis, np.arange(3), np.array([0.98, 7.3, np.nan]))
     assert axis.get_xlim() == pytest.approx((0.945, 1.055))
     assert [text.get_text() for text in axis.texts] == ["7.30"]
 
@@ -533,7 +533,7 @@ def test_reports_of_made_up_rows(tmp_path):
     row = {"sequence": "M2-room", "perturbation": p, "scale": [5.1, 0.102]}
     row |= {"deviation": [0.02, 0.02], "spread": 1e-5}
     row |= {"history": [[1.0, 5.1], [1.0, 0.102]], "h_ate": curve}
-    _reports.write_scale(tmp_path, [row], about="Simulated.")
+    reports.write_scale(tmp_path, [row], about="Simulated.")
     text = (tmp_path / "scale.md").read_text()
     assert "| M2-room | 5.0 | 5.1000 | 2.00 | 900.0 | 100.0 | 3.673 | 26.5 |" in text
     # Six perturbations have no mean, nor have the answers to them.
@@ -542,7 +542,7 @@ def test_reports_of_made_up_rows(tmp_path):
     row = {"sequence": "E2-room", "status": "converged", "status_no_landmarks": "-"}
     stages = ("original", "start", "perturbed", "no_landmarks", "landmarks")
     row |= {name: 0.1 for name in stages} | {f"{n}/scale": 1.0 for n in stages}
-    _reports.write_structure(tmp_path, [row], about="Simulated.")
+    reports.write_structure(tmp_path, [row], about="Simulated.")
     text = (tmp_path / "landmarks.md").read_text()
     both = "100.0 | 193.0 | 100.0 | 100.0 | 213.1 | 100.0 | 139.7 | 100.0 | 138.5"
     assert f"| E2-room | {both} |" in text
@@ -553,7 +553,7 @@ def test_reports_of_made_up_rows(tmp_path):
     short = {"sequence": "M2-room", "label": "no ground", "status": "no such term"}
     more = {**row, "label": "motion model short", "past": 2.0}
     rows = [row, short, more]
-    (*_, picture) = _reports.write_ablation(tmp_path, rows, about="Simulated.")
+    (*_, picture) = reports.write_ablation(tmp_path, rows, about="Simulated.")
     assert picture.name == "ablation_M2-room.png" and picture.stat().st_size > 0
     text = (tmp_path / "ablation.md").read_text()
     assert "| no keypoints | 20.0 | 20.0 | 20.0 | 20.0 | – | – | – |" in text
@@ -568,11 +568,11 @@ def test_reports_of_made_up_rows(tmp_path):
     for when in ("before", "after"):
         one |= {f"{when}/{k}": 0.5 for k in ("error", "scale", "j_ate_se3")}
     other = {**one, "set": "test", "sequence": "D1-room"}
-    _reports.write_weights(tmp_path, [row, one, other], about="Simulated.")
+    reports.write_weights(tmp_path, [row, one, other], about="Simulated.")
     text = (tmp_path / "weights.md").read_text()
     assert "| shape | 2.00 | 0.25 |" in text and "## test sequences" in text
     # Learnt, and interrupted before any sequence was judged.
-    _reports.write_weights(tmp_path, [row], about="Simulated.")
+    reports.write_weights(tmp_path, [row], about="Simulated.")
     assert "| shape | 2.00 | 0.25 |" in (tmp_path / "weights.md").read_text()
 
 
@@ -604,11 +604,11 @@ def few(tmp_path, monkeypatch, quick_compilation):
     """Less of everything that is many times the same; a motion model of one's own."""
     names = ("full", "no landmarks", "no smooth path", "no places seen again")
     chosen = {name: experiments.VARIANTS[name] for name in names}
-    monkeypatch.setattr(_plans, "VARIANTS", chosen)
+    monkeypatch.setattr(plans, "VARIANTS", chosen)
     name = "errors of frames independent"
-    monkeypatch.setattr(_ablation, "SETTINGS", {name: _ablation.SETTINGS[name]})
-    monkeypatch.setattr(_plans, "NOISE_LEVELS", ("low",))
-    monkeypatch.setattr(_plans, "LEARNING_STEPS", 3)
+    monkeypatch.setattr(ablation, "SETTINGS", {name: ablation.SETTINGS[name]})
+    monkeypatch.setattr(plans, "NOISE_LEVELS", ("low",))
+    monkeypatch.setattr(plans, "LEARNING_STEPS", 3)
     file = tmp_path / "own.npz"
     shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
     return str(file)
@@ -662,10 +662,10 @@ def test_every_plan_on_forty_frames(tmp_path, few, caplog):
     assert own["past"] == full["past"] == motion.load_motion_model(few).past
     assert own["j_ate_se3"] == pytest.approx(full["j_ate_se3"], rel=1e-3)
     assert full["c_ate_se3"] < 0.01 < ablated["no landmarks"]["c_ate_se3"]
-    first, *others = (ablated[order]["cost"] for order in _ablation.ORDERS)
+    first, *others = (ablated[order]["cost"] for order in ablation.ORDERS)
     assert first == pytest.approx(full["cost"], rel=1e-3) and first < min(others)
     known = {"converged", "no such term"}
-    first_order = lambda name: "order" in name or name == _ablation.PUBLISHED
+    first_order = lambda name: "order" in name or name == ablation.PUBLISHED
     solved = [row for name, row in ablated.items() if not first_order(name)]
     assert {row["status"] for row in solved} <= known
 

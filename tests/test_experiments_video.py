@@ -5,29 +5,29 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bodyslam_jax import evaluation, synthetic
+from bodyslam_jax import evaluation, simulation
 from bodyslam_jax.body import KEYPOINT_NAMES, load_body_model
 from bodyslam_jax.config import Config, Experiment
-from bodyslam_jax.experiments import _video
-from bodyslam_jax.experiments._detector import detection_figures
-from bodyslam_jax.experiments._journal import fits
-from bodyslam_jax.experiments._plans import PLANS
-from bodyslam_jax.experiments._video_table import write_video
-from bodyslam_jax.sequence import Keypoints
+from bodyslam_jax.experiments import video
+from bodyslam_jax.experiments.detector import detection_figures
+from bodyslam_jax.experiments.plans import PLANS
+from bodyslam_jax.experiments.row_cache import fits
+from bodyslam_jax.experiments.video_table import write_video
+from bodyslam_jax.types import Keypoints
 
 NAMES = KEYPOINT_NAMES["body25"]
 
 
 @pytest.fixture(scope="module")
 def simulated():
-    return synthetic.simulate(
-        synthetic.Simulation(sequence="E3", length=90, seed=5, noise="none")
+    return simulation.simulate(
+        simulation.Simulation(sequence="E3", length=90, seed=5, noise="none")
     )
 
 
 def moved(simulated, name, offset):
     """Exact keypoints, but one is off by `offset` m in its joint's frame."""
-    sequence = synthetic.as_sequence(simulated)
+    sequence = simulation.as_sequence(simulated)
     person, walk = simulated.person, simulated.walk
     G, joints = person.joints(walk.poses, walk.pelvis)
     k = NAMES.index(name)
@@ -65,7 +65,7 @@ def test_offset_of_a_keypoint_is_found_in_the_body_frame(simulated, side):
 
 
 def test_who_is_not_found_and_what_is_something_else_is_counted(simulated):
-    sequence = synthetic.as_sequence(simulated)
+    sequence = simulation.as_sequence(simulated)
     uv, confidence = (
         x.copy() for x in (sequence.keypoints.uv, sequence.keypoints.confidence)
     )
@@ -92,15 +92,15 @@ def test_difficulty_of_the_scenes_and_rows_of_the_plan(tmp_path):
 
 
 def test_tables_have_means_with_standard_errors(simulated, tmp_path):
-    truth = synthetic.as_truth(simulated)
+    truth = simulation.as_truth(simulated)
     pair = evaluation.associate(truth, truth, load_body_model())
     same = evaluation.evaluate(*pair)
-    detected = detection_figures(simulated, synthetic.as_sequence(simulated))
+    detected = detection_figures(simulated, simulation.as_sequence(simulated))
     rows = []
     for k, name in enumerate(("E1-room", "E2-room")):
-        for which in _video.INPUTS:
+        for which in video.INPUTS:
             row = {"sequence": name, "input": which, "status": "ok"}
-            row |= {key: float(same[key]) for key in _video.FIGURES} | {"size": 1.0}
+            row |= {key: float(same[key]) for key in video.FIGURES} | {"size": 1.0}
             row["h_ate_sim3"] = 0.04 + 0.01 * k
             if which == "pixels":
                 row |= detected
@@ -117,10 +117,10 @@ def test_tables_have_means_with_standard_errors(simulated, tmp_path):
 @pytest.mark.slow
 def test_a_short_sequence_from_pixels_alone(tmp_path):
     """The person is found, and what a row must have is there."""
-    plain = synthetic.Simulation(sequence="E1", family="follow", length=30, seed=11)
-    settings = _video.filmed(plain)
-    row = _video.video_row(settings, "pixels", Config(), tmp_path)
-    assert fits(row | {"sequence": "E1-follow"}, _video.FORM)
+    plain = simulation.Simulation(sequence="E1", family="follow", length=30, seed=11)
+    settings = video.filmed(plain)
+    row = video.video_row(settings, "pixels", Config(), tmp_path)
+    assert fits(row | {"sequence": "E1-follow"}, video.FORM)
     assert row["found"] > 0.9 and len(row["keypoints"]) == 25
     assert 0.5 < row["scale"] < 2 and row["pa_mpjpe"] < 0.15
     film = next(tmp_path.glob("E1-follow-*/film"))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import evaluation, export
 from bodyslam_jax.body import joints, load_body_model
-from bodyslam_jax.result import Result
+from bodyslam_jax.types import Result
 
 
 @dataclasses.dataclass(frozen=True)

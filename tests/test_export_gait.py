@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import export, synthetic
+from bodyslam_jax import export, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.summary import _slow_motion
+from bodyslam_jax.export.summary import _slow_motion
 
 PERIOD, FPS, SPEED, THIGH = 36, 30.0, 1.35, 0.4
 
 
 @pytest.fixture(scope="module")
 def walk():
-    made = synthetic.simulate(Simulation(sequence="M1", length=120))
-    return synthetic.as_truth(made)
+    made = simulation.simulate(Simulation(sequence="M1", length=120))
+    return simulation.as_truth(made)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from scipy.signal import savgol_filter
 
 from bodyslam_jax import export
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.export import _facts as facts
-from bodyslam_jax.result import Result
+from bodyslam_jax.export import statistics as facts
+from bodyslam_jax.types import Result
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
-from bodyslam_jax import reconstruction
 from bodyslam_jax.config import Config
-from bodyslam_jax.frontend import reconstruct
-from bodyslam_jax.sequence import Intrinsics, Sequence
+from bodyslam_jax.pipeline import sfm_stage
+from bodyslam_jax.sfm import reconstruct
+from bodyslam_jax.types import Intrinsics, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 NUM = 24
@@ -24,7 +24,7 @@ def sequence(tracks, factor: float, num: int) -> Sequence:
 def test_a_guess_off_by_a_fifth_is_corrected():
     """Where the camera goes round something; the standard deviation says how well."""
     tracks, truth = scene("orbit", num=NUM)
-    found = reconstruction.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
+    found = sfm_stage.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
     assert found.kind == "moving"
     assert abs(found.focal / 260 - 1) < 0.03
     assert abs(found.focal - 260) < 3 * found.focal_sigma < 0.15 * 260
@@ -39,7 +39,7 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
     tracks, _ = scene("orbit", num=NUM)
     first = reconstruct(tracks, CAMERA, NUM)
     turning = dataclasses.replace(first, kind="rotation", error=error)
-    monkeypatch.setattr(reconstruction, "_reconstruct", lambda *_: turning)
+    monkeypatch.setattr(sfm_stage, "_reconstruct", lambda *_: turning)
 
     def adjusted(cameras, sigma, config, guess):
         found = np.asarray(guess.params) * [0.9, 0.9, 1, 1]
@@ -47,8 +47,8 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
             cameras, intrinsics=found, focal_sigma=1.0, pixel_sigma=0.3
         )
 
-    monkeypatch.setattr(reconstruction, "_adjusted", adjusted)
-    found = reconstruction.estimate(sequence(tracks, 1.0, NUM), tracks, Config())
+    monkeypatch.setattr(sfm_stage, "_adjusted", adjusted)
+    found = sfm_stage.estimate(sequence(tracks, 1.0, NUM), tracks, Config())
     assert found.kind == kind
     np.testing.assert_allclose(found.focal, 0.9 * CAMERA.params[0])
 
@@ -57,7 +57,7 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
 def test_a_guess_is_kept_where_the_path_says_nothing():
     """Sideways before a wall, depth and focal length trade off against each other."""
     tracks, _ = scene("sideways", num=NUM, planar=True)
-    found = reconstruction.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
+    found = sfm_stage.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
     assert found.kind == "moving" and np.isnan(found.focal_sigma)
     np.testing.assert_allclose(
         found.intrinsics, CAMERA.params * [0.8, 0.8, 1, 1], rtol=1e-4

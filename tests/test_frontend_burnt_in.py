@@ -12,8 +12,8 @@ from test_frontend_motion import (
     write_images,
 )
 
-from bodyslam_jax.frontend import reconstruct, track, without_burnt_in
-from bodyslam_jax.sequence import Tracks
+from bodyslam_jax.sfm import reconstruct, track, without_burnt_in
+from bodyslam_jax.types import Tracks
 
 
 def with_text(tracks, num, share, rng, shown=None):

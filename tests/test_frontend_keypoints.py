@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.config import Association
-from bodyslam_jax.frontend import read_sequence
-from bodyslam_jax.frontend._association import associate
-from bodyslam_jax.frontend._keypoints import read_detections
-from bodyslam_jax.frontend._numbering import Unfit, frames_of_names
+from bodyslam_jax.io import read_sequence
+from bodyslam_jax.io.frame_index import Unfit, frames_of_names
+from bodyslam_jax.io.keypoints.associate import associate
+from bodyslam_jax.io.keypoints.reader import read_detections
 
 NUM, WIDTH, HEIGHT = 20, 320, 240
 

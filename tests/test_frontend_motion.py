@@ -10,17 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.config import Simulation, Structure, Tracking
-from bodyslam_jax.frontend import _structure, frames, read_sequence, reconstruct, track
-from bodyslam_jax.frontend._bundle import Scene, Views, adjust, errors
-from bodyslam_jax.frontend._features import match, spread
-from bodyslam_jax.frontend._geometry import resect
-from bodyslam_jax.frontend._mapper import Growing
-from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.frontend._reconstruct import interpolate_poses
-from bodyslam_jax.frontend._structure import Builder, build_map
-from bodyslam_jax.frontend._video import look_at
-from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence, Tracks
-from bodyslam_jax.synthetic import as_sequence, simulate
+from bodyslam_jax.io import frames, read_sequence
+from bodyslam_jax.io.video import look_at
+from bodyslam_jax.sfm import incremental, reconstruct, track
+from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
+from bodyslam_jax.sfm.features import match, spread
+from bodyslam_jax.sfm.incremental import Builder, build_map
+from bodyslam_jax.sfm.multiview import resect
+from bodyslam_jax.sfm.partial_map import Growing
+from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.sfm.sfm import interpolate_poses
+from bodyslam_jax.simulation import as_sequence, simulate
+from bodyslam_jax.types import Intrinsics, Keypoints, Sequence, Tracks
 
 SHARED = Path(__file__).parents[2] / "shared"
 SIZE = (320, 240)
@@ -306,7 +307,7 @@ def test_a_camera_that_turns_on_where_it_hardly_moves_is_located(monkeypatch):
     found = reconstruct(tracks, CAMERA, 60)
     assert found.registered.all()
     assert camera_error(found.T_WC, truth) < 0.05
-    monkeypatch.setattr(_structure, "_RELAXED", 0)
+    monkeypatch.setattr(incremental, "_RELAXED", 0)
     assert not reconstruct(tracks, CAMERA, 60).registered.all()
 
 
@@ -461,8 +462,8 @@ def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
     tracks = Tracks(tracks.frame[now] - first, landmark, tracks.uv[now])
     truth = simulated.T_WC[first : first + num]
     away = []
-    for thin in (_structure._THIN, 0):
-        monkeypatch.setattr(_structure, "_THIN", thin)
+    for thin in (incremental._THIN, 0):
+        monkeypatch.setattr(incremental, "_THIN", thin)
         config = Structure(join_tracks=False)
         found = reconstruct(tracks, sequence.intrinsics, num, config)
         assert found.registered.all()

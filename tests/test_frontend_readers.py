@@ -16,22 +16,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.config import Association
-from bodyslam_jax.frontend import read_sequence
-from bodyslam_jax.frontend._association import associate
-from bodyslam_jax.frontend._bodies import read_bodies
-from bodyslam_jax.frontend._calibration import (
+from bodyslam_jax.io import read_sequence
+from bodyslam_jax.io.bodies.perspective import crop_camera, full_translation
+from bodyslam_jax.io.bodies.reader import read_bodies
+from bodyslam_jax.io.camera.calibration import (
     as_opencv,
     guess_camera,
     project_points,
     rays,
     read_camera,
 )
-from bodyslam_jax.frontend._keypoints import read_detections
-from bodyslam_jax.frontend._layouts import to_body25
-from bodyslam_jax.frontend._numbering import gap_among
-from bodyslam_jax.frontend._perspective import crop_camera, full_translation
-from bodyslam_jax.frontend._pickle import restricted_load
-from bodyslam_jax.sequence import Intrinsics, Keypoints
+from bodyslam_jax.io.frame_index import gap_among
+from bodyslam_jax.io.keypoints.associate import associate
+from bodyslam_jax.io.keypoints.layouts import to_body25
+from bodyslam_jax.io.keypoints.reader import read_detections
+from bodyslam_jax.io.safe_pickle import restricted_load
+from bodyslam_jax.types import Intrinsics, Keypoints
 
 NUM, WIDTH, HEIGHT = 8, 64, 48
 CAMERA = Intrinsics(np.array([80.0, 82.0, 30.0, 25.0]), WIDTH, HEIGHT)
@@ -945,7 +945,7 @@ def test_images_alone_are_enough_in_the_order_of_their_numbers(tmp_path):
     for k in range(11):
         image = np.full((HEIGHT, WIDTH), 20 * k, dtype=np.uint8)
         cv2.imwrite(str(tmp_path / f"frame{k}.png"), image)
-    from bodyslam_jax.frontend import frames
+    from bodyslam_jax.io import frames
 
     found = read_sequence(tmp_path)
     means = [int(image.mean()) for image in frames(found, gray=True)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_frontend_motion import SIZE, plane_images
 
-from bodyslam_jax.frontend import read_sequence
+from bodyslam_jax.io import read_sequence
 
 
 def write(path, images, fps=30.0):

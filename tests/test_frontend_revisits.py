@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import synthetic
+from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation, Structure
-from bodyslam_jax.frontend import cut_tracks, reconstruct, told_by_other_pieces
-from bodyslam_jax.frontend._bundle import Scene, Views, errors, jacobian_of_points
-from bodyslam_jax.frontend._relocate import near, relocate, with_moved
-from bodyslam_jax.frontend._revisits import Revisits, told_by_others
+from bodyslam_jax.sfm import cut_tracks, reconstruct, told_by_other_pieces
+from bodyslam_jax.sfm.bundle import Scene, Views, errors, jacobian_of_points
+from bodyslam_jax.sfm.loop_closure import Revisits, told_by_others
+from bodyslam_jax.sfm.relocalise import near, relocate, with_moved
 
 PIXEL = 1 / 500
 
@@ -217,8 +217,8 @@ def test_long_tracks_are_cut_into_pieces_that_know_of_each_other(scene):
 
 def test_a_camera_that_turns_back_keeps_the_size_of_its_map():
     """The same tracks, joined and not: a room filmed for eight seconds."""
-    made = synthetic.simulate(Simulation(sequence="D1", family="room", length=240))
-    sequence = synthetic.as_sequence(made)
+    made = simulation.simulate(Simulation(sequence="D1", family="room", length=240))
+    sequence = simulation.as_sequence(made)
     error = {}
     for joined in (True, False):
         found = reconstruct(

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, SIZE, plane_images, scene
 
-from bodyslam_jax.frontend import _video, frames, read_sequence, reconstruct, track
-from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.sequence import Keypoints, Sequence, Tracks
+from bodyslam_jax.io import frames, read_sequence, video
+from bodyslam_jax.sfm import reconstruct, track
+from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.types import Keypoints, Sequence, Tracks
 
 
 def write(path: Path, images, fps: float = 25.0) -> Path:
@@ -52,7 +53,7 @@ def test_a_video_is_turned_as_it_asks(tmp_path, matrix, size, corner):
     image[:16, :16] = 250  # the sensor's first corner
     path = write(tmp_path / "a.mp4", [image] * 4)
     turn(path, matrix)
-    footage = _video.look_at(path)
+    footage = video.look_at(path)
     assert (footage.width, footage.height) == size
     for shown in frames(path, gray=True):
         assert shown.shape == size[::-1]
@@ -66,7 +67,7 @@ def test_a_video_is_turned_as_it_asks(tmp_path, matrix, size, corner):
 
 def test_a_steady_rate_is_left_as_it_is():
     times = 3.0 + np.arange(50) / 29.97
-    found, picks, warnings = _video.resampled(Path("a.mp4"), times, 29.97)
+    found, picks, warnings = video.resampled(Path("a.mp4"), times, 29.97)
     np.testing.assert_allclose(found, times - 3.0)
     assert picks is None and warnings == ()
 
@@ -76,7 +77,7 @@ def test_a_variable_rate_is_thinned_to_its_clock():
     steady = np.arange(60) / 30
     burst = steady[20] + np.arange(1, 8) / 240
     times = np.sort(np.concatenate([np.delete(steady, [40, 41]), burst]))
-    found, picks, warnings = _video.resampled(Path("a.mp4"), times, 30.0)
+    found, picks, warnings = video.resampled(Path("a.mp4"), times, 30.0)
     assert len(warnings) == 1 and "variable frame rate" in warnings[0]
     assert "58 of 65 frames used" in warnings[0]
     np.testing.assert_allclose(found, times[picks])
@@ -85,7 +86,7 @@ def test_a_variable_rate_is_thinned_to_its_clock():
 
 def test_a_variable_rate_without_a_burst_is_not_said_to_be_resampled():
     times = np.delete(np.arange(60) / 30, [30])
-    found, picks, warnings = _video.resampled(Path("a.mp4"), times, 30.0)
+    found, picks, warnings = video.resampled(Path("a.mp4"), times, 30.0)
     np.testing.assert_array_equal(found, times)
     assert picks is None and len(warnings) == 1
     assert "all frames used" in warnings[0] and "resampled" not in warnings[0]
@@ -119,7 +120,7 @@ def test_nobody_is_masked_before_they_come(tmp_path):
 
 def test_times_that_do_not_increase_are_made_up():
     times = np.array([0.0, 0.04, 0.04, 0.08])
-    found, picks, warnings = _video.resampled(Path("a.mp4"), times, 25.0)
+    found, picks, warnings = video.resampled(Path("a.mp4"), times, 25.0)
     np.testing.assert_allclose(found, np.arange(4) / 25)
     assert picks is None and "25 frames/s taken" in warnings[0]
 
@@ -153,9 +154,9 @@ def test_what_belongs_to_frames_left_out_is_left_out(tmp_path, monkeypatch):
     dense = np.concatenate([np.arange(6) / 25, 5 / 25 + np.arange(1, 4) / 200])
     times = np.concatenate([dense, 6 / 25 + np.arange(3) / 25])
     wanted = [0, 1, 2, 3, 4, 5, 9, 10, 11]
-    resampled = _video.resampled
+    resampled = video.resampled
     monkeypatch.setattr(
-        _video, "resampled", lambda path, _, rate: resampled(path, times, rate)
+        video, "resampled", lambda path, _, rate: resampled(path, times, rate)
     )
     sequence = read_sequence(tmp_path)
     np.testing.assert_allclose(sequence.timestamps, np.arange(9) / 25, atol=1e-9)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.frontend._bodies import read_bodies
-from bodyslam_jax.frontend._given_tracks import read_tracks
-from bodyslam_jax.frontend._perspective import crop_camera
-from bodyslam_jax.sequence import Bodies, Intrinsics
+from bodyslam_jax.io.bodies.perspective import crop_camera
+from bodyslam_jax.io.bodies.reader import read_bodies
+from bodyslam_jax.io.tracks import read_tracks
+from bodyslam_jax.types import Bodies, Intrinsics
 
 NUM = 20
 CAMERA = Intrinsics(np.array([525.0, 525.0, 319.5, 239.5]), 640, 480)

@@ -17,8 +17,8 @@ from problems import bent, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
-from bodyslam_jax.graph._keypoint_curvature import keypoint_curvature
-from bodyslam_jax.graph._keypoint_jacobian import keypoint_jacobian
+from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
+from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 import scenes
 
-from bodyslam_jax import (
-    export,
-    graph,
-    initialisation,
-    motion,
-    summary,
-)
+from bodyslam_jax import export, graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.ground import find_ground
-from bodyslam_jax.initialisation import ScaleStart
-from bodyslam_jax.result import Result
+from bodyslam_jax.export import summary
+from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.types import Result, ScaleStart
 
 
 def scene(factor: float = 1.0, tilt: float = 0.0, num: int = 40) -> Result:

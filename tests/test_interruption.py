@@ -14,9 +14,9 @@ import pytest
 from test_frontend_motion import plane_images
 from test_people_detect import constant_network, raw_output
 
-from bodyslam_jax import cli, frontend, people, pipeline
-from bodyslam_jax.cache import Cache
+from bodyslam_jax import cli, io, people, pipeline, sfm
 from bodyslam_jax.config import Config
+from bodyslam_jax.pipeline.stage_cache import Cache
 
 NUM = 8
 
@@ -68,8 +68,8 @@ def test_stages_that_were_done_are_not_done_again(
     def tracked_again(*args, **kwargs):
         raise AssertionError("tracked again")
 
-    monkeypatch.setattr(frontend, "track", tracked_again)
-    monkeypatch.setattr(frontend, "reconstruct", tracked_again)
+    monkeypatch.setattr(sfm, "track", tracked_again)
+    monkeypatch.setattr(sfm, "reconstruct", tracked_again)
     caplog.set_level("INFO")
     code, _ = command("run", sequence, "--out", out)
     assert code == 130
@@ -113,11 +113,11 @@ def test_an_interrupt_that_became_another_error_is_an_interrupt(
         except KeyboardInterrupt as error:
             raise SystemError("initialization failed") from error
 
-    monkeypatch.setattr(frontend, "track", broken)
+    monkeypatch.setattr(sfm, "track", broken)
     code, said = command("run", sequence, "--out", tmp_path / "run")
     assert code == 130 and "the same command continues it" in said
     cli._INTERRUPTS.clear()
-    monkeypatch.setattr(frontend, "track", lambda *a, **k: 1 / 0)
+    monkeypatch.setattr(sfm, "track", lambda *a, **k: 1 / 0)
     assert command("run", sequence, "--out", tmp_path / "run")[0] == 3
 
 
@@ -176,7 +176,7 @@ def test_people_are_detected_where_nobody_gave_keypoints(
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             pipeline.run(
-                frontend.read_sequence(sequence), config, cache=Cache(tmp_path / "c")
+                io.read_sequence(sequence), config, cache=Cache(tmp_path / "c")
             )
         monkeypatch.setattr(people, "detect_people", lambda *a, **k: pytest.fail("!"))
     for found in seen:

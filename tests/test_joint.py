@@ -8,12 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bodyslam_jax import graph, initialisation, joint, motion, people, solver
+from bodyslam_jax import graph, initialisation, motion, people, solver
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights
-from bodyslam_jax.initialisation import ScaleStart
-from bodyslam_jax.outcome import Cameras
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence, Tracks
+from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.types import (
+    Bodies,
+    Cameras,
+    Intrinsics,
+    Keypoints,
+    ScaleStart,
+    Sequence,
+    Tracks,
+)
 
 T = 4
 
@@ -68,14 +75,14 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
-    monkeypatch.setattr(joint, "predict", lambda *_: None)
-    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
+    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
     sequence = dataclasses.replace(
         _sequence(None if fitted else _bodies()), keypoints=seen if fitted else None
     )
     weights = GraphWeights(step_error=0.07, fitted_step_error=0.31)
-    prepared = joint.prepare(
+    prepared = joint_stage.prepare(
         sequence,
         _cameras(),
         _bodies(),
@@ -105,10 +112,10 @@ def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
-    monkeypatch.setattr(joint, "predict", lambda *_: None)
-    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
+    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     body = load_body_model(dtype=jnp.float64)
-    prepare = lambda: joint.prepare(
+    prepare = lambda: joint_stage.prepare(
         _sequence(_bodies()), _cameras(), _bodies(), body, Config()
     )
     cue = {}
@@ -186,10 +193,10 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, shot):
     monkeypatch.setattr(
         initialisation, "scale_start", lambda *_, **__: ScaleStart(2.0, 0.1)
     )
-    monkeypatch.setattr(joint, "predict", lambda *_: None)
-    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
+    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint.prepare(sequence, cameras, _bodies(), body, Config())
+    prepared = joint_stage.prepare(sequence, cameras, _bodies(), body, Config())
     free = np.asarray(prepared.problem.free.cameras)
     assert not free[~located].any()
     # The first and one coordinate of the farthest of those that are left.
@@ -241,7 +248,7 @@ def test_sizes_that_nobody_measured_are_as_uncertain_as_people_differ():
         landmarks=zeros((0, 3, 3)),
     )
     there = np.array([True])
-    found = joint.of_fitted_sizes(spread, state, body, np.array([0.4]), there)
+    found = joint_stage.of_fitted_sizes(spread, state, body, np.array([0.4]), there)
     np.testing.assert_allclose(found.shapes[0], np.eye(10), rtol=1e-12)
     # The leg's slope by differences.
     leg = lambda shape: float(motion.leg_length(body, jnp.asarray(shape)))
@@ -257,9 +264,9 @@ def test_sizes_that_nobody_measured_are_as_uncertain_as_people_differ():
         **{name: twice(getattr(state, name)) for name in ("shapes", "roots", "poses")},
     )
     absent = np.array([True, False])
-    alone = joint.of_fitted_sizes(two, both, body, np.array([0.4, 0.4]), absent)
+    alone = joint_stage.of_fitted_sizes(two, both, body, np.array([0.4, 0.4]), absent)
     np.testing.assert_allclose(alone.scale, found.scale)
-    measured = joint.of_fitted_sizes(spread, state, body, np.array([1.0]), there)
+    measured = joint_stage.of_fitted_sizes(spread, state, body, np.array([1.0]), there)
     np.testing.assert_array_equal(measured.shapes, spread.shapes)
     np.testing.assert_array_equal(measured.scale, spread.scale)
 
@@ -293,7 +300,7 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
 
 
 def test_metres_are_not_known_where_nobody_tells_them():
-    sigma = joint._scale_sigma
+    sigma = joint_stage._scale_sigma
     assert sigma(0.04, moving=True, told=True) == pytest.approx(0.2)
     # Held at 1, the scale has no variance; that is not to know it.
     assert sigma(0.0, moving=True, told=False) == np.inf
@@ -333,7 +340,7 @@ def test_the_weight_of_landmarks_is_what_was_asked_for(weights, expected):
     nobody = Bodies(np.zeros((0, T), bool), rows(72), rows(10), rows(3))
     config = dataclasses.replace(Config(), weights=weights)
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint.prepare(_sequence(None), cameras, nobody, body, config)
+    prepared = joint_stage.prepare(_sequence(None), cameras, nobody, body, config)
     track, prior = prepared.problem.factors
     assert isinstance(track, graph.Reprojection)
     assert isinstance(prior, graph.LandmarkPrior)
@@ -402,13 +409,13 @@ def test_postures_are_held_to_predictions_only_where_there_are_any(
     """Not in the frames after a gap, in which what stands there means nothing."""
     valid = np.array([[False, False, True, False]])
     predicted = _prediction(jnp.zeros(3), jnp.asarray(valid[0]))
-    monkeypatch.setattr(joint, "predict", lambda *_: predicted)
-    monkeypatch.setattr(joint, "_settle_people", lambda _, state, __: (state, {}))
+    monkeypatch.setattr(joint_stage, "predict", lambda *_: predicted)
+    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
     config = dataclasses.replace(Config.paper(), motion_coupling=coupling)
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint.prepare(sequence, _cameras(), _bodies(), body, config)
+    prepared = joint_stage.prepare(sequence, _cameras(), _bodies(), body, config)
     (factor,) = (f for f in prepared.problem.factors if isinstance(f, graph.Posture))
     known = np.isfinite(np.asarray(factor.sigma)).all(axis=-1)
     np.testing.assert_array_equal(known, valid)

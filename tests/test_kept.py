@@ -13,7 +13,7 @@ from jax.experimental.compilation_cache import compilation_cache
 import bodyslam_jax.graph as g
 from bodyslam_jax import kept as kept_
 from bodyslam_jax.kept import FOLDER, kept
-from bodyslam_jax.solver import _solve, solve
+from bodyslam_jax.solver import solve
 
 traced: list[object] = []
 
@@ -155,8 +155,8 @@ def test_the_solver_from_disk_finds_the_same_and_says_so(folder, monkeypatch):
     start = scenes.perturb(rng, problem, truth)
     found = []
     for _ in range(2):
-        program = kept(_solve._run, lambda: None)
-        monkeypatch.setattr(_solve, "_program", lambda alone, p=program: p)
+        program = kept(solve._run, lambda: None)
+        monkeypatch.setattr(solve, "_program", lambda alone, p=program: p)
         found.append(solve(problem, start))
     assert len(list(folder.iterdir())) == 1
     first, second = found

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyslam_jax.frontend._keypoint_names import layout_of, names_in
-from bodyslam_jax.frontend._keypoints import read_detections
-from bodyslam_jax.frontend._layouts import LAYOUTS, from_layout
+from bodyslam_jax.io.keypoints.layouts import LAYOUTS, from_layout
+from bodyslam_jax.io.keypoints.names import layout_of, names_in
+from bodyslam_jax.io.keypoints.reader import read_detections
 
 NUM, WIDTH, HEIGHT = 24, 640, 480
 NAMES = (

@@ -12,11 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_frontend_motion import CAMERA, camera_error, scene
 
-from bodyslam_jax import frontend, graph, initialisation, people
+from bodyslam_jax import graph, initialisation, io, people, sfm
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Known, Measured, Structure
 from bodyslam_jax.export import stature
-from bodyslam_jax.sequence import CameraPath, Keypoints, Sequence, Tracks
+from bodyslam_jax.types import CameraPath, Keypoints, Sequence, Tracks
 
 
 def test_a_height_is_a_number_with_its_deviation_for_one_person_or_for_all():
@@ -133,7 +133,7 @@ def test_cameras_and_paths_of_other_programs_are_read(tmp_path, footage, kind):
     else:
         camera, path = write_colmap(*arguments, kind == "binary")
     known = Known(camera_path=str(path), camera_path_metric=True, fps=30.0)
-    sequence = frontend.read_sequence(footage, camera=camera, known=known)
+    sequence = io.read_sequence(footage, camera=camera, known=known)
     # COLMAP's pixels begin at a corner.
     expected = [500.0, 510.0, 320.0, 240.0]
     np.testing.assert_allclose(sequence.intrinsics.params[:4], expected)
@@ -150,7 +150,7 @@ def test_a_trajectory_is_taken_at_the_times_of_frames(tmp_path, footage):
     path = tmp_path / "path.txt"
     path.write_text("\n".join(lines))
     known = Known(camera_path=str(path), fps=25.0)
-    found = frontend.read_sequence(footage, known=known).camera_path
+    found = io.read_sequence(footage, known=known).camera_path
     assert found is not None and found.known.all() and not found.metric
     np.testing.assert_allclose(found.T_WC[:, 0, 3], np.arange(8) / 25, atol=1e-9)
     np.testing.assert_allclose(found.T_WC[:, 2, 3], np.arange(8) / 12.5, atol=1e-9)
@@ -170,7 +170,7 @@ def test_a_camera_file_that_is_none_is_named(tmp_path, footage, name, content, t
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(ValueError, match=text) as error:
-        frontend.read_sequence(footage, camera=path)
+        io.read_sequence(footage, camera=path)
     assert str(path) in str(error.value)
 
 
@@ -180,21 +180,21 @@ def test_a_path_of_another_video_is_refused(tmp_path, footage):
     (tmp_path / "one.txt").write_text("5.0 0 0 0 0 0 0 1\n")
     for file in (path, tmp_path / "one.txt", tmp_path / "nothing.txt"):
         with pytest.raises(ValueError, match=str(file)):
-            frontend.read_sequence(footage, known=Known(camera_path=str(file)))
+            io.read_sequence(footage, known=Known(camera_path=str(file)))
 
 
 def test_only_what_lies_between_start_and_end_is_read(footage):
     known = Known(fps=10.0, start=0.2, end=0.5)
-    sequence = frontend.read_sequence(footage, known=known)
+    sequence = io.read_sequence(footage, known=known)
     np.testing.assert_allclose(sequence.timestamps, [0.2, 0.3, 0.4, 0.5])
-    shown = [int(image[0, 0, 0]) for image in frontend.frames(sequence)]
+    shown = [int(image[0, 0, 0]) for image in io.frames(sequence)]
     assert shown == [40, 60, 80, 100]
     with pytest.raises(ValueError, match="no frame between 3 and inf s"):
-        frontend.read_sequence(footage, known=Known(fps=10.0, start=3.0))
+        io.read_sequence(footage, known=Known(fps=10.0, start=3.0))
 
 
 def test_a_given_focal_length_is_no_guess(footage):
-    sequence = frontend.read_sequence(footage, known=Known(focal="700±10", fps=30.0))
+    sequence = io.read_sequence(footage, known=Known(focal="700±10", fps=30.0))
     camera = sequence.intrinsics
     assert camera.params[0] == camera.params[1] == 700.0
     assert camera.focal_sigma == 10.0 and not camera.is_guess and camera.is_refined
@@ -207,7 +207,7 @@ def test_a_given_focal_length_is_no_guess(footage):
 def test_points_seen_along_a_known_path_make_a_metric_map():
     tracks, truth = scene("sideways", num=40)
     path = CameraPath(truth, np.arange(40) % 5 != 3, True)
-    found = frontend.reconstruct(tracks, CAMERA, 40, path=path)
+    found = sfm.reconstruct(tracks, CAMERA, 40, path=path)
     assert found.kind == "moving" and found.registered.all()
     assert camera_error(found.T_WC, truth) < 0.01
     travelled = np.linalg.norm(truth[-1, :3, 3] - truth[0, :3, 3])
@@ -215,12 +215,12 @@ def test_points_seen_along_a_known_path_make_a_metric_map():
     np.testing.assert_allclose(found.unit * mapped, travelled, rtol=1e-3)
     turned_round = CameraPath(np.linalg.inv(truth), path.known, True)
     with pytest.raises(ValueError, match="% of the points in the images fit it"):
-        frontend.reconstruct(tracks, CAMERA, 40, path=turned_round)
+        sfm.reconstruct(tracks, CAMERA, 40, path=turned_round)
 
 
 def test_a_camera_on_a_tripod_is_not_looked_for():
     tracks, _ = scene("sideways", num=20)
-    found = frontend.reconstruct(tracks, CAMERA, 20, Structure(), static=True)
+    found = sfm.reconstruct(tracks, CAMERA, 20, Structure(), static=True)
     assert found.kind == "static"
     np.testing.assert_array_equal(found.T_WC, np.tile(np.eye(4), (20, 1, 1)))
 
@@ -228,11 +228,11 @@ def test_a_camera_on_a_tripod_is_not_looked_for():
 def test_before_a_bare_wall_a_tripod_will_do_and_a_path_is_refused():
     rows = np.zeros(0, int)
     nothing = Tracks(rows, rows, np.zeros((0, 2)))
-    found = frontend.reconstruct(nothing, CAMERA, 5, static=True)
+    found = sfm.reconstruct(nothing, CAMERA, 5, static=True)
     assert found.kind == "static" and found.registered.all()
     path = CameraPath(poses(5), np.ones(5, bool), True)
     with pytest.raises(ValueError, match="0 sightings of points in 0 frames"):
-        frontend.reconstruct(nothing, CAMERA, 5, path=path)
+        sfm.reconstruct(nothing, CAMERA, 5, path=path)
 
 
 def a_person(frames=4):

@@ -116,7 +116,7 @@ def test_factorisations_of_two_threads_end(tmp_path):
         tmp_path,
         """
         import os, threading
-        from bodyslam_jax.solver._triangular import half_of
+        from bodyslam_jax.solver.triangular import half_of
 
         square = np.random.default_rng(0).normal(size=(160, 69, 69))
         matrix = jnp.asarray(square @ square.transpose(0, 2, 1) + 69 * np.eye(69))

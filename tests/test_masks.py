@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyslam_jax.frontend._masks import read_mask, read_masks
-from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
+from bodyslam_jax.io.masks import read_mask, read_masks
+from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 NUM, WIDTH, HEIGHT = 20, 160, 120
 CAMERA = Intrinsics(np.array([150.0, 150.0, 79.5, 59.5]), WIDTH, HEIGHT)

@@ -9,10 +9,10 @@ from problems import dense, make
 
 from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.solver import Stage, clock, solve, trace
-from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._solve import method_of, run
-from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.solve import method_of, run
 
 TIGHT = (Stage(rtol=1e-12, max_steps=60),)
 

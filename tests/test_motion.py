@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from test_motion_data import make_clip
 
-from bodyslam_jax import cli, frontend, synthetic
+from bodyslam_jax import cli, io, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.motion import (
@@ -27,14 +27,18 @@ from bodyslam_jax.motion import (
     save_motion_model,
     scale_from_motion,
 )
-from bodyslam_jax.motion._measures import Steps, error_correlation
-from bodyslam_jax.motion._metric import MetricNetwork, cosine_basis, nearest_turn
-from bodyslam_jax.motion._network import lower_triangle
-from bodyslam_jax.motion._paper import PaperNetwork
-from bodyslam_jax.motion._predict import leg_length
-from bodyslam_jax.motion._rotations import matrix, vector
-from bodyslam_jax.motion._turning import straightened
-from bodyslam_jax.sequence import Intrinsics, Keypoints, Sequence
+from bodyslam_jax.motion.network import lower_triangle
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import (
+    MetricNetwork,
+    cosine_basis,
+    nearest_turn,
+)
+from bodyslam_jax.motion.prediction import leg_length
+from bodyslam_jax.motion.rotations import matrix, vector
+from bodyslam_jax.motion.training.measures import Steps, error_correlation
+from bodyslam_jax.motion.yaw_removal import straightened
+from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -238,7 +242,7 @@ def test_the_papers_network_ships_and_is_what_its_preset_uses(body):
     assert Config().motion_model is None
     assert isinstance(load_motion_model().network, MetricNetwork)
     check_compatible(paper, body, 30.0)
-    clips = Path(synthetic.__file__).parent / "assets" / "walking.npz"
+    clips = Path(simulation.__file__).parent / "assets" / "walking.npz"
     found = evaluate_model(paper, body, read_motion(clips)[:3])["walk"]
     assert 0.8 < found["slope"] < 1.15
     assert found["ratio"] < 0.4
@@ -292,7 +296,7 @@ def test_weights_for_another_body_stop_a_run_at_its_door(
         intrinsics=Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480),
         keypoints=Keypoints(np.zeros((1, 30, 25, 2)), np.zeros((1, 30, 25))),
     )
-    monkeypatch.setattr(frontend, "read_sequence", lambda *_, **__: sequence)
+    monkeypatch.setattr(io, "read_sequence", lambda *_, **__: sequence)
     monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
     argv = ["bodyslam", "run", "video", "--out", str(tmp_path / "run")]
     argv += ["--motion-model", str(tmp_path / "m.npz")]

@@ -16,16 +16,16 @@ import scenes
 from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
-from bodyslam_jax import motion, synthetic
+from bodyslam_jax import motion, simulation
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.joint import COUPLED
+from bodyslam_jax.pipeline.joint_stage import COUPLED
 from bodyslam_jax.solver import Stage, solve
-from bodyslam_jax.solver._apart import split_poses
-from bodyslam_jax.solver._blocks import mask_of, sizes_of
-from bodyslam_jax.solver._coupling import with_coupling
-from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._tables import gather
+from bodyslam_jax.solver.apart import split_poses
+from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.coupling import with_coupling
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.padding import pad
 
 FRAMES = 7
 TIGHT = (Stage(rtol=1e-12, max_steps=120),)
@@ -184,7 +184,7 @@ def walk(scale):
     places and postures may move; predicted by the network that ships."""
     body = scenes.body_model()
     settings = Simulation(sequence="E2", family="follow", length=60, noise="none")
-    truth = synthetic.as_truth(synthetic.simulate(settings, body))
+    truth = simulation.as_truth(simulation.simulate(settings, body))
     poses = jnp.asarray(truth.poses).reshape(1, 60, 24, 3)
     C_WC = jnp.asarray(truth.T_WC[:, :3, :3])
     T_WH = jnp.broadcast_to(jnp.eye(4), (1, 60, 4, 4))

@@ -10,7 +10,7 @@ import pytest
 
 from bodyslam_jax.body import PARENTS, load_body_model, rest_joints
 from bodyslam_jax.motion import disturb, drift, fit_shape, place, read_motion, resample
-from bodyslam_jax.motion._clips import (
+from bodyslam_jax.motion.capture.clips import (
     Clip,
     interleave,
     leg_length,
@@ -19,9 +19,9 @@ from bodyslam_jax.motion._clips import (
     root_matrices,
     split,
 )
-from bodyslam_jax.motion._noise import CORRELATION
-from bodyslam_jax.motion._readers import gender
-from bodyslam_jax.motion._rotations import matrix, vector
+from bodyslam_jax.motion.capture.readers import gender
+from bodyslam_jax.motion.rotations import matrix, vector
+from bodyslam_jax.motion.training.noise import CORRELATION
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -7,7 +7,7 @@ from test_motion_data import make_clip, write_amass, write_bvh, write_cmu
 
 from bodyslam_jax.body import joints, load_body_model, rest_joints
 from bodyslam_jax.motion import read_motion
-from bodyslam_jax.motion._clips import leg_length
+from bodyslam_jax.motion.capture.clips import leg_length
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

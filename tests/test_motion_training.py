@@ -19,9 +19,9 @@ from bodyslam_jax import cli
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion import load_motion_model, read_motion, split, train
-from bodyslam_jax.motion._losses import loss
-from bodyslam_jax.motion._paper import PaperNetwork
-from bodyslam_jax.motion._sampling import corpus, draw
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.training.losses import loss
+from bodyslam_jax.motion.training.sampling import corpus, draw
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -245,7 +245,7 @@ def test_where_weights_go_is_checked_before_training(
     def read(path):
         raise ValueError("read")
 
-    monkeypatch.setattr("bodyslam_jax.motion._command.read_motion", read)
+    monkeypatch.setattr("bodyslam_jax.motion.training.command.read_motion", read)
     new = tmp_path / "new" / "m.npz"  # a folder that can be made is no fault
     for out, message in (
         (file / "m.npz", f"{file / 'm.npz'}: {file} cannot be written (Not a dir"),

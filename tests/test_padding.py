@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver._padding import pad
+from bodyslam_jax.solver.padding import pad
 
 
 def video(frames, seed):

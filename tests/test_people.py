@@ -15,16 +15,15 @@ from bodyslam_jax.body import joints, keypoints, load_body_model, local_keypoint
 from bodyslam_jax.body import local_joints as body_joints
 from bodyslam_jax.config import Config, PeopleFit
 from bodyslam_jax.people import (
-    _bodies,
-    _chain,
-    _fit,
-    _path,
-    _prior,
-    _skeleton,
-    _starts,
-    _terms,
+    bodies,
+    costs,
+    multistart,
+    posture_prior,
+    skeleton,
+    trajectory_fit,
+    viterbi,
 )
-from bodyslam_jax.sequence import Bodies, Intrinsics, Keypoints, Sequence
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 FRAMES, FPS = 60, 30.0
 CAMERA = Intrinsics(np.array([600.0, 600.0, 319.5, 239.5]), 640, 480)
@@ -41,7 +40,7 @@ def truth(body):
     """Two people moving as the prior says: one turning from front to back, 4 m away;
     the other seen from the side, walking past at 5 m."""
     rng = np.random.default_rng(3)
-    prior = _prior.load_posture_prior(FPS)
+    prior = posture_prior.load_posture_prior(FPS)
     heading = np.stack([np.linspace(0.2, 2.9, FRAMES), np.full(FRAMES, 1.4)])
     path = np.zeros((2, FRAMES, 3))
     path[0] = [-0.4, 0.1, 4.0]
@@ -159,33 +158,33 @@ def test_fit_of_keypoints_that_are_all_in_one_place(body):
 def test_the_prior_at_another_rate_is_the_same_process():
     """Correlation over 1/30 s: one step at 30 fps, two steps at 60."""
     at = {
-        fps: np.asarray(_prior.load_posture_prior(fps).autoregression)
+        fps: np.asarray(posture_prior.load_posture_prior(fps).autoregression)
         for fps in (30.0, 60.0)
     }
     first = {fps: a[:, 0] / (1 - a[:, 1]) for fps, a in at.items()}
     second = at[60][:, 0] * first[60] + at[60][:, 1]
     # Sampling an oscillator's own correlation is exact only without zeros: 1 %.
     np.testing.assert_allclose(second, first[30], atol=0.02)
-    slow = np.asarray(_prior.load_posture_prior(24.0).autoregression)
+    slow = np.asarray(posture_prior.load_posture_prior(24.0).autoregression)
     assert (np.abs(slow[:, 1]) < 1).all() and (slow[:, 0] < 1 - slow[:, 1]).all()
 
 
 def random_fit(seed=0):
     rng = np.random.default_rng(seed)
-    prior = _prior.load_posture_prior(FPS)
+    prior = posture_prior.load_posture_prior(FPS)
     turn = jaxlie.SO3.exp(jnp.asarray([3.0, 0.3, -0.2])).as_matrix()
     latent = jnp.asarray(0.8 * rng.normal(size=prior.basis.shape[1]))
-    fit = _terms.Fit(turn, jnp.asarray([0.2, -0.1, 4.0]), latent)
-    return fit, jnp.asarray(0.5 * rng.normal(size=_skeleton.NUM_SHAPE))
+    fit = costs.Fit(turn, jnp.asarray([0.2, -0.1, 4.0]), latent)
+    return fit, jnp.asarray(0.5 * rng.normal(size=skeleton.NUM_SHAPE))
 
 
 def test_the_skeleton_is_the_body(body):
     """Joints exactly; keypoints on the skin within a centimetre of the skinned ones."""
     fit, shape = random_fit()
     shape = shape.at[10:].set(0.0)
-    prior = _prior.load_posture_prior(FPS)
-    skeleton = _skeleton.make_skeleton(body, 1.0)
-    found = jax.jit(_skeleton.place_points)(skeleton, prior.angles(fit.latent), shape)
+    prior = posture_prior.load_posture_prior(FPS)
+    bones = skeleton.make_skeleton(body, 1.0)
+    found = jax.jit(skeleton.place_points)(bones, prior.angles(fit.latent), shape)
     pose = prior.decode(fit.latent)
     wanted = jax.jit(body_joints)(body, pose, shape[:10])
     np.testing.assert_allclose(found[0], wanted, atol=1e-12)
@@ -196,7 +195,7 @@ def test_the_skeleton_is_the_body(body):
 
 def test_the_linearisation_is_the_gradient_of_the_cost(body):
     fit, shape = random_fit()
-    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit(limit_sigma=0.2))
+    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit(limit_sigma=0.2))
     rng = np.random.default_rng(1)
     uv = jnp.asarray(rng.normal([320, 240], 60.0, size=(25, 2)))
     sigma = jnp.full(25, 20.0).at[3].set(jnp.inf)
@@ -204,17 +203,17 @@ def test_the_linearisation_is_the_gradient_of_the_cost(body):
     other = jaxlie.SO3.exp(jnp.asarray([-0.4, 0.6, 0.3])).as_matrix() @ fit.orientation
     size = len(fit.latent)
     latent_sigma = jnp.asarray(rng.uniform(0.5, 2.0, size)).at[7].set(jnp.inf)
-    lifted = _terms.Lifted(
+    lifted = costs.Lifted(
         other, jnp.asarray(rng.normal(size=size)), latent_sigma, jnp.asarray(0.3)
     )
 
     def moved(step):
         split = 6 + len(fit.latent)
-        return _terms.cost(
+        return costs.cost(
             scene, fit.moved(step[:split]), shape + step[split:], uv, sigma, lifted
         )
 
-    normal = jax.jit(_terms.linearise)(scene, fit, shape, uv, sigma, lifted)
+    normal = jax.jit(costs.linearise)(scene, fit, shape, uv, sigma, lifted)
     value, wanted = jax.jit(jax.value_and_grad(moved))(
         jnp.zeros(6 + len(fit.latent) + len(shape))
     )
@@ -226,13 +225,13 @@ def test_the_linearisation_is_the_gradient_of_the_cost(body):
 
 def test_a_guess_weighs_as_much_as_it_is_sure(body):
     fit, shape = random_fit()
-    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
     uv, sigma = jnp.zeros((25, 2)), jnp.full(25, 20.0)
     size = len(fit.latent)
     sure = jnp.linspace(0.5, 2.0, size)
-    guess = _terms.Lifted(fit.orientation, fit.latent, sure, jnp.asarray(0.3))
+    guess = costs.Lifted(fit.orientation, fit.latent, sure, jnp.asarray(0.3))
     none = guess.widened(jnp.asarray(jnp.inf))
-    linearise = jax.jit(_terms.linearise)
+    linearise = jax.jit(costs.linearise)
     found, plain = (linearise(scene, fit, shape, uv, sigma, g) for g in (guess, none))
     wanted = np.concatenate([np.full(3, 0.3**-2), np.zeros(3), np.asarray(sure) ** -2])
     np.testing.assert_allclose(
@@ -242,19 +241,19 @@ def test_a_guess_weighs_as_much_as_it_is_sure(body):
 
 def test_a_guess_is_a_start(body, monkeypatch):
     """With no steps at all the one that is right is the best end."""
-    monkeypatch.setattr(_starts, "_FIRST_STEPS", 0)
-    monkeypatch.setattr(_starts, "_LAST_STEPS", 0)
+    monkeypatch.setattr(multistart, "_FIRST_STEPS", 0)
+    monkeypatch.setattr(multistart, "_LAST_STEPS", 0)
     fit, _ = random_fit()
-    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
-    _, local = jax.jit(_skeleton.place_points)(
-        scene.skeleton, scene.prior.angles(fit.latent), jnp.zeros(_skeleton.NUM_SHAPE)
+    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    _, local = jax.jit(skeleton.place_points)(
+        scene.skeleton, scene.prior.angles(fit.latent), jnp.zeros(skeleton.NUM_SHAPE)
     )
     p_C = np.asarray(local @ fit.orientation.T + fit.position)
     uv = p_C[:, :2] / p_C[:, 2:] * CAMERA.params[:2] + CAMERA.params[2:]
     sure = (jnp.full_like(fit.latent, 0.5), jnp.asarray(0.3))
-    guess = _terms.Lifted(fit.orientation, fit.latent, *sure)
+    guess = costs.Lifted(fit.orientation, fit.latent, *sure)
     guess = jax.tree.map(lambda a: a[None], guess)
-    fits, _, _ = _starts.fit_frames(scene, uv[None], np.full((1, 25), 5.0), guess)
+    fits, _, _ = multistart.fit_frames(scene, uv[None], np.full((1, 25), 5.0), guess)
     np.testing.assert_allclose(fits.latent[0, 0], fit.latent)
     np.testing.assert_allclose(fits.position[0, 0], fit.position, atol=1e-3)
 
@@ -274,7 +273,7 @@ def test_the_banded_solver_is_a_dense_one():
                 dense[k - back, :, k] = np.diag(off[k])
     right = rng.normal(size=(t, n, 3))
     wanted = np.linalg.solve(dense.reshape(t * n, t * n), right.reshape(t * n, 3))
-    found = jax.jit(_chain._solve_banded)(
+    found = jax.jit(trajectory_fit._solve_banded)(
         *map(jnp.asarray, (diagonal, one, two, right))
     )
     np.testing.assert_allclose(found.reshape(t * n, 3), wanted, atol=1e-10)
@@ -287,10 +286,10 @@ def test_the_path_prefers_continuity_to_the_cheaper_jump():
     costs = np.tile([0.0, 4.0], (5, 1))
     costs[2] = [2.0, 0.0]
     upright = np.tile(np.eye(3), (5, 2, 1, 1))
-    path = _path.best_path(costs, places, upright, np.arange(5) / 10)
+    path = viterbi.best_path(costs, places, upright, np.arange(5) / 10)
     assert path.tolist() == [0, 0, 0, 0, 0]
     costs[:2], costs[2:] = [0.0, 5e3], [5e3, 0.0]
-    path = _path.best_path(costs, places, upright, np.arange(5) / 10)
+    path = viterbi.best_path(costs, places, upright, np.arange(5) / 10)
     assert path.tolist() == [0, 0, 1, 1, 1]
 
 
@@ -308,7 +307,7 @@ def test_legs_go_on_where_they_cross():
     costs = np.zeros((30, 2))
     costs[np.arange(30), 1 - forward] = 1.0  # the left leg in front is a little cheaper
     upright = np.tile(np.eye(3), (30, 2, 1, 1))
-    path = _path.best_path(costs, joints, upright, time)
+    path = viterbi.best_path(costs, joints, upright, time)
     left = joints[np.arange(30), path, 7, 2]
     # Either all of it or none is mirrored, but for where both are the same anyway.
     away = [np.abs(left - sign * swing).max() for sign in (1, -1)]
@@ -318,9 +317,9 @@ def test_legs_go_on_where_they_cross():
 def test_a_path_of_one_or_two_frames():
     joints, costs = np.zeros((2, 3, 24, 3)), np.array([[2.0, 1, 3], [0, 1, 2]])
     upright = np.tile(np.eye(3), (2, 3, 1, 1))
-    one = _path.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
+    one = viterbi.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
     assert one.tolist() == [1]
-    two = _path.best_path(costs, joints, upright, np.arange(2) / 10)
+    two = viterbi.best_path(costs, joints, upright, np.arange(2) / 10)
     assert two.tolist() == [1, 0]
 
 
@@ -376,9 +375,9 @@ def test_people_without_bodies_are_fitted_to_their_keypoints(
     one = lambda name: getattr(truth, name)[1:]
     fitted = Bodies(one("present"), one("poses"), one("shapes"), one("trans"))
     monkeypatch.setattr(
-        _bodies, "fit_bodies", lambda keypoints, *_: asked.append(keypoints) or fitted
+        bodies, "fit_bodies", lambda keypoints, *_: asked.append(keypoints) or fitted
     )
-    monkeypatch.setattr(_bodies, "prepare_bodies", lambda x, *_: copy.deepcopy(x))
+    monkeypatch.setattr(bodies, "prepare_bodies", lambda x, *_: copy.deepcopy(x))
     sequence = Sequence("two", None, np.arange(FRAMES) / FPS, CAMERA, seen, given)
     assert people.without_bodies(sequence).tolist() == [False, True]
     found = people.estimate_bodies(sequence, body)

@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyslam_jax import frontend, people, pipeline, synthetic
-from bodyslam_jax.cache import Cache
+from bodyslam_jax import io, people, pipeline, sfm, simulation
 from bodyslam_jax.config import Config, Detect, Simulation
-from bodyslam_jax.frontend._person_mask import person_masks
-from bodyslam_jax.people import _blazepose, _depths, _found, _movenet, _networks
-from bodyslam_jax.sequence import Bodies, Intrinsics, Sequence
+from bodyslam_jax.people import blazepose, depths, movenet, networks
+from bodyslam_jax.people import found as found_
+from bodyslam_jax.pipeline.stage_cache import Cache
+from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.types import Bodies, Intrinsics, Sequence
 
 FRAMES = 12
 
@@ -21,10 +22,10 @@ FRAMES = 12
 @pytest.fixture(scope="module")
 def scene():
     """A walker whom a camera goes along with, without errors, and the images."""
-    simulated = synthetic.simulate(
+    simulated = simulation.simulate(
         Simulation(sequence="E1", family="follow", length=FRAMES, noise="none", seed=2)
     )
-    return simulated, list(synthetic.render(simulated))
+    return simulated, list(simulation.render(simulated))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,7 @@ def test_silhouettes_cover_the_body(scene, found):
     uv = np.stack([fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy], axis=1)
     column, row = np.round(uv).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0])
-    step = frontend.SILHOUETTE_STEP
+    step = sfm.SILHOUETTE_STEP
     small = np.unpackbits(found.silhouettes[3], axis=1)
     assert small[row[inside] // step, column[inside] // step].mean() > 0.85
     whole = with_people(images, found)
@@ -97,7 +98,7 @@ def test_silhouettes_cover_the_body(scene, found):
 def with_people(images, found, **changes):
     start = dataclasses.replace(sequence(images), **changes)
     points, person = found.by_frame(len(images))
-    return frontend.with_detections(start, points, person=person, seen=found.seen())
+    return io.with_detections(start, points, person=person, seen=found.seen())
 
 
 def test_people_become_keypoints_and_everybody_is_seen(scene, found):
@@ -146,7 +147,7 @@ def test_a_still_video_without_people_ends_well(tmp_path):
     for k in range(8):
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
     config = Config(overlay=False, uncertainty=False)
-    result = pipeline.run(frontend.read_sequence(tmp_path), config)
+    result = pipeline.run(io.read_sequence(tmp_path), config)
     assert result.poses.shape == (0, 8, 72)
     assert any("nobody was found" in text for text in result.summary["warnings"])
     assert result.summary["status"] != "ok"
@@ -156,7 +157,7 @@ def test_a_still_video_without_people_ends_well(tmp_path):
 def test_given_keypoints_come_first(scene, detect, monkeypatch):
     """The networks are not even opened, nor where nobody is to be looked for."""
     monkeypatch.setattr(people, "find_tracked", lambda *a: pytest.fail("looked"))
-    given = synthetic.as_sequence(scene[0])
+    given = simulation.as_sequence(scene[0])
     if detect == "none":
         given = dataclasses.replace(given, keypoints=None)
     given = dataclasses.replace(given, frames=Path("video.mp4"))
@@ -167,7 +168,7 @@ def test_given_keypoints_come_first(scene, detect, monkeypatch):
 
 @pytest.mark.parametrize("harm", ["missing", "damaged"])
 def test_a_network_that_is_missing_or_damaged_is_one_line(harm, tmp_path, monkeypatch):
-    monkeypatch.setattr(_networks, "_FOLDER", tmp_path)
+    monkeypatch.setattr(networks, "_FOLDER", tmp_path)
     if harm == "damaged":
         (tmp_path / "movenet_multipose.onnx").write_bytes(b"half a network")
     with pytest.raises(ValueError, match="install bodyslam-jax again") as caught:
@@ -183,7 +184,7 @@ def test_a_network_that_is_missing_or_damaged_is_one_line(harm, tmp_path, monkey
 def test_movenets_output_is_y_x_score_relative_to_the_input():
     raw = np.zeros((6, 56), np.float32)
     raw[0, :3], raw[0, 55] = (0.25, 0.5, 0.75), 0.625
-    points, score = _movenet.decode(raw, (64, 96))
+    points, score = movenet.decode(raw, (64, 96))
     np.testing.assert_allclose(points[0, 0], [47.75, 15.75, 0.75])
     assert score[0] == 0.625
 
@@ -194,14 +195,14 @@ def test_a_letterbox_knows_where_its_pixels_are(region, longer):
     """A bright square's centre of mass, found again through the canvas."""
     image = np.zeros((200, 300, 3), np.uint8)
     image[80:101, 60:91] = 255  # about (75, 90)
-    canvas, scale = _movenet.letterbox(image, region, longer)
+    canvas, scale = movenet.letterbox(image, region, longer)
     assert canvas.shape[0] % 32 == canvas.shape[1] % 32 == 0
     weight = canvas[..., 0].astype(float)
     rows, columns = np.mgrid[: canvas.shape[0], : canvas.shape[1]]
     at = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
     # Sides are whole pixels, so that scales of x and y may differ by a part of one.
     np.testing.assert_allclose(
-        _movenet.to_image(at, region, scale), [75, 90], atol=1 / scale * 0.6
+        movenet.to_image(at, region, scale), [75, 90], atol=1 / scale * 0.6
     )
 
 
@@ -211,9 +212,7 @@ def test_detections_that_share_three_keypoints_are_one():
     ghost = person.copy()
     ghost[8:, :2] += 60.0
     other = person + [150.0, 0, 0]
-    kept = _movenet.distinct(
-        np.array([ghost, person, other]), np.array([0.3, 0.6, 0.4])
-    )
+    kept = movenet.distinct(np.array([ghost, person, other]), np.array([0.3, 0.6, 0.4]))
     assert kept.tolist() == [1, 2]
 
 
@@ -227,7 +226,7 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     points[[15, 16], :2] = [(8, 90), (-8, 90)]
     points[[5, 6, 11, 12, 15, 16], 2] = 0.9
     points[:, :2] = points[:, :2] @ turn.T + [300, 200]
-    square = _blazepose.turned_square(points, 0.15)
+    square = blazepose.turned_square(points, 0.15)
     assert square.side > 2 * 90
     to_crop = square.from_image()
     inside = points[:, :2] @ to_crop[:, :2].T + to_crop[:, 2]
@@ -235,12 +234,12 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     np.testing.assert_allclose(inside[[5, 6]].mean(0)[0], 127.5)
     assert inside[5, 1] < inside[11, 1] < inside[15, 1]
     raw = np.zeros((33, 5), np.float32)
-    raw[_blazepose.COCO_OF_LANDMARKS, :2] = inside + 0.5
+    raw[blazepose.COCO_OF_LANDMARKS, :2] = inside + 0.5
     world = np.zeros((33, 3), np.float32)
     world[11] = (0.0, -0.5, 0.1)  # up in the square
-    pose = _blazepose.decode(raw, 1.0, np.zeros((256, 256)), world, square)
+    pose = blazepose.decode(raw, 1.0, np.zeros((256, 256)), world, square)
     sure = points[:, 2] > 0
-    away = _blazepose.disagreement(pose, points)
+    away = blazepose.disagreement(pose, points)
     np.testing.assert_allclose(away[sure], 0, atol=1e-4)
     np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
 
@@ -252,9 +251,9 @@ def test_depths_tell_which_leg_is_in_front():
     joints = np.zeros((1, 2, 24, 3))
     joints[0, 0, [5, 4, 8, 7], 2] = [0.22, -0.15, 0.4, -0.4]
     joints[0, 1] = -joints[0, 0]
-    right, wrong = _depths.depth_costs(depth, joints)[0]
+    right, wrong = depths.depth_costs(depth, joints)[0]
     assert right < 0.2 and wrong > right + 2
-    np.testing.assert_array_equal(_depths.depth_costs(0 * depth, joints), 0)
+    np.testing.assert_array_equal(depths.depth_costs(0 * depth, joints), 0)
 
 
 def test_depths_are_those_of_the_person_and_their_ray(scene, found):
@@ -272,20 +271,20 @@ def test_depths_are_those_of_the_person_and_their_ray(scene, found):
 
 def test_feet_of_somebody_else_are_left_out():
     points = np.column_stack([np.zeros((17, 2)), np.full(17, 0.9)])
-    square = _blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))
+    square = blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))
     landmarks = np.column_stack([np.ones((33, 2)), np.full(33, 1.0)])
     mask, world = np.zeros((256, 256), np.uint8), np.zeros((33, 3))
-    pose = _blazepose.Pose(landmarks, 1.0, mask, square, world)
+    pose = blazepose.Pose(landmarks, 1.0, mask, square, world)
     apart = np.zeros(17)
     apart[16] = 0.5  # the right ankle is elsewhere
-    feet = _found.find_feet(pose, points, apart)
+    feet = found_.find_feet(pose, points, apart)
     assert (feet[:2, 2] > 0.3).all() and (feet[2:, 2] == 0).all()
-    body = _found.as_body25(points, feet)
+    body = found_.as_body25(points, feet)
     assert body[21, 2] > 0 and body[19, 2] > 0 and not body[[22, 24], 2].any()
 
 
 def test_confidence_rises_with_the_score():
-    share = _found.confidence(np.linspace(0, 1, 50))
+    share = found_.confidence(np.linspace(0, 1, 50))
     assert (np.diff(share) >= 0).all() and share[0] == 0 and share[-1] == 1
-    likely, doubtful = _found.confidence(np.array([0.35, 0.2]))
+    likely, doubtful = found_.confidence(np.array([0.35, 0.2]))
     assert likely > 0.3 > doubtful

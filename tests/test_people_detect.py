@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.config import Detect
-from bodyslam_jax.people import _detect, detect_people
+from bodyslam_jax.people import detect, detect_people
 
 SIZE = (64, 96)  # rows, columns of the toy detector's canvas
 NUM_CELLS = sum((SIZE[0] // s) * (SIZE[1] // s) for s in (8, 16, 32))
@@ -30,7 +30,7 @@ def raw_output(*people):
 def test_boxes_of_every_stride():
     expected = [(20, 24, 16, 40, 0.9, 8), (70, 30, 30, 50, 0.8, 16)]
     expected.append((50, 40, 60, 20, 0.7, 32))
-    boxes, score = _detect.decode_yolox(raw_output(*expected), SIZE, 0.5)
+    boxes, score = detect.decode_yolox(raw_output(*expected), SIZE, 0.5)
     order = np.argsort(-score)
     np.testing.assert_allclose(score[order], [0.9, 0.8, 0.7], atol=1e-6)
     for box, (x, y, w, h, *_) in zip(boxes[order], expected):
@@ -42,17 +42,17 @@ def test_boxes_below_the_threshold_and_other_classes_are_dropped():
     raw = raw_output((20, 24, 16, 40, 0.4, 8), (70, 30, 30, 50, 0.9, 16))
     dog = raw[:, 5] == np.float32(0.9)
     raw[dog, 5], raw[dog, 21] = 0.0, 0.9
-    assert len(_detect.decode_yolox(raw, SIZE, 0.5)[0]) == 0
+    assert len(detect.decode_yolox(raw, SIZE, 0.5)[0]) == 0
 
 
 def test_a_detector_of_another_kind_is_refused():
     with pytest.raises(ValueError, match=r"detector: output of shape \(10, 85\)"):
-        _detect.decode_yolox(np.zeros((10, 85), np.float32), SIZE, 0.5)
+        detect.decode_yolox(np.zeros((10, 85), np.float32), SIZE, 0.5)
 
 
 def test_the_better_of_two_overlapping_boxes_stays():
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [8, 0, 18, 10.0]])
-    kept = _detect.suppress(boxes, np.array([0.7, 0.9, 0.8]), 0.45)
+    kept = detect.suppress(boxes, np.array([0.7, 0.9, 0.8]), 0.45)
     assert kept.tolist() == [1, 2]  # 0 and 1 share 9/11; 1 and 2 share 3/17
 
 
@@ -60,7 +60,7 @@ def test_simcc_takes_the_best_bin_and_the_lower_score():
     x, y = np.zeros((2, 3, 40))
     x[0, 12], y[0, 31] = 0.9, 0.6
     x[1, 0], y[1, 39] = 0.2, 1.5
-    points, confidence = _detect.decode_simcc(x, y)
+    points, confidence = detect.decode_simcc(x, y)
     np.testing.assert_allclose(points[:2], [[6, 15.5], [0, 19.5]])
     np.testing.assert_allclose(confidence, [0.6, 0.2, 0.0])
 
@@ -78,7 +78,7 @@ def test_body25_from_other_layouts(count):
         sides = ("left", "right")
         names += [f"{s}_{p}" for s in sides for p in ("big_toe", "small_toe", "heel")]
     points = np.column_stack([np.arange(count), -np.arange(count), np.ones(count)])
-    found = _detect.to_body25(points.astype(float))
+    found = detect.to_body25(points.astype(float))
     for k, name in enumerate(wanted):
         if name in names and name not in ("neck", "mid_hip"):
             assert found[k].tolist() == points[names.index(name)].tolist(), name
@@ -90,16 +90,16 @@ def test_body25_from_other_layouts(count):
 
 def test_a_pose_network_of_another_kind_is_refused():
     with pytest.raises(ValueError, match="21 keypoints, expected 17, 26 or 133"):
-        _detect.to_body25(np.zeros((21, 3)))
+        detect.to_body25(np.zeros((21, 3)))
 
 
 def test_sampling_is_exact_on_pixels_linear_between_and_black_outside():
     image = np.random.default_rng(0).integers(0, 255, (5, 7, 3), np.uint8)
-    whole = _detect.sample(image, np.arange(7.0), np.arange(5.0))
+    whole = detect.sample(image, np.arange(7.0), np.arange(5.0))
     np.testing.assert_allclose(whole, image)
-    middle = _detect.sample(image, np.array([2.5]), np.array([1.0]))
+    middle = detect.sample(image, np.array([2.5]), np.array([1.0]))
     np.testing.assert_allclose(middle[0, 0], image[1, 2:4].mean(0))
-    assert not _detect.sample(image, np.array([-3.0, 9.0]), np.array([2.0])).any()
+    assert not detect.sample(image, np.array([-3.0, 9.0]), np.array([2.0])).any()
 
 
 def test_models_are_fetched_once_and_checked(tmp_path, monkeypatch):
@@ -107,30 +107,30 @@ def test_models_are_fetched_once_and_checked(tmp_path, monkeypatch):
     (tmp_path / "remote.onnx").write_bytes(b"a network")
     digest = hashlib.sha256(b"a network").hexdigest()
     url = (tmp_path / "remote.onnx").as_uri()
-    model = _detect.Model("toy.onnx", url, digest, 0)
+    model = detect.Model("toy.onnx", url, digest, 0)
     with pytest.raises(ValueError, match="offline is set"):
-        _detect.model_path(None, model, offline=True)
-    path = _detect.model_path(None, model, offline=False)
+        detect.model_path(None, model, offline=True)
+    path = detect.model_path(None, model, offline=False)
     assert path.read_bytes() == b"a network"
     (tmp_path / "remote.onnx").unlink()
-    assert _detect.model_path(None, model, offline=True) == path
+    assert detect.model_path(None, model, offline=True) == path
     path.write_bytes(b"damaged")
     with pytest.raises(ValueError, match="delete the file"):
-        _detect.model_path(None, model, offline=True)
+        detect.model_path(None, model, offline=True)
 
 
 def test_no_network_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    gone = _detect.Model("x.onnx", (tmp_path / "gone").as_uri(), "0", 0)
+    gone = detect.Model("x.onnx", (tmp_path / "gone").as_uri(), "0", 0)
     with pytest.raises(ValueError, match="cannot be fetched") as caught:
-        _detect.model_path(None, gone, offline=False)
+        detect.model_path(None, gone, offline=False)
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "bodyslam" / "models").iterdir())  # nothing half-done
 
 
 def test_an_own_model_that_is_not_there():
     with pytest.raises(ValueError, match="nowhere.onnx: no such file"):
-        _detect.model_path("nowhere.onnx", _detect.POSE, offline=True)
+        detect.model_path("nowhere.onnx", detect.POSE, offline=True)
 
 
 def test_networks_that_always_say_the_same(tmp_path):

@@ -11,14 +11,14 @@ from bodyslam_jax import people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.motion import read_motion
-from bodyslam_jax.people import _fit, _lift, _skeleton
-from bodyslam_jax.people._prior import load_posture_prior
-from bodyslam_jax.sequence import Intrinsics, Keypoints
-from bodyslam_jax.synthetic import _measuring, _simulate
+from bodyslam_jax.people import fit, lift, skeleton
+from bodyslam_jax.people.posture_prior import load_posture_prior
+from bodyslam_jax.simulation import sensor_noise, sequences
+from bodyslam_jax.types import Intrinsics, Keypoints
 
 FPS = 30.0
 CAMERA = Intrinsics(np.array([900.0, 900.0, 640.0, 360.0]), 1280, 720)
-SIGMA = np.tile(_lift.KEYPOINT_SIGMA, (60, 1))
+SIGMA = np.tile(lift.KEYPOINT_SIGMA, (60, 1))
 ANKLES = [7, 8]
 
 
@@ -30,12 +30,12 @@ def body():
 @pytest.fixture(scope="module")
 def walk(body):
     """Someone of whom nothing was learnt walks away: joints and keypoints in C, m."""
-    clip = read_motion(str(_simulate.ASSETS / "walking.npz"))[6]
+    clip = read_motion(str(sequences.ASSETS / "walking.npz"))[6]
     poses, trans = clip.poses[:60].astype(float), clip.trans[:60].astype(float)
-    skeleton = _skeleton.make_skeleton(body, 0.0)
-    place = jax.jit(jax.vmap(_skeleton.place_points, in_axes=(None, 0, None)))
+    bones = skeleton.make_skeleton(body, 0.0)
+    place = jax.jit(jax.vmap(skeleton.place_points, in_axes=(None, 0, None)))
     angles = jnp.asarray(poses[:, 1:22].reshape(-1, 63))
-    local = place(skeleton, angles, jnp.zeros(_skeleton.NUM_SHAPE))
+    local = place(bones, angles, jnp.zeros(skeleton.NUM_SHAPE))
     ahead = trans[-1] - trans[0]
     # C looks along the walk, y down, from 3 m behind.
     z = ahead * [1, 0, 1] / np.linalg.norm(ahead * [1, 0, 1])
@@ -55,7 +55,7 @@ def pixels(points, intrinsics):
 
 def lift(uv, sigma, intrinsics=CAMERA.params, fps=FPS):
     arrays = (jnp.asarray(a) for a in (intrinsics, uv, sigma, fps))
-    return _lift.lift(_lift.load_lifter(), *arrays)
+    return lift.lift(lift.load_lifter(), *arrays)
 
 
 def test_a_guess_does_not_depend_on_the_lens_nor_on_where_the_camera_points(walk):
@@ -101,10 +101,10 @@ def test_a_guess_is_close_to_who_was_not_learnt_from(walk, body):
     found, _ = lift(pixels(points, CAMERA.params), SIGMA)
     turn = Rotation.from_matrix(np.asarray(found.orientation) @ np.swapaxes(R_CH, 1, 2))
     assert np.degrees(turn.magnitude()).mean() < 12
-    skeleton = _skeleton.make_skeleton(body, 0.0)
+    bones = skeleton.make_skeleton(body, 0.0)
     angles = load_posture_prior(FPS).angles(found.latent)
-    place = jax.vmap(_skeleton.place_points, in_axes=(None, 0, None))
-    guess, _ = eqx.filter_jit(place)(skeleton, angles, jnp.zeros(_skeleton.NUM_SHAPE))
+    place = jax.vmap(skeleton.place_points, in_axes=(None, 0, None))
+    guess, _ = eqx.filter_jit(place)(bones, angles, jnp.zeros(skeleton.NUM_SHAPE))
     guess = np.einsum("tij,tkj->tki", found.orientation, guess)
     error = np.linalg.norm(guess - (joints - joints[:, :1]), axis=-1)
     assert error[:, :22].mean() < 0.05
@@ -125,13 +125,13 @@ def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
     # Half a second after the last of them they are out of sight.
     np.testing.assert_allclose(found.latent[56:], plain.latent[56:], atol=1e-5)
 
-    scene = _fit.make_scene(CAMERA, body, FPS, PeopleFit())
-    guess = _fit.guess_postures(scene, uv, sigma, FPS)
+    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    guess = fit.guess_postures(scene, uv, sigma, FPS)
     assert np.isinf(guess.latent_sigma[missing]).all()
     assert np.isinf(guess.turn_sigma[missing]).all()
     assert np.isfinite(guess.latent_sigma[56:]).all()
     # One who is never seen.
-    guess = _fit.guess_postures(scene, 0 * uv, np.full_like(sigma, np.inf), FPS)
+    guess = fit.guess_postures(scene, 0 * uv, np.full_like(sigma, np.inf), FPS)
     assert np.isinf(guess.turn_sigma).all() and np.isfinite(guess.latent).all()
 
 
@@ -139,12 +139,12 @@ def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
 def seen(walk):
     """With a detector's errors."""
     _, joints, points = walk
-    uv, confidence = _measuring.detect_keypoints(
+    uv, confidence = sensor_noise.detect_keypoints(
         points,
         joints,
         CAMERA.params,
         (CAMERA.width, CAMERA.height),
-        _measuring.NOISE["real"],
+        sensor_noise.NOISE["real"],
         np.random.default_rng(0),
     )
     return Keypoints(uv[None], confidence[None])
@@ -173,11 +173,11 @@ def test_legs_of_who_walks_away_swing(walk, seen, body):
     def fit(settings):
         bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
         roots = people.roots_from_bodies(bodies, body)
-        place = jax.vmap(_skeleton.place_points, in_axes=(None, 0, None))
+        place = jax.vmap(skeleton.place_points, in_axes=(None, 0, None))
         found, _ = eqx.filter_jit(place)(
-            _skeleton.make_skeleton(body, 0.0),
+            skeleton.make_skeleton(body, 0.0),
             jnp.asarray(roots.body_pose[0, :, :21].reshape(-1, 63)),
-            jnp.zeros(_skeleton.NUM_SHAPE).at[:10].set(roots.shape[0]),
+            jnp.zeros(skeleton.NUM_SHAPE).at[:10].set(roots.shape[0]),
         )
         return np.einsum("tij,tkj->tki", roots.T_CH[0, :, :3, :3], found)
 
@@ -203,6 +203,6 @@ def test_in_single_precision(walk):
         jnp.asarray(a, jnp.float32)
         for a in (CAMERA.params, pixels(points, CAMERA.params), SIGMA, FPS)
     ]
-    other, _ = _lift.lift(_lift.load_lifter(), *single)
+    other, _ = lift.lift(lift.load_lifter(), *single)
     assert other.latent.dtype == other.orientation.dtype == jnp.float32
     np.testing.assert_allclose(other.latent, found.latent, atol=1e-3)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import frontend, people, synthetic
+from bodyslam_jax import io, people, simulation
 from bodyslam_jax.body import joints, keypoints, load_body_model
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.sequence import Bodies, Keypoints, Sequence
+from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 FRAMES, FPS = 90, 30.0
 HALF_TURN = Rotation.from_rotvec([0.0, np.pi, 0.0])
@@ -34,7 +34,7 @@ def truth(body) -> Sequence:
     settings = Simulation(
         sequence="E2", family="follow", length=FRAMES, seed=3, noise="none"
     )
-    return synthetic.as_sequence(synthetic.simulate(settings, body))
+    return simulation.as_sequence(simulation.simulate(settings, body))
 
 
 def turned_by(bodies: Bodies, turn: Rotation) -> Bodies:
@@ -226,8 +226,8 @@ def test_of_forty_jittery_sequences_nobody_is_turned_round(body, jitter):
         settings = Simulation(
             sequence=name, family=family, length=90, seed=seed, body_jitter=jitter
         )
-        made = synthetic.simulate(settings, body)
-        found = people.estimate_bodies(synthetic.as_sequence(made), body)
+        made = simulation.simulate(settings, body)
+        found = people.estimate_bodies(simulation.as_sequence(made), body)
         R_CW = np.swapaxes(made.T_WC[:, :3, :3], 1, 2)
         true = Rotation.from_matrix(R_CW) * Rotation.from_rotvec(made.poses[:, :3])
         poses = np.zeros((1, 90, 72))
@@ -282,7 +282,7 @@ def test_who_is_named_left_for_right_is_the_same_person(truth):
         other[[i, j]] = other[[j, i]]
     frames = [(other if k % 5 == 4 else one)[None] for k in range(40)]
     sequence = dataclasses.replace(truth, keypoints=None, bodies=None)
-    found = frontend.with_detections(
+    found = io.with_detections(
         dataclasses.replace(sequence, timestamps=np.arange(40) / FPS), frames
     )
     assert found.keypoints.uv.shape[0] == 1

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bodyslam_jax.people._appearance import describe, difference, mean_look
-from bodyslam_jax.people._linking import link, remarks
-from bodyslam_jax.people._regions import behind, regions
-from bodyslam_jax.people._tracking import Tracker, between
+from bodyslam_jax.people.appearance import describe, difference, mean_look
+from bodyslam_jax.people.linking import link, remarks
+from bodyslam_jax.people.regions import behind, regions
+from bodyslam_jax.people.tracking import Tracker, between
 
 # COCO's 17 keypoints of somebody who stands, in units of the height.
 STANDING = np.array(

@@ -6,9 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from bodyslam_jax import accuracy, assembly, evaluation, export, pipeline, synthetic
+from bodyslam_jax import evaluation, export, pipeline, simulation
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.evaluation import before_after
+from bodyslam_jax.pipeline import to_metric
 
 CONTRACT = {
     "timestamps": (60,),
@@ -25,16 +27,18 @@ CONTRACT = {
 
 @pytest.mark.slow
 def test_from_measurements_to_a_run_folder(tmp_path, caplog):
-    simulated = synthetic.simulate(
+    simulated = simulation.simulate(
         Simulation(sequence="M1", family="follow", length=60, noise="low")
     )
     camera = tmp_path / "camera.txt"
     export.write_tum(camera, simulated.timestamps, simulated.T_WC)
-    sequence = dataclasses.replace(synthetic.as_sequence(simulated), groundtruth=camera)
+    sequence = dataclasses.replace(
+        simulation.as_sequence(simulated), groundtruth=camera
+    )
     out = tmp_path / "run"
     result = pipeline.run_to_folder(sequence, out, Config())
 
-    found = evaluation.evaluate(result, synthetic.as_truth(simulated))
+    found = evaluation.evaluate(result, simulation.as_truth(simulated))
     # The simulated errors are centimetres; so must be what is made of them.
     assert float(found["c_ate_sim3"]) < 0.02
     assert float(found["scale_error"]) < 0.1
@@ -50,7 +54,9 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     assert "<html" in (out / "report.html").read_text().lower()
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "ok"
-    alone, joint = (summary["errors"][n] for n in (accuracy.ALONE, accuracy.JOINT))
+    alone, joint = (
+        summary["errors"][n] for n in (before_after.ALONE, before_after.JOINT)
+    )
     assert alone["c_ate_sim3"] < 0.02 and alone["scale"] == "no scale"
     assert alone["c_ate_sim3"] != joint["c_ate_sim3"]
     assert joint["c_ate_se3"] == pytest.approx(float(found["c_ate_se3"]), abs=1e-6)
@@ -78,10 +84,10 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
 
 
 def test_nothing_to_estimate_from_is_an_error():
-    simulated = synthetic.simulate(
+    simulated = simulation.simulate(
         Simulation(sequence="E1", length=30, noise="none", seed=1)
     )
-    sequence = synthetic.as_sequence(simulated)
+    sequence = simulation.as_sequence(simulated)
     tracks = sequence.tracks
     few = tracks.landmark < 3
     bare = dataclasses.replace(
@@ -98,7 +104,7 @@ def test_upright_turns_a_direction_up_and_keeps_distances():
     rng = np.random.default_rng(0)
     T_WC = np.tile(np.eye(4), (5, 1, 1))
     T_WC[:, :3, 3] = rng.normal(size=(5, 3))
-    turn = assembly.upright(T_WC, np.array([0.6, 0.0, 0.8]))
+    turn = to_metric.upright(T_WC, np.array([0.6, 0.0, 0.8]))
     np.testing.assert_allclose(turn[:3, :3] @ [0.6, 0.0, 0.8], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import synthetic
+from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.diagnostics import figures
 from bodyslam_jax.diagnostics.plausibility import (
@@ -21,8 +21,8 @@ FPS = 30.0
 @pytest.fixture(scope="module")
 def truth():
     """Somebody who really walked, and a camera that goes along."""
-    return synthetic.as_truth(
-        synthetic.simulate(
+    return simulation.as_truth(
+        simulation.simulate(
             Simulation(sequence="M1", family="follow", length=120, seed=5, noise="none")
         )
     )

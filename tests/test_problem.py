@@ -13,10 +13,10 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.graph import _memory
-from bodyslam_jax.graph._padding import Masked
-from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._solve import method_of, run
+from bodyslam_jax.graph import memory
+from bodyslam_jax.graph.padding import Masked
+from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.solve import method_of, run
 
 T, L, M = 3, 6, 5
 """Frames, landmarks and observations; one person."""
@@ -213,7 +213,7 @@ def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
         rng = np.random.default_rng(0)
         return scenes.truth(rng, frames, 20, 0)
 
-    monkeypatch.setattr(_memory, "memory", lambda: 2**27)
+    monkeypatch.setattr(memory, "memory", lambda: 2**27)
     with pytest.raises(
         ValueError, match=r"need about 0\.\d GiB, found 0\.1 GiB"
     ) as error:
@@ -231,8 +231,8 @@ def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
     def bytes_of(far):
         """What the factorisation keeps, and what is counted for those that go last."""
         longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
-        monkeypatch.setattr("bodyslam_jax.graph._layout.choose_lasting", longest)
-        monkeypatch.setattr("bodyslam_jax.graph._layout._SIZE", FAR)
+        monkeypatch.setattr("bodyslam_jax.graph.layout.choose_lasting", longest)
+        monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", FAR)
         problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
         assert problem.layout.lasting == far
         problem, state = pad(problem, state)
@@ -242,7 +242,7 @@ def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
         layout = problem.layout
         soon = tuple(dataclasses.replace(b, lasting=False) for b in layout.buckets)
         without = dataclasses.replace(layout, buckets=soon)
-        counted, others = (_memory.memory_needed(x, state) for x in (layout, without))
+        counted, others = (memory.memory_needed(x, state) for x in (layout, without))
         return np.array([kept.size * kept.dtype.itemsize, counted - others])
 
     kept, counted = bytes_of(FAR) - bytes_of(0)
@@ -252,10 +252,10 @@ def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
 def test_a_container_may_use_less_than_the_machine_has(monkeypatch, tmp_path):
     limit, other = tmp_path / "memory.max", tmp_path / "none"
     limit.write_text("1048576\n")
-    monkeypatch.setattr(_memory, "_LIMITS", (str(other), str(limit)))
-    assert _memory.memory() == 2**20
+    monkeypatch.setattr(memory, "_LIMITS", (str(other), str(limit)))
+    assert memory.memory() == 2**20
     limit.write_text("max\n")
-    assert _memory.memory() > 2**28
+    assert memory.memory() > 2**28
 
 
 def test_under_a_transformation_shapes_alone_are_looked_at():
@@ -297,8 +297,8 @@ def test_a_video_too_long_to_order_says_how_many_frames_fit(monkeypatch):
     def reached(*_):
         raise AssertionError("a dense table of chunks")
 
-    monkeypatch.setattr("bodyslam_jax.graph._ordering._spectral", reached)
-    monkeypatch.setattr(_memory, "memory", lambda: 2**27)
+    monkeypatch.setattr("bodyslam_jax.graph.ordering._spectral", reached)
+    monkeypatch.setattr(memory, "memory", lambda: 2**27)
     count = 10 * 3000
     landmark = np.repeat(np.arange(3000), 2)
     frame = 10 * landmark + np.tile([0, 5], 3000)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
-from bodyslam_jax import reconstruction
 from bodyslam_jax.config import Config, Structure
-from bodyslam_jax.sequence import Sequence
+from bodyslam_jax.pipeline import sfm_stage
+from bodyslam_jax.types import Sequence
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 NUM = 24
@@ -21,7 +21,7 @@ def test_long_tracks_are_cut_only_after_they_have_shown_the_path():
     found = {}
     for span in (NUM, 9):
         config = dataclasses.replace(Config(), structure=Structure(landmark_span=span))
-        found[span] = reconstruction.estimate(sequence, tracks, config)
+        found[span] = sfm_stage.estimate(sequence, tracks, config)
     whole, cut = found[NUM], found[9]
     np.testing.assert_allclose(cut.T_WC, whole.T_WC, atol=1e-9)
     assert camera_error(cut.T_WC, truth) < 0.01

@@ -6,11 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from bodyslam_jax import evaluation, joint, people, rehearsal, synthetic, view
-from bodyslam_jax.assembly import assemble
+from bodyslam_jax import evaluation, people, rehearsal, simulation, view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.initialisation import first_state
+from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.pipeline.to_metric import assemble
 from bodyslam_jax.rehearsal import Rehearsal
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -41,8 +42,8 @@ def test_a_stage_waits_for_its_own_part_and_for_no_other():
 @pytest.mark.slow
 def test_what_was_rehearsed_is_not_compiled_again(quick_compilation):
     jax.clear_caches()  # of other tests, which compile the same
-    scene = synthetic.simulate(Simulation(sequence="M1", family="follow", length=15))
-    sequence, truth = synthetic.as_sequence(scene), synthetic.as_truth(scene)
+    scene = simulation.simulate(Simulation(sequence="M1", family="follow", length=15))
+    sequence, truth = simulation.as_sequence(scene), simulation.as_truth(scene)
     body, config = load_body_model(), Config()
     compiled = set()
 
@@ -64,7 +65,9 @@ def test_what_was_rehearsed_is_not_compiled_again(quick_compilation):
         state = first_state(
             scene.T_WC, np.ones((77, 3)), roots, sequence.intrinsics.params
         )
-        joint.predict(joint.motion_predictor(sequence, roots, body, config), state)
+        joint_stage.predict(
+            joint_stage.motion_predictor(sequence, roots, body, config), state
+        )
         cameras, found = rehearsal._cameras(sequence), rehearsal._joint(sequence)
         result = assemble(sequence, config, body, cameras, found, {})
         evaluation.evaluate(result, truth)

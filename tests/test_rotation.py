@@ -6,9 +6,9 @@ import jaxlie
 import numpy as np
 import pytest
 
+from bodyslam_jax.geometry.so3 import compose, log, log_of
 from bodyslam_jax.graph import retract_rotation
-from bodyslam_jax.graph._state import inverse_right_jacobian
-from bodyslam_jax.rotation import compose, log, log_of
+from bodyslam_jax.graph.state import inverse_right_jacobian
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

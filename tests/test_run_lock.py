@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from bodyslam_jax import cli, export, pipeline
-from bodyslam_jax.cache import fingerprint
 from bodyslam_jax.config import Config
-from bodyslam_jax.export import _lock
-from bodyslam_jax.frontend import read_sequence
+from bodyslam_jax.export import lock
+from bodyslam_jax.io import read_sequence
+from bodyslam_jax.pipeline.stage_cache import fingerprint
 
 HOLD = """
 import importlib.util, sys, time
@@ -38,7 +38,7 @@ def holder(tmp_path):
 
     def hold(folder: Path) -> subprocess.Popen:
         process = subprocess.Popen(
-            [sys.executable, "-c", HOLD, str(folder), _lock.__file__],
+            [sys.executable, "-c", HOLD, str(folder), lock.__file__],
             stdout=subprocess.PIPE,
             text=True,
         )
@@ -90,11 +90,11 @@ def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
     message = "process 4 on node17 is writing this run.*try again in 60 s"
     with pytest.raises(ValueError, match=message), export.locked(tmp_path):
         pass
-    old = time.time() - 2 * _lock._STALE
+    old = time.time() - 2 * lock._STALE
     os.utime(file, (old, old))
     with export.locked(tmp_path):
         assert json.loads(file.read_text())["pid"] == os.getpid()
-        assert time.time() - file.stat().st_mtime < _lock._STALE
+        assert time.time() - file.stat().st_mtime < lock._STALE
     file.write_text("half")  # of a process that was killed as it wrote
     with export.locked(tmp_path):
         pass
@@ -102,7 +102,7 @@ def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
 
 
 def test_a_lock_is_renewed(tmp_path, monkeypatch):
-    monkeypatch.setattr(_lock, "_RENEWED", 0.01)
+    monkeypatch.setattr(lock, "_RENEWED", 0.01)
     with export.locked(tmp_path):
         file = tmp_path / ".lock"
         os.utime(file, (0, 0))
@@ -235,7 +235,7 @@ def report():
     jax.jit(lambda: add(jnp.ones((80, 80))).sum()).lower().compile()
     return [("compiled", "slowly")]
 sys.argv = ["bodyslam", "doctor"]
-with mock.patch("bodyslam_jax.doctor.report", report):
+with mock.patch("bodyslam_jax.cli.doctor.report", report):
     cli.main()
 """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TF_CPP")}

@@ -6,10 +6,11 @@ import optimistix as optx
 import pytest
 import scenes
 
-from bodyslam_jax import graph, joint, solver
+from bodyslam_jax import graph, solver
 from bodyslam_jax.config import Config
+from bodyslam_jax.pipeline import joint_stage
 from bodyslam_jax.solver import PAPER_SCHEDULE, Solution, Stage
-from bodyslam_jax.solver._schedule import check_names, check_schedule
+from bodyslam_jax.solver.schedule import check_names, check_schedule
 
 
 def test_the_papers_schedule_has_its_numbers_of_first_order_steps():
@@ -34,9 +35,9 @@ def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
         return Solution(state, optx.RESULTS.successful, cost, (), counts, 2 * cost)
 
     monkeypatch.setattr(solver, "solve", solve)
-    _, said = joint.solve_stage(problem, state, config, "joint")
+    _, said = joint_stage.solve_stage(problem, state, config, "joint")
     assert said["iterations"] == 7 and said["status"] == "converged"
-    joint.solve_stage(problem, state, config, "people alone")
+    joint_stage.solve_stage(problem, state, config, "people alone")
     assert told == [(config.solver, steps), (config.solver, steps[-1:])]
 
 

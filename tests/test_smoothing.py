@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.smoothing import low_pass, low_pass_rotations
+from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 
 FPS = 30.0
 ALL = np.ones(200, bool)

@@ -15,8 +15,8 @@ from jax.flatten_util import ravel_pytree
 from problems import bent, dense, make, structured_step
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.camera import project
 from bodyslam_jax.compilation import quick_options
+from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver import (
     Stage,
@@ -26,15 +26,15 @@ from bodyslam_jax.solver import (
     solve,
     trace,
 )
-from bodyslam_jax.solver._blocks import sizes_of
-from bodyslam_jax.solver._curvature import bend, curvature_of, next_share
-from bodyslam_jax.solver._gmres import RESTART, gmres
-from bodyslam_jax.solver._linearise import linearise
-from bodyslam_jax.solver._mapping import in_turn
-from bodyslam_jax.solver._padding import pad
-from bodyslam_jax.solver._solve import check_start
-from bodyslam_jax.solver._tables import gather
-from bodyslam_jax.solver._triangular import invert_lower
+from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.blocks import sizes_of
+from bodyslam_jax.solver.gmres import RESTART, gmres
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.second_order import bend, curvature_of, next_share
+from bodyslam_jax.solver.solve import check_start
+from bodyslam_jax.solver.triangular import invert_lower
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -63,8 +63,8 @@ def last(monkeypatch, count):
     if not count:
         return
     longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
-    monkeypatch.setattr("bodyslam_jax.graph._layout.choose_lasting", longest)
-    monkeypatch.setattr("bodyslam_jax.graph._layout._SIZE", count // 2)
+    monkeypatch.setattr("bodyslam_jax.graph.layout.choose_lasting", longest)
+    monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", count // 2)
 
 
 @pytest.mark.parametrize(
@@ -523,8 +523,8 @@ def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
     in_time, state, _ = make(9, frames=63, people=2, landmarks=80)
     assert in_time.layout.order is None
     order = np.array([3, 0, 5, 1, 6, 2, 4])
-    monkeypatch.setattr("bodyslam_jax.graph._ordering._GAIN", np.inf)
-    monkeypatch.setattr("bodyslam_jax.graph._ordering._spectral", lambda *_: order)
+    monkeypatch.setattr("bodyslam_jax.graph.ordering._GAIN", np.inf)
+    monkeypatch.setattr("bodyslam_jax.graph.ordering._spectral", lambda *_: order)
     problem = g.make_problem(in_time.factors, state)
     assert problem.layout.order.tolist() == order.tolist()
     assert problem.layout.reach == 6

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bodyslam_jax import export, rehearsal, synthetic
-from bodyslam_jax.assembly import assemble
+from bodyslam_jax import export, rehearsal, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.initialisation import ScaleStart
+from bodyslam_jax.pipeline.to_metric import assemble
+from bodyslam_jax.types import ScaleStart
 
 
 def test_metres_are_no_surer_than_the_two_cues_leave_them():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     cameras = rehearsal._cameras(sequence)
 
     def found(motion: float, sigma: float) -> tuple[dict, str]:
@@ -46,8 +46,8 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
 
 
 def test_noise_of_pixels_that_nobody_measured_is_not_told():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = rehearsal._joint(sequence)
     for kind, expected in (("static", None), ("rotation", None), ("moving", 0.7)):
         cameras = rehearsal._cameras(sequence)
@@ -57,8 +57,8 @@ def test_noise_of_pixels_that_nobody_measured_is_not_told():
 
 
 def test_the_summary_says_who_and_what_is_left_out():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = rehearsal._joint(sequence)
     moved = joint.cameras.copy()
     moved[:, 0, 3] = np.linspace(0, 3, 15)
@@ -103,8 +103,8 @@ def test_the_summary_says_who_and_what_is_left_out():
 
 
 def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = rehearsal._joint(sequence)
     cameras = dataclasses.replace(rehearsal._cameras(sequence), kind="moving")
 
@@ -122,8 +122,8 @@ def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
 
 
 def test_steps_that_are_too_slow_for_people_are_told(monkeypatch):
-    made = synthetic.simulate(Simulation(sequence="M1", length=15))
-    sequence, body, config = synthetic.as_sequence(made), load_body_model(), Config()
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = dataclasses.replace(rehearsal._joint(sequence), scale_sigma=np.nan)
     cameras = rehearsal._cameras(sequence)
     found = lambda: assemble(sequence, config, body, cameras, joint, {}).summary

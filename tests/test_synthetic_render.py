@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.synthetic._outfit import PARTS, Figure, Outfit, dress
-from bodyslam_jax.synthetic._posing import Person
-from bodyslam_jax.synthetic._raster import rasterise
-from bodyslam_jax.synthetic._render import Renderer, write_video
-from bodyslam_jax.synthetic._room import Box, Room, furnish, landmarks_on
-from bodyslam_jax.synthetic._scene import look_at, walk
-from bodyslam_jax.synthetic._shutter import Shutter, cameras_at
+from bodyslam_jax.simulation.exact_scene import look_at, walk
+from bodyslam_jax.simulation.outfit import PARTS, Figure, Outfit, dress
+from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.raster import rasterise
+from bodyslam_jax.simulation.renderer import Renderer, write_video
+from bodyslam_jax.simulation.room import Box, Room, furnish, landmarks_on
+from bodyslam_jax.simulation.shutter import Shutter, cameras_at
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 SIZE = (640, 480)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import body, synthetic
-from bodyslam_jax.synthetic import Simulation
+from bodyslam_jax import body, simulation
+from bodyslam_jax.simulation import Simulation
 
 FRAMES = 200
 
 
 @functools.cache
 def simulated(**settings):
-    return synthetic.simulate(Simulation(**{"length": FRAMES, "seed": 1, **settings}))
+    return simulation.simulate(Simulation(**{"length": FRAMES, "seed": 1, **settings}))
 
 
 @functools.cache
@@ -86,9 +86,9 @@ def test_noise_changes_nothing_that_is_true():
 
 
 def test_the_same_seed_gives_the_same_sequence_and_another_another():
-    a = synthetic.simulate(Simulation(length=30, seed=7))
-    b = synthetic.simulate(Simulation(length=30, seed=7))
-    c = synthetic.simulate(Simulation(length=30, seed=8))
+    a = simulation.simulate(Simulation(length=30, seed=7))
+    b = simulation.simulate(Simulation(length=30, seed=7))
+    c = simulation.simulate(Simulation(length=30, seed=8))
     np.testing.assert_array_equal(a.tracks.uv, b.tracks.uv)
     np.testing.assert_array_equal(a.keypoints[0], b.keypoints[0])
     np.testing.assert_array_equal(a.bodies.poses, b.bodies.poses)
@@ -236,7 +236,7 @@ def test_without_feet_and_face_there_are_fourteen_points():
 def test_motion_of_ones_own_and_bad_motion(tmp_path):
     own = dataclasses.replace(Simulation(length=20), motion=str(tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match="none"):
-        synthetic.simulate(own)
+        simulation.simulate(own)
     still = tmp_path / "stand.npz"
     upright = np.zeros((90, 156))
     upright[:, 0] = np.pi / 2
@@ -247,22 +247,22 @@ def test_motion_of_ones_own_and_bad_motion(tmp_path):
         mocap_framerate=30.0,
     )
     with pytest.raises(ValueError, match="no walk"):
-        synthetic.simulate(dataclasses.replace(own, motion=str(still)))
+        simulation.simulate(dataclasses.replace(own, motion=str(still)))
     with pytest.raises(ValueError, match="2 frames"):
-        synthetic.simulate(Simulation(length=1))
+        simulation.simulate(Simulation(length=1))
 
 
 def test_a_second_person_is_true_and_measured_and_changes_nothing_of_the_first():
     one, two = simulated(noise="low"), simulated(noise="low", people=2)
     np.testing.assert_array_equal(one.joints, two.joints)
     np.testing.assert_array_equal(one.T_WC, two.T_WC)
-    truth = synthetic.as_truth(two)
+    truth = simulation.as_truth(two)
     assert truth.joints.shape == (2, FRAMES, 24, 3)
     first, second = truth.joints
     assert np.linalg.norm(first - second, axis=-1).min() > 0.15  # nobody in nobody
     assert np.abs(truth.betas[0] - truth.betas[1]).max() > 0.3
     assert abs(second[:, [10, 11], 1].min(axis=1)).max() < 0.2  # on the same floor
-    measured = synthetic.as_sequence(two)
+    measured = simulation.as_sequence(two)
     uv, confidence = measured.keypoints.uv[1], measured.keypoints.confidence[1]
     there = confidence > 0
     assert there.any(axis=1).mean() > 0.3
@@ -297,4 +297,4 @@ def test_furniture_in_the_way_hides_keypoints_and_leaves_the_ways_free():
 )
 def test_what_cannot_be_filmed_is_said(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} .*expected"):
-        synthetic.simulate(Simulation(length=10, **wrong))
+        simulation.simulate(Simulation(length=10, **wrong))

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.motion import read_motion
-from bodyslam_jax.synthetic import _filming, _simulate, _walking
-from bodyslam_jax.synthetic._posing import Person
+from bodyslam_jax.simulation import camera_paths, gait_synthesis, sequences
+from bodyslam_jax.simulation.posing import Person
 
 
 @pytest.fixture(scope="module")
@@ -19,22 +19,22 @@ def person():
 
 @pytest.fixture(scope="module")
 def clips():
-    source = str(_simulate.ASSETS / "walking.npz")
-    return _walking.walking_clips(read_motion(source), source)
+    source = str(sequences.ASSETS / "walking.npz")
+    return gait_synthesis.walking_clips(read_motion(source), source)
 
 
 @pytest.fixture(scope="module")
 def path():
-    return _filming.floor_path("room", False, np.random.default_rng(0))[0]
+    return camera_paths.floor_path("room", False, np.random.default_rng(0))[0]
 
 
 @pytest.fixture(scope="module")
 def walk(person, clips, path):
-    return _walking.walk_along(person, clips, path, 300, np.random.default_rng(1))
+    return gait_synthesis.walk_along(person, clips, path, 300, np.random.default_rng(1))
 
 
 def test_feet_stand_still_also_at_seams_and_in_turns(person, walk):
-    sole = _walking.Soles(person)(walk.poses, walk.pelvis)
+    sole = gait_synthesis.Soles(person)(walk.poses, walk.pelvis)
     step = np.linalg.norm(np.diff(sole, axis=0)[:, :, [0, 2]], axis=2).min(axis=1)
     # m/s; a rolling foot, in the recordings 0.09, 0.19 and 0.38
     slide = np.percentile(step * 30, [50, 90, 100])
@@ -71,7 +71,9 @@ def test_length_of_steps_is_in_proportion_to_the_legs(clips, path):
     for beta in (-2.0, 2.0):
         size[0] = beta
         person = Person(model, size)
-        walk = _walking.walk_along(person, clips, path, 200, np.random.default_rng(1))
+        walk = gait_synthesis.walk_along(
+            person, clips, path, 200, np.random.default_rng(1)
+        )
         steps = np.linalg.norm(np.diff(walk.pelvis[:, [0, 2]], axis=0), axis=1)
         legs = np.linalg.norm(np.diff(person.rest[[1, 4, 7]], axis=0), axis=1).sum()
         speed.append(steps.mean() / legs)
@@ -91,28 +93,28 @@ def test_toes_bend_rather_than_go_through_the_floor(person, walk):
 
 def test_clips_are_walks_of_validation_subjects_if_there_are_any(clips):
     training = [dataclasses.replace(c, split="train") for c in clips]
-    kept = _walking.walking_clips([*training, *clips[:2]], "x")
+    kept = gait_synthesis.walking_clips([*training, *clips[:2]], "x")
     assert [c.split for c in kept] == ["val", "val"]
     fast = [dataclasses.replace(c, fps=60.0) for c in clips]
-    assert all(c.fps == 30 for c in _walking.walking_clips(fast, "x"))
-    assert len(_walking.walking_clips(training, "x")) == len(clips)
+    assert all(c.fps == 30 for c in gait_synthesis.walking_clips(fast, "x"))
+    assert len(gait_synthesis.walking_clips(training, "x")) == len(clips)
     dances = [dataclasses.replace(c, motion="dance") for c in clips]
     with pytest.raises(ValueError, match="dances.npz: no walk"):
-        _walking.walking_clips(dances, "dances.npz")
+        gait_synthesis.walking_clips(dances, "dances.npz")
     short = [
         dataclasses.replace(c, poses=c.poses[:30], trans=c.trans[:30]) for c in clips
     ]
     with pytest.raises(ValueError, match="1.4 s"):
-        _walking.walking_clips(short, "x")
+        gait_synthesis.walking_clips(short, "x")
 
 
 @pytest.mark.parametrize("level", ["E", "M", "D"])
 def test_a_camera_keeps_the_person_in_its_image(walk, level):
-    handling, rng = _filming.HANDLING[level], np.random.default_rng(2)
+    handling, rng = camera_paths.HANDLING[level], np.random.default_rng(2)
     place = np.array([0.0, -5.0])
     for T in (
-        _filming.film_room(walk.pelvis, place, handling, rng),
-        _filming.film_following(walk.pelvis, handling, rng),
+        camera_paths.film_room(walk.pelvis, place, handling, rng),
+        camera_paths.film_following(walk.pelvis, handling, rng),
     ):
         p_C = np.einsum("tab,ta->tb", T[:, :3, :3], walk.pelvis - T[:, :3, 3])
         assert (np.abs(p_C[:, :2]) < 0.45 * p_C[:, 2:]).all()

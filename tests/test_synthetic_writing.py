@@ -11,27 +11,27 @@ import numpy as np
 import pytest
 from test_cli import _run
 
-from bodyslam_jax import synthetic
+from bodyslam_jax import simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.evaluation import read_groundtruth
-from bodyslam_jax.frontend import read_sequence
-from bodyslam_jax.frontend._bodies import read_bodies
+from bodyslam_jax.io import read_sequence
+from bodyslam_jax.io.bodies.reader import read_bodies
 
-SETTINGS = synthetic.Simulation(sequence="M2", length=40, seed=3)
+SETTINGS = simulation.Simulation(sequence="M2", length=40, seed=3)
 
 
 @pytest.fixture(scope="module")
 def simulated():
-    return synthetic.simulate(SETTINGS)
+    return simulation.simulate(SETTINGS)
 
 
 @pytest.fixture(scope="module")
 def folder(simulated, tmp_path_factory):
-    return synthetic.write_sequence(tmp_path_factory.mktemp("a") / "m2", simulated)
+    return simulation.write_sequence(tmp_path_factory.mktemp("a") / "m2", simulated)
 
 
 def test_readers_find_what_was_simulated(simulated, folder):
-    found, wanted = read_sequence(folder), synthetic.as_sequence(simulated)
+    found, wanted = read_sequence(folder), simulation.as_sequence(simulated)
     assert found.warnings == ()
     np.testing.assert_allclose(found.timestamps, wanted.timestamps, atol=1e-9)
     np.testing.assert_array_equal(found.intrinsics.params, wanted.intrinsics.params)
@@ -51,7 +51,7 @@ def test_readers_find_what_was_simulated(simulated, folder):
 
 def test_truth_of_the_folder_is_the_truth(simulated, folder):
     found = read_groundtruth(folder, load_body_model())
-    wanted = synthetic.as_truth(simulated)
+    wanted = simulation.as_truth(simulated)
     np.testing.assert_allclose(found.T_WC, wanted.T_WC, atol=1e-7)  # nine decimals
     for name in ("poses", "trans", "betas", "joints", "landmarks", "present"):
         np.testing.assert_allclose(
@@ -60,7 +60,7 @@ def test_truth_of_the_folder_is_the_truth(simulated, folder):
 
 
 def test_weak_perspective_says_the_same(simulated, folder):
-    intrinsics = synthetic.as_sequence(simulated).intrinsics
+    intrinsics = simulation.as_sequence(simulated).intrinsics
     read = lambda name: read_bodies(folder / name, num_frames=40, intrinsics=intrinsics)
     full, weak = read("bodies.npz"), read("bodies_weak_perspective.npz")
     np.testing.assert_array_equal(full.present, weak.present)
@@ -76,8 +76,8 @@ def test_true_bodies_are_not_said_to_be_regressed(
 ):
     settings = dataclasses.replace(SETTINGS, noise="real", body_noise=noise)
     true = dataclasses.replace(simulated, settings=settings)
-    assert synthetic.as_sequence(true).bodies.shapes_regressed is regressed
-    folder = synthetic.write_sequence(tmp_path / "true", true)
+    assert simulation.as_sequence(true).bodies.shapes_regressed is regressed
+    folder = simulation.write_sequence(tmp_path / "true", true)
     assert read_sequence(folder).bodies.shapes_regressed is regressed
 
 
@@ -85,16 +85,16 @@ def test_folder_is_written_whole_and_over_nothing_else(simulated, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(ValueError, match="not empty"):
-        synthetic.write_sequence(tmp_path / "mine", simulated)
+        simulation.write_sequence(tmp_path / "mine", simulated)
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match="a file"):
-        synthetic.write_sequence(tmp_path / "file", simulated)
+        simulation.write_sequence(tmp_path / "file", simulated)
     with pytest.raises(ValueError, match="cannot be written"):
-        synthetic.write_sequence(tmp_path / "file" / "below", simulated)
+        simulation.write_sequence(tmp_path / "file" / "below", simulated)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "mine"]
-    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    out = simulation.write_sequence(tmp_path / "out", simulated)
     (out / "tracks.npz").unlink()
-    assert synthetic.write_sequence(out, simulated, tracks=False) == out
+    assert simulation.write_sequence(out, simulated, tracks=False) == out
     assert not (out / "tracks.npz").exists()
     assert json.loads((out / "simulation.json").read_text())["seed"] == 3
 
@@ -105,7 +105,7 @@ def test_a_write_that_fails_leaves_nothing(simulated, tmp_path, monkeypatch):
 
     monkeypatch.setattr("numpy.savez_compressed", full)
     with pytest.raises(ValueError, match="No space left"):
-        synthetic.write_sequence(tmp_path / "out", simulated)
+        simulation.write_sequence(tmp_path / "out", simulated)
     assert not list(tmp_path.iterdir())
 
 
@@ -115,7 +115,7 @@ def _files(folder):
 
 def test_what_no_simulation_wrote_is_kept(simulated, tmp_path):
     """A run, notes and images; but not the longer and rendered simulation before."""
-    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    out = simulation.write_sequence(tmp_path / "out", simulated)
     new = _files(out)
     mark = json.loads((out / "simulation.json").read_text())
     (out / "simulation.json").write_text(json.dumps(mark | {"render": True}))
@@ -124,7 +124,7 @@ def test_what_no_simulation_wrote_is_kept(simulated, tmp_path):
     for name in old | theirs:
         (out / name).parent.mkdir(exist_ok=True)
         (out / name).write_text("mine")
-    synthetic.write_sequence(out, simulated)
+    simulation.write_sequence(out, simulated)
     assert _files(out) == new | theirs
     assert all((out / name).read_text() == "mine" for name in theirs)
     # Nor a video or keypoints that are somebody's, by name or behind a link
@@ -132,12 +132,12 @@ def test_what_no_simulation_wrote_is_kept(simulated, tmp_path):
     (out / "keypoints").rename(tmp_path / "keypoints")
     (out / "keypoints").symlink_to(tmp_path / "keypoints")
     before = _files(tmp_path / "keypoints")
-    synthetic.write_sequence(out, simulated)
+    simulation.write_sequence(out, simulated)
     assert (out / "video.mp4").read_text() == "mine"
     assert _files(tmp_path / "keypoints") == before and len(before) == 41
     settings = dataclasses.replace(SETTINGS, render=True)
     with pytest.raises(ValueError, match="has video.mp4, which no simulation wrote"):
-        synthetic.check_folder(out, settings)
+        simulation.check_folder(out, settings)
 
 
 @pytest.mark.parametrize("moved", [0, 1, 5, 20, 46])
@@ -145,7 +145,7 @@ def test_what_no_simulation_wrote_is_kept(simulated, tmp_path):
 def test_interrupted_writing_is_no_sequence_and_is_finished(
     simulated, tmp_path, monkeypatch, moved, error
 ):
-    out = synthetic.write_sequence(tmp_path / "out", simulated)
+    out = simulation.write_sequence(tmp_path / "out", simulated)
     whole, replace, num = _files(out), os.replace, 0
     (out / "mine.txt").write_text("x")
 
@@ -158,27 +158,27 @@ def test_interrupted_writing_is_no_sequence_and_is_finished(
 
     monkeypatch.setattr("os.replace", interrupted)
     with pytest.raises((KeyboardInterrupt, ValueError)):
-        synthetic.write_sequence(out, simulated)
+        simulation.write_sequence(out, simulated)
     monkeypatch.undo()
     with pytest.raises((ValueError, FileNotFoundError)):
         read_sequence(out)
     assert "unfinished" in json.loads((out / "simulation.json").read_text())
     assert not list(out.glob(".*"))
     (out / ".simulation-abcd1234").mkdir()  # as `kill -9` leaves it
-    synthetic.write_sequence(out, simulated)
+    simulation.write_sequence(out, simulated)
     assert _files(out) == whole | {"mine.txt"} and not list(out.glob(".*"))
 
 
 def test_killed_before_the_first_file(simulated, tmp_path):
     (tmp_path / "out" / ".simulation-abcd1234").mkdir(parents=True)
-    synthetic.write_sequence(tmp_path / "out", simulated)
+    simulation.write_sequence(tmp_path / "out", simulated)
     assert not list((tmp_path / "out").glob(".*"))
 
 
 def test_a_link_to_a_folder_is_written_through(simulated, tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "real")
     for _ in range(2):
-        assert synthetic.write_sequence(tmp_path / "link", simulated).is_symlink()
+        assert simulation.write_sequence(tmp_path / "link", simulated).is_symlink()
     assert (tmp_path / "real" / "camera.json").exists()
 
 
@@ -205,7 +205,7 @@ def test_a_refused_option_is_named_and_leaves_nothing(
 def test_video_shows_the_person_where_the_truth_is(simulated):
     """Where the camera stands still, all that changes is the walker."""
     still = np.repeat(simulated.T_WC[:1], 40, axis=0)
-    film = synthetic.render(dataclasses.replace(simulated, T_WC=still))
+    film = simulation.render(dataclasses.replace(simulated, T_WC=still))
     frames = list(itertools.islice(film, 2))
     change = abs(frames[1].astype(float) - frames[0]).max(axis=2) > 25
     change = cv2.erode(change.astype(np.uint8), np.ones((2, 2), np.uint8)) > 0
@@ -222,23 +222,25 @@ def test_video_shows_the_person_where_the_truth_is(simulated):
 
 @pytest.mark.slow
 def test_demo_scene_is_a_sequence_with_a_video(tmp_path):
-    folder = synthetic.demo_scene(tmp_path / "demo")
+    folder = simulation.demo_scene(tmp_path / "demo")
     sequence = read_sequence(folder)
     assert sequence.frames == folder / "video.mp4"
     assert sequence.tracks is None
     assert 90 <= sequence.num_frames <= 120
     before = (folder / "video.mp4").stat().st_mtime_ns
-    synthetic.demo_scene(folder)
+    simulation.demo_scene(folder)
     assert (folder / "video.mp4").stat().st_mtime_ns == before
-    assert synthetic.demo_scene(folder, seed=1) == folder
+    assert simulation.demo_scene(folder, seed=1) == folder
     assert (folder / "video.mp4").stat().st_mtime_ns != before
 
 
 def test_two_people_are_written_and_read(tmp_path):
-    two = synthetic.simulate(dataclasses.replace(SETTINGS, people=2, noise="low"))
-    folder = synthetic.write_sequence(tmp_path / "two", two)
+    two = simulation.simulate(dataclasses.replace(SETTINGS, people=2, noise="low"))
+    folder = simulation.write_sequence(tmp_path / "two", two)
     truth = read_groundtruth(folder, load_body_model())
-    np.testing.assert_allclose(truth.joints, synthetic.as_truth(two).joints, atol=1e-12)
+    np.testing.assert_allclose(
+        truth.joints, simulation.as_truth(two).joints, atol=1e-12
+    )
     found = read_sequence(folder)
     assert found.bodies.present.shape == (2, 40)
     people = [
@@ -246,13 +248,13 @@ def test_two_people_are_written_and_read(tmp_path):
     ]
     assert max(map(len, people)) == 2
     # and one person again leaves none of the second
-    synthetic.write_sequence(folder, synthetic.simulate(SETTINGS))
+    simulation.write_sequence(folder, simulation.simulate(SETTINGS))
     assert len(read_groundtruth(folder, load_body_model()).joints) == 1
 
 
 def test_the_same_seed_gives_the_same_film_and_another_another():
     settings = dataclasses.replace(SETTINGS, length=3, people=2)
-    film = lambda s: np.stack(list(synthetic.render(synthetic.simulate(s))))
+    film = lambda s: np.stack(list(simulation.render(simulation.simulate(s))))
     first = film(settings)
     np.testing.assert_array_equal(first, film(settings))
     other = film(dataclasses.replace(settings, seed=4))
@@ -260,14 +262,14 @@ def test_the_same_seed_gives_the_same_film_and_another_another():
 
 
 def test_a_film_has_no_measurements_and_is_kept(simulated, tmp_path):
-    short = synthetic.simulate(dataclasses.replace(SETTINGS, length=3))
-    measured = synthetic.write_sequence(tmp_path / "a", short)
+    short = simulation.simulate(dataclasses.replace(SETTINGS, length=3))
+    measured = simulation.write_sequence(tmp_path / "a", short)
     assert read_sequence(measured).keypoints is not None
-    folder = synthetic.film_scene(tmp_path / "a", short)  # replaces what was measured
+    folder = simulation.film_scene(tmp_path / "a", short)  # replaces what was measured
     sequence = read_sequence(folder)
     assert sequence.keypoints is None and sequence.bodies is None
     assert sequence.tracks is None and sequence.num_frames == 3
     assert not (folder / "keypoints").exists()
     before = (folder / "video.mp4").stat().st_mtime_ns
-    synthetic.film_scene(folder, short)
+    simulation.film_scene(folder, short)
     assert (folder / "video.mp4").stat().st_mtime_ns == before

@@ -11,7 +11,7 @@ import scenes
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, solve
-from bodyslam_jax.solver._triangulation import triangulate_anew
+from bodyslam_jax.solver.retriangulation import triangulate_anew
 
 TIGHT = (Stage(rtol=1e-12, max_steps=60),)
 LOST = np.arange(0, 25, 3)

@@ -11,7 +11,7 @@ import scenes
 from bodyslam_jax import graph
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.initialisation import upright_factor
-from bodyslam_jax.initialisation._upright import mean_up
+from bodyslam_jax.initialisation.upright import mean_up
 
 ON = GraphWeights(upright_sigma=0.1)
 

@@ -10,9 +10,8 @@ import pytest
 
 from bodyslam_jax import view
 from bodyslam_jax.body import joints, keypoints, load_body_model, write_npz
-from bodyslam_jax.result import Result
-from bodyslam_jax.sequence import Tracks
-from bodyslam_jax.view import _plan, _video
+from bodyslam_jax.types import Result, Tracks
+from bodyslam_jax.view import overlay, top_view
 
 WIDTH, HEIGHT = 160, 120
 
@@ -130,7 +129,7 @@ def test_a_frame_that_is_not_there_is_named(body, frame):
 def test_the_inset_has_a_grid_for_scenes_of_any_size(body, size):
     result = _scene(body)
     result.T_WC[:, 0, 3] = np.linspace(0, size, 4)
-    plan = _plan.Plan(result, (WIDTH, HEIGHT))
+    plan = top_view.Plan(result, (WIDTH, HEIGHT))
     assert plan.step >= 1 and plan.side / plan.zoom / plan.step <= 10.001
 
 
@@ -176,7 +175,7 @@ def test_points_and_their_trails(tmp_path, body):
         np.array([[20.0, 80], [30, 80], [40, 80], [20, 20]]),
     )
     pictures = list(
-        _video.pictures(
+        overlay.pictures(
             None, iter(()), result, body, tracks, (WIDTH, HEIGHT), np.ones(2)
         )
     )
@@ -188,7 +187,9 @@ def test_the_inset_follows_camera_and_person(body):
     result = _scene(body, num=30)
     result.T_WC[:, 0, 3] = np.linspace(0, 3, 30)
     moving = list(
-        _video.pictures(None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2))
+        overlay.pictures(
+            None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2)
+        )
     )
     corner = np.s_[10:50, -50:-10]
     assert np.abs(moving[29][corner].astype(int) - moving[0][corner]).max() > 60
@@ -200,7 +201,7 @@ def test_a_video_cut_short_is_an_error(tmp_path, body):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(OSError, match="frames written; disk full"):
-        _video.check_length(path, 30)
+        overlay.check_length(path, 30)
 
 
 def test_one_frame_and_nobody(tmp_path, body):

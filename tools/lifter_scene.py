@@ -1,7 +1,7 @@
 """Motion capture seen by made-up cameras: what `train_lifter.py` learns from.
 
 People of random shape walk before cameras that stand or follow, and are seen with the
-errors of `synthetic.NOISE`.
+errors of `simulation.NOISE`.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import MIRRORED
-from bodyslam_jax.people._skeleton import NUM_SHAPE, Skeleton, place_points
-from bodyslam_jax.synthetic._measuring import NOISE, detect_keypoints
+from bodyslam_jax.people.skeleton import NUM_SHAPE, Skeleton, place_points
+from bodyslam_jax.simulation.sensor_noise import NOISE, detect_keypoints
 
 FRAMES = 320
 """Of a clip, at most."""

@@ -1,4 +1,4 @@
-"""Makes `bodyslam_jax/synthetic/assets/walking.npz`: a few seconds of CMU walking.
+"""Makes `bodyslam_jax/simulation/assets/walking.npz`: a few seconds of CMU walking.
 
     python tools/make_demo_motion.py CMU_LOCOMOTION.npz
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 TRIALS = "02_01 02_02 08_01 08_02 08_03 08_04 08_06 08_09".split()
-OUT = Path(__file__).parents[1] / "bodyslam_jax/synthetic/assets/walking.npz"
+OUT = Path(__file__).parents[1] / "bodyslam_jax/simulation/assets/walking.npz"
 
 
 def main(path: Path) -> None:

@@ -5,7 +5,7 @@
 `DATA_FOLDER` holds `cmu_locomotion.npz` and `cmu_other.npz`: SMPL joint rotations at
 30 fps with the arrays `poses` (n, 24, 3), `seq_start`, `seq_length`, `seq_subject`
 and, for the first, `seq_split`, `seq_phase`. What is learnt and why is in
-`bodyslam_jax/people/_prior.py`; what was held out is in the model card beside it.
+`bodyslam_jax/people/posture_prior.py`; what was held out is in the model card there.
 """
 
 import sys

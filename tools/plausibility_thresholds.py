@@ -19,18 +19,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import (
-    camera,
-    graph,
-    initialisation,
-    joint,
-    motion,
-    people,
-    synthetic,
-)
+from bodyslam_jax import graph, initialisation, motion, people, simulation
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.diagnostics import figures
 from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS
+from bodyslam_jax.geometry import camera
+from bodyslam_jax.pipeline import joint_stage
 
 SECONDS = (3.0, 5.0)
 SHORTEST = 0.7
@@ -75,8 +69,8 @@ def simulated(number: int) -> Iterator[tuple[str, dict[str, float]]]:
             length=240,
             seed=1000 + i,
         )
-        made = synthetic.simulate(settings, body)
-        truth, sequence = synthetic.as_truth(made), synthetic.as_sequence(made)
+        made = simulation.simulate(settings, body)
+        truth, sequence = simulation.as_truth(made), simulation.as_sequence(made)
         found = figures.camera_figures(truth.T_WC, sequence.fps)
         uv = project(body, truth, sequence)
         error = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
@@ -94,11 +88,11 @@ def carried_of(paths: list[Path], frames: int = 90) -> tuple[int, list[str]]:
     """Of how many pieces of motion capture, filmed by a camera that stands still, and
     of which the motion model's steps would be left out."""
     body = body_.load_body_model()
-    made = synthetic.as_sequence(synthetic.simulate(Simulation(length=frames), body))
+    made = simulation.as_sequence(simulation.simulate(Simulation(length=frames), body))
     there = np.ones((1, frames), bool)
     roots = people.roots_from_bodies(made.bodies, body)
     roots = dataclasses.replace(roots, present=there)
-    predictor = joint.motion_predictor(made, roots, body, Config())
+    predictor = joint_stage.motion_predictor(made, roots, body, Config())
     still = jnp.asarray(np.tile(np.eye(4), (frames, 1, 1)))
     number, found = 0, []
     clips = (clip for path in paths for clip in motion.read_motion(path))
@@ -119,7 +113,7 @@ def carried_of(paths: list[Path], frames: int = 90) -> tuple[int, list[str]]:
                 landmarks=jnp.zeros((1, 3)),
                 intrinsics=jnp.asarray(made.intrinsics.params),
             )
-            seen = joint.predict(predictor, state)
+            seen = joint_stage.predict(predictor, state)
             number += 1
             if initialisation.carried(state, seen, there, 1.0, made.fps):
                 found.append(clip.name)

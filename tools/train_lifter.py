@@ -38,17 +38,17 @@ from make_posture_prior import HELD_OUT
 from bodyslam_jax import people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import PeopleFit
-from bodyslam_jax.people import _fit, _lift
-from bodyslam_jax.people._lift import NUM_FEATURES, Lifter, features
-from bodyslam_jax.people._prior import PosturePrior, load_posture_prior
-from bodyslam_jax.people._skeleton import (
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.people import fit, lift
+from bodyslam_jax.people.lift import NUM_FEATURES, Lifter, features
+from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
+from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
     Skeleton,
     make_skeleton,
     place_points,
 )
-from bodyslam_jax.rotation import log
-from bodyslam_jax.sequence import Intrinsics, Keypoints
+from bodyslam_jax.types import Intrinsics, Keypoints
 
 CALIBRATION = ("05", "10", "12", "39")
 VIEWS = {True: 10, False: 24}  # cameras for each sequence of walking, of anything else
@@ -238,7 +238,7 @@ def learn(folder: Path, out: Path, steps: int) -> None:
 
 def judge(folder: Path, network: Path) -> None:
     """Fits to keypoints of the held-out people, with guesses and without."""
-    _fit.load_lifter = lambda: _lift.load_lifter(network)
+    fit.load_lifter = lambda: lift.load_lifter(network)
     body = load_body_model()
     skeleton = make_skeleton(body, 0.0)
     motions = [

@@ -3,17 +3,17 @@
 The command line and `config.yaml` are generated from these classes.
 """
 
-from bodyslam_jax.config._front_end import Association as Association
-from bodyslam_jax.config._front_end import Detect as Detect
-from bodyslam_jax.config._front_end import Structure as Structure
-from bodyslam_jax.config._front_end import Tracking as Tracking
-from bodyslam_jax.config._known import GRAVITY_SIGMA as GRAVITY_SIGMA
-from bodyslam_jax.config._known import PATH_SIGMA as PATH_SIGMA
-from bodyslam_jax.config._known import Known as Known
-from bodyslam_jax.config._known import Measured as Measured
-from bodyslam_jax.config._motion import MotionTraining as MotionTraining
-from bodyslam_jax.config._people import PeopleFit as PeopleFit
-from bodyslam_jax.config._run import Config as Config
-from bodyslam_jax.config._simulation import Experiment as Experiment
-from bodyslam_jax.config._simulation import Simulation as Simulation
-from bodyslam_jax.config._weights import GraphWeights as GraphWeights
+from bodyslam_jax.config.front_end import Association as Association
+from bodyslam_jax.config.front_end import Detect as Detect
+from bodyslam_jax.config.front_end import Structure as Structure
+from bodyslam_jax.config.front_end import Tracking as Tracking
+from bodyslam_jax.config.known import GRAVITY_SIGMA as GRAVITY_SIGMA
+from bodyslam_jax.config.known import PATH_SIGMA as PATH_SIGMA
+from bodyslam_jax.config.known import Known as Known
+from bodyslam_jax.config.known import Measured as Measured
+from bodyslam_jax.config.motion import MotionTraining as MotionTraining
+from bodyslam_jax.config.people import PeopleFit as PeopleFit
+from bodyslam_jax.config.run import Config as Config
+from bodyslam_jax.config.simulation import Experiment as Experiment
+from bodyslam_jax.config.simulation import Simulation as Simulation
+from bodyslam_jax.config.weights import GraphWeights as GraphWeights

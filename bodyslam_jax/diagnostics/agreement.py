@@ -18,28 +18,28 @@ from collections.abc import Callable
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics._exchanges import put_back_exchanges
-from bodyslam_jax.diagnostics._explanations import (
+from bodyslam_jax.diagnostics.exchanges import put_back_exchanges
+from bodyslam_jax.diagnostics.explanations import (
     Explanation,
     disagreement,
     explanations,
     of_frames,
     some_frames,
 )
-from bodyslam_jax.diagnostics._facing import shares, trunk_directions
-from bodyslam_jax.diagnostics._identities import settle_identities
-from bodyslam_jax.diagnostics._image_points import (
+from bodyslam_jax.diagnostics.facing import shares, trunk_directions
+from bodyslam_jax.diagnostics.identities import settle_identities
+from bodyslam_jax.diagnostics.image_points import (
     People,
     compact,
     distances,
     people_of,
     project,
 )
-from bodyslam_jax.diagnostics._oddities import warn_of_oddities
-from bodyslam_jax.diagnostics._times import settle_times
-from bodyslam_jax.diagnostics._timing import best_timing
-from bodyslam_jax.diagnostics._verdicts import undone
-from bodyslam_jax.sequence import Sequence
+from bodyslam_jax.diagnostics.oddities import warn_of_oddities
+from bodyslam_jax.diagnostics.renumbering import settle_times
+from bodyslam_jax.diagnostics.timing import best_timing
+from bodyslam_jax.diagnostics.verdicts import undone
+from bodyslam_jax.types import Sequence
 
 _log = logging.getLogger(__name__)
 

@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.diagnostics import _posture as posture
+from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.export import Gait, gait_of_joints
-from bodyslam_jax.gravity import find_stances
+from bodyslam_jax.geometry.gravity import find_stances
 
 _WALKING = (0.7, posture.RUNNING)
 """Median speeds over the ground of who goes on foot and does not run, m/s."""

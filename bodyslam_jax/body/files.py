@@ -1,0 +1,281 @@
+"""Body model files: found, read, checked, written.
+
+SMPL's files under their usual names and in their usual forms: the original pickle, and
+`.npz` with the same names of arrays. SMPL-H and SMPL-X have more joints (hands, jaw,
+eyes). At rest those follow the wrist or the head rigidly, so that their weights simply
+belong to it, and the body is driven by SMPL's 72 numbers.
+"""
+
+import contextlib
+import json
+import os
+import re
+import zipfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.body.model import BodyModel, runs_of_vertices, sparse_rows
+from bodyslam_jax.body.skeleton import JOINT_NAMES, PARENTS, SURFACE_POINTS
+from bodyslam_jax.body.unpickle import read_pickle
+from bodyslam_jax.body.validate import checked
+
+DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
+VARIABLE = "BODYSLAM_BODY_MODEL"
+_GENDERS = ("neutral", "female", "male")
+
+_NAMES = (
+    "SMPL_{G}.npz",
+    "SMPL_{G}.pkl",
+    "smpl/SMPL_{G}.npz",
+    "smpl/SMPL_{G}.pkl",
+    "basicModel_{g}_lbs_10_207_0_v1.0.0.pkl",
+    "basicmodel_{g}_lbs_10_207_0_v1.1.0.pkl",
+    "basicModel_{g}_lbs_10_207_0_v1.1.0.pkl",
+    "smpl/models/basicmodel_{g}_lbs_10_207_0_v1.1.0.pkl",
+    "SMPLH_{G}.npz",
+    "SMPLH_{G}.pkl",
+    "smplh/SMPLH_{G}.npz",
+    "smplh/SMPLH_{G}.pkl",
+    "{gender}/model.npz",
+    "smplh/{gender}/model.npz",
+    "SMPLX_{G}.npz",
+    "SMPLX_{G}.pkl",
+    "smplx/SMPLX_{G}.npz",
+    "smplx/SMPLX_{G}.pkl",
+)
+
+# Vertices of SURFACE_POINTS in SMPL's meshes (`vertex_ids.py` of smplx; the top of the
+# head is found as the highest vertex).
+_PICKS = {
+    6890: (332, 6260, 2800, 4071, 583, 3216, 3226, 3387, 6617, 6624, 6787),
+    10475: (9120, 9929, 9448, 616, 6, 5770, 5780, 8846, 8463, 8474, 8635),
+}
+_KIND = {24: "smpl", 52: "smplh", 55: "smplx"}
+
+
+def search_paths(gender: str = "neutral") -> list[Path]:
+    """Where a body model is looked for when none is named, in this order.
+
+    The file or folder in the environment variable `BODYSLAM_BODY_MODEL`, then the
+    user's folder for data. After them comes the body that ships with the package.
+    """
+    return [path for place in _places() for path in _candidates(place, gender)]
+
+
+def load_body_model(
+    path: str | Path | None = None, gender: str | None = None, dtype=None
+) -> BodyModel:
+    """Reads a body model; without a path the first that `search_paths` finds, or the
+    free body that ships with the package.
+
+    **Arguments:**
+
+    - `path`: a file (SMPL, SMPL-H, SMPL-X; `.pkl` or `.npz`) or a folder with the usual
+        names.
+    - `gender`: `neutral`, `female` or `male`; which file of a folder, and what the name
+        of a file must not contradict. Without it a folder's neutral file, or any file.
+    - `dtype`: of the arrays; by default JAX's own default.
+
+    **Raises:** `ValueError`, saying where it was looked for if there is no file, or
+    what is wrong with the one there is.
+    """
+    file = _find(path, gender)
+    model = _assemble(file, checked(file, read_arrays(file)))
+    dtype = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    cast = lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else jnp.int32)
+    arrays = {name: cast(x) for name, x in model.items() if isinstance(x, np.ndarray)}
+    return BodyModel(**{**model, **arrays})
+
+
+def check(path: str | Path, gender: str | None = None) -> str:
+    """What a body model file is, in one line; arguments as for `load_body_model`.
+
+    **Raises:** `ValueError`, in one line, if it is not usable as a body model.
+    """
+    file = _find(path, gender)
+    raw = checked(file, read_arrays(file))
+    num_vertices, num_joints = raw["weights"].shape
+    stature = np.ptp(raw["v_template"][:, 1])
+    kind = "the default body" if file == DEFAULT else _KIND[num_joints].upper()
+    return (
+        f"{file}: {kind}, {num_vertices} vertices, {len(raw['f'])} faces, "
+        f"{num_joints} joints, {raw['shapedirs'].shape[2]} shape components, "
+        f"{raw['posedirs'].shape[2]} pose blend shapes, {stature:.2f} m tall."
+    )
+
+
+def write_npz(model: BodyModel, path: str | Path) -> None:
+    """Writes SMPL's own layout, 24 joints, so that other tools for SMPL can read it.
+
+    Pose blend shapes that the model lacks are written as zeros. Nothing half-written
+    stays behind: the file appears when it is complete.
+
+    **Raises:** `ValueError` if the path is not of a `.npz`; `OSError`, naming it, if it
+    cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: suffix {path.suffix!r}, expected '.npz'.")
+    v = model.num_vertices
+    weights = np.zeros((v, 24), np.asarray(model.skin_weight).dtype)
+    rows = np.arange(v)[:, None]
+    np.add.at(weights, (rows, np.asarray(model.skin_joint)), model.skin_weight)
+    pose_dirs = np.zeros((v, 3, 207), weights.dtype)
+    pose_dirs[:, :, : model.pose_dirs.shape[2]] = model.pose_dirs
+    parents = np.array([2**32 - 1, *PARENTS[1:]], np.uint32)
+    picks = dict(zip(SURFACE_POINTS, np.asarray(model.picks).tolist(), strict=True))
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "wb") as file:
+            np.savez_compressed(
+                file,
+                v_template=np.asarray(model.template),
+                shapedirs=np.asarray(model.shape_dirs),
+                posedirs=pose_dirs,
+                J_regressor=np.asarray(model.joint_regressor),
+                J=np.asarray(model.joint_template),
+                weights=weights,
+                kintree_table=np.stack([parents, np.arange(24, dtype=np.uint32)]),
+                f=np.asarray(model.faces).astype(np.uint32),
+                joint_names=np.array(JOINT_NAMES),
+                header=np.array(json.dumps({"name": model.name, "keypoints": picks})),
+            )
+        part.replace(path)
+    except OSError as error:
+        # Of the file that was asked for, not of the one on the way to it.
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """The arrays in a `.npz` or a pickle, told apart by content; nothing is checked."""
+    if zipfile.is_zipfile(file):
+        arrays = {}
+        try:
+            with open(file, "rb") as opened, np.load(opened) as archive:
+                for name in archive.files:
+                    try:
+                        arrays[name] = archive[name]
+                    except ValueError as error:
+                        # SMPL-X keeps objects beside its arrays; they are not needed.
+                        if "Object arrays" not in str(error):
+                            raise
+        except Exception as error:
+            found = " ".join(str(error).split())[:120]
+            raise ValueError(f"{file}: a damaged .npz file ({found}).") from None
+        return arrays
+    if file.suffix == ".npz":
+        raise ValueError(f"{file}: not a .npz file, or cut short (no zip archive).")
+    return read_pickle(file)
+
+
+def _places() -> list[Path]:
+    places = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
+    home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return [*places, Path(home) / "bodyslam" / "body_models"]
+
+
+def _candidates(place: Path, gender: str) -> list[Path]:
+    if gender not in _GENDERS:
+        raise ValueError(f"gender {gender!r}, expected neutral, female or male.")
+    if place.suffix in (".npz", ".pkl") or place.is_file():
+        return [place]
+    short = gender if gender == "neutral" else gender[0]
+    names = [n.format(G=gender.upper(), g=short, gender=gender) for n in _NAMES]
+    return [place / name for name in names]
+
+
+def _find(path: str | Path | None, gender: str | None) -> Path:
+    wanted = gender or "neutral"
+    places = _places() if path is None else [Path(path)]
+    is_set = path is None and bool(os.environ.get(VARIABLE))
+    note = f" ({VARIABLE} is set)" if is_set else ""
+    for candidate in (file for place in places for file in _candidates(place, wanted)):
+        if candidate.is_file():
+            of = named_gender(candidate)
+            if gender and of not in (gender, None):
+                raise ValueError(
+                    f"{candidate}{note}: by its name a {of} body, expected {gender}."
+                )
+            return candidate
+    if path is None and wanted == "neutral" and not is_set:
+        return DEFAULT
+    tried = ", ".join(_tried(place, wanted) for place in places)
+    raise ValueError(f"No {wanted} body model found{note}; tried {tried}.")
+
+
+def named_gender(file: Path) -> str | None:
+    """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
+    name = (file.parent.name if file.stem == "model" else file.stem).lower()
+    words = re.split(r"[^a-z]+", name)
+    found = {g for g in _GENDERS if g in words or g[0] in words}
+    return found.pop() if len(found) == 1 else None
+
+
+def _tried(place: Path, gender: str) -> str:
+    files = _candidates(place, gender)
+    if files == [place]:
+        return str(place)
+    names = ", ".join(str(file.relative_to(place)) for file in files[:2])
+    return f"{place} ({names}, ...)"
+
+
+def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
+    """Arrays of a `BodyModel`, float64: 24 joints whatever the file has."""
+    template, weights, regressor = raw["v_template"], raw["weights"], raw["J_regressor"]
+    shape_dirs, pose_dirs = raw["shapedirs"][:, :, :10], raw["posedirs"]
+    num_joints = weights.shape[1]
+    if num_joints > 24:
+        parents = raw["parents"]
+        merged = np.zeros((len(template), 24))
+        for j in range(num_joints):
+            body_joint = j
+            while body_joint >= 22:
+                body_joint = parents[body_joint]
+            merged[:, body_joint] += weights[:, j]
+        # SMPL's hand joint is where the middle finger starts: the fourth joint of each
+        # hand, of 15.
+        first = num_joints - 30
+        rows = [*range(22), first + 3, first + 18]
+        weights, regressor = merged, regressor[rows]
+        pose_dirs = pose_dirs[:, :, : 9 * 21]
+    joint, weight = sparse_rows(weights / weights.sum(1, keepdims=True))
+    return {
+        "template": template,
+        "shape_dirs": shape_dirs,
+        "pose_dirs": pose_dirs if pose_dirs.any() else pose_dirs[:, :, :0],
+        "joint_template": regressor @ template,
+        "joint_shape_dirs": np.einsum("jv,vcs->jcs", regressor, shape_dirs),
+        "joint_regressor": regressor,
+        "skin_joint": joint,
+        "skin_weight": weight,
+        "faces": raw["f"],
+        "blocks": runs_of_vertices(weights),
+        "picks": raw["picks"] if "picks" in raw else _picks(template, regressor),
+        "name": file.stem,
+        "kind": "default" if file == DEFAULT else _KIND[num_joints],
+    }
+
+
+def _picks(template: np.ndarray, regressor: np.ndarray) -> np.ndarray:
+    """Vertices of the surface points of a mesh that does not name them."""
+    top = int(template[:, 1].argmax())
+    if len(template) in _PICKS:
+        return np.array([*_PICKS[len(template)], top])
+    # An unknown mesh: where the default body has them, relative to head and ankles,
+    # for the size of this one.
+    known = load_body_model(DEFAULT)
+    joints, picks = np.asarray(known.joint_template), np.asarray(known.picks)
+    points = np.asarray(known.template)[picks]
+    here = regressor @ template
+    size = np.ptp(template[:, 1]) / np.ptp(np.asarray(known.template)[:, 1])
+    anchor = [7 if "left" in n else 8 for n in SURFACE_POINTS]
+    is_foot = [n.endswith(("toe", "heel")) for n in SURFACE_POINTS]
+    anchor = np.where(is_foot, anchor, 15)
+    target = here[anchor] + size * (points - joints[anchor])
+    near = np.linalg.norm(template[None] - target[:, None], axis=-1).argmin(1)
+    return np.append(near[:-1], top)

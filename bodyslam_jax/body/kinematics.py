@@ -1,0 +1,303 @@
+"""From pose and shape to joints and keypoints; no vertex but the picked ones.
+
+SMPL (Loper et al., 2015): the joints at rest are linear in the shape,
+`J(β) = J_0 + J_s β`; joint k turns about its parent's frame,
+`G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
+
+Inside, the batch is the last axis: the 3x3 products are then plain arithmetic on long
+vectors, one level of the tree at a time.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.body.model import BodyModel
+from bodyslam_jax.body.skeleton import (
+    DETECTOR_BIAS,
+    KEYPOINT_JOINT,
+    KEYPOINT_NAMES,
+    LEVELS,
+    PARENTS,
+    SURFACE_POINTS,
+)
+
+_PARENT = np.array(PARENTS[1:])
+
+
+@jax.jit
+def rest_joints(
+    model: BodyModel, shape: Float[Array, "*b 10"]
+) -> Float[Array, "*b 24 3"]:
+    """Joints at rest for SMPL β, m, in the model's own frame (pelvis at `J_0(β)`)."""
+    moved = shape @ model.joint_shape_dirs.reshape(72, 10).T
+    return model.joint_template + moved.reshape(*shape.shape[:-1], 24, 3)
+
+
+@jax.jit
+def local_joints(
+    model: BodyModel,
+    body_pose: Float[Array, "*#b 23 3"],
+    shape: Float[Array, "*#b 10"],
+) -> Float[Array, "*b 24 3"]:
+    """Posed joints in the root frame H, m: the pelvis is the origin, unrotated.
+
+    `body_pose` holds the axis-angle rotations of joints 1 to 23, rad, each in its
+    parent's frame; `shape` is SMPL β. Leading axes broadcast.
+    """
+    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    R = _under_root(flatten(body_pose, batch, 2))
+    return _unflatten(pose_joints(model, R, flatten(shape, batch, 1)).x, batch)
+
+
+@jax.jit
+def joints(
+    model: BodyModel,
+    pose: Float[Array, "*#b 72"],
+    shape: Float[Array, "*#b 10"],
+    trans: Float[Array, "*#b 3"],
+) -> Float[Array, "*b 24 3"]:
+    """Posed joints, m, in the frame into which the root rotation `pose[:3]` turns.
+
+    The pelvis is at `J_0(β) + trans` whatever the pose. Leading axes broadcast.
+    """
+    return _placed(model, pose, shape, trans, lambda posed, shape: posed.x)
+
+
+@functools.partial(jax.jit, static_argnames="layout")
+def local_keypoints(
+    model: BodyModel,
+    body_pose: Float[Array, "*#b 23 3"],
+    shape: Float[Array, "*#b 10"],
+    layout: str = "body25",
+    bias: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "*b keypoints 3"]:
+    """Keypoints of a 2D detector in the root frame H, m: joints and picked vertices.
+
+    **Arguments:**
+
+    - `layout`: `body25`, `coco17` or `halpe26`; names are in `KEYPOINT_NAMES`.
+    - `bias`: 0 takes each keypoint to be SMPL's joint of that name, as projections of
+        bodies do; 1 puts hips, neck and shoulders where detectors trained on COCO put
+        them (`DETECTOR_BIAS`). Keypoints are linear in it.
+    """
+    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    beta = flatten(shape, batch, 1)
+    posed = pose_joints(model, _under_root(flatten(body_pose, batch, 2)), beta)
+    return _unflatten(_detected(model, posed, beta, layout, bias), batch)
+
+
+@functools.partial(jax.jit, static_argnames="layout")
+def keypoints(
+    model: BodyModel,
+    pose: Float[Array, "*#b 72"],
+    shape: Float[Array, "*#b 10"],
+    trans: Float[Array, "*#b 3"],
+    layout: str = "body25",
+    bias: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "*b keypoints 3"]:
+    """`local_keypoints`, placed like `joints`."""
+    points = lambda posed, beta: _detected(model, posed, beta, layout, bias)
+    return _placed(model, pose, shape, trans, points)
+
+
+class Posed:
+    """The joints of `n` bodies about the pelvis, batch last; lives within one function.
+
+    The frame is the one into which the root's rotation turns.
+    """
+
+    def __init__(self, R, rest, G, x):
+        self.R = R
+        """Rotations of all joints in their parents' frames, (24, 3, 3, n)."""
+        self.rest = rest
+        """Joints at rest, m, (24, 3, n)."""
+        self.G = G
+        """Rotations, (24, 3, 3, n)."""
+        self.x = x
+        """Places, m, (24, 3, n)."""
+
+
+def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
+    """Matrices of axis-angle vectors."""
+    if pose.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"poses are of type {pose.dtype}, expected float32 or float64.")
+    return jaxlie.SO3.exp(pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
+
+
+def _under_root(body_pose):
+    """Rotations of all joints, the root's none."""
+    R = rotations(body_pose)
+    return jnp.concatenate([_identity(R), R])
+
+
+def pose_joints(
+    model: BodyModel, R: Float[Array, "24 3 3 n"], shape: Float[Array, "n 10"]
+) -> Posed:
+    """Forward kinematics of a flat batch."""
+
+    def of_shape(template, dirs):
+        moved = dirs.reshape(-1, 10) @ shape.T
+        return template[:, :, None] + moved.reshape(*template.shape, -1)
+
+    J_0, J_s = model.joint_template, model.joint_shape_dirs
+    # Bones of their own, not differences of joints: a product less to differentiate.
+    bones = of_shape(J_0[1:] - J_0[_PARENT], J_s[1:] - J_s[_PARENT])
+    return Posed(R, of_shape(J_0, J_s), *_chain(R, bones))
+
+
+def matmul(A, B):
+    """Products of 3x3 matrices with more than one axis behind or before them.
+
+    `A` (j, 3, 3, n) times `B` (j, 3, c, n), written out: XLA makes one loop of it.
+    """
+    term = lambda i: A[:, :, i, None] * B[:, None, i]
+    return term(0) + term(1) + term(2)
+
+
+def matvec(A, x):
+    """`A` (j, 3, 3, n) times `x` (j, 3, n)."""
+    return (
+        A[:, :, 0] * x[:, None, 0]
+        + A[:, :, 1] * x[:, None, 1]
+        + (A[:, :, 2] * x[:, None, 2])
+    )
+
+
+def flatten(x, batch, num_axes):
+    """Broadcasts the leading axes to `batch` and makes one of them."""
+    tail = x.shape[x.ndim - num_axes :]
+    return jnp.broadcast_to(x, (*batch, *tail)).reshape(math.prod(batch), *tail)
+
+
+def pelvis_place(model, shape, trans):
+    """Where the pelvis is, (3, n), of a flat batch."""
+    return (model.joint_template[0] + shape @ model.joint_shape_dirs[0].T + trans).T
+
+
+def _unflatten(points, batch):
+    return points.transpose(2, 0, 1).reshape(*batch, points.shape[0], 3)
+
+
+def _placed(model, pose, shape, trans, points):
+    batch = jnp.broadcast_shapes(pose.shape[:-1], shape.shape[:-1], trans.shape[:-1])
+    pose, beta = flatten(pose, batch, 1), flatten(shape, batch, 1)
+    posed = pose_joints(model, rotations(pose.reshape(len(pose), 24, 3)), beta)
+    pelvis = pelvis_place(model, beta, flatten(trans, batch, 1))
+    return _unflatten(points(posed, beta) + pelvis, batch)
+
+
+def _detected(model, posed, shape, layout, bias):
+    """Keypoints (k, 3, n) about the pelvis."""
+    if layout not in KEYPOINT_NAMES:
+        known = ", ".join(KEYPOINT_NAMES)
+        raise ValueError(f"keypoint layout {layout!r}, expected one of {known}.")
+    names = KEYPOINT_NAMES[layout]
+    surface = [n for n in names if n in SURFACE_POINTS]
+    inner = [n for n in names if n not in SURFACE_POINTS]
+    joint = np.array([KEYPOINT_JOINT[n] for n in inner])
+    offset = np.array([DETECTOR_BIAS.get(n, (0.0, 0.0, 0.0)) for n in inner])
+    offset = jnp.asarray(bias, posed.x.dtype) * jnp.asarray(offset, posed.x.dtype)
+    at_joint = posed.x[joint] + matvec(posed.G[joint], offset[:, :, None])
+    on_skin = _picked_vertices(model, surface, posed, shape)
+    order = np.array([(inner + surface).index(n) for n in names])
+    return jnp.concatenate([at_joint, on_skin])[order]
+
+
+def _picked_vertices(model, names, posed, shape):
+    """Skinned vertices of the named surface points, (k, 3, n), about the pelvis."""
+    v = model.picks[np.array([SURFACE_POINTS.index(n) for n in names])]
+    dirs = model.shape_dirs[v].reshape(-1, 10)
+    rest = model.template[v][:, :, None] + (dirs @ shape.T).reshape(len(names), 3, -1)
+    num_features = model.pose_dirs.shape[-1]
+    if num_features:
+        feature = pose_feature(posed.R)[:num_features]
+        dirs = model.pose_dirs[v].reshape(-1, num_features)
+        rest = rest + (dirs @ feature).reshape(rest.shape)
+    point = jnp.zeros_like(rest)
+    for k in range(model.skin_joint.shape[1]):
+        j = model.skin_joint[v, k]
+        moved = posed.x[j] + matvec(posed.G[j], rest - posed.rest[j])
+        point = point + model.skin_weight[v, k][:, None, None] * moved
+    return point
+
+
+def pose_feature(R):
+    """SMPL's `vec(R_k - I)`, k = 1, 2, ...: (207, n) from (24, 3, 3, n)."""
+    eye = jnp.eye(3, dtype=R.dtype)[None, :, :, None]
+    return (R[1:] - eye).reshape(207, R.shape[-1])
+
+
+# The chain itself, with its own derivative. Differentiating the products of matrices
+# level by level is slow to compile and to run. But a small turn φ_k of joint k about
+# its own place (axis-angle, in the outer frame) moves every joint below it rigidly, so
+#   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x b_i + G_parent(i) do_i),
+# sums over i from the root down to k, products with constant matrices of ones; o_i is
+# the bone to joint i at rest and b_i = G_parent(i) o_i.
+
+
+def _ancestry():
+    below = np.zeros((24, 24))
+    for k in range(24):
+        i = k
+        while i >= 0:
+            below[k, i] = 1.0
+            i = PARENTS[i]
+    return below, below[_PARENT]
+
+
+_UP_TO_SELF, _UP_TO_PARENT = _ancestry()
+
+
+@jax.custom_jvp
+def _chain(R, bones):
+    """`G` (24, 3, 3, n) and `x` (24, 3, n) from `R` and bones (23, 3, n) at rest."""
+    G, x, above = R[:1], jnp.zeros_like(bones[:1]), (0,)
+    G_all, x_all = [G], [x]
+    for level in LEVELS:
+        parent = np.array([above.index(PARENTS[k]) for k in level])
+        G, x = G[parent], x[parent]
+        x = x + matvec(G, bones[level[0] - 1 : level[-1]])
+        G = matmul(G, R[level[0] : level[-1] + 1])
+        G_all.append(G)
+        x_all.append(x)
+        above = level
+    return jnp.concatenate(G_all), jnp.concatenate(x_all)
+
+
+@_chain.defjvp
+def _chain_jvp(primals, tangents):
+    R, bones = primals
+    dR, dbones = tangents
+    G, x = _chain(R, bones)
+    above = G[_PARENT]
+    G_parent = jnp.concatenate([_identity(G), above])
+    spin = lambda i, j: (dR[:, i] * R[:, j]).sum(1)  # of dR Rᵀ, which is skew
+    phi = matvec(G_parent, jnp.stack([spin(2, 1), spin(0, 2), spin(1, 0)], 1))
+    omega, omega_parent = _tree_sum(_UP_TO_SELF, phi), _tree_sum(_UP_TO_PARENT, phi)
+    dx = _cross(omega_parent, matvec(above, bones)) + matvec(above, dbones)
+    dG = jnp.stack([_cross(omega, G[:, :, i]) for i in range(3)], 2)
+    return (G, x), (dG, _tree_sum(_UP_TO_SELF[:, 1:], dx))
+
+
+def _identity(R):
+    """The root's rotation where it has none, (1, 3, 3, n)."""
+    eye = jnp.eye(3, dtype=R.dtype)[..., None]
+    return jnp.broadcast_to(eye, (1, 3, 3, R.shape[-1]))
+
+
+def _tree_sum(ones, u):
+    return (jnp.asarray(ones, u.dtype) @ u.reshape(len(u), -1)).reshape(
+        len(ones), *u.shape[1:]
+    )
+
+
+def _cross(a, b):
+    """Cross products of (j, 3, n)."""
+    c = lambda i, j: a[:, i] * b[:, j] - a[:, j] * b[:, i]
+    return jnp.stack([c(1, 2), c(2, 0), c(0, 1)], 1)

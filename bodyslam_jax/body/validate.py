@@ -1,0 +1,141 @@
+"""Whether arrays are a body model: each rule that a later stage relies on, once."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from bodyslam_jax.body.skeleton import PARENTS, SURFACE_POINTS
+
+_NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+
+
+def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays as float64 or int64, with `parents` and, if named, `picks`.
+
+    **Raises:** `ValueError`, one line: the file, what was found, what was expected.
+    """
+    missing = [name for name in _NEEDED if name not in raw]
+    if missing:
+        found = ", ".join(sorted(raw)[:12]) or "nothing"
+        lacks = ", ".join(missing)
+        raise ValueError(f"{file}: not a body model: no {lacks}; found {found}.")
+    number = lambda name: _numbers(file, name, raw[name])
+    template, weights = number("v_template"), number("weights")
+    v = len(template)
+    _expect(file, "v_template", template, template.shape == (v, 3) and v > 0, "(v, 3)")
+    j = weights.shape[-1]
+    _expect(file, "weights", weights, weights.shape == (v, j), f"({v}, joints)")
+    if j not in (24, 52, 55):
+        raise ValueError(
+            f"{file}: {j} joints, expected 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)."
+        )
+    out = {"v_template": template, "weights": weights}
+    out["shapedirs"] = dirs = number("shapedirs")
+    is_right = dirs.ndim == 3 and dirs.shape[:2] == (v, 3) and dirs.shape[2] >= 10
+    _expect(file, "shapedirs", dirs, is_right, f"({v}, 3, at least 10)")
+    out["posedirs"] = dirs = (
+        number("posedirs") if "posedirs" in raw else np.zeros((v, 3, 0))
+    )
+    is_right = dirs.ndim == 3 and dirs.shape[:2] == (v, 3)
+    is_right = is_right and dirs.shape[2] in (0, 9 * (j - 1))
+    _expect(file, "posedirs", dirs, is_right, f"({v}, 3, {9 * (j - 1)})")
+    out["J_regressor"] = regressor = number("J_regressor")
+    _expect(file, "J_regressor", regressor, regressor.shape == (j, v), f"({j}, {v})")
+    _sums_to_one(file, "weights", weights, 1e-3)
+    _sums_to_one(file, "J_regressor", regressor, 2e-2)
+    if (weights < -1e-6).any():
+        raise ValueError(f"{file}: weights has negative entries, expected 0 to 1.")
+    stature = float(np.ptp(template[:, 1]))
+    if not 0.2 < stature < 4:
+        raise ValueError(
+            f"{file}: the body is {stature:.3g} m tall (y axis), expected 0.2 to 4 m."
+        )
+    out["f"] = faces = _integers(file, "f", raw["f"])
+    _expect(file, "f", faces, faces.ndim == 2 and faces.shape[1] == 3, "(faces, 3)")
+    if faces.size and (faces.min() < 0 or faces.max() >= v):
+        raise ValueError(
+            f"{file}: f names vertex {faces.max()}, expected 0 to {v - 1}."
+        )
+    out["parents"] = np.array(_parents(file, raw["kintree_table"], j))
+    if "header" in raw:
+        out["picks"] = _picks(file, raw["header"], v)
+    return out
+
+
+def _expect(file, name, array, is_right, expected) -> None:
+    if not is_right:
+        raise ValueError(
+            f"{file}: {name} has shape {array.shape}, expected {expected}."
+        )
+
+
+def _numbers(file, name, array) -> np.ndarray:
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        found = getattr(array, "dtype", type(array).__name__)
+        raise ValueError(f"{file}: {name} is of type {found}, expected real numbers.")
+    if array.ndim == 0:
+        raise ValueError(f"{file}: {name} is a single number, expected an array.")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        count = int((~np.isfinite(array)).sum())
+        raise ValueError(
+            f"{file}: {name} has {count} entries that are NaN or infinite."
+        )
+    return array
+
+
+def _integers(file, name, array) -> np.ndarray:
+    array = _numbers(file, name, array)
+    if (array != np.round(array)).any():
+        raise ValueError(f"{file}: {name} has fractions, expected whole numbers.")
+    return array.astype(np.int64)
+
+
+def _sums_to_one(file, name, rows, tolerance) -> None:
+    worst = float(np.abs(rows.sum(-1) - 1).max())
+    if worst > tolerance:
+        raise ValueError(
+            f"{file}: rows of {name} sum to 1 only within {worst:.2g}, "
+            f"expected {tolerance:g}."
+        )
+
+
+def _parents(file, table, num_joints) -> list[int]:
+    """Parent of each joint from row 0 of the kinematic tree; -1 for the root."""
+    table = _integers(file, "kintree_table", table)
+    row = table[0] if table.ndim == 2 else table
+    _expect(
+        file, "kintree_table", table, row.shape == (num_joints,), f"(2, {num_joints})"
+    )
+    parents = [int(p) if 0 <= p < num_joints else -1 for p in row]
+    for start in range(num_joints):
+        joint, steps = start, 0
+        while joint > 0 and steps <= num_joints:
+            joint, steps = parents[joint], steps + 1
+        if steps > num_joints:
+            raise ValueError(
+                f"{file}: kintree_table is not a tree: joint {start} never reaches "
+                "the root (a cycle)."
+            )
+    count = 24 if num_joints == 24 else 22
+    if tuple([-1, *parents[1:count]]) != PARENTS[:count] or parents[0] not in (-1, 0):
+        raise ValueError(
+            f"{file}: kintree_table is not SMPL's tree: parents {parents[:count]}, "
+            f"expected {list(PARENTS[:count])}."
+        )
+    return parents
+
+
+def _picks(file, header, num_vertices) -> np.ndarray:
+    """Vertices of the surface points, named in the header of our own files."""
+    try:
+        named = json.loads(str(header))["keypoints"]
+        picks = np.array([named[name] for name in SURFACE_POINTS], np.int64)
+    except (ValueError, KeyError, TypeError, OverflowError):
+        raise ValueError(f"{file}: its header does not name the keypoints.") from None
+    if picks.min() < 0 or picks.max() >= num_vertices:
+        raise ValueError(
+            f"{file}: its header names vertex {picks.max()} of {num_vertices}."
+        )
+    return picks

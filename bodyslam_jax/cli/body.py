@@ -1,0 +1,65 @@
+"""`bodyslam body-model`: shows, converts and checks body model files."""
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from bodyslam_jax.cli.types import Input
+
+_Gender = Literal["neutral", "female", "male"]
+
+
+def body_show(
+    file: tyro.conf.Positional[Path | None] = None,
+    /,
+    *,
+    out: Path = Path("body_model.png"),
+    gender: _Gender | None = None,
+) -> None:
+    """Draws a body model: shape components at ±2σ and a few postures.
+
+    Args:
+        file: Body model; without it the one that `doctor` names.
+        out: Picture to write.
+        gender: Which file of a folder; without it the neutral one.
+    """
+    from bodyslam_jax import body
+
+    body.save_picture(body.load_body_model(file, gender), out)
+    print(out)
+
+
+def body_convert(
+    file: Input,
+    out: tyro.conf.Positional[Path],
+    /,
+    *,
+    gender: _Gender | None = None,
+) -> None:
+    """Writes a body model in SMPL's own .npz layout, readable without chumpy.
+
+    Args:
+        file: Any supported body model file, or a folder of them.
+        out: The .npz to write.
+        gender: Which file of a folder; without it the neutral one.
+    """
+    from bodyslam_jax import body
+
+    body.write_npz(body.load_body_model(file, gender), out)
+    print(out)
+
+
+def body_check(file: Input, /, *, gender: _Gender | None = None) -> None:
+    """Says what a body model file is, or why it is not usable.
+
+    Args:
+        file: Body model file or folder.
+        gender: Which file of a folder; without it the neutral one.
+    """
+    from bodyslam_jax import body
+
+    print(body.check(file, gender))
+
+
+ACTIONS = {"show": body_show, "convert": body_convert, "check": body_check}

@@ -1,0 +1,77 @@
+"""What `bodyslam doctor` says: versions, devices, codecs, where models were found."""
+
+import importlib.metadata
+import os
+import platform
+import tempfile
+from pathlib import Path
+
+_PACKAGES = (
+    "bodyslam-jax jax jaxlib equinox optimistix lineax jaxlie jaxopt optax numpy scipy "
+    "opencv-python-headless onnxruntime trimesh matplotlib tyro"
+).split()
+_CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
+
+
+def report() -> list[tuple[str, str]]:
+    """Lines of `(what, finding)`; never raises because something is missing."""
+    rows = [("python", f"{platform.python_version()} on {platform.platform()}")]
+    rows += [(name, _version(name)) for name in _PACKAGES]
+    return rows + _devices() + _opencv() + _networks() + _models()
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _devices() -> list[tuple[str, str]]:
+    import jax
+
+    found = ", ".join(str(device) for device in jax.devices())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else "?"
+    return [("devices", f"{found}; {cores} CPU cores")]
+
+
+def _opencv() -> list[tuple[str, str]]:
+    from bodyslam_jax import sfm
+
+    return [("BRISK", sfm.brisk_status())] + [
+        (f"video writer {codec}", _can_write(codec, suffix))
+        for codec, suffix in _CODECS.items()
+    ]
+
+
+def _networks() -> list[tuple[str, str]]:
+    from bodyslam_jax import people
+
+    return [(f"network {name}", found) for name, found in people.network_status()]
+
+
+def _can_write(codec: str, suffix: str) -> str:
+    from bodyslam_jax import view
+
+    with tempfile.TemporaryDirectory() as folder:
+        works = view.can_write(Path(folder) / f"probe{suffix}", codec)
+    return "present" if works else "absent"
+
+
+def _models() -> list[tuple[str, str]]:
+    from bodyslam_jax import body, motion
+
+    rows = []
+    for path in body.search_paths():
+        rows.append(("body model", f"{path}: {'found' if path.exists() else 'no'}"))
+    model = motion.load_motion_model()
+    rows.append(("default motion model", f"for the {model.body} body"))
+    try:
+        found = body.load_body_model()
+    except (OSError, ValueError) as error:
+        return [*rows, ("body in use", f"none: {error}")]
+    try:
+        motion.check_compatible(model, found, model.fps)
+    except ValueError as error:
+        return [*rows, ("body in use", f"{found.name}, but {error}")]
+    return [*rows, ("body in use", found.name)]

@@ -1,0 +1,129 @@
+"""What is made beside a run: simulated sequences, motion models, experiments."""
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bodyslam_jax.cli.types import Flat, Input, Preset
+from bodyslam_jax.config import Config, Experiment, MotionTraining, Simulation
+
+_Experiment = Literal[
+    "table1", "scale", "landmarks", "motion", "ablation", "weights", "video"
+]
+log = logging.getLogger(__name__)
+
+
+def simulate(
+    out: Input,
+    /,
+    *,
+    config: Annotated[Simulation, tyro.conf.arg(name="")] = Simulation(),
+) -> None:
+    """Writes a simulated sequence folder with ground truth.
+
+    Args:
+        out: Sequence folder to write; an earlier simulation in it is replaced.
+        config: What to simulate.
+    """
+    from bodyslam_jax import simulation
+
+    simulation.check_folder(out, config)  # said now, not after a minute
+    simulation.write_sequence(out, simulation.simulate(config))
+    print(out)
+
+
+def train_motion(
+    data: Input,
+    /,
+    *,
+    out: Path,
+    body_model: Path | None = None,
+    preset: Preset = "default",
+    config: Annotated[MotionTraining, tyro.conf.arg(name="")] = MotionTraining(),
+) -> None:
+    """Trains a motion model on AMASS folders, BVH folders or CMU .npz files.
+
+    Args:
+        data: File or folder of motion.
+        out: Weights to write (.npz); an interrupted training is continued.
+        body_model: Body to train for, if not the one that `doctor` names.
+        preset: `paper` is its network, loss, optimiser and choice of motion.
+        config: Architecture and training.
+    """
+    from bodyslam_jax import motion
+
+    with _progress() as report:
+        motion.train_from_data(data, out, config, report, body_model)
+    print(out)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
+    """A bar on a terminal, a line an epoch in a file."""
+    from rich import console, progress
+
+    terminal = console.Console(stderr=True)
+    columns = (
+        progress.TextColumn("epoch"),
+        progress.MofNCompleteColumn(),
+        progress.BarColumn(bar_width=16),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
+    )
+    with progress.Progress(
+        *columns, console=terminal, disable=not terminal.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=None)
+
+        def report(epoch: int, epochs: int, measures: dict[str, float]) -> None:
+            told = ", ".join(f"{name} {value:.3f}" for name, value in measures.items())
+            ratios = [f"{v:.2f}" for name, v in measures.items() if "ratio" in name]
+            brief = " ".join([f"loss {measures['loss']:.3g}", *ratios])
+            bar.update(task, completed=epoch, total=epochs, description=brief)
+            if not terminal.is_terminal:
+                log.info("epoch %d of %d: %s", epoch, epochs, told)
+
+        yield report
+
+
+def experiment(
+    name: tyro.conf.Positional[_Experiment],
+    /,
+    *,
+    out: Path,
+    preset: Preset = "default",
+    settings: Path | None = None,
+    on: Annotated[Experiment, tyro.conf.arg(name="")] = Experiment(),
+    config: Flat = Config(),
+) -> None:
+    """Repeats one of the paper's experiments, or of ours, on simulated sequences.
+
+    Args:
+        name: Which one.
+        out: Folder for tables and figures; finished rows are kept there.
+        preset: `paper` has the paper's weights, motion network and first-order steps.
+        settings: A config.yaml to start from; options beside it prevail.
+        on: What it runs on.
+        config: Settings of every stage.
+    """
+    if name == "scale":
+        _make_each_core_a_device()
+    from bodyslam_jax import experiments
+
+    for path in experiments.run_experiment(name, out, on, config):
+        print(path)
+
+
+def _make_each_core_a_device() -> None:
+    """So that mapped solves run side by side; too late where JAX runs already."""
+    import jax
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    with contextlib.suppress(RuntimeError):
+        if jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
+            jax.config.update("jax_num_cpu_devices", cores)

@@ -1,0 +1,167 @@
+"""What a user knows of a video: measurements, each with a standard deviation.
+
+Every field is an option of the command line (`--height 1.78`, `--focal 1250±20`) and a
+line of `config.yaml`. A value may carry its own standard deviation after `±` (or `+-`);
+without one the default given in the field's docstring is used.
+"""
+
+import dataclasses
+import math
+import re
+from typing import NamedTuple
+
+from bodyslam_jax.config.check import NOT_NEGATIVE, check
+
+HEIGHT_SIGMA = 0.02
+"""m. Self-reported statures are 1 cm too tall on average and scatter by 2 cm
+(Gorber et al., Obesity Reviews 2007)."""
+FOCAL_SIGMA = 0.02
+"""Of the focal length: a data sheet's lens, before stabilisation crops the image."""
+GRAVITY_SIGMA = math.radians(1.0)
+"""rad: a phone's accelerometer at rest in a hand."""
+PATH_SIGMA = 0.01
+"""Of a camera path: its scale if it is metric, and its positions by the median distance
+of the scene; rotations in rad."""
+
+RANGES = {
+    "gravity": (-math.inf, math.inf),
+    "start": NOT_NEGATIVE,
+    "end": NOT_NEGATIVE,
+    "person": NOT_NEGATIVE,
+}
+"""What the numbers may be."""
+_SIGMA = re.compile(r"±|\+-|\+/-")
+_NARROWEST, _WIDEST = 1.0, 179.0
+
+
+class Measured(NamedTuple):
+    """A number and its standard deviation, in the same unit."""
+
+    value: float
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """What a user knows of a video and the people in it."""
+
+    height: tuple[str, ...] = ()
+    """Stature, m, of the only person or of each by number: `1.78`, `1.78±0.01`,
+    `0=1.78 1=1.65`. Without a standard deviation 2 cm."""
+    focal: str | None = None
+    """Focal length, px of the video, if it is known better than by a guess: `1250`,
+    `1250±20`. Without a standard deviation 2 %."""
+    fov: str | None = None
+    """Horizontal field of view, degrees, in place of the focal length: `65`, `65±2`."""
+    camera_path: str | None = None
+    """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `.bin`, or
+    nerfstudio `transforms.json`. Structure from motion then only makes the map."""
+    camera_path_metric: bool = False
+    """Whether that path is in metres, as a visual-inertial tracker's is."""
+    static_camera: bool = False
+    """Whether the camera stands on a tripod: no camera motion is looked for."""
+    gravity: tuple[float, ...] = ()
+    """Direction in which things fall, in the first frame's camera axes (x right, y
+    down, z forward): `0 1 0` for a level camera. Known to 1 degree."""
+    fps: float | None = None
+    """Frames a second, in place of what the file says."""
+    start: float | None = None
+    """Where to begin in the video, s."""
+    end: float | None = None
+    """Where to end in the video, s."""
+    person: tuple[int, ...] = ()
+    """Numbers of the people that are estimated, all without it. The others are still
+    left out of the map."""
+
+    def check_known(self) -> None:
+        """Refuses what cannot be; the settings that hold these call it.
+
+        **Raises:** `ValueError` that names the option, what was found and what was
+        expected.
+        """
+        check(self, RANGES)
+        self.heights()
+        if self.focal is not None and self.fov is not None:
+            raise ValueError("focal and fov: both given, expected one of them.")
+        self.focal_length(1000)
+        if self.start is not None and self.end is not None and self.end <= self.start:
+            raise ValueError(
+                f"end: found {self.end:g} s, expected more than start, "
+                f"{self.start:g} s."
+            )
+        if self.gravity and (len(self.gravity) != 3 or not any(self.gravity)):
+            raise ValueError(
+                f"gravity: found {self.gravity}, expected a direction of 3 numbers."
+            )
+        if self.camera_path_metric and self.camera_path is None:
+            raise ValueError("camera_path_metric: expected a camera_path beside it.")
+        if self.static_camera and self.camera_path is not None:
+            raise ValueError("static_camera and camera_path: expected one of them.")
+
+    def heights(self) -> dict[int | None, Measured]:
+        """Statures, m, by the person's number; under `None` that of everybody else.
+
+        **Raises:** `ValueError` if one is no stature.
+        """
+        found: dict[int | None, Measured] = {}
+        for text in self.height:
+            who, _, number = text.rpartition("=")
+            person = None
+            if who:
+                if not who.strip().isdigit():
+                    raise ValueError(
+                        f"height: found {text!r}, expected PERSON=METRES as in 0=1.78."
+                    )
+                person = int(who)
+            height = _measured("height", number, HEIGHT_SIGMA, "METRES or METRES±SIGMA")
+            if not 0.4 <= height.value <= 2.8:
+                raise ValueError(
+                    f"height: found {height.value:g}, expected 0.4 to 2.8 m."
+                )
+            if person in found:
+                raise ValueError(f"height: {text!r}, but that person's was given.")
+            found[person] = height
+        return found
+
+    def focal_length(self, width: int) -> Measured | None:
+        """Focal length, px, of images `width` px wide; `None` if it is not known."""
+        if self.focal is not None:
+            found = _measured("focal", self.focal, None, "PIXELS or PIXELS±SIGMA")
+            if not 0 < found.value < math.inf:
+                raise ValueError(f"focal: found {found.value:g}, expected more than 0.")
+            return _or_share(found, FOCAL_SIGMA)
+        if self.fov is None:
+            return None
+        angle = _measured("fov", self.fov, None, "DEGREES or DEGREES±SIGMA")
+        if not _NARROWEST <= angle.value <= _WIDEST:
+            raise ValueError(
+                f"fov: found {angle.value:g}, expected {_NARROWEST:g} to {_WIDEST:g} "
+                "degrees."
+            )
+        half = math.radians(angle.value) / 2
+        focal = width / 2 / math.tan(half)
+        # d log f = -dθ / sin θ of the whole angle θ.
+        sigma = focal * math.radians(angle.sigma) / math.sin(2 * half)
+        return _or_share(Measured(focal, sigma), FOCAL_SIGMA)
+
+
+def _or_share(found: Measured, share: float) -> Measured:
+    """The measurement with a default standard deviation where none was given."""
+    sigma = share * found.value if math.isnan(found.sigma) else found.sigma
+    return Measured(found.value, sigma)
+
+
+def _measured(name: str, text: str, sigma: float | None, expected: str) -> Measured:
+    """`VALUE` or `VALUE±SIGMA`; NaN for a sigma that is neither given nor default."""
+    parts = _SIGMA.split(str(text))
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2) or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{name}: found {text!r}, expected {expected}.")
+    if len(numbers) == 1:
+        return Measured(numbers[0], math.nan if sigma is None else sigma)
+    if numbers[1] <= 0:
+        raise ValueError(f"{name}: {text!r} has no positive standard deviation.")
+    return Measured(*numbers)

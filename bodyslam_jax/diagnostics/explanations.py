@@ -1,0 +1,281 @@
+"""What may have been done to keypoints or bodies that do not agree, each as a forecast.
+
+An explanation says where the keypoints would lie if the bodies were right but for it.
+The one that comes nearest to the keypoints is found by trying them all: turned,
+mirrored and resized images, cameras of another focal length, other units and other
+axes. What they do to people's size and to their place in the image tells them apart:
+
+- a resized copy multiplies pixels about the image's corner, size and place alike;
+- another focal length multiplies them about the principal point;
+- another unit of `trans` changes the size, not the place;
+- a crop, or another principal point, moves the place, not the size.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.diagnostics.image_points import (
+    SWAPPED,
+    People,
+    centred,
+    distances,
+    in_common,
+    project,
+)
+
+Forecast = Callable[[Float[np.ndarray, "t b 14 3"]], Float[np.ndarray, "t b 14 2"]]
+
+_PLACE, _SIZE = 0.04, 0.12
+"""How near a ratio must be to one that there is a reason for, relative: measured by
+people's place in the image, and by their size, in which regressors err."""
+_SIMPLE = (1 / 4, 1 / 3, 3 / 8, 4 / 9, 1 / 2, 2 / 3, 3 / 4, 4 / 5)
+"""Sizes that videos are copied at: 2160, 1440, 1080, 960, 720, 540, 480 lines."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageMap:
+    """`q = A p + b`: pixels of the true image -> pixels of the one keypoints are of."""
+
+    A: Float[np.ndarray, "2 2"]
+    b: Float[np.ndarray, " 2"]
+    swap: bool = False
+    """Whether what is left there is called right."""
+
+    def __call__(
+        self, uv: Float[np.ndarray, "*n 14 2"]
+    ) -> Float[np.ndarray, "*n 14 2"]:
+        moved = uv @ self.A.T + self.b
+        return moved[..., SWAPPED, :] if self.swap else moved
+
+    def inverse(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Without the swap of sides."""
+        return (uv - self.b) @ np.linalg.inv(self.A).T
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """One thing that may have happened; `kind` says which of the fields it has."""
+
+    kind: str
+    """`agree`, `sides`, `keypoints` (`image`), `axes` (`R`), `focal`, `unit`
+    (`factor`), `crop` (`image`) or `copy` (`image`: resized and moved)"""
+    forecast: Forecast
+    image: ImageMap | None = None
+    R: Float[np.ndarray, "3 3"] | None = None
+    """Turns given bodies to where they are."""
+    factor: float = 1.0
+    """Resized by; or the bodies' focal length over the camera's; or units in 1 m."""
+    name: str = ""
+    reason: bool = True
+    """Whether the factor is one that has a reason, not just what was measured."""
+
+
+def disagreement(
+    seen: Float[np.ndarray, "t k 14 2"], posed: Float[np.ndarray, "t b 14 2"]
+) -> float:
+    """How far people of the one kind are from the nearest of the other, the median over
+    people and frames, in sizes of a person; of the kind that has fewer without a
+    partner. NaN if there is too little to compare."""
+    apart = distances(seen, posed)
+    apart = np.where(np.isfinite(apart), apart, np.inf)
+    if not apart.size:
+        return np.nan
+    found = []
+    for axis in (1, 2):
+        nearest = apart.min(axis)
+        nearest = nearest[np.isfinite(nearest)]
+        if len(nearest) < 3:
+            return np.nan
+        found.append(float(np.median(nearest)))
+    return min(found)
+
+
+def explanations(people: People) -> Iterator[Explanation]:
+    """All of them, that of agreement first; `people` are those of a few frames."""
+    camera = people.camera
+    plain = lambda p: project(camera, p)
+    yield Explanation("agree", plain)
+    yield Explanation("sides", lambda p: plain(p)[..., SWAPPED, :])
+    posed = plain(people.bodies)
+    ratios = _ratios(people.keypoints, posed)
+    for name, image in _symmetries(camera.width, camera.height):
+        if name:
+            yield _of_image(plain, image, name)
+        places = _ratios(people.keypoints, image(posed), about_corner=True)
+        places = [p for p in places if any(abs(np.log(p / r)) < 0.2 for r in ratios)]
+        for scale, reason in _likely(places, _SIMPLE, _PLACE):
+            resized = ImageMap(scale * image.A, scale * image.b, image.swap)
+            yield _of_image(plain, resized, name, scale, reason)
+    yield from _other_bodies(people, ratios)
+    yield from _moved(people.keypoints, posed, ratios, plain)
+
+
+def _of_image(plain, image, name, factor=1.0, reason=True) -> Explanation:
+    forecast = lambda p: image(plain(p))
+    return Explanation(
+        "keypoints", forecast, image, factor=factor, name=name, reason=reason
+    )
+
+
+def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
+    camera = people.camera
+    fx = camera.params[0]
+    turned = lambda R: lambda p: project(camera, p @ R.T)
+    scaled = lambda s: lambda p: project(camera, p / np.asarray(s))
+    for R in _axes():
+        yield Explanation("axes", turned(R), R=R, name=_axes_name(R))
+    longer = max(camera.width, camera.height)
+    # What tools take where they are not told (`io.bodies.tool_focal`), and SPIN's.
+    usual = np.array(
+        [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
+    )
+    for factor, reason in _likely(ratios, usual / fx, _SIZE, inverse=False):
+        # Of people nearby, the size is not quite proportional to the focal length.
+        for by in (1.0,) if reason else (0.85, 0.92, 1.0, 1.08, 1.17):
+            value = by * factor
+            forecast = scaled([1, 1, value])
+            name = "" if by == 1 else "of people nearby"
+            yield Explanation("focal", forecast, None, None, value, name, reason)
+    # Bodies that are `factor` times too far look as small: mm, cm, dm, feet.
+    for factor, reason in _likely(ratios, (10.0, 100.0, 1000.0, 1 / 0.3048), _SIZE):
+        yield Explanation(
+            "unit", _of_unit(camera, factor), factor=factor, reason=reason
+        )
+
+
+def _of_unit(camera, factor):
+    """Only the place is in another unit; the body's own size is the model's."""
+
+    def forecast(p):
+        pelvis = p[..., 7:8, :]
+        return project(camera, p - pelvis + pelvis / factor)
+
+    return forecast
+
+
+def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
+    """Moved by a constant, at the same size or resized, which nothing bounds."""
+    middles = [
+        [centred(uv)[0] for uv in in_common(seen[:, k], posed[:, b])]
+        for k, b in _pairs(seen, posed)
+    ]
+    for scale in (1.0, *ratios):
+        shift = np.concatenate([q - scale * p for q, p in middles])
+        shift = shift[np.isfinite(shift).all(-1)]
+        if len(shift):
+            image = ImageMap(scale * np.eye(2), np.median(shift, axis=0))
+            kind = "crop" if scale == 1.0 else "copy"
+            forecast = lambda p, image=image: image(plain(p))
+            yield Explanation(kind, forecast, image, factor=scale)
+
+
+def _pairs(seen, posed) -> list[tuple[int, int]]:
+    """Rows that may be of one person, likelier ones first."""
+    rows = itertools.product(range(seen.shape[1]), range(posed.shape[1]))
+    return sorted(rows, key=lambda pair: (sum(pair), abs(pair[0] - pair[1])))[:24]
+
+
+def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
+    """How many times as large people are in keypoints as in bodies, or as far from the
+    image's corner, by pairs of rows."""
+    found: list[float] = []
+    for k, b in _pairs(seen, posed):
+        pair = in_common(seen[:, k], posed[:, b])
+        (q, big), (p, small) = (centred(uv) for uv in pair)
+        if about_corner:
+            ratio = (q * p).sum(-1) / np.maximum((p**2).sum(-1), 1.0)
+        else:
+            ratio = big / np.maximum(small, 1e-3)
+        ratio = ratio[np.isfinite(ratio)]
+        middle = float(np.median(ratio)) if len(ratio) >= 3 else 0.0
+        if (
+            middle > 0
+            and abs(np.log(middle)) > 0.1
+            and all(abs(np.log(middle / f)) > 0.02 for f in found)
+        ):
+            found.append(middle)
+    return found[:12]
+
+
+def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, bool]]:
+    """The measured ratios, and those near them that there is a reason for."""
+    known = [*reasons, *(1 / r for r in reasons)] if inverse else list(reasons)
+    for ratio in ratios:
+        for reason in known:
+            if abs(np.log(reason / ratio)) < tolerance:
+                yield float(reason), True
+        yield ratio, False
+
+
+def _symmetries(width: int, height: int) -> Iterator[tuple[str, ImageMap]]:
+    """The ways to turn and mirror an image of that size, none first."""
+    w, h = width - 1.0, height - 1.0
+    matrix = lambda *rows: np.array(rows, dtype=np.float64)
+    yield "", ImageMap(np.eye(2), np.zeros(2))
+    yield (
+        "turned by 90 degrees clockwise",
+        ImageMap(matrix([0, -1], [1, 0]), np.array([h, 0.0])),
+    )
+    yield "turned by 180 degrees", ImageMap(-np.eye(2), np.array([w, h]))
+    yield (
+        "turned by 90 degrees anticlockwise",
+        ImageMap(matrix([0, 1], [-1, 0]), np.array([0.0, w])),
+    )
+    mirrored = (
+        ("mirrored left to right", matrix([-1, 0], [0, 1]), [w, 0.0]),
+        (
+            "upside down, y counted from the lower edge",
+            matrix([1, 0], [0, -1]),
+            [0.0, h],
+        ),
+        ("with x and y exchanged", matrix([0, 1], [1, 0]), [0.0, 0.0]),
+        ("turned by 90 degrees and mirrored", matrix([0, -1], [-1, 0]), [h, w]),
+    )
+    for name, A, b in mirrored:
+        for swap in (True, False):
+            yield name, ImageMap(A, np.array(b), swap)
+
+
+def _axes() -> Iterator[Float[np.ndarray, "3 3"]]:
+    """The rotations that exchange axes, without the one that does nothing."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            R = np.zeros((3, 3))
+            R[np.arange(3), order] = signs
+            if np.linalg.det(R) > 0 and not np.array_equal(R, np.eye(3)):
+                yield R
+
+
+def _axes_name(R: Float[np.ndarray, "3 3"]) -> str:
+    """What x, y, z of a camera are among the given axes."""
+    letters = [
+        ("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in R
+    ]
+    right, down, forward = letters
+    return f"right is {right}, down is {down}, forward is {forward}"
+
+
+def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> People:
+    """Keypoints of some frames beside bodies of others; frames beyond the end have no
+    bodies."""
+    inside = (bodies_at >= 0) & (bodies_at < len(people.bodies))
+    posed = people.bodies[np.where(inside, bodies_at, 0)]
+    posed = np.where(inside[:, None, None, None], posed, np.nan)
+    return People(people.keypoints[frames], posed, people.camera)
+
+
+def some_frames(people: People, most: int) -> np.ndarray:
+    """Up to `most` frames with both kinds in them, evenly spread."""
+    (where,) = np.nonzero(people.both)
+    return evenly(where, most)
+
+
+def evenly(where: np.ndarray, most: int) -> np.ndarray:
+    """Up to `most` of these, evenly spread."""
+    if len(where) <= most:
+        return where
+    return where[np.linspace(0, len(where) - 1, most).round().astype(int)]

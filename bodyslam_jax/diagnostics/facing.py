@@ -1,0 +1,79 @@
+"""What people's own shape says: which way they face, and that they stand upright."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.diagnostics.image_points import (
+    ANKLES,
+    L_HIP,
+    L_SHOULDER,
+    MID_HIP,
+    NECK,
+    R_HIP,
+    R_SHOULDER,
+)
+
+_LYING = 55.0
+"""Angle between a trunk and the vertical of the image from which it lies, degrees."""
+_WIDE = 0.15
+"""Width of hips and shoulders over the length of the trunk from which it shows whether
+somebody is seen from the front or from behind."""
+
+
+def trunk_directions(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
+    """Direction from neck to hips, rad: 0 points down, positive to the image's right.
+
+    NaN where the legs, if they are seen, go another way: people who bend or sit.
+    """
+    trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
+    ankles = uv[..., ANKLES, :]
+    there = np.isfinite(ankles[..., :1])
+    count = there.sum(-2)
+    foot = np.where(there, ankles, 0.0).sum(-2) / np.maximum(count, 1)
+    leg = foot - uv[..., MID_HIP, :]
+    with np.errstate(invalid="ignore"):
+        straight = (leg * trunk).sum(-1) > 0.5 * np.linalg.norm(
+            leg, axis=-1
+        ) * np.linalg.norm(trunk, axis=-1)
+    angle = np.arctan2(trunk[..., 0], trunk[..., 1])
+    return np.where((count[..., 0] == 0) | straight, angle, np.nan)
+
+
+def shares(
+    directions: Float[np.ndarray, "*n"],
+) -> tuple[int, dict[str, float]]:
+    """How many people there are in all frames, and the shares of those who are upright,
+    upside down, or whose heads point to the left or to the right."""
+    angle = np.degrees(directions[np.isfinite(directions)])
+    if not len(angle):
+        return 0, dict.fromkeys(("upright", "upside down", "left", "right"), 0.0)
+    lying = np.abs(np.abs(angle) - 90) < 90 - _LYING
+    return len(angle), {
+        "upright": float((np.abs(angle) <= _LYING).mean()),
+        "upside down": float((np.abs(angle) >= 180 - _LYING).mean()),
+        "left": float((lying & (angle > 0)).mean()),
+        "right": float((lying & (angle < 0)).mean()),
+    }
+
+
+def facings(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
+    """Positive where somebody is seen from behind, negative from the front: width of
+    shoulders and hips over the trunk's length; NaN if not known."""
+    trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
+    across = (
+        uv[..., R_SHOULDER, :]
+        - uv[..., L_SHOULDER, :]
+        + uv[..., R_HIP, :]
+        - uv[..., L_HIP, :]
+    ) / 2
+    length2 = np.maximum((trunk**2).sum(-1), 1.0)
+    return (across[..., 0] * trunk[..., 1] - across[..., 1] * trunk[..., 0]) / length2
+
+
+def opposed(
+    seen: Float[np.ndarray, "*n 14 2"], posed: Float[np.ndarray, "*n 14 2"]
+) -> tuple[Bool[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
+    """Where it shows in both which way somebody faces, and where they contradict."""
+    a, b = facings(seen), facings(posed)
+    shown = (np.abs(np.nan_to_num(a)) > _WIDE) & (np.abs(np.nan_to_num(b)) > _WIDE)
+    return shown, shown & (np.nan_to_num(a) * np.nan_to_num(b) < 0)

@@ -1,0 +1,281 @@
+"""Who is who between keypoints and bodies: each person once, with all that is theirs.
+
+Trackers lose people and find them under another number, or follow one person twice. As
+keypoints and bodies are usually made by different programs, the one kind tells which
+numbers of the other belong together.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics.image_points import (
+    centred,
+    distances,
+    people_of,
+    project,
+)
+from bodyslam_jax.diagnostics.person_rows import Person, gathered, have_any, in_words
+from bodyslam_jax.types import Sequence
+
+_SAME = 0.3
+"""Distance of keypoints and bodies, in sizes of a person, below which it is one."""
+_TWICE = 0.15
+"""Distance of two people of one kind below which they are one person followed twice."""
+_OVERLAP = 0.15
+"""Share of a person's frames that may be another's, too, and the two yet be one."""
+_MOST = 0.8
+_FEWEST = 3
+_SOON = 5
+"""Frames after which a person without keypoints is still recognised by the place."""
+_HABIT = 0.05
+"""Distance by which other keypoints have to be nearer than those of the same row."""
+
+Warn = Callable[[str], None]
+
+
+def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
+    """The sequence with one row per person; itself if that is how it came."""
+    people = people_of(sequence, body)
+    posed = project(people.camera, people.bodies)
+    there = have_any(sequence)
+    apart = distances(people.keypoints, posed)
+    persons = _pair(apart, there)
+    persons = _joined(persons, apart, (people.keypoints, posed), there)
+    if there[0].any():
+        persons = _attached(persons, apart, posed, there[1])
+    else:
+        persons = _joined_by_place(persons, posed, there[1], warn)
+    _say_who_is_one(persons, there, warn)
+    persons = _worth_keeping(persons, sequence, posed, apart, there, warn)
+    return gathered(sequence, persons, apart)
+
+
+def _pair(apart, there) -> list[Person]:
+    """Everybody with keypoints, with the bodies that fit them best, then the others.
+
+    Rows of the same number stay together unless other keypoints fit clearly better.
+    """
+    seen_at, posed_at = there
+    middle, count = _medians(apart)
+    persons = [Person((int(k),), ()) for k in np.flatnonzero(seen_at.any(1))]
+    free = set(np.flatnonzero(posed_at.any(1)).tolist())
+    own = np.eye(*middle.shape, dtype=bool)
+    cost = np.where(count >= _FEWEST, middle, np.inf) - _HABIT * own
+    # Rows that are never there together say nothing against each other.
+    cost = np.where(own & (count == 0), _SAME - 0.01, cost)
+    paired: dict[int, int] = {}
+    for at in np.argsort(cost, axis=None, kind="stable"):
+        k, b = (int(i) for i in np.unravel_index(at, cost.shape))
+        if cost[k, b] < _SAME and b in free and k not in paired and seen_at[k].any():
+            paired[k] = b
+            free.remove(b)
+    persons = [
+        Person(p.keypoints, (paired[p.keypoints[0]],))
+        if p.keypoints[0] in paired
+        else p
+        for p in persons
+    ]
+    return [*persons, *(Person((), (b,)) for b in sorted(free))]
+
+
+def _joined(persons, apart, points, there) -> list[Person]:
+    """People of whom the one kind lies on the other's, unless at two places."""
+    middle, count = _medians(apart)
+    # All of what is there for a frame or two only.
+    seen, posed = (at.sum(1) for at in there)
+    enough = np.minimum(_FEWEST, np.minimum(seen[:, None], posed))
+    fits = (count >= np.maximum(enough, 1)) & (middle < _SAME)
+
+    @functools.cache
+    def same_place(kind: int, rows_a, rows_b) -> bool:
+        return _same_place(points[kind], rows_a, rows_b, there[kind])
+
+    def linked(a: Person, b: Person) -> bool:
+        crossed = [fits[np.ix_(x.keypoints, y.bodies)] for x, y in ((a, b), (b, a))]
+        return any(bool(c.any()) for c in crossed)
+
+    def at_two_places(kind: int, rows_a, rows_b) -> bool:
+        if not rows_a or not rows_b:
+            return False
+        a, b = (there[kind][list(rows)].any(0) for rows in (rows_a, rows_b))
+        if (a & b).sum() <= _OVERLAP * min(a.sum(), b.sum()):
+            return False
+        return not same_place(kind, rows_a, rows_b)
+
+    def one(a: Person, b: Person) -> bool:
+        kinds = ((0, a.keypoints, b.keypoints), (1, a.bodies, b.bodies))
+        known = linked(a, b) or any(
+            x and y and same_place(kind, x, y) for kind, x, y in kinds
+        )
+        return known and not any(at_two_places(*kind) for kind in kinds)
+
+    done: list[Person] = []
+    waiting = list(persons)
+    while waiting:
+        person = waiting.pop(0)
+        other = next((p for p in (*done, *waiting) if one(person, p)), None)
+        if other is None:
+            done.append(person)
+            continue
+        (done if other in done else waiting).remove(other)
+        joined = Person(
+            tuple(sorted((*person.keypoints, *other.keypoints))),
+            tuple(sorted((*person.bodies, *other.bodies))),
+        )
+        waiting.insert(0, joined)
+    return done
+
+
+def _attached(persons, apart, posed, posed_at) -> list[Person]:
+    """Bodies of frames without keypoints, to those that they go on from or lead to."""
+    shape = centred(posed)
+    lone = [
+        p
+        for p in persons
+        if not p.keypoints and not np.isfinite(apart[:, :, list(p.bodies)]).any()
+    ]
+    kept = [p for p in persons if p not in lone]
+    for person in sorted(lone, key=lambda p: int(_frames(posed_at, p)[0])):
+        own = _frames(posed_at, person)
+        for other in [p for p in kept if p.bodies]:
+            theirs = _frames(posed_at, other)
+            before, after = theirs[theirs < own[0]], theirs[theirs > own[-1]]
+            links = []
+            if len(before):
+                links.append(((before[-1], other.bodies), (own[0], person.bodies)))
+            if len(after):
+                links.append(((own[-1], person.bodies), (after[0], other.bodies)))
+            apart_in_time = not np.isin(own, theirs).any()
+            if apart_in_time and any(
+                start[0] - end[0] <= _SOON and _goes_on(*shape, end, start)
+                for end, start in links
+            ):
+                kept.remove(other)
+                both = tuple(sorted((*other.bodies, *person.bodies)))
+                kept.append(Person(other.keypoints, both))
+                break
+        else:
+            kept.append(person)
+    return kept
+
+
+def _frames(posed_at, person: Person) -> np.ndarray:
+    return np.flatnonzero(posed_at[list(person.bodies)].any(0))
+
+
+def _joined_by_place(persons, posed, posed_at, warn: Warn) -> list[Person]:
+    """Without keypoints: a body that begins where another has just ended."""
+    middle, radius = centred(posed)
+    ends = lambda p: _frames(posed_at, p)[[0, -1]]
+    done: list[Person] = []
+    for person in sorted(persons, key=lambda p: int(ends(p)[0])):
+        first = int(ends(person)[0])
+        before = [p for p in done if ends(p)[1] < first]
+        earlier = max(before, key=lambda p: int(ends(p)[1]), default=None)
+        if earlier is not None:
+            last = int(ends(earlier)[1])
+            goes_on = _goes_on(
+                middle, radius, (last, earlier.bodies), (first, person.bodies)
+            )
+            if goes_on and first - last <= _SOON:
+                done.remove(earlier)
+                person = Person((), (*earlier.bodies, *person.bodies))
+            else:
+                warn(
+                    f"bodies that begin in frame {first} may be of the person who was "
+                    f"last there in frame {last}."
+                )
+        done.append(person)
+    return done
+
+
+def _goes_on(middle, radius, end, start) -> bool:
+    """Whether who leaves is in the place and of the size of who comes."""
+    (last, before), (first, after) = end, start
+    a = next((r for r in before if np.isfinite(radius[last, r])), None)
+    b = next((r for r in after if np.isfinite(radius[first, r])), None)
+    if a is None or b is None:
+        return False
+    moved = np.linalg.norm(middle[first, b] - middle[last, a]) / radius[last, a]
+    ratio = radius[first, b] / radius[last, a]
+    return bool(moved < 0.3 + 0.1 * (first - last) and 0.8 < ratio < 1.25)
+
+
+def _same_place(points, rows_a, rows_b, there) -> bool:
+    """Whether two people are in one place in most of the frames that they share."""
+    shared = there[list(rows_a)].any(0) & there[list(rows_b)].any(0)
+    fewest = min(there[list(rows)].any(0).sum() for rows in (rows_a, rows_b))
+    if shared.sum() <= max(_FEWEST, _OVERLAP * fewest):
+        return False
+    both = points[shared]
+    gap = distances(both[:, list(rows_a)], both[:, list(rows_b)])
+    near = (np.where(np.isfinite(gap), gap, np.inf) < _TWICE).any((1, 2))
+    return bool(near.mean() >= _MOST)
+
+
+def _say_who_is_one(persons, there, warn: Warn) -> None:
+    for person in persons:
+        kinds = ("keypoints", person.keypoints), ("bodies", person.bodies)
+        for (what, rows), at in zip(kinds, there, strict=True):
+            if len(rows) < 2:
+                continue
+            twice = int((at[list(rows)].sum(0) > 1).sum())
+            also = f", in {twice} frames twice" if twice else ""
+            warn(
+                f"{what} of {len(rows)} numbers are of one person{also}: "
+                f"{in_words(at, rows)}; taken together, by where they are in the image."
+            )
+
+
+def _worth_keeping(persons, sequence, posed, apart, there, warn) -> list[Person]:
+    """Without those of whom nothing is there, or whom the image cannot show."""
+    width, height = sequence.intrinsics.width, sequence.intrinsics.height
+    seen_at, posed_at = there
+    for row in range(max(len(seen_at), len(posed_at))):
+        if not seen_at[row : row + 1].any() and not posed_at[row : row + 1].any():
+            warn(f"person {row} has neither keypoints nor bodies: left out.")
+    kept = []
+    for person in persons:
+        rows = list(person.bodies)
+        if person.keypoints or not seen_at.any():
+            kept.append(person)
+            continue
+        u, v = np.moveaxis(posed[:, rows], -1, 0)
+        inside = ((u >= 0) & (u < width) & (v >= 0) & (v < height)).any((1, 2))
+        share = float((~inside[posed_at[rows].any(0)]).mean())
+        who = f"bodies of {in_words(posed_at, rows)}"
+        if share > 0.5:
+            warn(
+                f"{who} are outside the image in {100 * share:.0f} % of their frames, "
+                "and without keypoints: left out."
+            )
+            continue
+        near = apart[:, :, rows]
+        near = near[np.isfinite(near)]
+        far = (
+            f"the nearest keypoints are {np.median(near):.1f} of a person's size away"
+            if len(near)
+            else "there are none in their frames"
+        )
+        warn(
+            f"{who} have no keypoints: {far} (median); taken as a person whom the "
+            "detector of keypoints did not find."
+        )
+        kept.append(person)
+    first = lambda p: ((p.keypoints or p.bodies)[0], not p.keypoints)
+    return sorted(kept, key=first)
+
+
+def _medians(apart: Float[np.ndarray, "t k b"]):
+    """Median distance and the number of frames in which there is one."""
+    count = np.isfinite(apart).sum(0)
+    if not len(apart):
+        return np.full(count.shape, np.inf), count
+    ordered = np.sort(apart, axis=0)  # NaN last
+    at = np.maximum((count - 1) // 2, 0)
+    middle = np.take_along_axis(ordered, at[None], axis=0)[0]
+    return np.where(count > 0, middle, np.inf), count

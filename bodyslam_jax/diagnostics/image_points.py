@@ -1,0 +1,193 @@
+"""Keypoints and bodies as the same 14 points of the image, so that they compare.
+
+NumPy only: this runs before anything is compiled. The points are those of BODY_25 that
+are joints of SMPL: neck, shoulders, elbows, wrists, hips, knees, ankles; neck and
+middle hip are midpoints, as OpenPose defines them. NaN is missing.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
+
+POINTS = slice(1, 15)
+"""Of BODY_25: the points that are compared."""
+NECK, R_SHOULDER, L_SHOULDER, MID_HIP, R_HIP, L_HIP = 0, 1, 4, 7, 8, 11
+ANKLES = (10, 13)
+SWAPPED = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
+"""The point on the other side of the body."""
+
+_JOINT = np.array([-1, 17, 19, 21, 16, 18, 20, -1, 2, 5, 8, 1, 4, 7])
+"""SMPL's joint of each point; -1 are midpoints."""
+_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+_BEHIND = 1e6
+"""Pixel of what is behind the camera: far from everything."""
+_FEWEST = 5
+"""Points in common from which two people are compared."""
+_FARTHEST = 3.0
+"""Distance, in sizes of a person, beyond which all distances are alike."""
+_SURE = 0.25
+"""Confidence, of a person's usual best, from which a keypoint counts."""
+_SMALLEST = 10.0
+"""Sizes below this are not divided by, px."""
+
+
+@dataclasses.dataclass(frozen=True)
+class People:
+    """Who is seen in each of `t` frames, by either kind of input."""
+
+    keypoints: Float[np.ndarray, "t k 14 2"]
+    """px"""
+    bodies: Float[np.ndarray, "t b 14 3"]
+    """m, in the camera frame"""
+    camera: Intrinsics
+
+    @property
+    def both(self) -> Bool[np.ndarray, " t"]:
+        """Frames in which there is somebody of either kind."""
+        return np.logical_and(
+            have_points(self.keypoints).any(1), have_points(self.bodies).any(1)
+        )
+
+
+def people_of(sequence: Sequence, body: BodyModel) -> People:
+    """All people, in the order of the sequence; a missing kind has no one."""
+    t = sequence.num_frames
+    seen, posed = np.zeros((t, 0, 14, 2)), np.zeros((t, 0, 14, 3))
+    if sequence.keypoints is not None:
+        seen = sure_points(sequence.keypoints).transpose(1, 0, 2, 3)
+    if sequence.bodies is not None:
+        posed = body_points(sequence.bodies, body).transpose(1, 0, 2, 3)
+    return People(seen, posed, sequence.intrinsics)
+
+
+def sure_points(keypoints: Keypoints) -> Float[np.ndarray, "h t 14 2"]:
+    """The keypoints that their detector is about as sure of as of any, px."""
+    confidence = keypoints.confidence[..., POINTS]
+    best = [np.quantile(c[c > 0], 0.9) if (c > 0).any() else 1.0 for c in confidence]
+    least = _SURE * np.reshape(best, (-1, 1, 1))
+    sure = (confidence > 0) & (confidence >= least)
+    return np.where(sure[..., None], keypoints.uv[:, :, POINTS], np.nan)
+
+
+def body_points(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "h t 14 3"]:
+    """Joints of bodies in the camera frame, m."""
+    template = np.asarray(body.joint_template, float)[:22]
+    directions = np.asarray(body.joint_shape_dirs, float)[:22]
+    at = bodies.present
+    rest = template + np.einsum("jcb,mb->mjc", directions, bodies.shapes[at])
+    angles = bodies.poses[at].reshape(-1, 24, 3)[:, :22]
+    turn = Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix()
+    turn = turn.reshape(-1, 22, 3, 3)
+    G, x = np.empty_like(turn), np.empty_like(rest)
+    G[:, 0], x[:, 0] = turn[:, 0], rest[:, 0] + bodies.trans[at]
+    for k in range(1, 22):
+        parent = _PARENTS[k]
+        bone = rest[:, k] - rest[:, parent]
+        x[:, k] = x[:, parent] + np.einsum("mij,mj->mi", G[:, parent], bone)
+        G[:, k] = G[:, parent] @ turn[:, k]
+    points = x[:, _JOINT]
+    points[:, NECK] = (points[:, R_SHOULDER] + points[:, L_SHOULDER]) / 2
+    points[:, MID_HIP] = (points[:, R_HIP] + points[:, L_HIP]) / 2
+    out = np.full((*at.shape, 14, 3), np.nan)
+    out[at] = points
+    return out
+
+
+def project(
+    camera: Intrinsics, p_C: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 2"]:
+    """Pixels (px); far away where a point is behind the camera, NaN where missing."""
+    fx, fy, cx, cy = camera.params[:4]
+    missing, front = np.isnan(p_C[..., 2]), p_C[..., 2] > 0.05
+    z = np.where(front, p_C[..., 2], 1.0)
+    x, y = p_C[..., 0] / z, p_C[..., 1] / z
+    if len(camera.params) == 8:
+        k1, k2, p1, p2 = camera.params[4:]
+        corner = (camera.width / fx) ** 2 + (camera.height / fy) ** 2
+        r2 = x * x + y * y
+        held = np.minimum(r2, corner)  # beyond the image the polynomial folds back
+        radial = 1 + held * (k1 + held * k2)
+        fade = np.where(r2 > 0, held / np.where(r2 > 0, r2, 1.0), 1.0)
+        x, y = (
+            x * radial + fade * (2 * p1 * x * y + p2 * (r2 + 2 * x * x)),
+            y * radial + fade * (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y),
+        )
+    uv = np.stack([fx * x + cx, fy * y + cy], axis=-1)
+    uv = np.where(front[..., None], uv, _BEHIND)
+    return np.where(missing[..., None], np.nan, uv)
+
+
+def have_points(points: Float[np.ndarray, "*n 14 c"]) -> Bool[np.ndarray, "*n"]:
+    """Whether enough of a person's points are there to compare them."""
+    return np.isfinite(points[..., 0]).sum(-1) >= _FEWEST
+
+
+def sizes(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
+    """Longer side of the box around each person, px; NaN if nobody is there."""
+    there = np.isfinite(uv)
+    low = np.where(there, uv, np.inf).min(-2)
+    high = np.where(there, uv, -np.inf).max(-2)
+    size = np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0)
+    return np.where(have_points(uv), size.max(-1).clip(_SMALLEST), np.nan)
+
+
+def distances(
+    seen: Float[np.ndarray, "t k 14 2"], posed: Float[np.ndarray, "t b 14 2"]
+) -> Float[np.ndarray, "t k b"]:
+    """Mean distance of the points of two people, in sizes of the first; NaN where they
+    share too few."""
+    apart = np.hypot(*np.moveaxis(seen[:, :, None] - posed[:, None], -1, 0))
+    there = np.isfinite(apart)
+    size = sizes(seen)[:, :, None]
+    limit = _FARTHEST * np.where(np.isfinite(size), size, 1.0)
+    total = np.where(there, np.minimum(apart, limit[..., None]), 0.0).sum(-1)
+    count = there.sum(-1)
+    return np.where(count >= _FEWEST, total / np.maximum(count, 1) / size, np.nan)
+
+
+def centred(
+    uv: Float[np.ndarray, "*n 14 2"],
+) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
+    """Median of each person's points, and the mean distance from it of the three
+    quarters that are nearest, px."""
+    middle = _median(uv, -2)
+    away = np.sort(np.hypot(*np.moveaxis(uv - middle[..., None, :], -1, 0)), -1)
+    count = np.isfinite(away).sum(-1)
+    kept = np.arange(away.shape[-1]) < np.ceil(0.75 * count)[..., None]
+    total = np.where(kept, away, 0.0).sum(-1)
+    fine = have_points(uv)
+    radius = total / np.maximum(kept.sum(-1), 1)
+    return np.where(fine[..., None], middle, np.nan), np.where(fine, radius, np.nan)
+
+
+def in_common(
+    a: Float[np.ndarray, "*n 14 2"], b: Float[np.ndarray, "*n 14 2"]
+) -> tuple[Float[np.ndarray, "*n 14 2"], Float[np.ndarray, "*n 14 2"]]:
+    """Two people with the points that both have."""
+    there = np.isfinite(a) & np.isfinite(b)
+    return np.where(there, a, np.nan), np.where(there, b, np.nan)
+
+
+def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m"]:
+    """Of what is not NaN; NaN if nothing is."""
+    count = np.isfinite(values).sum(axis, keepdims=True)
+    ordered = np.sort(values, axis=axis)  # NaN last
+    at = lambda i: np.take_along_axis(ordered, np.maximum(i, 0), axis=axis)
+    return ((at((count - 1) // 2) + at(count // 2 * (count > 0))) / 2).squeeze(axis)
+
+
+def compact(points: Float[np.ndarray, "t h 14 c"], most: int):
+    """The same with at most `most` people a frame, whoever is there first: people of
+    the same frame in the same row need not be the same."""
+    there = have_points(points)
+    order = np.argsort(~there, axis=1, kind="stable")
+    width = min(most, int(there.sum(1).max(initial=0)))
+    order = order[:, :width]
+    chosen = np.take_along_axis(points, order[:, :, None, None], axis=1)
+    kept = np.take_along_axis(there, order, axis=1)
+    return np.where(kept[..., None, None], chosen, np.nan)

@@ -1,0 +1,221 @@
+"""What is odd about people, without one thing that would explain it beyond doubt."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bodyslam_jax.diagnostics.explanations import ImageMap
+from bodyslam_jax.diagnostics.facing import opposed, shares, trunk_directions
+from bodyslam_jax.diagnostics.image_points import (
+    MID_HIP,
+    NECK,
+    People,
+    centred,
+    distances,
+    have_points,
+    in_common,
+    project,
+)
+from bodyslam_jax.diagnostics.undo import with_keypoints_mapped_back
+from bodyslam_jax.types import Sequence
+
+_FEWEST = 10
+"""Frames from which it is said what is so in most of them."""
+_MOST = 0.8
+_OPPOSED = 0.6
+_ELSEWHERE, _SOME = 0.6, 0.1
+"""Distance from which a body is not its person's, and the share of frames to say so."""
+_RATIO = 0.12
+"""Difference in size (relative) beyond a regressor's usual error."""
+_OUTSIDE = 0.02
+"""Share of points outside the image of the wrong orientation that settles it."""
+
+
+def warn_of_oddities(
+    sequence: Sequence, people: People, warn: Callable[[str], None], *, sides: bool
+) -> Sequence:
+    """The sequence, with keypoints turned back if they cannot be of it as they are.
+
+    Args:
+        sides: whether it is not yet said that left and right contradict.
+
+    **Raises:** `ValueError` if there is nothing of the bodies in the image.
+    """
+    posed = project(people.camera, people.bodies)
+    for h in range(min(people.keypoints.shape[1], people.bodies.shape[1])):
+        seen = people.keypoints[:, h]
+        if sides:
+            _warn_of_sides(h, seen, posed[:, h], warn)
+        _warn_of_person(h, seen, posed[:, h], people, warn)
+    sequence = _upright(sequence, people, warn)
+    if sequence.keypoints is None:
+        _check_bodies_alone(people, posed, warn)
+    else:
+        _warn_of_renumbering(sequence, warn)
+        _warn_of_a_corner(sequence, warn)
+    return sequence
+
+
+def _warn_of_sides(h: int, seen, posed, warn) -> None:
+    shown, against = opposed(seen, posed)
+    if shown.sum() >= _FEWEST and against.sum() > _OPPOSED * shown.sum():
+        warn(
+            f"person {h}: left and right of the keypoints contradict the bodies in "
+            f"{100 * against.sum() / shown.sum():.0f} % of the frames in which it "
+            "shows "
+            "whether the person is seen from the front: sides are exchanged in the "
+            "keypoints, or the bodies face the other way."
+        )
+
+
+def _warn_of_person(h: int, seen, posed, people: People, warn) -> None:
+    apart = distances(seen[:, None], posed[:, None])[:, 0, 0]
+    both = np.isfinite(apart)
+    if both.sum() < _FEWEST:
+        return
+    away = both & (apart > _ELSEWHERE)
+    if _SOME * both.sum() < away.sum() < (1 - _SOME) * both.sum():
+        first, last = np.flatnonzero(away)[[0, -1]]
+        warn(
+            f"person {h}: in {100 * away.sum() / both.sum():.0f} % of the frames, "
+            "between "
+            f"{first} and {last}, the bodies are more than {_ELSEWHERE:g} of the "
+            "person's size from the keypoints: of somebody else there?"
+        )
+    near = both & ~away
+    big, small = (centred(uv[near])[1] for uv in in_common(seen, posed))
+    ratio = big / np.maximum(small, 1e-3)
+    ratio = ratio[np.isfinite(ratio)]
+    if len(ratio) < _FEWEST:
+        return
+    low, middle, high = np.quantile(ratio, [0.1, 0.5, 0.9])
+    if (low > 1 + _RATIO / 2 and middle > 1 + _RATIO) or (
+        high < 1 - _RATIO / 2 and middle < 1 - _RATIO
+    ):
+        focal = float(people.camera.params[0])
+        warn(
+            f"person {h}: {middle:.2f} times as large in the keypoints as in the "
+            "bodies "
+            f"({low:.2f} to {high:.2f}): bodies that are {middle:.2f} times too far "
+            "away, "
+            f"or of a camera of {middle * focal:.0f} px focal length, not {focal:.0f} "
+            "px."
+        )
+
+
+def _upright(sequence: Sequence, people: People, warn) -> Sequence:
+    """Whether people lie or stand on their heads nearly all the time."""
+    width, height = sequence.intrinsics.width, sequence.intrinsics.height
+    kind = "keypoints" if have_points(people.keypoints).any() else "bodies"
+    points = people.keypoints
+    if kind == "bodies":
+        points = project(people.camera, people.bodies)
+    count, share = shares(trunk_directions(points))
+    worst = max(("upside down", "left", "right"), key=lambda name: share[name])
+    if count < _FEWEST or share[worst] < _MOST:
+        return sequence
+    percent = f"{100 * share[worst]:.0f} %"
+    if worst == "upside down":
+        warn(
+            f"{kind}: heads are below feet in {percent} of all people and frames; if "
+            "people stand, the video is upside down, or "
+            + (
+                "y was counted from the lower edge."
+                if kind == "keypoints"
+                else "y points up in the bodies' frame, where the camera's points down."
+            )
+        )
+        return sequence
+    clockwise = worst == "right"
+    if kind == "keypoints" and _exceeds(sequence, width, height):
+        w, h = width - 1.0, height - 1.0
+        image = (
+            ImageMap(np.array([[0.0, -1.0], [1.0, 0.0]]), np.array([h, 0.0]))
+            if clockwise
+            else ImageMap(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([0.0, w]))
+        )
+        back = with_keypoints_mapped_back(sequence, image)
+        if not _exceeds(back, width, height):
+            warn(
+                f"keypoints are of an image of {height}x{width} px turned by 90 "
+                "degrees "
+                f"(people lie in {percent} of all frames, and beyond the edge of this "
+                f"video of {width}x{height} px): turned back."
+            )
+            return back
+    warn(
+        f"{kind}: people lie on their side, heads to the {worst}, in {percent} of all "
+        f"people and frames; if they stand, {kind} were made on a copy turned by 90 "
+        "degrees (a phone's video without its rotation): make them on the video as it "
+        "is shown."
+    )
+    return sequence
+
+
+def _exceeds(sequence: Sequence, width: int, height: int) -> bool:
+    keypoints = sequence.keypoints
+    uv = keypoints.uv[keypoints.confidence > 0.3]
+    if not len(uv):
+        return False
+    margin = 0.02 * max(width, height)
+    beyond = (uv < -margin) | (uv > np.array([width, height]) + margin)
+    return bool(beyond.any(-1).mean() > _OUTSIDE)
+
+
+def _check_bodies_alone(people: People, posed, warn) -> None:
+    """Bodies without keypoints: in the image, and in a camera's frame."""
+    width, height = people.camera.width, people.camera.height
+    there = have_points(people.bodies)
+    if not there.any():
+        return
+    u, v = posed[..., 0], posed[..., 1]
+    inside = ((u >= 0) & (u < width) & (v >= 0) & (v < height)).any(-1)
+    share = 100 * float((~inside[there]).mean())
+    if share > 70:
+        raise ValueError(
+            f"bodies are outside the image of {width}x{height} px in {share:.0f} % of "
+            "their frames; expected bodies in the frame of the camera, x right, y "
+            "down, "
+            "z forward, in m, not in a world."
+        )
+    if share > 20:
+        warn(f"bodies are outside the image in {share:.0f} % of their frames.")
+    trunk = (people.bodies[..., NECK, :] - people.bodies[..., MID_HIP, :])[there]
+    away = trunk[:, 2] > 0.8 * np.linalg.norm(trunk, axis=-1)
+    if len(away) >= _FEWEST and away.mean() > _MOST:
+        warn(
+            f"bodies: heads point away from the camera in {100 * away.mean():.0f} % of "
+            "all frames: z up, as in a world? Expected the camera's frame, x right, y "
+            "down, z forward."
+        )
+
+
+def _warn_of_renumbering(sequence: Sequence, warn) -> None:
+    """Keypoints that end where every n-th frame, numbered anew, would."""
+    if sequence.bodies is not None:
+        return
+    seen = np.any(sequence.keypoints.confidence > 0, axis=(0, 2))
+    t, count = len(seen), int(np.flatnonzero(seen)[-1]) + 1
+    for n in (2, 3, 4, 5, 6, 10):
+        if count == -(-t // n) and count >= _FEWEST and seen[:count].mean() > _MOST:
+            warn(
+                f"keypoints only in frames 0 to {count - 1} of {t}, one frame in {n}: "
+                f"taken as they are numbered; if only one frame in {n} was looked at, "
+                "and numbered anew, give them the numbers of their frames."
+            )
+
+
+def _warn_of_a_corner(sequence: Sequence, warn) -> None:
+    """Keypoints that fill a quarter of the image only, as those of a copy of half the
+    size do: nobody who stands on the ground before a level camera is there."""
+    keypoints = sequence.keypoints
+    size = np.array([sequence.intrinsics.width, sequence.intrinsics.height])
+    uv = keypoints.uv[keypoints.confidence > 0]
+    high = np.quantile(uv, 0.99, axis=0) if len(uv) else size
+    frames = int((keypoints.confidence > 0).any((0, 2)).sum())
+    if sequence.bodies is None and frames >= _FEWEST and (high < 0.5 * size).all():
+        warn(
+            f"keypoints reach ({high[0]:.0f}, {high[1]:.0f}) px only, of {size[0]}x"
+            f"{size[1]}: all in the upper left quarter; if people are elsewhere in the "
+            "video, the keypoints are of a smaller copy of it."
+        )

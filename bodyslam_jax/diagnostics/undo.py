@@ -1,0 +1,62 @@
+"""Takes back what was done to keypoints or bodies, once it is known."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics.explanations import ImageMap
+from bodyslam_jax.types import Bodies, Keypoints, Sequence
+
+_SWAPPED = np.array(
+    [0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11]
+    + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
+)
+"""The keypoint of BODY_25 on the other side of the body."""
+
+
+def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
+    """Keypoints in the true image, which were in one that `image` makes of it."""
+    keypoints = sequence.keypoints
+    uv, confidence = image.inverse(keypoints.uv), keypoints.confidence
+    uv = np.where(confidence[..., None] > 0, uv, 0.0)
+    if image.swap:
+        uv, confidence = uv[:, :, _SWAPPED], confidence[:, :, _SWAPPED]
+    return dataclasses.replace(sequence, keypoints=Keypoints(uv, confidence))
+
+
+def with_bodies_moved(
+    sequence: Sequence,
+    body: BodyModel,
+    place: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 3"]],
+    R: Float[np.ndarray, "3 3"] | None = None,
+) -> Sequence:
+    """Bodies whose pelvis (m) goes through `place`, turned about it by `R`."""
+    bodies = sequence.bodies
+    at = bodies.present
+    J_0 = np.asarray(body.joint_template[0], float)
+    J_0 = J_0 + bodies.shapes[at] @ np.asarray(body.joint_shape_dirs[0], float).T
+    trans, poses = bodies.trans.copy(), bodies.poses.copy()
+    trans[at] = place(trans[at] + J_0) - J_0
+    if R is not None:
+        root = Rotation.from_matrix(R) * Rotation.from_rotvec(poses[at][:, :3])
+        poses[at] = np.concatenate([root.as_rotvec(), poses[at][:, 3:]], axis=-1)
+    bodies = dataclasses.replace(bodies, trans=trans, poses=poses)
+    return dataclasses.replace(sequence, bodies=bodies)
+
+
+def retimed(
+    bundle: Keypoints | Bodies, new: Callable[[Int[np.ndarray, " t"]], np.ndarray]
+):
+    """The same arrays with frame k at frame `new(k)`; beyond the end it is dropped."""
+    arrays = {k: v for k, v in vars(bundle).items() if isinstance(v, np.ndarray)}
+    t = next(iter(arrays.values())).shape[1]
+    at = new(np.arange(t))
+    inside = (at >= 0) & (at < t)
+    moved = {k: np.zeros_like(v) for k, v in arrays.items()}
+    for name, value in arrays.items():
+        moved[name][:, at[inside]] = value[:, inside]
+    return dataclasses.replace(bundle, **moved)

@@ -1,0 +1,123 @@
+"""What a data set's files must hold; every refusal names the file."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax import io
+from bodyslam_jax.io.safe_pickle import restricted_load
+
+_HOME = {
+    "EMDB": "https://emdb.ait.ethz.ch",
+    "3DPW": "https://virtualhumans.mpi-inf.mpg.de/3DPW",
+    "RICH": "https://rich.is.tue.mpg.de",
+    "AMASS": "https://amass.is.tue.mpg.de",
+}
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
+
+
+def not_there(path: Path, dataset: str) -> FileNotFoundError:
+    """The error that says where a data set is given out."""
+    return FileNotFoundError(
+        f"{path}: not there; {dataset} is given to researchers who register at "
+        f"{_HOME[dataset]}."
+    )
+
+
+def dictionary(file: Path, needed: tuple[str, ...]) -> dict[str, Any]:
+    """A pickled dictionary with all names in `needed`."""
+    return fields(file, "", restricted_load(file), needed)
+
+
+def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[str, Any]:
+    """`data`, which is `name` in `file`, if it is a dictionary with all in `needed`."""
+    where = f"{file}: {name + ' is ' if name else ''}"
+    if not isinstance(data, dict):
+        raise ValueError(f"{where}a {type(data).__name__}, not a dictionary.")
+    missing = [f"{name}.{key}" if name else key for key in needed if key not in data]
+    if missing:
+        raise ValueError(f"{file}: no {', '.join(missing)}, only {[*data]}.")
+    return data
+
+
+def entries(file: Path, name: str, data: Any, count: int | None = None) -> list[Any]:
+    """What `name` holds for each of `count` people, or for at least one."""
+    is_list = isinstance(data, list | tuple)
+    if not is_list and not (isinstance(data, np.ndarray) and data.ndim):
+        raise ValueError(f"{file}: {name}: a {type(data).__name__}, not a list.")
+    if not len(data) or len(data) != (count or len(data)):
+        wanted = "at least one person" if count is None else f"{count} people"
+        raise ValueError(f"{file}: {name}: {len(data)} entries, not of {wanted}.")
+    return list(data)
+
+
+def array(
+    file: Path, name: str, values: Any, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """`values` as finite float64 of this shape; `None` is any length but 0."""
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        kind = type(values).__name__
+        raise ValueError(
+            f"{file}: {name}: a {kind}, not an array of numbers."
+        ) from None
+    fits = found.ndim == len(shape) and all(
+        n == wanted or (wanted is None and n > 0)
+        for n, wanted in zip(found.shape, shape, strict=True)
+    )
+    if not fits or not np.all(np.isfinite(found)):
+        wanted = str(shape).replace("None", "any")
+        raise ValueError(
+            f"{file}: {name}: {found.shape} values, not {wanted} finite numbers."
+        )
+    return found
+
+
+def first(file: Path, name: str, values: Any, count: int) -> np.ndarray:
+    """The first `count` of `values`, whatever their shape."""
+    try:
+        flat = np.ravel(values)[:count]
+    except ValueError:  # lists of unlike lengths
+        flat = values
+    return array(file, name, flat, (count,))
+
+
+def whole(file: Path, name: str, value: Any) -> int:
+    """A whole number above 0."""
+    number = float(array(file, name, value, ()))
+    if number < 1 or number != round(number):
+        raise ValueError(f"{file}: {name}: {number:g}, not a whole number above 0.")
+    return int(number)
+
+
+def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarray:
+    """World-to-camera matrices, which can be inverted."""
+    found = array(file, name, values, (num, 4, 4))
+    if np.any(abs(np.linalg.det(found)) < 1e-6):
+        raise ValueError(f"{file}: {name}: matrices without an inverse, not poses.")
+    return found
+
+
+def images(folder: Path, num: int = 1) -> list[Path]:
+    """The images of a folder, by name; at least `num`.
+
+    Fewer than the truth has frames are those of a download that broke off: they would
+    go to the wrong frames.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of images.")
+    found = (p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
+    listed = sorted(found, key=lambda file: file.name)
+    if not listed:
+        raise ValueError(f"{folder}: no image in it.")
+    if len(listed) < num:
+        raise ValueError(f"{folder}: {len(listed)} images, not one for {num} frames.")
+    return listed
+
+
+def image_size(folder: Path) -> tuple[int, int]:
+    """Width and height of the first image, px."""
+    image = next(io.frames(folder))
+    return image.shape[1], image.shape[0]

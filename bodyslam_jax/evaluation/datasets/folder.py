@@ -1,0 +1,120 @@
+"""Sequence folders, written whole or not at all."""
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.export.folder import write_body, write_tum
+
+FPS = 30.0
+"""Of all three data sets."""
+_MARK = "conversion.json"
+"""Where a sequence came from; what a folder with it has may be written again."""
+
+
+@contextlib.contextmanager
+def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
+    """A hidden folder whose content appears in `out` when the block ends well.
+
+    It takes the place of what an earlier conversion wrote; what else lies in `out`
+    stays. If the block raises, `out` is as it was.
+
+    **Raises:** `ValueError` if `out` cannot be written, or has of its own what would be
+    written.
+    """
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: a file; expected a folder to write.")
+    try:
+        home = out.resolve().parent
+        home.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=".conversion-", dir=home))
+    except OSError as error:
+        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+    try:
+        yield partial
+        mark = {"dataset": dataset, "source": str(source.resolve())}
+        (partial / _MARK).write_text(json.dumps(mark) + "\n")
+        partial.chmod(0o755)
+        _move(partial, out)
+    except OSError as error:
+        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _move(partial: Path, out: Path) -> None:
+    if not out.exists():
+        os.replace(partial, out)
+        return
+    written = sorted(partial.iterdir(), key=lambda entry: entry.name == _MARK)
+    theirs = [e.name for e in written if os.path.lexists(out / e.name)]
+    if theirs and not (out / _MARK).exists():
+        raise ValueError(
+            f"{out}: has {', '.join(theirs)}, which no conversion wrote; choose "
+            "another folder."
+        )
+    for entry in written:
+        old = out / entry.name
+        if old.is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink(missing_ok=True)
+        os.replace(entry, old)
+
+
+def write_truth(
+    folder: Path, T_CW: Float[np.ndarray, "t 4 4"], people: list[dict[str, Any]]
+) -> None:
+    """The trajectory, camera to world, and a file for each person."""
+    truth = folder / "groundtruth"
+    truth.mkdir()
+    write_tum(truth / "camera.txt", np.arange(len(T_CW)) / FPS, np.linalg.inv(T_CW))
+    for h, person in enumerate(people):
+        name = "body.npz" if len(people) == 1 else f"body_{h}.npz"
+        write_body(truth / name, fps=FPS, **person)
+
+
+def write_camera(
+    folder: Path,
+    K: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
+    distortion: tuple[float, ...] = (),
+) -> None:
+    """`camera.json`, with `k1 k2 p1 p2` if there is any distortion."""
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    model = "PINHOLE"
+    if any(distortion):
+        model, params = "OPENCV", [*params, *distortion[:4]]
+    camera = {"model": model, "width": size[0], "height": size[1]}
+    camera |= {"params": [float(p) for p in params], "fps": FPS}
+    (folder / "camera.json").write_text(json.dumps(camera) + "\n")
+
+
+def link_images(folder: Path, images: Path) -> None:
+    """A link, as data sets are large."""
+    link = folder / "images"
+    link.symlink_to(images.resolve(), target_is_directory=True)
+
+
+def write_keypoints(
+    folder: Path, name: str, people: list[Float[np.ndarray, "t 18 3"]]
+) -> None:
+    """OpenPose's own files, COCO-18; a person who was not detected is left out."""
+    keypoints = folder / "keypoints"
+    keypoints.mkdir()
+    for k in range(len(people[0])):
+        found: list[Mapping[str, Any]] = [
+            {"person_id": [-1], "pose_keypoints_2d": person[k].ravel().tolist()}
+            for person in people
+            if person[k, :, 2].any()
+        ]
+        text = json.dumps({"version": 1.3, "people": found})
+        (keypoints / f"{name}_{k:012d}_keypoints.json").write_text(text)

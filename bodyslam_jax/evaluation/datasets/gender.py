@@ -1,0 +1,161 @@
+"""The body that true parameters belong to: its kind and its gender.
+
+Shape parameters mean another person in another body: ground truths are posed with the
+gendered SMPL that they were made with, as their own evaluations do (EMDB, WHAM, TRAM).
+"""
+
+import dataclasses
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
+from bodyslam_jax.body.files import VARIABLE, _candidates, named_gender
+from bodyslam_jax.evaluation.readers import _load_npz, read_groundtruth
+from bodyslam_jax.types import Result
+
+log = logging.getLogger(__name__)
+
+_GENDERS = {"f": "female", "m": "male", "n": "neutral"}
+_GENDERS |= {gender: gender for gender in _GENDERS.values()}
+_NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
+_NAMES["default"] = "the free body that ships with the package"
+_KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
+"""Numbers in a posture, and the bodies that it and its shape fit, best first."""
+_STEMS = {"smpl": ("smpl_", "basicmodel"), "smplh": ("smplh_", "model")}
+_STEMS["smplx"] = ("smplx_",)
+"""How names of files begin, where they are usual."""
+
+
+def gender_of(value: Any) -> str | None:
+    """`female`, `male` or `neutral`, from text, bytes or arrays of them."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    text = value.decode("latin1") if isinstance(value, bytes) else str(value)
+    return _GENDERS.get(text.strip().lower())
+
+
+def body_for(
+    file: Path, gender: str, kind: str, body_model: Path | None = None
+) -> BodyModel:
+    """The body of one kind and gender, for the parameters in `file`.
+
+    `body_model` is a file, or a folder with a file for each gender, and for other kinds
+    too; without it one is looked for where `load_body_model` does.
+
+    **Raises:** `ValueError` if there is no such body.
+    """
+    is_found = body_model or os.environ.get(VARIABLE) or _is_installed(gender)
+    place = body_model if is_found else DEFAULT
+    body, wrong = _load(place, gender, gender, (kind,))
+    if wrong:
+        raise ValueError(
+            f"{file}: its joints need {_NAMES[kind]}, {gender}, not {wrong}; name its "
+            "file or folder with --body-model."
+        )
+    return body
+
+
+def read_truth(path: Path, body_model: Path | None = None) -> Result:
+    """`read_groundtruth`, where each body without joints is posed with its own gender.
+
+    Says so where the body at hand is not the one that the parameters are of.
+
+    **Raises:** as `read_groundtruth` and `load_body_model`.
+    """
+    if body_model and not body_model.exists():
+        raise FileNotFoundError(f"{body_model}: no such body model.")
+    files = _bodies(path)
+    needs = [None if "joints" in x else _needed(x) for x in files.values()]
+    wanted = sorted({need for need in needs if need})
+    if not wanted:
+        return read_groundtruth(path, load_body_model(DEFAULT))  # poses nobody
+    bodies = {need: _body_at_hand(body_model, *need) for need in wanted}
+    for file, need in zip(files, needs, strict=True):
+        if need and (wrong := bodies[need][1]):
+            log.warning(
+                "%s: no joints in it; its parameters are of %s, %s, but posed with %s, "
+                "which makes another person of them; name the right body with "
+                "--body-model.",
+                *(file, _NAMES[need[1][0]], need[0], wrong),
+            )
+    read = {need: read_groundtruth(path, body) for need, (body, _) in bodies.items()}
+    of = [need or wanted[0] for need in needs]
+    joints = np.stack([read[need].joints[h] for h, need in enumerate(of)])
+    return dataclasses.replace(read[wanted[0]], joints=joints)
+
+
+def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
+    """The body files of a ground truth in the order of its people, read."""
+    if not path.is_dir():
+        files = [path] if path.is_file() and path.suffix == ".npz" else []
+    elif not (path / "groundtruth").is_dir() and (path / "result.npz").exists():
+        files = []
+    else:
+        folder = path / "groundtruth" if (path / "groundtruth").is_dir() else path
+        files = sorted(folder.glob("body.npz")) or sorted(folder.glob("body_*.npz"))
+    return {file: _load_npz(file) for file in files}
+
+
+def _needed(person: dict[str, np.ndarray]) -> tuple[str, tuple[str, ...]]:
+    """Gender of an AMASS file, and which kinds of body it fits; the best first."""
+    width = np.shape(person.get("poses"))[-1:]
+    kinds = _KINDS.get(width[0] if width else 0, ("smpl", "smplh"))
+    return gender_of(person.get("gender")) or "neutral", kinds
+
+
+def _is_installed(gender: str) -> bool:
+    return any(file.is_file() for file in search_paths(gender))
+
+
+def _body_at_hand(
+    body_model: Path | None, gender: str, kinds: tuple[str, ...]
+) -> tuple[BodyModel, str | None]:
+    """That of the gender; if none is named and none is there, the neutral one."""
+    there = gender if body_model or _is_installed(gender) else "neutral"
+    return _load(body_model, there, gender, kinds)
+
+
+def _load(
+    place: Path | None, there: str, gender: str, kinds: tuple[str, ...]
+) -> tuple[BodyModel, str | None]:
+    """The body of one of `kinds`, best first, among those called `there`.
+
+    If there is none, it is another, and what that is instead is said.
+    """
+    named = place or os.environ.get(VARIABLE) or Path()
+    files = _candidates(place, there) if place else search_paths(there)
+    order = lambda file: (not file.is_relative_to(named), _rank(file, kinds))
+    files = sorted(filter(Path.is_file, files), key=order)
+    found = []
+    for file in files:
+        body = load_body_model(file)
+        wrong = _mismatch(body, file, gender, kinds)
+        if not wrong:
+            return body, None
+        found.append((body, wrong))
+    if found:
+        return found[0]
+    body = load_body_model(place, there)  # the free one, or says where none is
+    return body, _mismatch(body, DEFAULT, gender, kinds)
+
+
+def _rank(file: Path, kinds: tuple[str, ...]) -> int:
+    """Place of a file among `kinds` by its name, which need not be true."""
+    fits = [file.stem.lower().startswith(_STEMS[kind]) for kind in kinds]
+    return [*fits, True].index(True)
+
+
+def _mismatch(
+    body: BodyModel, file: Path, gender: str, kinds: tuple[str, ...]
+) -> str | None:
+    """What a body is if it is not what was wanted; its gender goes by its name."""
+    name = _NAMES[body.kind]
+    if body.kind == "default":
+        return name
+    of = named_gender(file)
+    if body.kind not in kinds or of not in (gender, None):
+        return f"{body.name} ({name}{', ' + of if of else ''})"
+    return None

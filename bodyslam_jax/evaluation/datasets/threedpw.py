@@ -1,0 +1,75 @@
+"""3DPW: one or two people, a moving camera, joints in the file."""
+
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax.evaluation.datasets import checks, folder
+from bodyslam_jax.evaluation.datasets.gender import gender_of
+
+_NEEDED = ("sequence", "poses", "trans", "betas", "cam_poses", "cam_intrinsics")
+_NEEDED += ("campose_valid", "jointPositions")
+
+
+def convert_3dpw(source: Path, out: Path) -> Path:
+    """Turns one 3DPW sequence into `out`, with its 2D detections as keypoints.
+
+    `source` is `sequenceFiles/<split>/<name>.pkl`; the images are looked for in
+    `imageFiles/<name>` beside `sequenceFiles`. Joints are the file's own. A person is
+    present where the camera's pose was aligned to the image.
+
+    **Raises:** as `convert_emdb`.
+    """
+    if not source.is_file():
+        raise checks.not_there(source, "3DPW")
+    data = checks.dictionary(source, _NEEDED)
+    name = str(data["sequence"])
+    if Path(name).name != name:  # it names files, and must not lead elsewhere
+        raise ValueError(f"{source}: sequence: {name!r}, not the name of a folder.")
+    T_CW = checks.extrinsics(source, "cam_poses", data["cam_poses"], None)
+    K = checks.array(source, "cam_intrinsics", data["cam_intrinsics"], (3, 3))
+    people = _people(source, data, len(T_CW))
+    detections = None
+    if data.get("poses2d") is not None:
+        detections = [
+            checks.array(source, "poses2d", x, (len(T_CW), 3, 18)).transpose(0, 2, 1)
+            for x in checks.entries(source, "poses2d", data["poses2d"], len(people))
+        ]
+    # Resolved: the file may be given by its name alone, from within its folder.
+    images = source.resolve().parent.parent.parent / "imageFiles" / name
+    checks.images(images, len(T_CW))
+    size = checks.image_size(images)
+    with folder.sequence_folder(out, "3DPW", source) as partial:
+        folder.write_camera(partial, K, size)
+        folder.write_truth(partial, T_CW, people)
+        folder.link_images(partial, images)
+        if detections:
+            folder.write_keypoints(partial, name, detections)
+    return out
+
+
+def _people(file: Path, data: dict[str, Any], num: int) -> list[dict[str, Any]]:
+    poses = checks.entries(file, "poses", data["poses"])
+    each = lambda name: checks.entries(file, name, data[name], len(poses))
+    unknown = ["neutral"] * len(poses)
+    genders = data.get("genders", data.get("gender", unknown))
+    array = lambda name, values, *shape: checks.array(file, name, values, (num, *shape))
+    rows = zip(
+        poses,
+        each("trans"),
+        each("betas"),
+        each("campose_valid"),
+        each("jointPositions"),
+        checks.entries(file, "genders", genders, len(poses)),
+        strict=True,
+    )
+    return [
+        {
+            "poses": array("poses", pose, 72),
+            "trans": array("trans", trans, 3),
+            "betas": checks.first(file, "betas", betas, 10),
+            "present": array("campose_valid", valid).astype(bool),
+            "gender": gender_of(gender) or "neutral",
+            "joints": array("jointPositions", joints, 72).reshape(num, 24, 3),
+        }
+        for pose, trans, betas, valid, joints, gender in rows
+    ]

@@ -1,0 +1,296 @@
+"""All errors of an estimate at once: a pure function of two aligned-in-time bundles."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.evaluation import metrics, plausibility
+from bodyslam_jax.evaluation.alignment import Alignment, align, is_point
+
+PELVIS = 0
+NOBODY = -1
+STILL = 0.01
+"""m; a camera whose path has a smaller radius (root mean square) stands still."""
+STRAIGHT = 0.1
+"""m, root mean square; how far about a path that is straighter a person is turned,
+alignment A1 hardly tells, and J-ATE is of little else."""
+FEET = (7, 10, 8, 11)
+"""Left ankle and foot, right ankle and foot: what slides where no mesh is known."""
+
+
+class Trajectories(eqx.Module):
+    """A camera and `h` people over `t` frames: what is compared, in one world frame.
+
+    Two of them are comparable when frame `k` is the same moment and person `i` the same
+    person in both; `associate` makes such a pair of two results.
+    """
+
+    T_WC: Float[Array, "*b t 4 4"]
+    """Camera to world, m."""
+    camera_valid: Bool[Array, "*b t"]
+    """Where the camera is known."""
+    joints: Float[Array, "*b h t 24 3"]
+    """m"""
+    present: Bool[Array, "*b h t"]
+    """Where the person is known."""
+    feet: Float[Array, "*b h t f 3"]
+    """Points of the feet for `foot_sliding`, m."""
+    fps: Float[Array, "*b"]
+    """1/s"""
+
+
+class Pair(eqx.Module):
+    """A person of the truth, and who of the estimate was taken for them."""
+
+    truth: int
+    estimate: int
+    """`NOBODY` if they are not found."""
+    frames: int
+    """In which both are known."""
+    of_frames: int
+    """In which the truth is known."""
+
+
+class Scope(eqx.Module):
+    """How much of a truth an evaluation is about."""
+
+    cameras: int
+    """Frames in which both cameras are known."""
+    of_cameras: int
+    """In which the truth's is."""
+    people: tuple[Pair, ...]
+    """One for each person of the truth."""
+    others: int
+    """People of the estimate who are none of the truth's."""
+    straight: tuple[bool, ...] = ()
+    """For each of `people`: whether, where compared, their true pelvis stays within
+    `STRAIGHT` of a line."""
+
+
+class Evaluation(eqx.Module):
+    """Errors by name in m, rad, s: `found["c_ate_se3"]` is a mean, `..._rmse` its RMSE.
+
+    A mapping: `keys`, `items`, `in` and `len` work. NaN where the truth (or the
+    estimate) lacks what the error is about, and where a frame that counts is NaN.
+    """
+
+    values: dict[str, Float[Array, "*b"]]
+    """Cameras, and the mean over people of theirs."""
+    people: dict[str, Float[Array, "*b h"]]
+    """The same names, person by person, in the truth's order; those matched only."""
+    feet: str = eqx.field(static=True, default="the points given")
+    """What `foot_sliding` is of."""
+    scope: Scope | None = None
+    """What was compared; `None` for `Trajectories`, which are all compared."""
+
+    def __getitem__(self, name: str) -> Float[Array, "*b"]:
+        return self.values[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def keys(self):
+        return self.values.keys()
+
+    def items(self):
+        return self.values.items()
+
+
+def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evaluation:
+    """Every error of module `_metrics`; jits, and vmaps over leading axes.
+
+    `c_` is the camera, `h_` the human centre, `j_` the joints. `_se3` and `_sim3` are
+    alignment A1 (camera and person each on its own), `_a2`, `_a3`, `_a4` the other
+    three in SE(3). `scale` is that of the camera's Sim(3) alignment (paper: "scale
+    error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
+    `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then. An
+    estimated one that does not move at all has no scale and no Sim(3) either.
+
+    `gravity_error` and the figures of module `_plausibility` take y for up in the
+    estimate, as it is in a result.
+    """
+    camera_valid = estimate.camera_valid & truth.camera_valid
+    values = _camera_errors(estimate, truth, camera_valid)
+    true_up, known = plausibility.up_axis(truth.joints, truth.present)
+    tilt = plausibility.gravity_error(estimate.T_WC, truth.T_WC, camera_valid, true_up)
+    values["gravity_error"] = jnp.where(known, tilt, jnp.nan)
+    people: dict[str, Array] = {}
+    if truth.present.shape[0]:
+        per_person = jax.vmap(_person_errors, (0,) * 6 + (None,) * 4)
+        people = per_person(
+            estimate.joints,
+            truth.joints,
+            estimate.feet,
+            truth.feet,
+            estimate.present,
+            truth.present,
+            estimate,
+            truth,
+            camera_valid,
+            true_up,
+        )
+        counts = estimate.present & truth.present
+        broken = jnp.zeros(len(counts), bool)
+        for side in (estimate, truth):
+            broken |= _is_broken(side.T_WC, camera_valid)
+            broken |= jax.vmap(_is_broken)(side.joints, counts)
+        mean = lambda value: _mean_over_people(value, broken)
+        values |= {name: mean(value) for name, value in people.items()}
+    return Evaluation(values, people)
+
+
+def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether something that counts is not a number."""
+    return jnp.any(valid & ~jnp.all(jnp.isfinite(x), tuple(range(1, x.ndim))))
+
+
+def _mean_over_people(
+    value: Float[Array, " h"], broken: Bool[Array, " h"]
+) -> Float[Array, ""]:
+    """Over those for whom the error exists; NaN if it is NaN as what counts is."""
+    exists = ~jnp.isnan(value) | broken
+    return metrics.Errors(value, exists).mean()
+
+
+def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether the camera's root mean square distance from its mean is above `STILL`."""
+    (centre,) = metrics.only(valid, T_WC[:, :3, 3])
+    count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
+    (apart,) = metrics.only(valid, centre - jnp.sum(centre, 0) / count)
+    return jnp.sum(apart**2) / count > STILL**2
+
+
+def _stands(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
+    """Whether the camera is in one place, but for rounding; of any unit."""
+    (centre,) = metrics.only(valid, T_WC[:, :3, 3])
+    count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
+    mean = jnp.sum(centre, 0) / count
+    (apart,) = metrics.only(valid, centre - mean)
+    return is_point(jnp.sum(apart**2) / count, mean)
+
+
+def _both(name: str, errors: metrics.Errors) -> dict[str, Array]:
+    return {name: errors.mean(), f"{name}_rmse": errors.rmse()}
+
+
+def _camera_errors(
+    estimate: Trajectories, truth: Trajectories, valid: Bool[Array, " t"]
+) -> dict[str, Array]:
+    weights = valid.astype(truth.T_WC.dtype)
+    centres, true_centres = estimate.T_WC[:, :3, 3], truth.T_WC[:, :3, 3]
+    values: dict[str, Array] = {}
+    scale = jnp.ones((), weights.dtype)
+    for group, with_scale in (("se3", False), ("sim3", True)):
+        found, _ = align(
+            "A1",
+            truth.T_WC,
+            estimate.T_WC,
+            weights,
+            true_centres,
+            centres,
+            weights,
+            with_scale,
+        )
+        error = metrics.trajectory_error(centres, true_centres, valid, found)
+        values |= _both(f"c_ate_{group}", error)
+        scale = found.scale
+    values["ate_s"] = values["c_ate_se3"]
+    known = _moves(truth.T_WC, valid) & ~_stands(estimate.T_WC, valid)
+    for name in ("c_ate_sim3", "c_ate_sim3_rmse"):
+        values[name] = jnp.where(known, values[name], jnp.nan)
+    values["scale"] = jnp.where(known, scale, jnp.nan)
+    values["scale_error"] = jnp.where(known, jnp.abs(1 - scale), jnp.nan)
+    moved, turned = metrics.relative_pose_errors(estimate.T_WC, truth.T_WC, valid)
+    return values | _both("rpe_translation", moved) | _both("rpe_rotation", turned)
+
+
+def _person_errors(
+    joints: Float[Array, "t 24 3"],
+    true_joints: Float[Array, "t 24 3"],
+    feet: Float[Array, "t f 3"],
+    true_feet: Float[Array, "t f 3"],
+    present: Bool[Array, " t"],
+    true_present: Bool[Array, " t"],
+    estimate: Trajectories,
+    truth: Trajectories,
+    camera_valid: Bool[Array, " t"],
+    true_up: Float[Array, " 3"],
+) -> dict[str, Array]:
+    valid = present & true_present
+    dtype = true_joints.dtype
+    centre, true_centre = joints[:, PELVIS], true_joints[:, PELVIS]
+    values: dict[str, Array] = {}
+    choices: tuple[tuple[str, Alignment, bool], ...] = (
+        ("se3", "A1", False),
+        ("sim3", "A1", True),
+        ("a2", "A2", False),
+        ("a3", "A3", False),
+        ("a4", "A4", False),
+    )
+    for name, alignment, with_scale in choices:
+        camera, human = align(
+            alignment,
+            truth.T_WC,
+            estimate.T_WC,
+            camera_valid.astype(dtype),
+            true_centre,
+            centre,
+            valid.astype(dtype),
+            with_scale,
+        )
+        usable = valid if alignment == "A1" else valid & jnp.any(camera_valid)
+        if alignment == "A2":
+            usable = valid & _moves(truth.T_WC, camera_valid)
+        if alignment in ("A3", "A4"):
+            values |= _both(
+                f"c_ate_{name}",
+                metrics.trajectory_error(
+                    estimate.T_WC[:, :3, 3], truth.T_WC[:, :3, 3], camera_valid, camera
+                ),
+            )
+        values |= _both(
+            f"h_ate_{name}",
+            metrics.trajectory_error(centre, true_centre, usable, human),
+        )
+        values |= _both(
+            f"j_ate_{name}",
+            metrics.joint_trajectory_error(joints, true_joints, usable, human),
+        )
+    chunkings: dict[str, metrics.Chunking] = {"": "wham", "_tram": "tram"}
+    for suffix, chunking in chunkings.items():
+        first = metrics.world_mpjpe(joints, true_joints, valid, "first", chunking)
+        every = metrics.world_mpjpe(joints, true_joints, valid, "all", chunking)
+        values |= _both(f"w_mpjpe{suffix}", first) | _both(f"wa_mpjpe{suffix}", every)
+    values |= _both("rte", metrics.root_trajectory_error(centre, true_centre, valid))
+    seen = valid & camera_valid
+    in_camera, true_in_camera = (
+        metrics.camera_frame(*metrics.only(seen, points, T_WC))
+        for points, T_WC in ((joints, estimate.T_WC), (true_joints, truth.T_WC))
+    )
+    values |= _both("mpjpe", metrics.mpjpe(in_camera, true_in_camera, seen))
+    values |= _both("pa_mpjpe", metrics.pa_mpjpe(joints, true_joints, valid))
+    values |= _both(
+        "acceleration_error",
+        metrics.acceleration_error(
+            metrics.hip_centred(in_camera),
+            metrics.hip_centred(true_in_camera),
+            seen,
+            estimate.fps,
+        ),
+    )
+    values |= _both("jitter", metrics.jitter(joints, valid, estimate.fps))
+    values |= _both("jitter_of_truth", metrics.jitter(true_joints, valid, truth.fps))
+    up = jnp.asarray(plausibility.Y, dtype)
+    own = plausibility.posture_figures(joints, valid, up, estimate.fps)
+    theirs = plausibility.posture_figures(true_joints, valid, true_up, truth.fps)
+    values |= own | {f"{name}_of_truth": value for name, value in theirs.items()}
+    return values | _both("foot_sliding", metrics.foot_sliding(feet, true_feet, valid))

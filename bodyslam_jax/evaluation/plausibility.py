@@ -1,0 +1,119 @@
+"""Figures of one side alone, estimate or truth: gravity, feet, knees, acceleration.
+
+Errors of trajectories do not see that somebody slides, floats or crouches. These are
+the figures by which a result is doubted (`bodyslam_jax.diagnostics`), as functions that
+jit and map; each is told of the estimate and of the truth, side by side.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.evaluation.metrics import norm, only
+
+_HIPS, _KNEES, _ANKLES, _FEET = (np.array([i, i + 1]) for i in (1, 4, 7, 10))
+_LOWEST = np.array([7, 8, 10, 11])
+_PELVIS, _NECK = 0, 12
+_UPRIGHT = float(np.cos(np.radians(35.0)))
+"""People's trunks are this near an axis of the world, if that is up."""
+Y = np.array([0.0, 1.0, 0.0])
+"""Up in a result."""
+
+
+def up_axis(
+    joints: Float[Array, "h t 24 3"], present: Bool[Array, "h t"]
+) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
+    """The axis of the world that is up, the one along which trunks point on average,
+    and whether that is known: it is within 35 degrees of that, and somebody is there.
+    """
+    trunk = jnp.where(present[..., None], joints[..., _NECK, :] - joints[..., 0, :], 0)
+    total = jnp.sum(trunk, (0, 1))
+    largest = jnp.argmax(jnp.abs(total))
+    sign = jnp.where(total[largest] < 0, -1, 1).astype(joints.dtype)
+    axis = jnp.zeros(3, joints.dtype).at[largest].set(sign)
+    known = jnp.abs(total[largest]) > _UPRIGHT * norm(total)
+    return axis, known
+
+
+def gravity_error(
+    T_WC: Float[Array, "t 4 4"],
+    true_T_WC: Float[Array, "t 4 4"],
+    valid: Bool[Array, " t"],
+    true_up: Float[Array, " 3"],
+) -> Float[Array, ""]:
+    """Mean angle between up in the estimate, y, and in the truth, seen from the camera,
+    rad: no alignment has a part in it. NaN without cameras."""
+    T, true_T = (
+        jnp.where(valid[:, None, None], x, jnp.eye(4, dtype=x.dtype))
+        for x in (T_WC, true_T_WC)
+    )
+    up = T[:, 1, :3]
+    true_up_C = jnp.einsum("tji,j->ti", true_T[:, :3, :3], true_up)
+    # Of small angles the sine is exact, where the cosine is flat.
+    angle = jnp.arctan2(norm(jnp.cross(up, true_up_C)), jnp.sum(up * true_up_C, -1))
+    return _mean(angle, valid)
+
+
+def posture_figures(
+    joints: Float[Array, "t 24 3"],
+    valid: Bool[Array, " t"],
+    up: Float[Array, " 3"],
+    fps: Float[Array, ""],
+) -> dict[str, Float[Array, ""]]:
+    """One person's figures, in rad, m, s.
+
+    `knee`, `straighter_knee`: mean angle between thigh and shin, of both and of the
+    straighter leg. `feet_low`, `feet_high`: 5th and 95th percentile of the height of
+    the lowest of ankle and toe joints, over the world's zero. `foot_speed`: median
+    horizontal speed of the lower toe joint. `joint_acceleration`: median over joints
+    and frames.
+    """
+    (joints,) = only(valid, joints)
+    thigh = joints[:, _KNEES] - joints[:, _HIPS]
+    shin = joints[:, _ANKLES] - joints[:, _KNEES]
+    knee = jnp.arctan2(norm(jnp.cross(thigh, shin)), jnp.sum(thigh * shin, -1))
+    lowest = jnp.min(joints[:, _LOWEST] @ up, 1)
+    feet = joints[:, _FEET]
+    step = jnp.diff(feet, axis=0)
+    flat = norm(step - (step @ up)[..., None] * up) * fps
+    lower = jnp.argmin(feet[:-1] @ up, 1)
+    speed = jnp.take_along_axis(flat, lower[:, None], 1)[:, 0]
+    two = valid[1:] & valid[:-1]
+    bent = norm(jnp.diff(joints, n=2, axis=0)) * fps**2
+    three = two[1:] & two[:-1]
+    return {
+        "knee": _mean(jnp.mean(knee, 1), valid),
+        "straighter_knee": _mean(jnp.min(knee, 1), valid),
+        "feet_low": _quantile(lowest, valid, 0.05),
+        "feet_high": _quantile(lowest, valid, 0.95),
+        "foot_speed": _quantile(speed, two, 0.5),
+        "joint_acceleration": _quantile(bent, three[:, None], 0.5),
+    }
+
+
+FIGURES = (
+    "knee",
+    "straighter_knee",
+    "feet_low",
+    "feet_high",
+    "foot_speed",
+    "joint_acceleration",
+)
+"""Names of `posture_figures`; with `_of_truth` they are the truth's."""
+
+
+def _mean(x: Float[Array, " n"], valid: Bool[Array, " n"]) -> Float[Array, ""]:
+    count = jnp.sum(valid).astype(x.dtype)
+    total = jnp.sum(jnp.where(valid, x, 0))
+    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
+
+
+def _quantile(
+    x: Float[Array, "*n"], valid: Bool[Array, "*#n"], share: float
+) -> Float[Array, ""]:
+    """Of what counts; NaN if nothing does, or if a number that counts is none."""
+    if not x.size:  # differences of one frame or two
+        return jnp.full((), jnp.nan, x.dtype)
+    broken = jnp.any(jnp.isnan(x) & valid)
+    found = jnp.nanquantile(jnp.where(valid, x, jnp.nan), jnp.asarray(share, x.dtype))
+    return jnp.where(broken, jnp.nan, found)

@@ -1,0 +1,299 @@
+"""Run folders and ground truths, read into one `Result` each."""
+
+import json
+import logging
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import BodyModel, joints
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.evaluation.association import brackets, interpolate_poses
+from bodyslam_jax.io import read_tum as read_tum
+from bodyslam_jax.types import Result
+
+log = logging.getLogger(__name__)
+
+_RUN_FIELDS = {
+    "timestamps": ("t",),
+    "T_WC": ("t", 4, 4),
+    "scale": (),
+    "intrinsics": ("i",),
+    "landmarks": ("l", 3),
+    "poses": ("h", "t", 72),
+    "trans": ("h", "t", 3),
+    "betas": ("h", 10),
+    "joints": ("h", "t", 24, 3),
+    "present": ("h", "t"),
+}
+
+
+def read_result(path: Path) -> Result:
+    """Reads `result.npz` (or the run folder around it) and its `summary.json`.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    what was expected.
+    """
+    file = path / "result.npz" if path.is_dir() else path
+    arrays = _load_npz(file)
+    missing = [name for name in _RUN_FIELDS if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
+    sizes: dict[str, int] = {}
+    for name, axes in _RUN_FIELDS.items():
+        shape = arrays[name].shape
+        fits = len(shape) == len(axes) and all(
+            n == (axis if isinstance(axis, int) else sizes.setdefault(axis, n))
+            for n, axis in zip(shape, axes, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
+        _check_finite(file, name, arrays[name])
+    summary_file = file.with_name("summary.json")
+    summary = _read_summary(summary_file) if summary_file.exists() else {}
+    fields: dict[str, Any] = {name: _float(arrays[name]) for name in _RUN_FIELDS}
+    fields["scale"] = float(arrays["scale"])
+    fields["present"] = arrays["present"].astype(bool)
+    return Result(**fields, summary=summary)
+
+
+def _read_summary(file: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file}: not readable as JSON ({error}).") from None
+    if not isinstance(summary, dict):
+        raise ValueError(f"{file}: {type(summary).__name__}, expected an object.")
+    return summary
+
+
+def read_groundtruth(path: Path, body: BodyModel) -> Result:
+    """Reads a true camera trajectory, true bodies, or both, into one `Result`.
+
+    `path` is a folder with `camera.txt` (TUM, camera to world) and `body.npz` (AMASS
+    style; or `body_0.npz`, `body_1.npz` ... for several people), a sequence folder with
+    such a `groundtruth/`, a run folder, or one such file. Bodies start at the camera's
+    first timestamp. Joints that a file does not hold come from `body`. What is not
+    known is absent: `summary["has_camera"]` is false, or there are no people.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    what was expected.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such ground truth.")
+    if path.is_dir():
+        if (path / "groundtruth").is_dir():
+            path = path / "groundtruth"
+        elif (path / "result.npz").exists():
+            return read_result(path)
+        cameras = [p for n in ("camera.txt", "camera.tum") if (p := path / n).exists()]
+        bodies = sorted(path.glob("body.npz")) or sorted(path.glob("body_*.npz"))
+        landmarks = path / "landmarks.npy"
+    elif path.suffix == ".npz":
+        if "T_WC" in _load_npz(path):
+            return read_result(path)
+        cameras, bodies, landmarks = [], [path], None
+    else:
+        cameras, bodies, landmarks = [path], [], None
+    if not cameras and not bodies:
+        raise ValueError(f"{path}: neither camera.txt nor body.npz in this folder.")
+    people = [_read_body(file, body) for file in bodies]
+    camera = read_tum(cameras[0]) if cameras else None
+    times, T_WC = _timeline(camera, people)
+    if camera is not None:
+        for file, person in zip(bodies, people, strict=True):
+            _tell_beyond(file, person, times)
+    placed = [_at(person, times, camera is not None) for person in people]
+    stack = lambda name, *shape: np.reshape(
+        [person[name] for person in placed], (len(placed), *shape)
+    )
+    return Result(
+        timestamps=times,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.ones(4),
+        landmarks=_landmarks(landmarks),
+        poses=stack("poses", len(times), 72).astype(float),
+        trans=stack("trans", len(times), 3).astype(float),
+        betas=stack("betas", 10).astype(float),
+        joints=stack("joints", len(times), 24, 3).astype(float),
+        present=stack("present", len(times)).astype(bool),
+        summary={"input": str(path), "has_camera": camera is not None},
+    )
+
+
+def _timeline(
+    camera: tuple[np.ndarray, np.ndarray] | None, people: list[dict[str, Any]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The denser of camera and bodies sets the moments; the camera's poses there."""
+    longest = max(people, key=lambda p: len(p["poses"]), default=None)
+    if camera is None:
+        assert longest is not None
+        times = np.arange(len(longest["poses"])) / longest["fps"]
+        return times, np.tile(np.eye(4), (len(times), 1, 1))
+    times, T_WC = camera
+    if longest is None or len(longest["poses"]) <= len(times):
+        return times, T_WC
+    at = times[0] + np.arange(len(longest["poses"])) / longest["fps"]
+    before, after, weight, close = brackets(times, at)
+    return at[close], interpolate_poses(T_WC, before, after, weight)[close]
+
+
+def _tell_beyond(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
+    """Warns of bodies after the last true camera, which are left out."""
+    num, fps = len(person["poses"]), person["fps"]
+    beyond = times[0] + (num - 1) / fps - times[-1]
+    if num != len(times) and beyond > 1.5 / fps:
+        log.warning(
+            "%s: %d frames, of which the last %d are after the last true camera and "
+            "left out.",
+            *(file, num, round(beyond * fps)),
+        )
+
+
+def _at(
+    person: dict[str, Any], times: np.ndarray, has_camera: bool
+) -> dict[str, np.ndarray]:
+    """One person at the moments of the timeline."""
+    num, fps = len(person["poses"]), person["fps"]
+    own = times[0] + np.arange(num) / fps
+    if (
+        has_camera
+        and num == len(times) > 1
+        and abs(np.median(np.diff(times)) * fps - 1) < 0.02
+    ):
+        own = times  # frame by frame, whatever the camera's clock does
+    before, after, weight, close = brackets(own, times)
+    w = weight[:, None]
+    nearest = np.where(weight < 0.5, before, after)
+    trans, joint, present = person["trans"], person["joints"], person["present"]
+    # Of a place between two frames both must be known.
+    known = (present[before] | (weight == 1)) & (present[after] | (weight == 0))
+    return {
+        "poses": person["poses"][nearest],
+        "trans": (1 - w) * trans[before] + w * trans[after],
+        "betas": person["betas"],
+        "joints": (1 - w[..., None]) * joint[before] + w[..., None] * joint[after],
+        "present": close & known,
+    }
+
+
+def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
+    """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10.
+
+    An optional `present` (t,) says in which frames the person is known.
+    """
+    arrays = _load_npz(path)
+    missing = [name for name in ("poses", "trans", "betas") if name not in arrays]
+    rate = next((n for n in _RATES if n in arrays), None)
+    if missing or rate is None:
+        missing += [] if rate else [_RATES[0]]
+        raise ValueError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
+    for name in {"poses", "trans", "betas", "joints", "present", rate} & set(arrays):
+        if arrays[name].dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path}: {name} is of type {arrays[name].dtype}, no number."
+            )
+    if arrays[rate].size != 1:
+        raise ValueError(f"{path}: {rate} is {arrays[rate].tolist()}, not one number.")
+    poses, trans = _float(arrays["poses"]), _float(arrays["trans"])
+    betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate].item())
+    num = len(poses) if poses.ndim == 2 else -1
+    if num < 1 or poses.shape[1] < 66 or trans.shape != (num, 3):
+        raise ValueError(
+            f"{path}: poses {poses.shape}, trans {trans.shape}, not (t, 72), (t, 3)."
+        )
+    if not 1 <= fps <= 1000:
+        raise ValueError(f"{path}: {rate} is {fps}, not a frame rate in 1/s.")
+    if poses.shape[1] != 72:
+        poses = np.concatenate([poses[:, :66], np.zeros((num, 6))], 1)
+    betas = np.pad(betas[:10], (0, max(0, 10 - len(betas))))
+    if "joints" in arrays:
+        found = _float(arrays["joints"])
+        if found.shape != (num, 24, 3):
+            raise ValueError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
+    else:
+        found = posed_joints(body, poses, betas, trans)
+    for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
+        _check_finite(path, name, array)
+    present = np.ravel(arrays.get("present", np.ones(num))).astype(bool)
+    if len(present) != num:
+        raise ValueError(f"{path}: present {present.shape}, not {(num,)}.")
+    return {
+        "poses": poses,
+        "trans": trans,
+        "betas": betas,
+        "joints": found,
+        "present": present,
+        "fps": fps,
+    }
+
+
+def posed_joints(
+    body: BodyModel,
+    poses: Float[np.ndarray, "t 72"],
+    betas: Float[np.ndarray, " 10"],
+    trans: Float[np.ndarray, "t 3"],
+) -> Float[np.ndarray, "t 24 3"]:
+    """Joints of a body model, m, in padded chunks: one compilation for all lengths."""
+    found = []
+    for start in range(0, len(poses), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        missing = _CHUNK - len(poses[part])
+        pose, place = (np.pad(x[part], ((0, missing), (0, 0))) for x in (poses, trans))
+        as_body = [jnp.asarray(x, body.dtype) for x in (pose, betas, place)]
+        found.append(_float(_joints(body, *as_body))[: _CHUNK - missing])
+    return np.concatenate(found)
+
+
+_CHUNK = 256
+_joints = jit_once(joints)
+
+_RATES = ("mocap_framerate", "mocap_frame_rate")
+
+
+def _landmarks(path: Path | None) -> np.ndarray:
+    if path is None or not path.exists():
+        return np.zeros((0, 3))
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path}: not a readable .npy file ({error}).") from None
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise ValueError(f"{path}: shape {found.shape}, expected (landmarks, 3).")
+    _check_finite(path, "landmarks", found)
+    return _float(found)
+
+
+def _load_npz(path: Path) -> dict[str, np.ndarray]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file.")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {n: archive[n] for n in archive.files if n not in _OBJECTS}
+    except _UNREADABLE as error:
+        raise ValueError(f"{path}: not a readable .npz file ({error}).") from None
+
+
+_UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, AttributeError),
+    *(OSError, NotImplementedError),
+)
+"""What NumPy raises of damaged archives."""
+
+_OBJECTS = ("marker_data", "marker_labels")
+"""Of AMASS; not needed, and at times pickled."""
+
+
+def _float(array: Any) -> np.ndarray:
+    return np.asarray(array, np.float64)
+
+
+def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
+    if array.dtype.kind not in "fiub" or not np.all(np.isfinite(array)):
+        raise ValueError(f"{path}: {name} holds values that are not finite numbers.")

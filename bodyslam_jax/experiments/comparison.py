@@ -1,0 +1,131 @@
+"""The paper's table 1: full estimate, no motion model, and simpler ways to metres."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import evaluation, graph, people
+from bodyslam_jax.experiments.ablation import as_published
+from bodyslam_jax.experiments.problems import with_scale, without_map
+from bodyslam_jax.experiments.scenario import Case
+from bodyslam_jax.experiments.scoring import NAMES, trajectories
+from bodyslam_jax.initialisation import first_state
+from bodyslam_jax.pipeline.joint_stage import solve_stage
+
+METHODS = {
+    "no_mm": "no motion model: cameras in the map's own unit, people from keypoints",
+    "depth": "cameras scaled by the median of the regressed depths, same people",
+    "start": "scale in closed form from motion and ground, same people",
+    "scale_only": "cameras held, s and people optimised, no landmarks",
+    "per_frame": "the regressor's bodies in the cameras of the full estimate",
+    "published": "as published: the paper's weights, network and first-order steps",
+    "full": "the full estimate",
+}
+"""What is compared, from the same tracks, keypoints and regressed bodies."""
+_EVERY = 3
+"""Frames from one drawn point of a path to the next."""
+_NEAR = 5
+"""Landmarks nearest to the ankles, whose depth is taken for the person's."""
+
+
+def compare_methods(case: Case) -> dict[str, Any]:
+    """Errors of all `METHODS` on one sequence: `full/c_ate_se3` and so on, m.
+
+    Beside them what is true of the sequence, the scale over what it should be at the
+    start (`start_ratio`) and at the end (`scale_ratio`), steps and status.
+    """
+    prepared = case.prepare()
+    alone = prepared.state
+    if not prepared.moving:
+        raise ValueError(f"{case.name}: the camera does not move; nothing to compare.")
+    solution, stage = solve_stage(prepared.problem, alone, case.config, "joint")
+    full = solution.state
+    fixed, bare = without_map(prepared.problem, alone, hold_cameras=True)
+    moved, _ = solve_stage(fixed, bare, case.config, "scale only")
+    raw = people.roots_from_bodies(case.bodies, case.body)
+    regressed = first_state(
+        np.asarray(full.cameras),
+        np.asarray(full.landmarks),
+        raw,
+        np.asarray(full.intrinsics),
+    )
+    states = {
+        "no_mm": with_scale(alone, 1.0),
+        "depth": with_scale(alone, depth_scale(case)),
+        "start": alone,
+        "scale_only": moved.state,
+        "per_frame": with_scale(regressed, full.scale),
+        "full": full,
+    }
+    row: dict[str, Any] = {
+        "frames": float(case.sequence.num_frames),
+        "radius": case.radius,
+        "registered": float(case.cameras.registered.mean()),
+        "start_ratio": prepared.scale.value / case.map_scale,
+        "start_sigma": prepared.scale.standard_error / case.map_scale,
+        "steps": float(stage["iterations"]),
+        "seconds": float(stage["seconds"]),
+        "status": stage["status"],
+    }
+    for name, state in states.items():
+        found = case.score(state, prepared.roots.present)
+        row |= {f"{name}/{key}": value for key, value in found.items()}
+    published = as_published(case)
+    row |= {f"published/{name}": published[name] for name in NAMES}
+    row["scale_ratio"] = 1 / float(row["full/scale"])
+    drawn = {name: states[name] for name in ("no_mm", "full")}
+    return row | {"paths": _paths(case, drawn, prepared.roots.present)}
+
+
+def _paths(case: Case, states: dict[str, graph.State], present: np.ndarray) -> dict:
+    """Camera and human centre from above (x, z, m), each aligned by SE(3) (A1)."""
+    truth = case.truth
+    found = {
+        "camera/truth": truth.T_WC[:, :3, 3],
+        "human/truth": truth.joints[0, :, 0],
+    }
+    valid = jnp.asarray(case.cameras.registered, float)
+    for name, state in states.items():
+        there = trajectories(
+            state, case.body, present, case.cameras.registered, truth.fps
+        )
+        camera, human = evaluation.align(
+            "A1",
+            truth.T_WC,
+            there.T_WC,
+            valid,
+            truth.joints[0, :, 0],
+            there.joints[0, :, 0],
+            jnp.asarray(present[0], float),
+        )
+        found[f"camera/{name}"] = camera.apply(there.T_WC[:, :3, 3])
+        found[f"human/{name}"] = human.apply(there.joints[0, :, 0])
+    thin = lambda x: np.round(np.asarray(x)[::_EVERY, ::2], 4).tolist()
+    return {name: thin(path) for name, path in found.items()}
+
+
+def depth_scale(case: Case) -> float:
+    """Metres per unit of the map if what is seen at the feet is as far as the person.
+
+    In each frame the regressed depth of the pelvis over the median depth of the
+    landmarks that are nearest, in the image, to the ankles; of that the median.
+    """
+    cameras, keypoints = case.cameras, case.sequence.keypoints
+    if keypoints is None:
+        raise ValueError(f"{case.name}: no keypoints, so no feet to look for.")
+    tracks, T_WC = cameras.tracks, cameras.T_WC
+    pelvis = people.roots_from_bodies(case.bodies, case.body).T_CH[0, :, 2, 3]
+    found = []
+    for k in np.flatnonzero(case.bodies.present[0] & cameras.registered):
+        sure = keypoints.confidence[0, k, [11, 14]] > 0.3
+        rows = np.flatnonzero((tracks.frame == k) & cameras.keep)
+        if not sure.any() or len(rows) < _NEAR:
+            continue
+        feet = keypoints.uv[0, k, [11, 14]][sure].mean(axis=0)
+        near = rows[np.argsort(np.linalg.norm(tracks.uv[rows] - feet, axis=1))[:_NEAR]]
+        offset = cameras.landmarks[tracks.landmark[near]] - T_WC[k, :3, 3]
+        depth = float(np.median(offset @ T_WC[k, :3, 2]))
+        if depth > 0:
+            found.append(pelvis[k] / depth)
+    return float(np.median(found)) if found else 1.0

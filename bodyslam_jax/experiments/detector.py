@@ -1,0 +1,117 @@
+"""Where a detector puts the keypoints of rendered people, whose joints are known."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.body import KEYPOINT_NAMES
+from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
+from bodyslam_jax.simulation import SimulatedSequence
+from bodyslam_jax.simulation.point_tracks import is_behind
+from bodyslam_jax.types import Sequence
+
+_TALLEST = 60.0
+"""Height in the image, px, from which a person has to be found."""
+_GROSS = 0.1
+"""Of the stature: a keypoint further away is of something else."""
+_NAMES = KEYPOINT_NAMES["body25"]
+
+
+def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str, Any]:
+    """How often the first person is found, and how far off each keypoint is.
+
+    `found` is the share of the frames in which the person is larger than 60 px and half
+    of the joints are in the image with nothing in front. `keypoints` has for each name:
+    `offset`, the mean error in the frame of the joint that it moves with (x to the left
+    on the left side, mirrored on the right, y up and z forward at rest), a constant
+    fitted to the errors in the image at the true depth; `spread`, the standard
+    deviation of what remains in the image; both shares of the stature; `seen`, the
+    share of the frames found and with nothing in front of it in which it is given;
+    `gross`, the share of these that is of something else.
+    """
+    exact, depth, R_CJ, inside = _truth(simulated)
+    wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
+    if found.keypoints is None or not wanted.any():
+        return {"found": 0.0, "keypoints": {}}
+    uv, there, number = _nearest(found, exact)
+    stature = np.ptp(simulated.person.skin[:, 1])
+    error = (uv - exact) / simulated.intrinsics[:2] * depth[:, :, None] / stature
+    return {
+        "found": float(number[wanted].mean()),
+        "keypoints": {
+            name: _offset(
+                error[:, k], R_CJ[:, k], there[:, k], inside[:, k], number & wanted,
+                mirrored=name.startswith("right"),
+            )
+            for k, name in enumerate(_NAMES)
+        },
+    }  # fmt: skip
+
+
+def _truth(simulated: SimulatedSequence):
+    """Pixels and depths of BODY_25, frames of its joints in the camera, and which of
+    its points are in the image with neither furniture nor others in front."""
+    person, walk = simulated.person, simulated.walk
+    G, joints = person.joints(walk.poses, walk.pelvis)
+    points = person.keypoints(G, joints)
+    R_CW = np.swapaxes(simulated.T_WC[:, :3, :3], 1, 2)
+    p = np.einsum("tab,tkb->tka", R_CW, points - simulated.T_WC[:, None, :3, 3])
+    depth = np.maximum(p[..., 2], 0.05)
+    uv = p[..., :2] / depth[..., None] * simulated.intrinsics[:2]
+    uv = uv + simulated.intrinsics[2:]
+    free = ((uv >= 0) & (uv <= np.array(simulated.size) - 1)).all(axis=2)
+    free &= p[..., 2] > 0.1
+    for k, T in enumerate(simulated.T_WC):
+        free[k] &= ~simulated.room.is_hidden(T[:3, 3], points[k])
+    for other in simulated.others:
+        off = other.joints - simulated.T_WC[:, None, :3, 3]
+        q = np.einsum("tab,tjb->tja", R_CW, off)
+        free &= ~is_behind(p, q, simulated.intrinsics)
+    leads = [_leader(name) for name in _NAMES]
+    return uv, depth, R_CW[:, None] @ G[:, leads], free
+
+
+def _leader(name: str) -> int:
+    """The joint that a keypoint moves with."""
+    if name not in SURFACE_POINTS:
+        return KEYPOINT_JOINT[name]
+    if "toe" in name or "heel" in name:
+        return KEYPOINT_JOINT[f"{name.split('_')[0]}_ankle"]
+    return KEYPOINT_JOINT["head"]
+
+
+def _nearest(
+    found: Sequence, exact: Float[np.ndarray, "t 25 2"]
+) -> tuple[
+    Float[np.ndarray, "t 25 2"], Bool[np.ndarray, "t 25"], Bool[np.ndarray, " t"]
+]:
+    """Of the people found in each frame the one who is there, if anybody is: within a
+    quarter of the height in the median."""
+    uv, there = found.keypoints.uv, found.keypoints.confidence > 0
+    away = np.linalg.norm(uv - exact, axis=-1)
+    few = there.sum(axis=-1) < 5
+    middle = np.ma.median(np.ma.masked_array(away, ~there), axis=-1).filled(np.inf)
+    middle = np.where(few, np.inf, middle)
+    who, frame = middle.argmin(axis=0), np.arange(uv.shape[1])
+    near = middle[who, frame] < 0.25 * np.ptp(exact[..., 1], axis=1)
+    return uv[who, frame], there[who, frame] & near[:, None], near
+
+
+def _offset(error, R_CJ, given, in_view, counted, *, mirrored: bool) -> dict[str, Any]:
+    """`detection_figures` of one keypoint; `error` in the image, of the stature."""
+    seen = given & in_view & counted
+    good = seen & (np.linalg.norm(error, axis=1) < _GROSS)
+    row: dict[str, Any] = {
+        "seen": float(seen.sum() / max((counted & in_view).sum(), 1)),
+        "gross": float(1 - good.sum() / seen.sum()) if seen.any() else np.nan,
+    }
+    if good.sum() < 10:
+        return {**row, "offset": [np.nan] * 3, "spread": np.nan}
+    A, b = R_CJ[good, :2].reshape(-1, 3), error[good].reshape(-1)
+    # Where a view never changes its depth is not seen: there it is taken to be small
+    ridge = 1e-3 * len(A) * np.eye(3)
+    offset = np.linalg.solve(A.T @ A + ridge, A.T @ b)
+    rest = b - A @ offset
+    offset = offset * ([-1, 1, 1] if mirrored else 1)
+    return {**row, "offset": offset.tolist(), "spread": float(rest.std())}

@@ -1,0 +1,109 @@
+"""What an experiment is made of: rows that are computed one by one, and kept."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import motion
+from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.scenario import Case, make_case, simulations
+from bodyslam_jax.simulation import LENGTH
+
+FRONT, SOLVE, COMPILE = 0.15, 0.08, 25.0
+"""Processor time on a 2.5 GHz core: the stages before the joint estimate, s a frame; a
+solve of everything, s a frame; a problem of new shapes, s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One row: what it follows from, what it costs, how it is computed."""
+
+    label: str
+    key: tuple[Any, ...]
+    seconds: float
+    """Of processor time, about."""
+    compute: Callable[[], Row]
+    form: Any
+    """What a kept row must have for the report, as `_journal.fits` takes it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """An experiment: its rows in their order, and the report on those that are done."""
+
+    jobs: list[Job]
+    write: Callable[[Path, list[Row]], list[Path]]
+
+
+def check_files(experiment: Experiment, config: Config) -> None:
+    """Reads what rows will need, before minutes are spent on others.
+
+    **Raises:** `FileNotFoundError` or `ValueError`, naming the file or the option.
+    """
+    if experiment.frames is not None and experiment.frames < 2:
+        raise ValueError(
+            f"--frames {experiment.frames}: a sequence needs 2 frames or more."
+        )
+    if experiment.motion is not None:
+        source = Path(experiment.motion)
+        if not source.is_dir():  # which may be large, and is read when it is needed
+            motion.read_motion(source)
+    body = body_.load_body_model(config.body_model)
+    for file in (config.motion_model, *experiment.motion_models):
+        model = motion.load_motion_model(file)
+        try:
+            motion.check_compatible(model, body, model.fps)
+        except ValueError as error:
+            raise ValueError(f"{file or 'the default'}: {error}") from None
+
+
+def named(settings: Simulation) -> str:
+    """Such as `M2-room`."""
+    return f"{settings.sequence}-{settings.family}"
+
+
+def cost(settings: Simulation, solves: float, shapes: float) -> float:
+    """Processor time of so many solves, of so many kinds, on one sequence, s."""
+    own = LENGTH[settings.sequence]
+    frames = own if settings.length is None else settings.length
+    return frames * (FRONT + SOLVE * solves) + COMPILE * shapes
+
+
+def cases(config: Config, stages: Path) -> Callable[[Simulation], Case]:
+    """Makes cases, and keeps the last one: rows of one sequence follow one another."""
+
+    @functools.lru_cache(maxsize=1)
+    def case(settings: Simulation) -> Case:
+        return make_case(settings, config, cache=stages)
+
+    return case
+
+
+def by_sequence(
+    experiment: Experiment,
+    config: Config,
+    stages: Path,
+    sequences: Sequence[str],
+    families: Sequence[str],
+    compute: Callable[[Case], Row],
+    effort: tuple[float, float],
+    form: dict[str, Any],
+) -> list[Job]:
+    """One row a sequence; `effort` are solves and kinds of problem.
+
+    `form` is what a row must have beside its sequence.
+    """
+    case = cases(config, stages)
+
+    def job(settings: Simulation) -> Job:
+        name = named(settings)
+        run = lambda: {"sequence": name, **compute(case(settings))}
+        seconds = cost(settings, *effort)
+        full = {"sequence": name, **form}
+        return Job(name, (settings, config), seconds, run, full)
+
+    return [job(s) for s in simulations(experiment, sequences, families)]

@@ -1,0 +1,216 @@
+"""What each experiment computes, row by row, and what it writes of it."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import motion
+from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.experiments import ablation as ablation_
+from bodyslam_jax.experiments import reports
+from bodyslam_jax.experiments import video as video_
+from bodyslam_jax.experiments.comparison import compare_methods
+from bodyslam_jax.experiments.jobs import Job, Plan, by_sequence, cases, cost, named
+from bodyslam_jax.experiments.learning import described, judge
+from bodyslam_jax.experiments.paper import STRUCTURE
+from bodyslam_jax.experiments.provenance import about
+from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.scale import PERTURBATIONS, scale_recovery
+from bodyslam_jax.experiments.scenario import Case, simulations
+from bodyslam_jax.experiments.structural_landmarks import landmark_ablation
+from bodyslam_jax.experiments.table1 import FORM, write_table1
+from bodyslam_jax.experiments.variants import FULL, VARIANTS
+from bodyslam_jax.experiments.video_table import write_video
+from bodyslam_jax.experiments.weights import Learned, Trial, learn_weights, make_trial
+from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
+
+ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
+NOISE_LEVELS = ("none", "low", "real")
+LEARNING_STEPS = 12
+DERIVATIVE = 240.0
+"""Processor time of compiling the solver's derivative, s: where sequences are few and
+short, most of what learning takes."""
+
+
+def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """All methods on all ten sequences, both families."""
+    jobs = by_sequence(
+        experiment,
+        config,
+        stages,
+        ALL,
+        ("room", "follow"),
+        compare_methods,
+        (3.0, 6.0),
+        FORM,
+    )
+    return Plan(jobs, functools.partial(write_table1, about=about(experiment, config)))
+
+
+def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Recovery of the scale from six perturbations, mapped."""
+
+    def compute(case: Case) -> Row:
+        found = scale_recovery(case)
+        return {
+            **{k: v.tolist() for k, v in vars(found).items()},
+            "deviation": found.deviation.tolist(),
+            "spread": found.spread,
+        }
+
+    jobs = by_sequence(
+        experiment,
+        config,
+        stages,
+        ("E2", "M2", "D2"),
+        ("room",),
+        compute,
+        (len(PERTURBATIONS) * 1.5, 3.0),
+        reports.SCALE,
+    )
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_scale, about=told))
+
+
+def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Shaken cameras, optimised with and without landmarks: the paper's five."""
+    jobs = by_sequence(
+        experiment,
+        config,
+        stages,
+        tuple(STRUCTURE),
+        ("room",),
+        functools.partial(landmark_ablation, seed=experiment.seed or 0),
+        (2.5, 4.0),
+        reports.STRUCTURE,
+    )
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_structure, about=told))
+
+
+def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """How well the motion model predicts clips that it was not trained on."""
+    source = experiment.motion or str(reports.CLIPS)
+
+    def compute() -> Row:
+        model = motion.load_motion_model(config.motion_model)
+        body = body_.load_body_model(config.body_model)
+        training, held = motion.split(motion.read_motion(source))
+        clips = held or training
+        rows = motion.compare({"default": model}, body, clips, training=training)
+        return {"rows": rows, "clips": len(clips), "held_out": bool(held)}
+
+    def write(out: Path, rows: list[Row]) -> list[Path]:
+        return reports.write_motion(out, rows, source, config)
+
+    model = config.motion_model and Path(config.motion_model)
+    key = (Path(source), model, body_model_file(config.body_model))
+    return Plan([Job("motion", key, 60.0, compute, reports.MOTION)], write)
+
+
+def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Terms off and on, other weights, noise levels, first against second order."""
+    case = cases(config, stages)
+
+    @functools.lru_cache(maxsize=1)
+    def prepared(settings: Simulation):
+        return case(settings).prepare()
+
+    jobs: list[Job] = []
+    begun: set[Simulation] = set()
+
+    def add(settings: Simulation, label: str, compute, solves=1.0, extra=()):
+        name = named(settings)
+        row = lambda: {"sequence": name, "label": label, **compute()}
+        seconds = cost(settings, solves, solves)
+        if settings in begun:
+            seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are kept
+        begun.add(settings)
+        key = (settings, config, *extra)
+        form = {"sequence": name, "label": label, "status": str}
+        jobs.append(Job(f"{name}-{label}", key, seconds, row, form))
+
+    for s in simulations(experiment, ("M2", "D1"), ("room",)):
+        for v in VARIANTS:
+            add(s, v, lambda s=s, v=v: ablation_.ablate(case(s), prepared(s), v))
+        for label, weights in ablation_.SETTINGS.items():
+            one = lambda s=s, w=weights: ablation_.with_weights(case(s), w)
+            add(s, label, one, extra=(weights,))
+        add(s, ablation_.PUBLISHED, lambda s=s: ablation_.as_published(case(s)))
+        for file in experiment.motion_models:
+            one = lambda s=s, f=file: ablation_.with_motion_model(case(s), f)
+            add(s, f"motion model {Path(file).stem}", one, extra=(Path(file),))
+        orders = functools.lru_cache(maxsize=1)(
+            lambda s=s: ablation_.compare_orders(case(s), prepared(s))
+        )
+        for order in ablation_.ORDERS:
+            add(s, order, lambda o=order, f=orders: f()[o], solves=2.0)
+        for noise in NOISE_LEVELS:
+            quiet = dataclasses.replace(s, noise=noise)
+            one = lambda q=quiet: ablation_.ablate(case(q), prepared(q), FULL)
+            add(quiet, f"noise: {noise}", one)
+    told = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_ablation, about=told))
+
+
+def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Weights learnt on some sequences, and what each of all sequences gains.
+
+    Cameras and map stay as bundle adjustment left them, which takes landmarks out of
+    the problem: what is learnt is how people are weighed.
+    """
+    chosen = simulations(
+        experiment, ("E1", "M1", "M4", "D2", "E2", "M2", "D1"), ("room",)
+    )
+    half = (len(chosen) + 1) // 2
+    training, test = chosen[:half], chosen[half:]
+    key = (tuple(training), config, LEARNING_STEPS)
+    mark = fingerprint(*key)
+    case = cases(config, stages)
+
+    @functools.lru_cache(maxsize=half)
+    def trial(settings: Simulation) -> Trial:
+        prepared = case(settings).prepare()
+        return make_trial(case(settings), prepared, hold_cameras=True)
+
+    @functools.cache
+    def learned() -> Learned:
+        folder = stages / f"weights-{mark}"
+        learn = lambda: learn_weights(
+            [trial(s) for s in training],
+            steps=LEARNING_STEPS,
+            progress=folder / "progress.npz",
+        )
+        return Cache(folder).stage("learned", mark, Learned, learn)
+
+    seconds = DERIVATIVE + sum(cost(s, 8.0, 1.0) for s in training)
+    learnt = lambda: described(learned())
+    jobs = [Job("learnt", key, seconds, learnt, reports.LEARNT)]
+    for group, settings in (("training", training), ("test", test)):
+        for s in settings:
+            told = {"sequence": named(s), "set": group}
+            row = lambda s=s, told=told: {**told, **judge(trial(s), learned())}
+            form = {**told, **reports.JUDGED}
+            label = f"{group}-{named(s)}"
+            jobs.append(Job(label, (s, *key), cost(s, 2.0, 1.0), row, form))
+    write = functools.partial(reports.write_weights, about=about(experiment, config))
+    return Plan(jobs, write)
+
+
+def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Pixels alone beside simulated keypoints and bodies, all ten, both families."""
+    jobs = video_.jobs(experiment, config, stages, ALL)
+    return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
+
+
+PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
+    "table1": table1,
+    "scale": scale,
+    "landmarks": landmarks,
+    "motion": motion_model,
+    "ablation": ablation,
+    "weights": weights,
+    "video": video,
+}

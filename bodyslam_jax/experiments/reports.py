@@ -1,0 +1,235 @@
+"""Tables and figures of finished rows: Markdown, CSV and PNG beside one another."""
+
+import functools
+from pathlib import Path
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import motion, simulation
+from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.experiments import figures, paper
+from bodyslam_jax.experiments.provenance import deviations
+from bodyslam_jax.experiments.tables import (
+    MM,
+    Column,
+    Row,
+    intro,
+    to_csv,
+    write_tables,
+    write_text,
+)
+
+CLIPS = Path(simulation.__file__).parent / "assets" / "walking.npz"
+"""The clips that ship."""
+SCALE = {
+    **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
+    **dict.fromkeys(("history", "h_ate"), [[float]]),
+    "spread": float,
+}
+_STAGES = ("original", "start", "perturbed", "no_landmarks", "landmarks")
+STRUCTURE = {
+    **dict.fromkeys(_STAGES, float),
+    **{f"{stage}/scale": float for stage in _STAGES},
+    **dict.fromkeys(("status", "status_no_landmarks"), str),
+}
+MOTION = {
+    "rows": [{"model": str, "drift": float, "class": str, "error_mm": float}],
+    "clips": int,
+    "held_out": bool,
+}
+LEARNT = {
+    "names": [str],
+    "path": [[float]],
+    **dict.fromkeys(("log", "factor", "history"), [float]),
+}
+JUDGED = {
+    f"{when}/{name}": float
+    for when in ("before", "after")
+    for name in ("error", "scale", "j_ate_se3")
+}
+"""What kept rows must have for the reports below, see `_journal.fits`."""
+
+
+def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
+    """Deviation by perturbation, and convergence."""
+    flat = []
+    for row in rows:
+        for i, p in enumerate(row["perturbation"]):
+            flat.append(
+                {
+                    "sequence": row["sequence"],
+                    "perturbation": p,
+                    "scale": row["scale"][i],
+                    "deviation": row["deviation"][i],
+                    "h_before": row["h_ate"][i][0],
+                    "h_after": row["h_ate"][i][-1],
+                    "paper": paper.SCALE[p][0] if p in paper.SCALE else None,
+                    "paper_deviation": paper.SCALE[p][1] if p in paper.SCALE else None,
+                }
+            )
+    columns = [
+        Column("sequence", "sequence"),
+        Column("perturbation 1/s'", "perturbation", average=False),
+        Column("estimated s", "scale", digits=4, average=False),
+        Column("deviation, %", "deviation", 100.0, 2),
+        Column("H-ATE before, mm", "h_before", MM),
+        Column("H-ATE after, mm", "h_after", MM),
+        Column("the paper's s, its own data", "paper", digits=3, average=False),
+        Column("the paper's deviation, %", "paper_deviation"),
+    ]
+    spread = [
+        Column("sequence", "sequence"),
+        Column("largest difference between answers, %", "spread", 100.0, 4),
+    ]
+    head = intro(
+        "Scale recovery from perturbed cameras",
+        about,
+        "Cameras of bundle adjustment at their true size, made 1/p as large and held; "
+        "no landmarks; s starts at 1; s and people are free. The answer should not "
+        "depend on the start. Deviation is signed: the motion model's bias on the "
+        "sequence.",
+    )
+    parts = [("By perturbation", columns, flat), ("Spread", spread, rows)]
+    written = write_tables(out, "scale", head, parts, about)
+    figures.draw_scale(out / "scale.png", rows, about)
+    return [*written, out / "scale.png"]
+
+
+def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
+    """C-ATE of shaken cameras with and without landmarks, by the paper's."""
+    names = ("original", "perturbed", "no_landmarks", "landmarks")
+    theirs: list[Row | None] = []
+    beside = []
+    for row in rows:
+        known = paper.STRUCTURE.get(row["sequence"].split("-")[0])
+        values = None if known is None else [1e-3 * v for v in known]
+        theirs.append(values and dict(zip(names, values, strict=True)))
+        found = theirs[-1] or {}
+        beside.append({**row, **{f"paper:{name}": v for name, v in found.items()}})
+    ours_and_theirs = lambda title, name: (
+        Column(f"{title}, mm", name, MM),
+        Column(f"the paper's {title}, mm", f"paper:{name}", MM),
+    )
+    columns = [
+        Column("sequence", "sequence"),
+        *ours_and_theirs("original (map's unit)", "original"),
+        Column("scale in closed form, mm", "start", MM),
+        *ours_and_theirs("perturbed", "perturbed"),
+        *ours_and_theirs("optimised, no landmarks", "no_landmarks"),
+        *ours_and_theirs("optimised, landmarks", "landmarks"),
+        Column("scale, no landmarks", "no_landmarks/scale", digits=3),
+        Column("scale, landmarks", "landmarks/scale", digits=3),
+        Column("status, no landmarks", "status_no_landmarks"),
+        Column("status, landmarks", "status"),
+    ]
+    head = intro(
+        "Structural landmarks",
+        about,
+        "C-ATE, SE(3), mean over frames. Every camera is moved by up to 100 mm and "
+        "0.01 rad in each coordinate, then everything is optimised.",
+    )
+    parts = [("By sequence", columns, beside)]
+    written = write_tables(out, "landmarks", head, parts, about)
+    figures.draw_structure(out / "landmarks.png", rows, theirs, about)
+    return [*written, out / "landmarks.png"]
+
+
+def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> list[Path]:
+    """The motion model's errors in the paper's form, and their histograms."""
+    found = rows[0]
+    error, step = paper.MOTION
+    nan = float("nan")
+    table = [{k: nan if v is None else v for k, v in r.items()} for r in found["rows"]]
+    ours = next(r for r in table if r["class"] == "all" and r["drift"] == 0)
+    which = "held out of training" if found["held_out"] else "of one person"
+    head = (
+        "# Prediction of motion\n\n"
+        f"{found['clips']} clips of `{Path(source).name}`, {which}. "
+        f"Mean error {ours['error_mm']:.1f} mm at a mean step of {ours['step_mm']:.1f} "
+        f"mm a frame (ratio {ours['ratio']:.3f}). The paper's, on AMASS, other data: "
+        f"{error} mm at {step} mm (ratio {error / step:.3f}). "
+        + deviations(Experiment(), config)
+    )
+    write_text(out / "motion.md", f"{head.rstrip()}\n\n{motion.write_table(table)}")
+    names = list(found["rows"][0])
+    columns = [Column(name, name) for name in names]
+    write_text(out / "motion.csv", to_csv(columns, found["rows"]))
+    model = motion.load_motion_model(config.motion_model)
+    training, held = motion.split(motion.read_motion(source))
+    picture = out / "motion.png"
+    body = body_.load_body_model(config.body_model)
+    motion.draw_errors(model, body, held or training, picture)
+    return [out / "motion.md", out / "motion.csv", picture]
+
+
+def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
+    """Every variant's errors, sequence by sequence."""
+    number = functools.partial(Column, average=False)  # a mean of variants says nothing
+    columns = [
+        Column("variant", "label"),
+        number("C-ATE SE(3), mm", "c_ate_se3", MM),
+        number("H-ATE SE(3), mm", "h_ate_se3", MM),
+        number("J-ATE SE(3), mm", "j_ate_se3", MM),
+        number("J-ATE Sim(3), mm", "j_ate_sim3", MM),
+        number("estimated / true scale", "scale_ratio", digits=3),
+        number("leg / true leg", "leg_ratio", digits=3),
+        number("past frames", "past", digits=0),
+        number("steps", "steps", digits=0),
+        number("seconds", "seconds"),
+        number("cost", "cost", digits=0),
+        Column("status", "status"),
+    ]
+    parts, written = [], []
+    for sequence in dict.fromkeys(row["sequence"] for row in rows):
+        own = [row for row in rows if row["sequence"] == sequence]
+        parts.append((sequence, columns, own))
+        picture = out / f"ablation_{sequence}.png"
+        figures.draw_variants(picture, own, about)
+        written.append(picture)
+    head = intro(
+        "Ablations",
+        about,
+        "`seconds` are wall time with compilation, but processor time without it for "
+        "the three rows on orders. `past frames` are those that the motion model sees.",
+    )
+    files = write_tables(out, "ablation", head, parts, about)
+    everything = to_csv([Column("sequence", "sequence"), *columns], rows, about)
+    write_text(out / "ablation.csv", everything)
+    return [*files, *written]
+
+
+def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
+    """Learnt factors, and errors before and after on training and test sequences.
+
+    The first row is of the weights, each other one of a sequence.
+    """
+    found, *judged = rows
+    factors = [
+        {"weight": n, "factor": f, "lambda": None if f is None else f**-2}
+        for n, f in zip(found["names"], found["factor"], strict=True)
+    ]
+    columns = [
+        Column("sequence", "sequence"),
+        Column("set", "set"),
+        Column("error before, 1", "before/error", digits=2),
+        Column("after", "after/error", digits=2),
+        Column("scale before", "before/scale", digits=3),
+        Column("scale after", "after/scale", digits=3),
+        Column("J-ATE before, mm", "before/j_ate_se3", MM),
+        Column("J-ATE after, mm", "after/j_ate_se3", MM),
+    ]
+    learnt = [
+        Column("weight", "weight"),
+        Column("factor on σ (or robust scale)", "factor", digits=2, average=False),
+        Column("factor on λ", "lambda", digits=2, average=False),
+    ]
+    head = intro("Weights learnt through the solver", about)
+    parts = [
+        (f"{name} sequences", columns, [r for r in judged if r["set"] == name])
+        for name in ("training", "test")
+    ]
+    parts = [part for part in parts if part[2]]
+    parts.append(("Learnt", learnt, factors))
+    files = write_tables(out, "weights", head, parts, about)
+    write_text(out / "weights.csv", to_csv(columns, judged, about))
+    figures.draw_learning(out / "weights.png", found, about)
+    return [*files, out / "weights.png"]

@@ -1,0 +1,98 @@
+"""Finished rows kept on disk: an interrupted experiment goes on where it stopped."""
+
+import json
+import logging
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax.pipeline.stage_cache import fingerprint
+
+log = logging.getLogger(__name__)
+Row = dict[str, Any]
+
+
+class Journal:
+    """A folder with one JSON file a row, named by all that the row follows from."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.computed = 0
+        """Rows that were not on disk."""
+
+    def path(self, name: str, label: str, *key: Any) -> Path:
+        words = re.sub(r"[^A-Za-z0-9.]+", "_", label).strip("_")
+        return self.folder / f"{name}-{words}-{fingerprint(name, label, *key)}.json"
+
+    def kept(
+        self, name: str, label: str, key: Sequence[Any], form: Any = dict
+    ) -> Row | None:
+        """The row of this `key` if it is on disk and of that `form`, see `fits`."""
+        try:
+            found = json.loads(self.path(name, label, *key).read_text())
+        except (FileNotFoundError, ValueError):
+            return None
+        return found if fits(found, form) else None
+
+    def row(
+        self,
+        name: str,
+        label: str,
+        key: Sequence[Any],
+        compute: Callable[[], Row],
+        form: Any = dict,
+    ) -> Row:
+        """The row of this `key`, from disk if it is there; `label` is for people."""
+        found = self.kept(name, label, key, form)
+        if found is not None:
+            log.info("%s %s: taken from an earlier run", name, label)
+            return found
+        path = self.path(name, label, *key)
+        if path.exists():
+            log.warning("%s: not a row as expected; computed again", path)
+        start = time.perf_counter()
+        row = _plain(compute())
+        self.computed += 1
+        log.info("%s %s: %.0f s", name, label, time.perf_counter() - start)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(row, indent=1))
+        os.replace(partial, path)
+        return row
+
+
+def fits(value: Any, form: Any) -> bool:
+    """Whether JSON is of a form: a type, a text that it must be, or parts of forms.
+
+    `{"a": float}` has at least an `a`, `[float]` any number of items. A number that was
+    not finite is `None`, and fits `float`.
+    """
+    if isinstance(form, dict):
+        return isinstance(value, dict) and all(
+            name in value and fits(value[name], one) for name, one in form.items()
+        )
+    if isinstance(form, list):
+        return isinstance(value, list) and all(fits(item, form[0]) for item in value)
+    if isinstance(form, str):
+        return value == form
+    if form is float:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        return value is None or number
+    return isinstance(value, form)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, what is not finite as null: JSON that others can read."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

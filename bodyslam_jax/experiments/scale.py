@@ -1,0 +1,101 @@
+"""Recovery of a perturbed scale through people alone (section 4.2, appendix D)."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import graph, solver
+from bodyslam_jax.evaluation import Trajectories, evaluate_trajectories
+from bodyslam_jax.experiments.problems import rescaled, with_scale, without_map
+from bodyslam_jax.experiments.scenario import Case
+from bodyslam_jax.experiments.scoring import trajectories
+
+PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
+"""The paper's 1/s': what the estimated s should come to."""
+SCHEDULE = (
+    solver.Stage(("scale", "roots"), max_steps=5, rtol=1e-4),
+    solver.Stage(max_steps=30),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaleRecovery:
+    """`p` perturbations of one sequence, solved together; `n` iterations."""
+
+    perturbation: Float[np.ndarray, " p"]
+    """1/s': the s that would undo it."""
+    scale: Float[np.ndarray, " p"]
+    """What was found, in the unit of the perturbed map."""
+    history: Float[np.ndarray, "p n"]
+    """s after each iteration, the start included."""
+    h_ate: Float[np.ndarray, "p n"]
+    """H-ATE under SE(3) after each iteration, m."""
+
+    @property
+    def deviation(self) -> Float[np.ndarray, " p"]:
+        """`s / (1/s') - 1`: the paper's deviation, signed."""
+        return self.scale / self.perturbation - 1
+
+    @property
+    def spread(self) -> float:
+        """How far answers lie apart, of their mean: 0 if the start does not matter."""
+        answer = self.scale / self.perturbation
+        return float(np.ptp(answer) / answer.mean())
+
+
+def scale_recovery(
+    case: Case,
+    perturbations: tuple[float, ...] = PERTURBATIONS,
+    *,
+    schedule: tuple[solver.Stage, ...] = SCHEDULE,
+    prepared: tuple[graph.Problem, graph.State] | None = None,
+) -> ScaleRecovery:
+    """Cameras of the true size, made `1/p` as large and held; s starts at 1.
+
+    Only s and people are free, no landmark is seen. All perturbations are one solve,
+    mapped over its first states and shared out among JAX's devices. The cameras are
+    those of the pipeline (the paper takes the motion capture's), put to their true size
+    by Sim(3).
+    """
+    if prepared is None:
+        found = case.prepare()
+        prepared = without_map(found.problem, found.state, hold_cameras=True)
+    problem, state = prepared
+    true_size = rescaled(with_scale(state, 1.0), case.map_scale)
+    state, seen = _recover(
+        jnp.asarray(perturbations),
+        problem,
+        true_size,
+        case.truth,
+        case.body,
+        jnp.asarray(case.bodies.present),
+        jnp.asarray(case.cameras.registered),
+        schedule,
+    )
+    return ScaleRecovery(
+        perturbation=np.array(perturbations),
+        scale=np.asarray(state.scale),
+        history=np.asarray(seen["scale"]),
+        h_ate=np.asarray(seen["h_ate"]),
+    )
+
+
+def _recover_one(
+    perturbation, problem, state, truth, body, present, registered, schedule
+):
+    start = rescaled(state, 1 / perturbation)
+    observe = lambda y: {
+        "scale": y.scale,
+        "h_ate": _h_ate(y, truth, body, present, registered),
+    }
+    return solver.trace(problem, start, observe, schedule=schedule)
+
+
+_recover = solver.over_devices(_recover_one, (0, *(None,) * 7))
+
+
+def _h_ate(state, truth: Trajectories, body, present, registered):
+    there = trajectories(state, body, present, registered, truth.fps)
+    return evaluate_trajectories(there, truth)["h_ate_se3"]

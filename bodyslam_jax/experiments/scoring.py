@@ -1,0 +1,144 @@
+"""How far a state is from the truth: pure, so that it maps, jits and differentiates."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax import evaluation, graph
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.evaluation import Trajectories
+from bodyslam_jax.pipeline import to_metric
+from bodyslam_jax.types import Result
+
+NAMES = (
+    "c_ate_se3",
+    "c_ate_sim3",
+    "h_ate_se3",
+    "h_ate_sim3",
+    "j_ate_se3",
+    "j_ate_sim3",
+    "scale",
+)
+"""Errors of the paper's table 1: mean over frames, m; `scale` is truth per estimate."""
+PLAUSIBLE = (
+    "gravity_error",
+    *(f"{name}{whose}" for name in evaluation.FIGURES for whose in ("", "_of_truth")),
+)
+"""Whether people slide, float or crouch: rad, m, s; without the result's low pass."""
+_FEET = (7, 10, 8, 11)
+_FRAMES = 100
+"""Numbers of frames are rounded up to this, so that lengths share what is compiled."""
+
+
+def truth_of(result: Result) -> Trajectories:
+    """A simulation's truth as what is compared with."""
+    joints = jnp.asarray(result.joints)
+    t = len(result.timestamps)
+    fps = (t - 1) / (result.timestamps[-1] - result.timestamps[0])
+    return Trajectories(
+        T_WC=jnp.asarray(result.T_WC),
+        camera_valid=jnp.ones(t, bool),
+        joints=joints,
+        present=jnp.asarray(result.present),
+        feet=joints[..., np.array(_FEET), :],
+        fps=jnp.asarray(fps),
+    )
+
+
+def trajectories(
+    state: graph.State,
+    body: BodyModel,
+    present: Bool[Array | np.ndarray, "h t"],
+    registered: Bool[Array | np.ndarray, " t"],
+    fps: Float[Array, ""],
+) -> Trajectories:
+    """Cameras, pelvis and joints of a state in metres, in the map's world frame."""
+    cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
+    T_WH = graph.world_from_root(state)
+    p_H = local_joints(body, state.poses, state.shapes[:, None])
+    turn, move = T_WH[..., :3, :3], T_WH[..., None, :3, 3]
+    joints = jnp.einsum("htij,htkj->htki", turn, p_H) + move
+    return Trajectories(
+        T_WC=cameras,
+        camera_valid=jnp.asarray(registered),
+        joints=joints,
+        present=jnp.asarray(present),
+        feet=joints[..., np.array(_FEET), :],
+        fps=fps,
+    )
+
+
+def errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
+    """The errors in `NAMES`; people are paired in the order in which they come."""
+    found = evaluation.evaluate_trajectories(estimate, truth)
+    return {name: found[name] for name in NAMES}
+
+
+def score(
+    state: graph.State,
+    truth: Trajectories,
+    body: BodyModel,
+    present: Bool[Array | np.ndarray, "h t"],
+    registered: Bool[Array | np.ndarray, " t"],
+) -> dict[str, float]:
+    """`errors` of one state as plain numbers, compiled once for many lengths.
+
+    `leg_ratio` is the length of the first person's legs over what it should be; beside
+    it stand the figures named in `PLAUSIBLE`.
+    """
+    frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
+    estimate = trajectories(state, body, present, registered, truth.fps)
+    estimate = _upright(estimate, state, body)
+    found = _errors(
+        evaluation.pad_frames(estimate, frames), evaluation.pad_frames(truth, frames)
+    )
+    ratio = leg_of(estimate) / leg_of(truth)
+    return {name: float(value) for name, value in found.items()} | {
+        "leg_ratio": float(ratio)
+    }
+
+
+def leg_of(people: Trajectories) -> Float[Array, ""]:
+    """Hip to knee to ankle of the first person, m: a pose does not change it."""
+    first = people.joints[0, 0]
+    bones = first[np.array([4, 5, 7, 8])] - first[np.array([1, 2, 4, 5])]
+    return jnp.sqrt((bones**2).sum(-1)).sum() / 2
+
+
+def _upright(
+    estimate: Trajectories, state: graph.State, body: BodyModel
+) -> Trajectories:
+    """The same in a world whose y axis is up and whose floor is at y = 0."""
+    present, fps = np.asarray(estimate.present), float(estimate.fps)
+    if not present.any():
+        return estimate
+    T_WC, joints = np.asarray(estimate.T_WC), np.asarray(estimate.joints)
+    turn, _ = to_metric.level(
+        T_WC,
+        np.asarray(graph.world_from_root(state)),
+        joints[:, :, to_metric.FEET],
+        present,
+        np.asarray(state.scale * state.landmarks),
+        fps,
+        np.zeros(len(present), bool),
+    )
+    at = lambda points: np.asarray(points) @ turn[:3, :3].T + turn[:3, 3]
+    floor = to_metric.floor_height(
+        body, np.asarray(state.shapes), at(joints), present, fps
+    )
+    turn[1, 3] -= floor
+    return Trajectories(
+        T_WC=jnp.asarray(turn @ T_WC),
+        camera_valid=estimate.camera_valid,
+        joints=jnp.asarray(at(joints)),
+        present=estimate.present,
+        feet=jnp.asarray(at(estimate.feet)),
+        fps=estimate.fps,
+    )
+
+
+@eqx.filter_jit
+def _errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
+    found = evaluation.evaluate_trajectories(estimate, truth)
+    return {name: found[name] for name in (*NAMES, *PLAUSIBLE)}

@@ -1,0 +1,105 @@
+"""Rows as Markdown and CSV: one table or several, under what they are of."""
+
+import csv
+import dataclasses
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax.experiments.paper import OTHER_DATA
+
+Row = dict[str, Any]
+MM = 1e3
+"""From a row's metres to a table's millimetres."""
+Cell = str | float | int | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """What stands in a column, and how."""
+
+    title: str
+    key: str
+    factor: float = 1.0
+    """From the row's unit (SI) to the table's."""
+    digits: int = 1
+    average: bool = True
+    """Whether the last row has its mean."""
+
+    def value(self, row: dict[str, Any]) -> Cell:
+        found = row.get(self.key)
+        if isinstance(found, (int, float)) and not isinstance(found, bool):
+            return found * self.factor
+        return found
+
+    def text(self, value: Cell) -> str:
+        if value is None:
+            return "–"
+        return value if isinstance(value, str) else f"{value:.{self.digits}f}"
+
+
+def markdown(
+    columns: Sequence[Column], rows: Sequence[dict[str, Any]], *, mean: bool = False
+) -> str:
+    """A Markdown table, with the mean over rows at its end if it is wanted."""
+    lines = [[column.title for column in columns], ["---"] * len(columns)]
+    lines += [[c.text(c.value(row)) for c in columns] for row in rows]
+    if mean and rows:
+        last: list[str] = []
+        for column in columns:
+            values = [column.value(row) for row in rows]
+            numbers = [v for v in values if isinstance(v, (int, float))]
+            known = column.average and len(numbers) == len(rows)
+            last.append(column.text(sum(numbers) / len(rows)) if known else "")
+        if any(last):
+            lines.append(["**mean**", *last[1:]])
+    escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
+
+
+def to_csv(
+    columns: Sequence[Column], rows: Sequence[dict[str, Any]], about: str = ""
+) -> str:
+    """The same columns in full precision, units as in the titles.
+
+    The last one, `data`, has what the rows are of, if that is given.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    last = [about] if about else []
+    writer.writerow([column.title for column in columns] + ["data"] * len(last))
+    for row in rows:
+        cells = [column.value(row) for column in columns]
+        writer.writerow([*("" if c is None else c for c in cells), *last])
+    return out.getvalue()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def intro(title: str, about: str, *lines: str) -> str:
+    """Title, what the data are, and `lines` on what follows."""
+    return "\n".join([f"# {title}", "", f"{about} {OTHER_DATA}", *lines, "", ""])
+
+
+def write_tables(
+    out: Path,
+    name: str,
+    head: str,
+    parts: Sequence[tuple[str, Sequence[Column], Sequence[Row]]],
+    about: str,
+) -> list[Path]:
+    """`name.md` with all parts under their titles, `name.csv` with the first, of which
+    `about` says what data they are of."""
+    text = head
+    for title, columns, rows in parts:
+        text += f"## {title}\n\n{markdown(columns, rows, mean=len(rows) > 1)}\n"
+    write_text(out / f"{name}.md", text)
+    write_text(out / f"{name}.csv", to_csv(*parts[0][1:], about))
+    return [out / f"{name}.md", out / f"{name}.csv"]

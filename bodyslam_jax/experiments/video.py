@@ -1,0 +1,102 @@
+"""From pixels alone, beside keypoints and bodies that are simulated: the same images.
+
+Every sequence is rendered with people in clothes. Medium ones have furniture in the
+way, difficult ones a second person, too, and a rolling shutter. The pipeline then sees
+the video and camera.json, and: nothing else (`pixels`); the simulated keypoints of the
+people (`keypoints`); these and bodies as of a regressor (`bodies`).
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import evaluation, io, pipeline, simulation
+from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.experiments.detector import detection_figures
+from bodyslam_jax.experiments.jobs import COMPILE, Job, named
+from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.scenario import simulations
+from bodyslam_jax.experiments.scoring import leg_of
+from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
+
+INPUTS = ("pixels", "keypoints", "bodies")
+FRAMES = 300
+FIGURES = (
+    *("c_ate_se3", "c_ate_sim3", "h_ate_se3", "h_ate_sim3", "j_ate_se3", "j_ate_sim3"),
+    *("scale", "pa_mpjpe", "gravity_error", *evaluation.FIGURES),
+    *(f"{name}_of_truth" for name in evaluation.FIGURES),
+)
+FORM: dict[str, Any] = {
+    **dict.fromkeys((*FIGURES, "size"), float),
+    "status": str,
+}
+"""What a kept row must have, beside its sequence."""
+_SECONDS = 0.6
+"""Processor time of all stages, a frame and input, s."""
+_READOUT = 0.015
+
+
+def jobs(
+    experiment: Experiment, config: Config, stages: Path, sequences: tuple[str, ...]
+) -> list[Job]:
+    """One row for each sequence and input."""
+    if experiment.frames is None:
+        experiment = dataclasses.replace(experiment, frames=FRAMES)
+    if experiment.family is None:
+        experiment = dataclasses.replace(experiment, family="both")
+    out = []
+    for plain in simulations(experiment, sequences, ("room", "follow")):
+        settings = filmed(plain)
+        for which in INPUTS:
+            label = f"{named(settings)}-{which}"
+            form = {"sequence": named(settings), **FORM, "input": which}
+            seconds = COMPILE + _SECONDS * (settings.length or FRAMES)
+            one = functools.partial(video_row, settings, which, config, stages)
+            out.append(Job(label, (settings, which, config), seconds, one, form))
+    return out
+
+
+def filmed(settings: Simulation) -> Simulation:
+    """The same with what stands in the way and who else is there."""
+    level = settings.sequence[0]
+    return dataclasses.replace(
+        settings,
+        render=True,
+        hiding=level in "MD",
+        people=2 if level == "D" else 1,
+        readout=_READOUT if level == "D" else 0.0,
+    )
+
+
+def video_row(
+    settings: Simulation, which: str, config: Config = Config(), stages: Path = Path()
+) -> Row:
+    """Renders, runs everything on the images, and compares with the truth.
+
+    `which` is of `INPUTS`. The film and finished stages are kept in `stages`.
+
+    **Raises:** as `simulation.simulate` and `pipeline.run`.
+    """
+    body = body_.load_body_model(config.body_model)
+    simulated = simulation.simulate(settings, body)
+    folder = stages / f"{simulated.name}-{fingerprint(settings)}"
+    film = simulation.film_scene(folder / "film", simulated)
+    sequence, measured = io.read_sequence(film), simulation.as_sequence(simulated)
+    cache = Cache(folder / which)
+    row: Row = {"sequence": simulated.name, "input": which}
+    if which == "pixels":
+        sequence = pipeline.find_people(sequence, config, cache)
+        row |= detection_figures(simulated, sequence)
+    else:
+        sequence = dataclasses.replace(sequence, keypoints=measured.keypoints)
+    if which == "bodies":
+        sequence = dataclasses.replace(sequence, bodies=measured.bodies)
+    result = pipeline.run(sequence, config, cache=cache)
+    pair = evaluation.associate(result, simulation.as_truth(simulated), body)
+    errors = evaluation.evaluate(*pair)
+    row |= {name: float(errors[name]) for name in FIGURES}
+    row["size"] = float(leg_of(pair[0]) / leg_of(pair[1]))
+    row["status"] = result.summary["status"]
+    return row

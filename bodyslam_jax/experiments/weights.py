@@ -1,0 +1,256 @@
+"""Weights learnt through the solver: the gradient of the error at its optimum.
+
+The solution depends on the weights by the implicit function theorem (`solver.solve`
+has its derivative), so an error after alignment can be lowered by gradient on training
+sequences. A weight is the logarithm of a factor on a standard deviation, or on a robust
+loss' scale: λ = σ^-2, so log λ falls by twice as much.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from bodyslam_jax import evaluation, graph, solver
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.experiments.problems import without_map
+from bodyslam_jax.experiments.scenario import Case
+from bodyslam_jax.experiments.scoring import errors, trajectories
+from bodyslam_jax.pipeline import joint_stage, stage_cache
+
+log = logging.getLogger(__name__)
+WEIGHTS: dict[str, tuple[type[graph.AbstractFactor], str]] = {
+    "keypoint": (graph.JointReprojection, "sigma"),
+    "keypoint loss": (graph.JointReprojection, "loss"),
+    "motion": (graph.HumanMotion, "whitening"),
+    "posture": (graph.Posture, "sigma"),
+    "shape": (graph.Shape, "sigma"),
+    "orientation": (graph.RootOrientation, "sigma"),
+    "turning": (graph.RootTurning, "sigma"),
+    "upright": (graph.UpDirection, "sigma"),
+    "smooth path": (graph.RootSmoothness, "sigma"),
+    "ground": (graph.GroundContact, "sigma"),
+    "landmark": (graph.Reprojection, "sigma"),
+    "landmark loss": (graph.Reprojection, "loss"),
+}
+"""What each weight multiplies: a term's field."""
+SCALE_UNIT, JOINT_UNIT = 0.05, 0.05
+"""What counts as an error of 1: in log s, and in J-ATE, m."""
+SCHEDULE = (solver.Stage(),)
+"""From a solution with other weights no first step is needed."""
+PRIOR = 0.02
+"""Cost of a weight that is off by a factor e: few sequences decide little."""
+
+
+class Trial(eqx.Module):
+    """A problem, a state near its solution, and the truth: one sequence of training."""
+
+    problem: graph.Problem
+    state: graph.State
+    truth: evaluation.Trajectories
+    body: BodyModel
+    registered: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """`w` weights after `n` steps on the training sequences."""
+
+    names: tuple[str, ...]
+    log: Float[np.ndarray, " w"]
+    """Logarithm of the factor on each standard deviation or robust scale."""
+    history: Float[np.ndarray, " n"]
+    """Mean error over the training sequences before each step."""
+    path: Float[np.ndarray, "n w"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """What a step of learning leaves for the next, as arrays."""
+
+    names: tuple[str, ...]
+    standing: tuple[np.ndarray, ...]
+    """Weights, Adam's memory, and the solution of each sequence."""
+    history: Float[np.ndarray, " n"]
+    path: Float[np.ndarray, "n w"]
+
+
+def make_trial(
+    case: Case, prepared: joint_stage.Prepared, *, hold_cameras: bool
+) -> Trial:
+    """The problem of a case and its solution with the weights as they are.
+
+    With `hold_cameras` there are no landmarks, and a solve is far cheaper.
+    """
+    problem, state = prepared.problem, prepared.state
+    if hold_cameras:
+        problem, state = without_map(problem, state, hold_cameras=True)
+    solution = solver.solve(problem, state, schedule=solver.PAPER_SCHEDULE)
+    registered = jnp.asarray(case.cameras.registered)
+    return Trial(problem, solution.state, case.truth, case.body, registered)
+
+
+def names_of(problem: graph.Problem) -> tuple[str, ...]:
+    """The weights that a problem has terms for."""
+    kinds = {type(factor) for factor in problem.factors}
+    return tuple(name for name, (kind, _) in WEIGHTS.items() if kind in kinds)
+
+
+def reweighted(
+    problem: graph.Problem, names: Sequence[str], log: Float[Array, " w"]
+) -> graph.Problem:
+    """The problem with the standard deviations of its terms times `exp(log)`.
+
+    **Raises:** `ValueError` for a name that is not among `WEIGHTS`.
+    """
+    unknown = set(names) - set(WEIGHTS)
+    if unknown:
+        raise ValueError(f"weights {sorted(unknown)}, expected of {list(WEIGHTS)}.")
+    factors = list(problem.factors)
+    for name, value in zip(names, log, strict=True):
+        kind, field = WEIGHTS[name]
+        for i, factor in enumerate(factors):
+            if isinstance(factor, kind):
+                factors[i] = _scaled(factor, field, jnp.exp(value))
+    return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
+
+
+def _scaled(
+    factor: graph.AbstractFactor, field: str, by: Array
+) -> graph.AbstractFactor:
+    if field == "loss":
+        return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)  # pyright: ignore
+    old = getattr(factor, field)
+    if field == "whitening":
+        new = old / by
+    else:
+        # Infinite is missing, and has no derivative.
+        missing = jnp.isinf(old)
+        new = jnp.where(missing, jnp.inf, jnp.where(missing, 1.0, old) * by)
+    return eqx.tree_at(lambda f: getattr(f, field), factor, new)
+
+
+def outcome(
+    trial: Trial,
+    names: Sequence[str],
+    log: Float[Array, " w"],
+    schedule: tuple[solver.Stage, ...] = SCHEDULE,
+) -> tuple[graph.State, Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Solution, cost and errors under these weights: pure and differentiable."""
+    problem = reweighted(trial.problem, names, log)
+    solution = solver.solve(problem, trial.state, schedule=schedule)
+    motion = problem.motion
+    present = trial.truth.present if motion is None else motion.present
+    there = trajectories(
+        solution.state, trial.body, present, trial.registered, trial.truth.fps
+    )
+    return solution.state, solution.cost, errors(there, trial.truth)
+
+
+def training_error(found: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
+    """`(log s / 0.05)² + J-ATE / 0.05 m`, J-ATE after SE(3): smooth in the solution."""
+    return (jnp.log(found["scale"]) / SCALE_UNIT) ** 2 + found["j_ate_se3"] / JOINT_UNIT
+
+
+@eqx.filter_jit
+def error_and_gradient(
+    trial: Trial, names: tuple[str, ...], log: Float[Array, " w"], state: graph.State
+) -> tuple[Float[Array, ""], Float[Array, " w"], graph.State]:
+    """The training error, its gradient by the weights, and the solution."""
+    near = eqx.tree_at(lambda t: t.state, trial, state)
+
+    def of(log):
+        found, _, measured = outcome(near, names, log)
+        return training_error(measured), found
+
+    (value, found), gradient = jax.value_and_grad(of, has_aux=True)(log)
+    return value, gradient, found
+
+
+def learn_weights(
+    trials: Sequence[Trial],
+    *,
+    steps: int = 12,
+    rate: float = 0.15,
+    names: tuple[str, ...] | None = None,
+    progress: Path | None = None,
+) -> Learned:
+    """Adam on the mean training error over `trials`, each solved from its last answer.
+
+    What a step leaves for the next is kept in the file `progress`: learning that was
+    interrupted goes on from there, and comes to the same.
+
+    **Raises:** `ValueError` if there is no trial, or if `progress` has other weights.
+    """
+    if not trials:
+        raise ValueError("no sequence to learn from.")
+    names = names or names_of(trials[0].problem)
+    value = jnp.zeros(len(names))
+    method = optax.adam(rate)
+    standing = (value, method.init(value), [trial.state for trial in trials])
+    history, path = [], []
+    if progress is not None and (kept := _read(progress, names)) is not None:
+        form = jax.tree.structure(standing)
+        standing = jax.tree.unflatten(form, [jnp.asarray(x) for x in kept.standing])
+        history, path = list(kept.history), list(kept.path)
+    for step in range(len(history), steps):
+        value, memory, states = standing
+        error, slope, states = _mean_error(trials, names, value, states)
+        history.append(error)
+        path.append(np.asarray(value))
+        log.info("weights: step %d of %d, error %.4g", step + 1, steps, error)
+        # optax takes powers of Python's numbers.
+        with jax.numpy_dtype_promotion("standard"):
+            change, memory = method.update(slope, memory)
+        value = jnp.clip(optax.apply_updates(value, change), -2.0, 2.0)
+        standing = (value, memory, states)
+        if progress is not None:
+            leaves = tuple(np.asarray(x) for x in jax.tree.leaves(standing))
+            progress.parent.mkdir(parents=True, exist_ok=True)
+            kept = Progress(names, leaves, np.array(history), np.array(path))
+            stage_cache.save(progress, kept)
+    best = int(np.nanargmin(history))
+    return Learned(names, path[best], np.array(history), np.array(path))
+
+
+def _mean_error(
+    trials: Sequence[Trial],
+    names: tuple[str, ...],
+    value: Float[Array, " w"],
+    states: Sequence[graph.State],
+) -> tuple[float, Float[Array, " w"], list[graph.State]]:
+    """The mean training error, its gradient with that of the prior, new solutions."""
+    total, slope, found = 0.0, PRIOR * 2 * value, []
+    for k, (trial, state) in enumerate(zip(trials, states, strict=True)):
+        error, gradient, state = error_and_gradient(trial, names, value, state)
+        total += float(error) / len(trials)
+        # A solve that failed says nothing; one sequence decides no more than 1.
+        if not np.all(np.isfinite(gradient)):
+            log.warning("training sequence %d: no gradient, left out of this step", k)
+            gradient = jnp.zeros_like(gradient)
+        size = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
+        slope = slope + gradient * jnp.minimum(1.0, 5.0 / size) / len(trials)
+        found.append(state)
+    return total, slope, found
+
+
+def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
+    """What an earlier run left, `None` if it is nothing that can be read."""
+    if not progress.exists():
+        return None
+    try:
+        kept = stage_cache.load(progress, Progress)
+    except stage_cache.UNREADABLE as error:
+        log.warning("%s: not readable (%s); learnt from the start", progress, error)
+        return None
+    if kept.names != names:
+        raise ValueError(f"{progress}: weights {kept.names}, expected {names}.")
+    log.info("weights: %d steps taken from an earlier run", len(kept.history))
+    return kept

@@ -1,0 +1,238 @@
+"""The run folder: every file of the contract, all of them or none.
+
+Files are written into a hidden folder inside the run folder and moved out together,
+`summary.json` last. A folder without `summary.json` is not a finished run.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import trimesh
+import yaml
+from jaxtyping import Float
+
+from bodyslam_jax.types import Result
+
+_LAST = "summary.json"
+_OWN = ("result.npz", "camera.tum", "body_*.npz", "landmarks.ply", _LAST, "config.yaml")
+_OWN += ("report.html", "overlay.webm")
+
+
+def check_folder(
+    folder: Path,
+    source: dict[str, Any] | None = None,
+    begun_for: dict[str, Any] | None = None,
+) -> None:
+    """Fails early, before anything is computed, where a run could not be written.
+
+    Args:
+        source: what will be run, by the names of `input` in `summary.json`.
+        begun_for: the same of an unfinished run in `folder`.
+
+    **Raises:** `ValueError` naming the folder and what is wrong with it: not writable,
+    a full disk, files that are no run's, or the run of another input.
+    """
+    owner = begun_for or _finished_for(folder)
+    if owner is None:
+        theirs = sorted(file.name for p in _OWN for file in folder.glob(p))
+        if theirs:
+            raise ValueError(
+                f"{folder}: has {', '.join(theirs[:3])}, but is not the folder of a "
+                "run; give another folder."
+            )
+    elif source and (differ := [k for k in source if owner.get(k) != source[k]]):
+        was = ", ".join(f"{k} {owner.get(k)}" for k in differ)
+        now = ", ".join(f"{k} {source[k]}" for k in differ)
+        raise ValueError(
+            f"{folder}: is the run of another input ({was}, not {now}); give another "
+            "folder, or delete this one."
+        )
+    with _partial(folder) as partial:
+        (partial / _LAST).write_text("{}")
+
+
+def _finished_for(folder: Path) -> dict[str, Any] | None:
+    """The input of the finished run in a folder, `None` if there is none."""
+    try:
+        return dict(json.loads((folder / _LAST).read_text())["input"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+@contextlib.contextmanager
+def run_folder(folder: Path) -> Iterator[Path]:
+    """A hidden folder whose files appear in `folder` when the block ends well.
+
+    Files of an earlier run are then removed, others (the stage cache) are kept. If the
+    block raises, what it wrote is deleted and `folder` is as it was.
+
+    **Raises:** `ValueError` if the folder cannot be written or the disk is full.
+    """
+    with _partial(folder) as partial:
+        yield partial
+        (folder / _LAST).unlink(missing_ok=True)
+        for pattern in _OWN:
+            for old in folder.glob(pattern):
+                old.unlink()
+        written = sorted(partial.iterdir(), key=lambda file: file.name == _LAST)
+        for file in written:
+            os.replace(file, folder / file.name)
+
+
+@contextlib.contextmanager
+def _partial(folder: Path) -> Iterator[Path]:
+    """A hidden folder in `folder`, gone afterwards, and `folder` too if it is empty."""
+    existed = folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
+            try:
+                yield partial
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+        finally:
+            if not existed:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            reason = "the disk is full"
+        elif error.errno in _NOT_WRITABLE and str(folder) in str(error.filename):
+            reason = f"cannot be written ({os.strerror(error.errno or 0)})"
+        else:
+            raise
+        raise ValueError(f"{folder}: {reason}; give a writable folder.") from error
+
+
+_NOT_WRITABLE = (
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOTDIR,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+)
+
+
+def write_run(folder: Path, result: Result, config: Any = None) -> None:
+    """Writes the contract's files but for report and overlay; all of them or none.
+
+    `config` is the settings as resolved, a dataclass or a dictionary. To add report and
+    overlay, use `run_folder` and `write_files`.
+    """
+    with run_folder(folder) as partial:
+        write_files(partial, result, config)
+
+
+def write_files(folder: Path, result: Result, config: Any = None) -> None:
+    """`write_run` into an existing folder, file by file."""
+    arrays = {
+        field.name: np.asarray(getattr(result, field.name))
+        for field in dataclasses.fields(result)
+        if field.name != "summary"
+    }
+    _savez(folder / "result.npz", arrays)
+    located = result.located
+    write_tum(folder / "camera.tum", result.timestamps[located], result.T_WC[located])
+    for h in range(len(result.poses)):
+        write_body(
+            folder / f"body_{h}.npz",
+            result.poses[h],
+            result.trans[h],
+            result.betas[h],
+            fps=frame_rate(result),
+            joints=result.joints[h],
+            present=result.present[h],
+            timestamps=result.timestamps,
+        )
+    write_points(folder / "landmarks.ply", result.landmarks)
+    (folder / "config.yaml").write_text(to_yaml(config))
+    (folder / _LAST).write_text(json.dumps(plain(result.summary), indent=2) + "\n")
+
+
+def frame_rate(result: Result) -> float:
+    """Mean frame rate, 1/s; 30 for a single frame."""
+    t = result.timestamps
+    return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
+
+
+def write_tum(
+    path: Path, timestamps: Float[np.ndarray, " t"], T_WC: Float[np.ndarray, "t 4 4"]
+) -> None:
+    """Writes a TUM trajectory: camera to world, m, quaternion `xyzw`."""
+    rotation = jaxlie.SO3.from_matrix(jnp.asarray(T_WC[:, :3, :3]))
+    xyzw = np.asarray(rotation.as_quaternion_xyzw())
+    np.savetxt(
+        path,
+        np.column_stack([timestamps, T_WC[:, :3, 3], xyzw]),
+        fmt="%.9f",
+        header="timestamp tx ty tz qx qy qz qw (camera to world)",
+    )
+
+
+def write_body(
+    path: Path,
+    poses: Float[np.ndarray, "t 72"],
+    trans: Float[np.ndarray, "t 3"],
+    betas: Float[np.ndarray, " 10"],
+    fps: float,
+    gender: str = "neutral",
+    **more: np.ndarray,
+) -> None:
+    """Writes one person AMASS style, at the given rate; `more` arrays beside."""
+    person = {"poses": poses, "trans": trans, "betas": betas}
+    rate = {"mocap_framerate": np.array(fps), "gender": np.array(gender)}
+    _savez(path, person | rate | more)
+
+
+def _savez(path: Path, arrays: dict[str, Any]) -> None:
+    np.savez_compressed(path, **arrays)
+
+
+def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:
+    """Writes points as binary PLY, m."""
+    if len(points):
+        trimesh.PointCloud(points).export(path, file_type="ply")
+        return
+    # trimesh refuses to write no point at all, and an empty map is a result too.
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n"
+    )
+
+
+def to_yaml(config: Any) -> str:
+    """Settings (dataclass or dictionary) as YAML."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        config = dataclasses.asdict(config)
+    return yaml.safe_dump(plain(config or {}), sort_keys=False)
+
+
+def plain(value: Any) -> Any:
+    """The same in what JSON and YAML know: NumPy and paths made plain, NaN null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | jnp.ndarray):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return str(value)

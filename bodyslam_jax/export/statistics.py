@@ -1,0 +1,118 @@
+"""What a person wants to know of a result, as numbers: how far, how fast, how tall."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.export.folder import frame_rate
+from bodyslam_jax.types import Result
+
+_UP = 1
+"""The y axis of a result's world points up."""
+_PLAN = [0, 2]
+_FEET = [10, 11]
+_SMOOTHING = 0.5
+"""Moving average over so many seconds, so that jitter is not counted as distance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PathFacts:
+    """One moving thing: the camera, or a person's pelvis."""
+
+    seconds: float
+    """How long it is there."""
+    distance: float
+    """Length of the smoothed path on the ground, m."""
+    speed: Float[np.ndarray, " t"]
+    """Of the smoothed path, m/s; NaN where it is not there."""
+    height: float
+    """Mean height above y = 0, m."""
+
+    @property
+    def mean_speed(self) -> float:
+        """Distance over time, m/s."""
+        return self.distance / self.seconds if self.seconds > 0 else 0.0
+
+
+def camera_facts(
+    result: Result, used: Bool[np.ndarray, " t"] | None = None
+) -> PathFacts:
+    """The camera's way in the frames `used`, by default those that are located."""
+    if used is None:
+        used = result.located
+    return _path_facts(result, result.T_WC[:, :3, 3], used)
+
+
+def person_facts(result: Result, person: int) -> PathFacts:
+    """A person's way: that of the pelvis joint, where the person is present."""
+    return _path_facts(result, result.joints[person, :, 0], result.present[person])
+
+
+def _path_facts(
+    result: Result, points: Float[np.ndarray, "t 3"], present: Bool[np.ndarray, " t"]
+) -> PathFacts:
+    t, fps = result.timestamps, frame_rate(result)
+    speed = np.full(len(t), np.nan)
+    distance, seconds = 0.0, 0.0
+    for run in runs(present):
+        smooth = smoothed(points[run][:, _PLAN], fps)
+        steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
+        distance += float(steps.sum())
+        seconds += float(t[run][-1] - t[run][0])
+        if len(steps):
+            rate = steps / np.maximum(np.diff(t[run]), 1e-9)
+            speed[run] = np.append(rate, rate[-1])
+    height = float(points[present, _UP].mean()) if present.any() else 0.0
+    return PathFacts(seconds, distance, speed, height)
+
+
+def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
+    """The stretches of frames in which something is there."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
+    return [slice(a, b) for a, b in edges.reshape(-1, 2)]
+
+
+def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, "t d"]:
+    """Moving average; straight lines at the ends, where an average would lag."""
+    size = min(int(_SMOOTHING * fps) | 1, len(points) - 1 + len(points) % 2)
+    if size < 3:
+        return points
+    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    beyond = ((size // 2, size // 2), (0, 0))
+    wide = np.pad(points, beyond, mode="reflect", reflect_type="odd")
+    return np.lib.stride_tricks.sliding_window_view(wide, size, axis=0).mean(axis=-1)
+
+
+def foot_skating(result: Result, person: int) -> float:
+    """Median horizontal speed of the lower foot, m/s.
+
+    Of a real walk it is about 0.1, not 0: it is also of when the lower foot changes.
+    """
+    speeds = [np.zeros(0)]
+    for run in runs(result.present[person]):
+        feet = result.joints[person, run][:, _FEET]
+        moved = np.linalg.norm(np.diff(feet[..., _PLAN], axis=0), axis=-1)
+        lower = np.argmin(feet[:-1, :, _UP], axis=1)
+        chosen = moved[np.arange(len(moved)), lower]
+        speeds.append(chosen / np.maximum(np.diff(result.timestamps[run]), 1e-9))
+    every = np.concatenate(speeds)
+    return float(np.median(every)) if len(every) else 0.0
+
+
+def distance_to_camera(result: Result, person: int) -> tuple[float, float]:
+    """Least and greatest distance of the pelvis from the camera, m."""
+    there = result.present[person]
+    if not there.any():
+        return 0.0, 0.0
+    gap = result.joints[person, there, 0] - result.T_WC[there, :3, 3]
+    length = np.linalg.norm(gap, axis=1)
+    return float(length.min()), float(length.max())
+
+
+def stature(body: BodyModel, betas: Float[np.ndarray, " 10"]) -> float:
+    """Height of the body's mesh at rest for SMPL β, m."""
+    template = np.asarray(body.template, np.float64)[:, _UP]
+    tall = template + np.asarray(body.shape_dirs, np.float64)[:, _UP] @ betas
+    return float(tall.max() - tall.min())

@@ -1,0 +1,1 @@
+"""Cameras, rotations, planes and smoothing: what every stage computes with."""

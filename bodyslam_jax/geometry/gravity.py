@@ -1,0 +1,336 @@
+"""Where up is, from trunks, standing feet and the map's ground.
+
+Nothing measures gravity. Three cues tell it, each with an error of its own:
+
+- People keep their trunk upright, to some degrees. Leaning across the image is seen;
+  leaning towards the camera is mostly inferred, and less sure.
+- Most of what people walk on is level, to a degree or so, and some of it slopes.
+  Where it lies is seen twice: by the feet that stand on it, and by the points of the
+  map that lie in one plane below the camera.
+
+The plane is found first (`feet_plane` and `find_ground`, weighted by their
+covariances), then its normal and the trunks' mean are combined. Either can be far off,
+on a hill or where postures are wrong; so each has a narrow and a wide error, and the
+result is the mean over the four combinations, each weighed by how well it explains the
+angle between the two.
+
+Small angles: a direction is its first and third coordinate over its second, in a frame
+whose y axis is nearly up.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.config import GRAVITY_SIGMA
+from bodyslam_jax.geometry.ground_plane import find_ground
+
+_DEGREE = np.pi / 180
+_TRUNK_ACROSS = 2.0 * _DEGREE
+"""Standard deviation of a person's mean trunk from the vertical, across the view."""
+_TRUNK_ALONG = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
+"""The same along the view, without and with bodies fitted to keypoints: ten simulated
+sequences gave 1.5 and 3.4 degrees root mean square; of real clips one gave 11."""
+_WORSE_TRUNKS = {False: 0.05, True: 0.15}
+_HOW_MUCH_WORSE = 2.5
+"""Share of people whose trunks are worse, of either kind, and how many times."""
+_LEVEL = 0.7 * _DEGREE
+_SLOPES = (0.25, 4.0 * _DEGREE)
+"""Standard deviation of the slope of what is level; share of grounds that are not, and
+theirs."""
+_FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
+"""Errors of the plane through feet and of the map's that more of them do not reduce."""
+_STANCE = 0.02
+"""Least standard deviation of the height of a foot that stands, m."""
+_SIZE = 0.05
+"""By which share a person's size may be off: by that of the camera's height over them
+their feet are too high or too low, all alike."""
+_SHORTEST_STANCE = 0.1
+"""s"""
+_OFF_THE_PLANE = 0.25
+"""Of the camera's height: people who are this far off the plane do not stand on it."""
+
+
+STANDING_SPEED = 0.6
+"""The lower foot stands where it is slower than this, m/s."""
+_SPEED_WINDOW = 0.1
+"""Speeds of feet are taken over so many seconds: noise of single frames, which an
+estimate has and people have not, counts less."""
+
+
+def standing_feet(
+    feet: Float[np.ndarray, "t 2 3"], up: Float[np.ndarray, " 3"], fps: float
+) -> tuple[Bool[np.ndarray, " t"], Int[np.ndarray, " t"]]:
+    """Frames in which the lower foot stands, and which foot that is.
+
+    `feet` are the toe joints in frames that follow one another, m, in any world; `up`
+    need be right to 20 degrees only. A foot stands where it is slower than
+    `STANDING_SPEED`, in every direction.
+    """
+    frame = np.arange(len(feet))
+    lower = (feet @ up).argmin(axis=1)
+    half = max(1, round(_SPEED_WINDOW * fps / 2))
+    before = np.maximum(frame - half, 0)
+    after = np.minimum(frame + half, len(feet) - 1)
+    moved = np.linalg.norm(feet[after, lower] - feet[before, lower], axis=-1)
+    speed = moved * fps / np.maximum(after - before, 1)
+    return (speed < STANDING_SPEED) & (len(feet) > 1), lower
+
+
+@dataclasses.dataclass(frozen=True)
+class Plane:
+    """How a plane rises along x and z, in a frame whose y axis is nearly up."""
+
+    gradient: Float[np.ndarray, " 2"]
+    covariance: Float[np.ndarray, "2 2"]
+    """Of `gradient`, rad²."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Upright:
+    """Up, in the frame in which the cues were given."""
+
+    up: Float[np.ndarray, " 3"]
+    """Unit vector."""
+    sigma: float
+    """Standard deviation of its less sure direction, rad; infinite without any cue."""
+    trunks: float
+    """Angle between `up` and where trunks point, rad; NaN without people."""
+    ground: float
+    """Slope of the ground that explains the cues best, rad; NaN without one."""
+
+
+def find_upright(
+    trunks: Float[np.ndarray, "h t 3"],
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    eyes: Float[np.ndarray, "t 3"],
+    landmarks: Float[np.ndarray, "l 3"],
+    fps: float,
+    fitted: Bool[np.ndarray, " h"],
+    known: Float[np.ndarray, " 3"] | None = None,
+) -> Upright:
+    """Up by all cues there are, in a frame whose y axis is roughly up.
+
+    Args:
+        trunks: y axes of the people's root frames, unit vectors.
+        feet: toe joints, m.
+        eyes: centres of the camera, m.
+        landmarks: points of the map, m; none where the camera did not move.
+        fitted: whether a person's body was fitted to keypoints, not regressed.
+        known: up as an accelerometer has it, to `GRAVITY_SIGMA`.
+    """
+    told = _trunks(trunks, present, eyes, feet, fps, fitted)
+    stances = find_stances(feet, present, fps)
+    height = _height_of_camera(eyes, stances)
+    planes = [feet_plane(stances, _SIZE * height)]
+    planes.append(map_plane(landmarks, eyes, stances))
+    ground = _fused([plane for plane in planes if plane is not None])
+    worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
+    if known is not None:
+        told, worse = _with_known(told, known), 0.0
+    tilt, slope, sigma = _combined(told, ground, worse)
+    up = np.array([tilt[0], 1.0, tilt[1]])
+    up /= np.linalg.norm(up)
+    return Upright(
+        up=up,
+        sigma=sigma,
+        trunks=np.nan if told is None else float(np.linalg.norm(told[0] - tilt)),
+        ground=float(np.arctan(np.linalg.norm(slope))),
+    )
+
+
+def _with_known(told, up):
+    """Trunks and a measurement of up, as one: a small tilt and its covariance, rad²."""
+    tilt, weight = up[[0, 2]] / up[1], np.eye(2) / GRAVITY_SIGMA**2
+    if told is None:
+        return tilt, np.linalg.inv(weight)
+    trunk = np.linalg.inv(told[1])
+    covariance = np.linalg.inv(trunk + weight)
+    return covariance @ (trunk @ told[0] + weight @ tilt), covariance
+
+
+def _trunks(trunks, present, eyes, feet, fps, fitted):
+    """Where trunks point on average, as a small tilt, and its covariance, rad²."""
+    information, total = np.zeros((2, 2)), np.zeros(2)
+    for h in np.flatnonzero(present.any(axis=1)):
+        here = present[h]
+        own = trunks[h, here]
+        own = own[own[:, 1] > 0.2]  # who lies down says nothing
+        if not len(own):
+            continue
+        tilt = own[:, [0, 2]] / own[:, 1:2]
+        mean = np.median(tilt, axis=0)
+        # Postures last: a person holds one for about a second.
+        seconds = max(1.0, len(own) / fps)
+        scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
+        view = (feet[h, here].mean(axis=1) - eyes[here])[:, [0, 2]]
+        length = np.linalg.norm(view, axis=1, keepdims=True)
+        view = view / np.maximum(length, 1e-9)
+        along = (view[:, :, None] * view[:, None, :]).mean(axis=0)
+        across = np.eye(2) - along
+        noise = scatter**2 / seconds
+        weight = along / (_TRUNK_ALONG[bool(fitted[h])] ** 2 + noise)
+        weight = weight + across / (_TRUNK_ACROSS**2 + noise)
+        information += weight
+        total += weight @ mean
+    if not information.any():
+        return None
+    covariance = np.linalg.inv(information)
+    return covariance @ total, covariance
+
+
+def find_stances(
+    feet: Float[np.ndarray, "h t 2 3"], present: Bool[np.ndarray, "h t"], fps: float
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Where each person's feet stand: the toe joint's median place, one for each time
+    that a foot does, in a frame whose y axis is roughly up."""
+    return [_stances(*one, fps) for one in zip(feet, present, strict=True)]
+
+
+def _stances(feet, present, fps) -> Float[np.ndarray, "s 3"]:
+    found = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
+    for start, stop in edges.reshape(-1, 2):
+        stands, lower = standing_feet(feet[start:stop], np.array([0.0, 1.0, 0.0]), fps)
+        place = feet[start + np.arange(stop - start), lower]
+        # A change of foot ends a stance too.
+        label = np.where(stands, 1 + lower, 0)
+        ends = np.flatnonzero(np.diff(label, prepend=0, append=0))
+        for a, b in itertools.pairwise(ends):
+            if label[a] and b - a >= max(2, _SHORTEST_STANCE * fps):
+                found.append(np.median(place[a:b], axis=0))
+    return np.array(found).reshape(-1, 3)
+
+
+def _height_of_camera(eyes, stances) -> float:
+    every = np.concatenate([np.zeros((0, 3)), *stances])
+    if not len(every):
+        return 1.5
+    return float(max(abs(np.median(eyes[:, 1]) - np.median(every[:, 1])), 0.3))
+
+
+def feet_plane(
+    stances: list[Float[np.ndarray, "_ 3"]], person_sigma: float
+) -> Plane | None:
+    """The plane through standing feet; `None` with fewer than three of them.
+
+    Each person's feet may be too high or too low by `person_sigma` (m), all alike.
+    Robust: stances are weighted as by a Cauchy distribution of their residuals, whose
+    width is their own.
+    """
+    people = np.concatenate(
+        [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
+    ).astype(int)
+    if len(people) < 3:
+        return None
+    points = np.concatenate(stances)
+    centre = points.mean(axis=0)
+    x = points - centre
+    design = np.column_stack(
+        [x[:, [0, 2]], np.ones(len(x)), people[:, None] == np.arange(len(stances))]
+    )
+    # 45 degrees, and as high as you like: hardly a prior, but a solution always.
+    prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
+    sigma, weight = 5 * _STANCE, np.ones(len(x))
+    for _ in range(20):
+        scaled = design * (weight / sigma**2)[:, None]
+        information = design.T @ scaled + prior
+        solution = np.linalg.solve(information, scaled.T @ x[:, 1])
+        residual = x[:, 1] - design @ solution
+        spread = 1.4826 * np.median(np.abs(residual))
+        sigma = max(_STANCE, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
+        weight = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
+    covariance = np.linalg.inv(information)[:2, :2] + _FEET_SYSTEMATIC**2 * np.eye(2)
+    return Plane(solution[:2], covariance)
+
+
+def map_plane(
+    landmarks: Float[np.ndarray, "l 3"],
+    eyes: Float[np.ndarray, "t 3"],
+    stances: list[Float[np.ndarray, "_ 3"]],
+) -> Plane | None:
+    """The ground of the map; `None` without one, or where people do not stand on it."""
+    up = np.array([0.0, 1.0, 0.0])
+    plane = find_ground(landmarks, eyes, up) if len(landmarks) else None
+    if plane is None:
+        return None
+    normal, offset = plane[:3], plane[3]
+    height = float(np.median(eyes @ normal + offset))
+    every = np.concatenate([np.zeros((0, 3)), *stances])
+    if len(every):
+        away = np.median(every @ normal + offset)
+        if height <= 0 or abs(away) > _OFF_THE_PLANE * height:
+            return None
+    away = landmarks @ normal + offset
+    near = np.abs(away) < 0.05 * height
+    flat = landmarks[near][:, [0, 2]]
+    flat = flat - flat.mean(axis=0)
+    # One in ten: errors of neighbouring points are not independent.
+    information = flat.T @ flat / 10 / max(float(np.var(away[near])), 1e-12)
+    covariance = np.linalg.inv(information + np.eye(2))
+    return Plane(
+        -normal[[0, 2]] / normal[1],
+        covariance + _MAP_SYSTEMATIC**2 * np.eye(2),
+    )
+
+
+def _fused(planes: list[Plane]) -> Plane | None:
+    """The mean weighted by information; what disagrees is all less sure (Birge)."""
+    if not planes:
+        return None
+    weights = [np.linalg.inv(plane.covariance) for plane in planes]
+    covariance = np.linalg.inv(sum(weights))
+    gradient = covariance @ sum(
+        w @ plane.gradient for w, plane in zip(weights, planes, strict=True)
+    )
+    if len(planes) > 1:
+        apart = [plane.gradient - gradient for plane in planes]
+        chi2 = sum(d @ w @ d for w, d in zip(weights, apart, strict=True))
+        covariance = covariance * max(1.0, chi2 / (2 * (len(planes) - 1)))
+    return Plane(gradient, covariance)
+
+
+def _combined(
+    told: tuple[np.ndarray, np.ndarray] | None, ground: Plane | None, worse: float
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
+    """The tilt of up, the slope of the ground, and the standard deviation of the less
+    sure direction of up, rad."""
+    unknown = np.full(2, np.nan)
+    if told is None and ground is None:
+        return np.zeros(2), unknown, np.inf
+    if ground is None:
+        return told[0], unknown, _largest(told[1])
+    if told is None:
+        level = ground.covariance + _LEVEL**2 * np.eye(2)
+        return -ground.gradient, np.zeros(2), _largest(level)
+    mean, trunk = told
+    sloping, steep = _SLOPES
+    # Up is `mean + e`, with covariance `trunk`; the ground's gradient is `slope - up`.
+    apart = ground.gradient + mean
+    density, tilts, slopes, covariances = [], [], [], []
+    for (p, factor), (q, sigma) in itertools.product(
+        [(1 - worse, 1.0), (worse, _HOW_MUCH_WORSE)],
+        [(1 - sloping, _LEVEL), (sloping, steep)],
+    ):
+        own = factor**2 * trunk
+        total = own + ground.covariance + sigma**2 * np.eye(2)
+        explained = np.linalg.solve(total, apart)
+        likelihood = np.exp(-apart @ explained / 2) / np.sqrt(np.linalg.det(total))
+        density.append(p * q * likelihood)
+        tilts.append(mean - own @ explained)
+        slopes.append(sigma**2 * explained)
+        covariances.append(own - own @ np.linalg.solve(total, own))
+    # Where nothing explains it the widest has to.
+    weight = np.array(density) + 1e-300 * np.array([0, 0, 0, 1])
+    weight = weight / weight.sum()
+    tilt = weight @ np.array(tilts)
+    scatter = [np.outer(t - tilt, t - tilt) for t in tilts]
+    covariance = np.tensordot(weight, np.array(covariances) + np.array(scatter), 1)
+    return tilt, weight @ np.array(slopes), _largest(covariance)
+
+
+def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance).max()))

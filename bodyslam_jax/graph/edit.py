@@ -1,0 +1,50 @@
+"""Other problems with the shapes of a given one, so that nothing is compiled anew."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from bodyslam_jax.graph.factor import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph.factors.camera import AbstractIntrinsicsFactor
+from bodyslam_jax.graph.factors.landmark import LandmarkPrior
+from bodyslam_jax.graph.factors.reprojection import Reprojection
+from bodyslam_jax.graph.padding import Masked
+from bodyslam_jax.graph.problem import Problem
+from bodyslam_jax.graph.state import Step
+
+
+def mute(problem: Problem, *kinds: type[AbstractFactor]) -> Problem:
+    """The problem with its terms of these kinds weighing nothing.
+
+    Their measurements become missing ones.
+    """
+    factors = tuple(
+        _missing(f, problem) if isinstance(f, kinds) else f for f in problem.factors
+    )
+    return eqx.tree_at(lambda p: p.factors, problem, factors)
+
+
+def _missing(factor: AbstractFactor, problem: Problem) -> AbstractFactor:
+    if isinstance(factor, Reprojection):
+        values = {"sigma": jnp.inf}
+    elif isinstance(factor, LandmarkPrior):
+        values = {"whitening": 0.0}
+    elif isinstance(factor, AbstractIntrinsicsFactor) and hasattr(factor, "sigma"):
+        values = {"sigma": jnp.inf}
+    elif isinstance(factor, AbstractFrameFactor) and factor.padding:
+        values = factor.padding
+    else:
+        free = problem.free
+        lead = free.roots if getattr(factor, "of_people", False) else free.cameras
+        return Masked(factor, jnp.zeros(lead.shape[:-1], bool))
+    for field, value in values.items():
+        full = jnp.full_like(getattr(factor, field), value)
+        factor = eqx.tree_at(lambda f, n=field: getattr(f, n), factor, full)
+    return factor
+
+
+def hold(free: Step, *names: str) -> Step:
+    """The same mask with groups of variables held, by their names in `State`."""
+    held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
+    return dataclasses.replace(free, **held)

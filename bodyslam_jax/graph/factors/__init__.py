@@ -1,0 +1,1 @@
+"""The error terms of the graph, one kind of measurement a file."""

@@ -1,0 +1,137 @@
+"""Priors of the camera, and error terms of it beyond the paper."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.graph.factor import AbstractFrameFactor, Touch
+from bodyslam_jax.graph.losses import AbstractLoss, Squared
+
+
+class CameraPrior(AbstractFrameFactor):
+    """A camera known beforehand: `[Log(C̃^T C), r' - r̃'] / σ`."""
+
+    cameras: Float[Array, "t 4 4"]
+    """T̃'_WC"""
+    sigma: Float[Array, "t 6"]
+    """rad, then units of the map; `inf` where not known."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ("cameras", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("camera", 0),)
+
+    def data(self):
+        return self.cameras, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        camera = window[0].camera
+        turn = log(known[:3, :3].T @ camera[:3, :3])
+        return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
+
+
+class ScalePrior(AbstractFrameFactor):
+    """A known size of the map, `(s - s̃) / σ`: of a camera path that is in metres."""
+
+    scale: Float[Array, " t"]
+    """s̃, m per unit of the map."""
+    sigma: Float[Array, " t"]
+    """m per unit of the map; finite in one frame, `inf` in all others."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ("scale", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("scale", 0),)
+
+    def data(self):
+        return self.scale, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        return (shared.scale - known)[None] / sigma
+
+
+class AbstractIntrinsicsFactor(AbstractFrameFactor):
+    """A factor of the intrinsics alone: one for the whole video."""
+
+    of_people = False
+    frame_fields = ()
+    padding = {}  # its one row is no frame
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return (("intrinsics", 0),)
+
+    def map_frames(self, function, state, extra=None):
+        first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])
+        return super().map_frames(function, first, extra)
+
+
+class IntrinsicsPrior(AbstractIntrinsicsFactor):
+    """A calibration, as known as it is: `(intrinsics - known) / σ`."""
+
+    intrinsics: Float[Array, "1 i"]
+    sigma: Float[Array, "1 i"]
+    """px, distortion: 1; `inf` where not known."""
+    loss: AbstractLoss = Squared()
+
+    def data(self):
+        return self.intrinsics, self.sigma
+
+    def local(self, data, window, shared):
+        known, sigma = data
+        return (shared.intrinsics - known) / sigma
+
+
+class SquarePixels(AbstractIntrinsicsFactor):
+    """One focal length for rows and columns, `(fx - a fy) / σ`."""
+
+    sigma: Float[Array, " 1"]
+    """px"""
+    loss: AbstractLoss = Squared()
+    ratio: float = eqx.field(static=True, default=1.0)
+    """a, the height of a pixel over its width: 1 for square pixels."""
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data
+
+
+class CameraSmoothness(AbstractFrameFactor):
+    """The camera keeps its velocity: turn and shift, against those before.
+
+    `(Log(C_{k-1}^T C_k) - Log(C_{k-2}^T C_{k-1})) / σ_1` of C = C_WC, in rad per frame
+    squared, and `(r'_k - 2 r'_{k-1} + r'_{k-2}) / σ_2` of r' = r'_WC, in units of the
+    map per frame squared: in metres, it would draw s towards 0.
+    """
+
+    sigma: Float[Array, "t 2"]
+    """Per frame squared: rad, units of the map; `inf` for the first two frames."""
+    loss: AbstractLoss = Squared()
+    of_people = False
+    frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        return ("camera", 0), ("camera", 1), ("camera", 2)
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        now, before, first = (f.camera for f in window)
+        turn = log(before[:3, :3].T @ now[:3, :3])
+        turn = turn - log(first[:3, :3].T @ before[:3, :3])
+        shift = now[:3, 3] - 2 * before[:3, 3] + first[:3, 3]
+        return jnp.concatenate([turn / data[0], shift / data[1]])

@@ -1,0 +1,108 @@
+"""People stand on the ground of the map: scale from what is under their feet."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.graph.factor import AbstractFrameFactor, Limbs, Touch
+from bodyslam_jax.graph.factors.stance import BODY25_FEET
+from bodyslam_jax.graph.keypoint_jacobian import (
+    keypoint_jacobian,
+    turning_joints,
+)
+from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.state import State
+
+SOLE = 0.018
+"""How far the points of the feet lie above what the sole stands on, m."""
+_SOFTNESS = 0.01
+"""Points this much higher than the lowest count e times less, m."""
+
+
+class GroundContact(AbstractFrameFactor):
+    """The lowest point of the feet is on a plane that is fixed in the map.
+
+    `(n^T (s r'_WC + C_WC p_C) + s d - SOLE) / σ`, where `n^T x' + d = 0` is the ground
+    among the landmarks and p_C the softly lowest of heels and toes. Metres of the body
+    meet units of the map at one place: scale is seen also where nobody walks.
+    """
+
+    body: BodyModel
+    plane: Float[Array, " 4"]
+    """Upward unit normal n, and d in units of the map."""
+    sigma: Float[Array, "h t"]
+    """m; `inf` where feet are not seen. Where the plane lies is one error for all
+    frames: its standard deviation times the root of their number."""
+    loss: AbstractLoss = Squared()
+    of_people = True
+    frame_fields = ("sigma",)
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def touches(self) -> tuple[Touch, ...]:
+        frames = (("camera", 0), ("root", 0), ("pose", 0))
+        return (*frames, ("scale", 0), ("shape", 0))
+
+    @property
+    def limbs(self) -> Limbs:
+        return (turning_joints(self.body, "body25", BODY25_FEET),)
+
+    def data(self):
+        return self.sigma
+
+    def local(self, data, window, shared):
+        (frame,) = window
+        return (self._lowest(frame, shared) - SOLE)[None] / data
+
+    def jacobian(self, data, window, shared):
+        (frame,) = window
+        points = keypoint_jacobian(self.body, frame.pose, shared.shape, "body25", 0.0)
+        feet = np.array(BODY25_FEET)
+        p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
+        height, up_C = self._heights(p_H, frame, shared)
+        share = jax.nn.softmax(-height / _SOFTNESS)
+        up_H = frame.root[:3, :3].T @ up_C
+        at_H = share @ p_H
+        at_C = frame.root[:3, :3] @ at_H + frame.root[:3, 3]
+        normal, offset = self.plane[:3], self.plane[3]
+        r_WC = frame.camera[:3, 3]
+        # n^T C Exp(ω) p = up^T (p + ω x p), so the derivative is p x up.
+        parts: dict[Touch, Array] = {
+            ("camera", 0): jnp.concatenate(
+                [jnp.cross(at_C, up_C), shared.scale * normal]
+            ),
+            ("root", 0): jnp.concatenate([jnp.cross(at_H, up_H), up_C]),
+            ("pose", 0): jnp.einsum("f,i,ifm->m", share, up_H, by_pose),
+            ("scale", 0): (normal @ r_WC + offset)[None],
+            ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
+        }
+        parts = {touch: part[None] / data for touch, part in parts.items()}
+        return (_soft_minimum(height) - SOLE)[None] / data, parts
+
+    def scales(self, state: State) -> Float[Array, "h t"]:
+        """The s that would put the feet on the ground, for each person and frame."""
+        frames = lambda _, window, shared, __: self._scale(window[0], shared)
+        return self.map_frames(frames, state)
+
+    def _scale(self, frame, shared):
+        eye = self.plane[:3] @ frame.camera[:3, 3] + self.plane[3]
+        return (shared.scale * eye - self._lowest(frame, shared) + SOLE) / eye
+
+    def _lowest(self, frame, shared):
+        p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
+        height, _ = self._heights(p_H[np.array(BODY25_FEET)], frame, shared)
+        return _soft_minimum(height)
+
+    def _heights(self, p_H, frame, shared):
+        """Heights of points above the ground, m, and the ground's normal in C."""
+        normal, offset = self.plane[:3], self.plane[3]
+        up_C = frame.camera[:3, :3].T @ normal
+        p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
+        eye = shared.scale * (normal @ frame.camera[:3, 3] + offset)
+        return p_C @ up_C + eye, up_C
+
+
+def _soft_minimum(height: Float[Array, " f"]) -> Float[Array, ""]:
+    return -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)

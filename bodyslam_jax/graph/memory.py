@@ -1,0 +1,55 @@
+"""Whether a problem fits into memory: refused at the door, not killed on the way."""
+
+import os
+from pathlib import Path
+
+from bodyslam_jax.graph.layout import Layout
+from bodyslam_jax.graph.ordering import CHUNK
+from bodyslam_jax.graph.state import State
+
+_LIMITS = (
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
+"""Of a container, of both generations; a word or a huge number where there is none."""
+
+
+def memory() -> int:
+    """Bytes of this machine, or that its container may use of them."""
+    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for name in _LIMITS:
+        try:
+            found.append(int(Path(name).read_text()))
+        except (OSError, ValueError):
+            continue
+    return min(found)
+
+
+def memory_needed(layout: Layout, state: State) -> int:
+    """Bytes that the solver's tables take, about."""
+    item = state.scale.dtype.itemsize
+    people = len(state.roots)
+    pose = 3 * len(layout.joints)
+    person = pose + 12  # what stays of a chunk: a posture and two roots
+    front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
+    front += 3 * layout.lasting
+    pivot = 6 * CHUNK + people * person
+    window = 2 * person + 6 * CHUNK + 24
+    postures = CHUNK * 4 * pose * (2 * pose + 6 * CHUNK + 12)
+    chunk = 3 * pivot * front + people * (window**2 + postures)
+    tables = sum(40 * bucket.row.size for bucket in layout.buckets)
+    return item * (chunk * layout.num_chunks + tables)
+
+
+def check_memory(layout: Layout, state: State) -> None:
+    """Refuses what cannot fit: bytes grow linearly with frames, and say so.
+
+    **Raises:** `ValueError` with the number of frames that fit.
+    """
+    need, have = memory_needed(layout, state), memory()
+    if need > have:
+        count = len(state.cameras)
+        raise ValueError(
+            f"{count} frames need about {need / 2**30:.1f} GiB, found "
+            f"{have / 2**30:.1f} GiB: about {int(count * have / need)} frames fit."
+        )

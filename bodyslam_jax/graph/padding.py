@@ -1,0 +1,212 @@
+"""Frames that a factor is given in addition, and that must weigh nothing.
+
+The solver rounds the number of frames up, so that videos of about the same length share
+a compiled program. A factor says by `padding` with which values of its fields a frame
+weighs nothing; one that does not say is masked, whatever its fields are called.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import AbstractArray, Array, Bool
+
+from bodyslam_jax.compilation import is_traced
+from bodyslam_jax.graph.factor import AbstractFrameFactor
+from bodyslam_jax.graph.losses import AbstractLoss
+from bodyslam_jax.graph.state import State
+
+_MOVED = 0.01
+"""rad, m and so on: how far from the first state costs are compared, where a residual
+may be 0 by chance."""
+_SAME = {"float64": 1e-8, "float32": 1e-3}
+"""How much costs may differ, as a share of their own."""
+
+
+class Masked(AbstractFrameFactor):
+    """A factor of which only some frames count: the residual of the others is 0.
+
+    Frames that do not count repeat the last one that does, measurement and variables
+    alike: nothing is evaluated where the factor may not be defined, as where two frames
+    are the same, and derivatives are finite wherever those of the factor are.
+    """
+
+    factor: AbstractFrameFactor
+    present: Bool[Array, "*h t"]
+    """Which frames count, of each person if it is of people; those that do not are the
+    last."""
+    frame_fields = ("present",)
+    padding = {"present": False}
+
+    @property
+    def of_people(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.factor.of_people
+
+    @property
+    def per_joint(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.factor.per_joint
+
+    @property
+    def loss(self) -> AbstractLoss:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.factor.loss
+
+    @property
+    def touches(self):
+        return self.factor.touches
+
+    @property
+    def limbs(self):
+        return self.factor.limbs
+
+    def frame_of_row(self, num_frames):
+        known = self.present.reshape(-1, num_frames).any(axis=0)
+        last = jnp.maximum(known.sum(dtype=int) - 1, 0)
+        return jnp.minimum(jnp.arange(num_frames), last)
+
+    def data(self):
+        row = self.frame_of_row(self.present.shape[-1])
+        axis = self.present.ndim - 1
+        given = jax.tree.map(lambda x: jnp.take(x, row, axis), self.factor.data())
+        return self.present, given
+
+    def local(self, data, window, shared):
+        present, given = data
+        return _where(present, self.factor.local(given, window, shared))
+
+    def jacobian(self, data, window, shared):
+        present, given = data
+        known = self.factor.jacobian(given, window, shared)
+        if known is None:
+            return None
+        return jax.tree.map(lambda x: _where(present, x), known)
+
+
+def _where(present: Array, x: Array) -> Array:
+    return jnp.where(present, x, jnp.zeros_like(x))
+
+
+def pad_factor(
+    factor: AbstractFrameFactor, state: State, frames: int
+) -> AbstractFrameFactor:
+    """The same factor with `frames` more frames than `state` has; they weigh nothing.
+
+    A loss whose scale is one for each measurement gets longer, too.
+    """
+    lead = state.roots.shape[:2] if factor.of_people else state.cameras.shape[:1]
+    axis = len(lead) - 1
+    fill = factor.padding or {}
+    padded = factor
+    for name in factor.frame_fields:
+        values = extend(getattr(factor, name), axis, frames, fill.get(name, "edge"))
+        padded = eqx.tree_at(lambda f, n=name: getattr(f, n), padded, values)
+    longer = lambda x: (
+        extend(x, axis, frames, "edge") if jnp.shape(x)[: len(lead)] == lead else x
+    )
+    if any(jnp.ndim(x) for x in jax.tree.leaves(factor.loss)):
+        loss = jax.tree.map(longer, factor.loss)
+        padded = eqx.tree_at(lambda f: f.loss, padded, loss)
+    if factor.padding is not None or not _is_over_frames(factor):
+        return padded
+    present = np.ones((*lead[:-1], lead[-1] + frames), bool)
+    present[..., lead[-1] :] = False
+    return Masked(padded, jnp.asarray(present))
+
+
+def _is_over_frames(factor: AbstractFrameFactor) -> bool:
+    """Whether its rows are the frames: not, if it maps them in a way of its own."""
+    return type(factor).map_frames is AbstractFrameFactor.map_frames
+
+
+def extend_state(state: State, frames: int) -> State:
+    """The same state with its last frame repeated."""
+    return dataclasses.replace(
+        state,
+        cameras=extend(state.cameras, 0, frames, "edge"),
+        roots=extend(state.roots, 1, frames, "edge"),
+        poses=extend(state.poses, 1, frames, "edge"),
+    )
+
+
+def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
+    """`count` more entries along an axis, of a value or of the last (`"edge"`).
+
+    Outside jit by NumPy: JAX would compile one small program per shape.
+    """
+    widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
+    traced = isinstance(x, jax.core.Tracer)
+    grow = jnp.pad if traced else lambda a, *w, **k: np.pad(np.asarray(a), *w, **k)
+    if isinstance(fill, str):
+        return jnp.asarray(grow(x, widths, mode=fill))
+    return jnp.asarray(grow(x, widths, constant_values=np.asarray(fill, x.dtype)))
+
+
+def check_padding(factor: AbstractFrameFactor, state: State) -> None:
+    """Refuses a factor of one's own that frames which measure nothing would change.
+
+    What fields are called does not matter, but all arrays over frames must be named.
+    Costs are compared where there are values, which is not within `jit` and `vmap`.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    name = type(factor).__name__
+    if type(factor).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return
+    fields = factor.frame_fields
+    for field in factor.padding or {}:
+        if field not in fields:
+            raise ValueError(
+                f"{name}.padding: found {field!r}, expected fields among "
+                f"`frame_fields`, {list(fields)}."
+            )
+    axes = ["h", "t"] if factor.of_people else ["t"]
+    for field in dataclasses.fields(factor):
+        kind = field.type
+        if not (isinstance(kind, type) and issubclass(kind, AbstractArray)):
+            continue
+        leading = kind.dim_str.split()[: len(axes)]
+        if leading == axes and field.name not in fields:
+            raise ValueError(
+                f"{name}.frame_fields: found {list(fields)}, expected {field.name!r}, "
+                "an array over frames, among them."
+            )
+    if is_traced((factor, state)):
+        return
+    frames = factor.num_lags + 1
+    found, expected = (
+        float(x)
+        for x in _costs(
+            factor,
+            pad_factor(factor, state, frames),
+            extend_state(state, frames),
+            len(state.cameras),
+        )
+    )
+    same = _SAME[state.scale.dtype.name]
+    if not np.isclose(found, expected, rtol=same, atol=same, equal_nan=True):
+        raise ValueError(
+            f"{name}.padding: with {frames} frames more, which are to measure nothing, "
+            f"the cost is {found:.6g}, expected {expected:.6g} as without them; name "
+            "the values with which a frame weighs nothing, or leave `padding` out."
+        )
+
+
+@eqx.filter_jit
+def _costs(factor, padded, state, num_frames):
+    """With frames added and without, at a state away from the first."""
+    step = state.zero_step()
+    leaves, treedef = jax.tree.flatten(step)
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
+    step = treedef.unflatten([draw(k, x) for k, x in zip(keys, leaves, strict=True)])
+    moved = state.retract(step)
+    cut = dataclasses.replace(
+        moved,
+        cameras=moved.cameras[:num_frames],
+        roots=moved.roots[:, :num_frames],
+        poses=moved.poses[:, :num_frames],
+    )
+    return padded.cost(moved), factor.cost(cut)

@@ -1,0 +1,149 @@
+"""What is estimated, and how a step moves it.
+
+Cameras carry the paper's scale over-parameterisation (Section 3.6): `r_WC = s r'_WC`
+with a linear `s`. People are anchored in the camera (`T_CH`, not `T_WH`), so that the
+keypoint terms see neither the cameras nor `s`, and `s` is free to move.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from bodyslam_jax.geometry.so3 import compose, log_of
+
+
+class Step(eqx.Module):
+    """A flat move of a `State`, in its tangent space."""
+
+    scale: Float[Array, ""]
+    """m per unit of the map"""
+    cameras: Float[Array, "t 6"]
+    """Rotation vector in the camera's own frame (rad), then centre (units, world)."""
+    roots: Float[Array, "h t 6"]
+    """Rotation vector in the person's own frame (rad), then pelvis (m, camera)."""
+    poses: Float[Array, "h t 23 3"]
+    """Rotation vector in each joint's own frame, rad."""
+    shapes: Float[Array, "h 10"]
+    landmarks: Float[Array, "l 3"]
+    """units of the map"""
+    intrinsics: Float[Array, " i"]
+    """px for focal length and centre; dimensionless for distortion."""
+
+
+class State(eqx.Module):
+    """`t` cameras, `h` people, `l` landmarks."""
+
+    scale: Float[Array, ""]
+    """s, metres per unit of the map"""
+    cameras: Float[Array, "t 4 4"]
+    """T'_WC: camera to world, with its centre in units of the map: `r_WC = s r'_WC`."""
+    roots: Float[Array, "h t 4 4"]
+    """T_CH: person's root frame to camera; translation is the pelvis joint, m."""
+    poses: Float[Array, "h t 23 3"]
+    """θ: axis-angle of each joint but the root, rad."""
+    shapes: Float[Array, "h 10"]
+    """SMPL β"""
+    landmarks: Float[Array, "l 3"]
+    """Static points in the world frame, units of the map."""
+    intrinsics: Float[Array, " i"]
+    """`fx fy cx cy` px, then `k1 k2 p1 p2` if distorted."""
+
+    def retract(self, step: Step) -> "State":
+        """Moves by `step`: rotations through the exponential map, the rest added."""
+        poses = jnp.concatenate([self.cameras[None], self.roots])
+        steps = jnp.concatenate([step.cameras[None], step.roots])
+        moved = retract_pose(poses, steps)
+        return State(
+            scale=self.scale + step.scale,
+            cameras=moved[0],
+            roots=moved[1:],
+            poses=retract_rotation(self.poses, step.poses),
+            shapes=self.shapes + step.shapes,
+            landmarks=self.landmarks + step.landmarks,
+            intrinsics=self.intrinsics + step.intrinsics,
+        )
+
+    def zero_step(self) -> Step:
+        """The step that goes nowhere."""
+        return Step(
+            scale=jnp.zeros_like(self.scale),
+            cameras=jnp.zeros_like(self.cameras, shape=(*self.cameras.shape[:-2], 6)),
+            roots=jnp.zeros_like(self.roots, shape=(*self.roots.shape[:-2], 6)),
+            poses=jnp.zeros_like(self.poses),
+            shapes=jnp.zeros_like(self.shapes),
+            landmarks=jnp.zeros_like(self.landmarks),
+            intrinsics=jnp.zeros_like(self.intrinsics),
+        )
+
+
+def retract_pose(
+    pose: Float[Array, "*b 4 4"], step: Float[Array, "*b 6"]
+) -> Float[Array, "*b 4 4"]:
+    """`C Exp(step[:3])` and `r + step[3:]`."""
+    turn = jaxlie.SO3.exp(step[..., :3]).as_matrix()
+    top = jnp.concatenate(
+        [
+            pose[..., :3, :3] @ turn,
+            (pose[..., :3, 3] + step[..., 3:])[..., None],
+        ],
+        axis=-1,
+    )
+    return jnp.concatenate([top, pose[..., 3:, :]], axis=-2)
+
+
+def retract_rotation(
+    rotation: Float[Array, "*b 3"], step: Float[Array, "*b 3"]
+) -> Float[Array, "*b 3"]:
+    """`Log(Exp(rotation) Exp(step))`, continuous in `step` around every angle up to pi.
+
+    Where it is more than 2 rad long the logarithm is taken on the branch of the base
+    point: an axis-angle vector may leave the ball of radius pi, and does not jump
+    there. Beyond 2 pi - 2 it comes back by a full turn, to the same rotation.
+    """
+    moved = log_of(compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)))
+    squared = jnp.sum(moved**2, axis=-1, keepdims=True)
+    far = squared > 4.0
+    angle = jnp.sqrt(jnp.where(far, squared, 1.0))
+    flipped = jnp.sum(moved * rotation, axis=-1, keepdims=True) < 0
+    return jnp.where(far & flipped, moved * (1 - 2 * jnp.pi / angle), moved)
+
+
+def inverse_right_jacobian(
+    rotation: Float[Array, "*b 3"],
+) -> Float[Array, "*b 3 3"]:
+    """`d Log(Exp(θ) Exp(δ)) / dδ` at 0, `*b 3 3`; finite below a full turn."""
+    squared = jnp.sum(rotation**2, axis=-1)[..., None, None]
+    small = squared < 1e-4
+    safe = jnp.where(small, 1.0, squared)
+    angle = jnp.sqrt(safe)
+    half = 0.5 * angle
+    factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    factor = jnp.where(small, 1 / 12 + squared / 720, factor)
+    x, y, z = (rotation[..., i] for i in range(3))
+    zero = jnp.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    eye = jnp.eye(3, dtype=rotation.dtype)
+    return eye + 0.5 * skew + factor * (skew @ skew)
+
+
+def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
+    """T_WH in metres: `r_WH = s r'_WC + C_WC r_CH`, `C_WH = C_WC C_CH`."""
+    cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
+    return cameras @ state.roots
+
+
+@jax.jit
+def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
+    """1 where a camera coordinate may move, 0 where it holds the map in place.
+
+    The world's origin and axes are the first camera; the unit of the map is one
+    coordinate, the largest, of the camera that is farthest from it. Seven numbers, held
+    exactly: no prior, and no null space in the normal equations.
+    """
+    offset = jnp.abs(cameras[:, :3, 3] - cameras[0, :3, 3])
+    held = jnp.zeros_like(offset).reshape(-1).at[jnp.argmax(offset)].set(1.0)
+    free = jnp.concatenate([jnp.ones_like(offset), 1 - held.reshape(-1, 3)], axis=1)
+    return free.at[0].set(0.0)

@@ -1,0 +1,277 @@
+"""What the door of a problem refuses: shapes, kinds and values that do not fit.
+
+Shapes are those of the fields' annotations: `t` frames, `h` people, `l` landmarks and
+`i` intrinsics are as many as the state has. Shapes are known under `jit` and `vmap`
+too; values are looked at where there are any.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import AbstractArray, Bool, Float, Int
+
+from bodyslam_jax.body import KEYPOINT_NAMES
+from bodyslam_jax.compilation import is_traced
+from bodyslam_jax.graph.factor import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph.factors.camera import CameraPrior
+from bodyslam_jax.graph.factors.ground import GroundContact
+from bodyslam_jax.graph.factors.landmark import LandmarkPrior
+from bodyslam_jax.graph.factors.reprojection import JointReprojection, Reprojection
+from bodyslam_jax.graph.factors.root import (
+    RootOrientation,
+    RootPlace,
+    UpDirection,
+)
+from bodyslam_jax.graph.factors.stance import StanceFoot
+from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.validation_weights import check_early, check_loss, check_runs
+
+Sizes = dict[str, int]
+"""Lengths of named axes."""
+
+_ROTATION = 1e-3
+"""How far `C^T C` may be from 1: files have few digits, and single precision drifts."""
+_KINDS = {
+    Float: (jnp.floating, "floating point"),
+    Int: (jnp.integer, "integers"),
+    Bool: (jnp.bool_, "bool"),
+}
+
+
+def check_state(state: State, free: Step | None = None) -> Sizes:
+    """Refuses a state that is none; how long its axes are.
+
+    With `free`, the mask of a problem, a state of other sizes or another precision is
+    refused, too.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    sizes: Sizes = {}
+    if free is not None:
+        check_shapes(free, "problem.free", sizes)
+    check_shapes(state, "state", sizes)
+    _check_precision(state, free)
+    if not sizes["t"]:
+        raise ValueError("state.cameras: 0 frames, expected 1 or more.")
+    if sizes["i"] not in (4, 8):
+        raise ValueError(f"state.intrinsics: {sizes['i']} numbers, expected 4 or 8.")
+    _check_values(state, "state")
+    _check_rotations(state.cameras, "state.cameras")
+    _check_rotations(state.roots, "state.roots")
+    return sizes
+
+
+def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
+    """Refuses measurements that do not fit a state with axes of these `sizes`.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    name = type(factor).__name__
+    of_landmarks = isinstance(factor, Reprojection | LandmarkPrior)
+    if not of_landmarks and not isinstance(factor, AbstractFrameFactor):
+        raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
+    sizes = dict(sizes)
+    check_loss(factor.loss, f"{name}.loss")
+    scale = np.shape(getattr(factor.loss, "scale", 0.0))
+    each = isinstance(factor, JointReprojection)
+    if scale and not (each and scale == factor.sigma.shape):
+        expected = f"one number, or {factor.sigma.shape}" if each else "one number"
+        raise ValueError(f"{name}.loss.scale: shape {scale}, expected {expected}.")
+    if isinstance(factor, JointReprojection):
+        if factor.layout not in KEYPOINT_NAMES:
+            raise ValueError(
+                f"{name}.layout: found {factor.layout!r}, expected one of "
+                f"{sorted(KEYPOINT_NAMES)}."
+            )
+        sizes["j"] = len(KEYPOINT_NAMES[factor.layout])
+    if isinstance(factor, StanceFoot):
+        sizes["f"] = len(factor.points)
+        _check_range(f"{name}.points", np.array(factor.points, int), 25)
+    check_shapes(factor, name, sizes)
+    if isinstance(factor, AbstractFrameFactor):
+        _check_frames(factor, name, sizes)
+    _check_values(factor, name)
+    check_early(factor, name)
+    check_runs(factor, name)
+    if isinstance(factor, Reprojection):
+        _check_tracks(factor, sizes)
+    if isinstance(factor, RootOrientation):
+        known = _known(factor.sigma[..., None])
+        _check_rotations(factor.orientation, f"{name}.orientation", known)
+    if isinstance(factor, CameraPrior):
+        known = _known(factor.sigma[:, :3])
+        _check_rotations(factor.cameras, f"{name}.cameras", known)
+    if isinstance(factor, GroundContact):
+        _check_unit(factor.plane[:3], f"{name}.plane")
+    if isinstance(factor, UpDirection):
+        _check_unit(factor.up, f"{name}.up")
+    if isinstance(factor, RootPlace) and not is_traced(factor.place):
+        depth = np.asarray(factor.place)[..., 2][_known(factor.sigma)]
+        if not (depth > 0).all():
+            raise ValueError(
+                f"{name}.place: found a depth of {depth.min()} m, expected above 0."
+            )
+
+
+def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
+    """Holds arrays against the annotations of their fields.
+
+    Lengths of axes that are not in `sizes` follow from the first array, and are added.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    for field in dataclasses.fields(module):
+        kind, found = field.type, getattr(module, field.name)
+        if not (isinstance(kind, type) and issubclass(kind, AbstractArray)):
+            continue
+        where = f"{name}.{field.name}"
+        if not isinstance(found, jax.Array | np.ndarray):
+            raise ValueError(f"{where}: found {found!r:.40}, expected an array.")
+        numbers, word = _KINDS.get(kind.dtype, (jnp.generic, "numbers"))
+        if not jnp.issubdtype(found.dtype, numbers):
+            raise ValueError(f"{where}: found {found.dtype}, expected {word}.")
+        axes = kind.dim_str.split()
+        if not all(axis.isidentifier() or axis.isdecimal() for axis in axes):
+            continue
+        if len(axes) == found.ndim:
+            for axis, size in zip(axes, found.shape):
+                if axis.isidentifier():
+                    sizes.setdefault(axis, size)
+        length = lambda axis: int(axis) if axis.isdecimal() else sizes.get(axis, axis)
+        expected = [length(axis) for axis in axes]
+        if list(found.shape) != expected:
+            shape = str(tuple(expected)).replace("'", "")
+            raise ValueError(
+                f"{where}: shape {found.shape}, expected {shape} for `{kind.dim_str}`."
+            )
+
+
+def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
+    """Refuses what is known of landmarks other than those of these observations.
+
+    **Raises:** `ValueError` that says how many there are.
+    """
+    if is_traced(factor.whitening):
+        return
+    known = np.asarray(factor.whitening).any(axis=(1, 2))
+    known = known & ~np.isin(np.arange(len(known)), landmark)
+    if known.any():
+        raise ValueError(
+            f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
+            "observation; expected both, or a `whitening` of 0."
+        )
+
+
+def _check_frames(factor, name, sizes):
+    """Of factors whose annotations do not say so, too."""
+    axes = "ht" if factor.of_people else "t"
+    lead = tuple(sizes[axis] for axis in axes)
+    for field in factor.frame_fields:
+        shape = getattr(factor, field).shape
+        if shape[: len(lead)] != lead:
+            raise ValueError(
+                f"{name}.{field}: shape {shape}, expected to begin with {lead}."
+            )
+
+
+def _check_values(module, name):
+    padding = getattr(module, "padding", None) or {}
+    missing = [f".{field}" for field, value in padding.items() if np.isinf(value)]
+    for path, leaf in jax.tree_util.tree_leaves_with_path(module):
+        where = name + jax.tree_util.keystr(path)
+        if is_traced(leaf) or not eqx.is_inexact_array_like(leaf):
+            continue
+        values = np.asarray(leaf)
+        if "sigma" in where or jax.tree_util.keystr(path) in missing:
+            if not (values > 0).all():
+                raise ValueError(f"{where}: found {values.min()}, expected above 0.")
+            continue
+        if not np.isfinite(values).all():
+            bad = int(np.sum(~np.isfinite(values)))
+            text = f"{where}: {bad} of {values.size} values are not finite."
+            if np.isposinf(values[~np.isfinite(values)]).all() and path[0].name in (
+                getattr(module, "frame_fields", ())
+            ):
+                text += f" If inf is a missing one, say so: `padding` of {name}."
+            raise ValueError(text)
+        if where.endswith(".correlation") and not (abs(values) < 1).all():
+            far = values.flat[abs(values).argmax()]
+            raise ValueError(f"{where}: found {far}, expected between -1 and 1.")
+
+
+def _check_precision(state, free):
+    """One for all, and the same as the problem's: else a loop changes it as it goes."""
+    expected, like = state.scale.dtype, "state.scale"
+    if free is not None:
+        expected, like = free.scale.dtype, "the problem"
+    if expected not in (np.float32, np.float64):
+        raise ValueError(f"{like}: found {expected}, expected float32 or float64.")
+    for name, value in vars(state).items():
+        if value.dtype != expected:
+            raise ValueError(
+                f"state.{name}: found {value.dtype}, expected {expected} as in {like}."
+            )
+
+
+def _known(sigma):
+    """Where any coordinate is measured; nowhere, if that is not known yet."""
+    if is_traced(sigma):
+        return np.zeros(sigma.shape[:-1], bool)
+    return np.isfinite(np.asarray(sigma)).any(axis=-1)
+
+
+def _check_rotations(poses, where, known=None):
+    """Poses or rotations; of a pose, the last row too."""
+    if is_traced(poses):
+        return
+    poses = np.asarray(poses, float)
+    C = poses[..., :3, :3]
+    away = abs(np.swapaxes(C, -1, -2) @ C - np.eye(3)).max(axis=(-2, -1), initial=0)
+    away = np.where(np.linalg.det(C) > 0, away, np.inf)
+    if poses.shape[-1] == 4:
+        away = np.maximum(away, abs(poses[..., 3, :] - np.eye(4)[3]).max(axis=-1))
+    if known is not None:
+        away = np.where(known, away, 0)
+    wrong = away > _ROTATION
+    if wrong.any():
+        at = tuple(int(i) for i in np.argwhere(wrong)[0])
+        what = "poses" if poses.shape[-1] == 4 else "rotations"
+        raise ValueError(
+            f"{where}: {int(wrong.sum())} of {wrong.size} are no rigid {what}, the "
+            f"first at {at}; expected all to be."
+        )
+
+
+def _check_unit(direction, where):
+    if is_traced(direction):
+        return
+    length = np.linalg.norm(np.asarray(direction, float))
+    if abs(length - 1) > _ROTATION:
+        raise ValueError(f"{where}: a direction of length {length:.4g}, expected 1.")
+
+
+def _check_range(where, index, limit):
+    if len(index) and not (index.min() >= 0 and index.max() < limit):
+        raise ValueError(
+            f"{where}: indices {index.min()} to {index.max()}, expected 0 to "
+            f"{limit - 1}."
+        )
+
+
+def _check_tracks(factor, sizes):
+    if is_traced(factor.frame) or is_traced(factor.landmark):
+        return
+    frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
+    _check_range("Reprojection.frame", frame, sizes["t"])
+    _check_range("Reprojection.landmark", landmark, sizes["l"])
+    pair = np.sort(frame.astype(np.int64) * sizes["l"] + landmark)
+    twice = pair[1:][pair[1:] == pair[:-1]]
+    if len(twice):
+        f, l = divmod(int(twice[0]), sizes["l"])
+        raise ValueError(
+            f"Reprojection: landmark {l} is observed twice in frame {f} "
+            f"({len(twice)} such observations), expected once at most."
+        )

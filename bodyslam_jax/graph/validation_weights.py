@@ -1,0 +1,139 @@
+"""Checks of what measurements weigh: losses, precisions, masks, first frames."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.compilation import is_traced
+from bodyslam_jax.graph.factor import AbstractFactor
+from bodyslam_jax.graph.factors.body_pose import Posture
+from bodyslam_jax.graph.factors.camera import CameraSmoothness
+from bodyslam_jax.graph.factors.human_motion import HumanMotion, OrientationChange
+from bodyslam_jax.graph.factors.root import (
+    RootOrientation,
+    RootPlace,
+    RootSmoothness,
+    RootTurning,
+)
+from bodyslam_jax.graph.factors.stance import StanceFoot
+from bodyslam_jax.graph.losses import AbstractLoss
+from bodyslam_jax.graph.state import State, Step
+
+_EARLY = (
+    (HumanMotion, "whitening", 1, 0.0),
+    # Of the first prediction too: the one before has none.
+    (HumanMotion, "correlation", 2, 0.0),
+    (Posture, "correlation", 1, 0.0),
+    (RootOrientation, "correlation", 1, 0.0),
+    (RootPlace, "correlation", 1, 0.0),
+    (OrientationChange, "sigma", 1, np.inf),
+    (StanceFoot, "sigma", 1, np.inf),
+    (CameraSmoothness, "sigma", 2, np.inf),
+    (RootSmoothness, "sigma", 2, np.inf),
+    (RootTurning, "sigma", 2, np.inf),
+)
+"""How many of the first frames look back to where there is none, and what a field must
+be there: windows repeat the first frame, which would be taken for a measurement."""
+
+
+def check_precision(factor: AbstractFactor, state: State) -> None:
+    """Refuses measurements of more digits than a state has, which would pass them on.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    most = state.scale.dtype
+    for path, leaf in jax.tree_util.tree_leaves_with_path(factor):
+        if not eqx.is_inexact_array(leaf) or getattr(leaf, "weak_type", False):
+            continue
+        if jnp.finfo(leaf.dtype).bits > jnp.finfo(most).bits:
+            where = type(factor).__name__ + jax.tree_util.keystr(path)
+            raise ValueError(
+                f"{where}: found {leaf.dtype}, expected {most} as in state."
+            )
+
+
+def check_mask(free: Step) -> None:
+    """Refuses what is neither free nor held.
+
+    **Raises:** `ValueError` that says where, and what was found.
+    """
+    for name, value in vars(free).items():
+        if is_traced(value):
+            continue
+        values = np.asarray(value)
+        other = values[(values != 0) & (values != 1)]
+        if len(other):
+            raise ValueError(f"free.{name}: found {other[0]}, expected 0 or 1.")
+
+
+def check_loss(loss: Any, where: str) -> None:
+    """Refuses what is no loss, and scales that are no lengths.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    if not isinstance(loss, AbstractLoss):
+        raise ValueError(
+            f"{where}: found {loss!r:.60}, expected a loss such as `Squared()`."
+        )
+    scale = getattr(loss, "scale", 1.0)
+    if is_traced(scale):
+        return
+    values = np.asarray(scale)
+    if not np.issubdtype(values.dtype, np.number):
+        raise ValueError(f"{where}.scale: found {scale!r:.40}, expected a number.")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}.scale: found {scale}, which is not finite.")
+    if not (values > 0).all():
+        raise ValueError(f"{where}.scale: found {values.min()}, expected above 0.")
+
+
+def check_early(factor: AbstractFactor, name: str) -> None:
+    """Refuses weights of frames that look back to where there is none.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    for kind, field, count, empty in _EARLY:
+        value = getattr(factor, field, None)
+        # Not of others made from it, which may look back elsewhere.
+        if type(factor) is not kind or is_traced(value):
+            continue
+        early = np.asarray(value)
+        early = early[:, :count] if factor.of_people else early[:count]
+        other = early[early != empty]
+        if len(other):
+            frames = "frame 0" if count == 1 else f"frames 0 to {count - 1}"
+            raise ValueError(
+                f"{name}.{field}: found {other[0]} within {frames}, expected {empty}: "
+                "there is no earlier frame."
+            )
+
+
+def check_runs(factor: AbstractFactor, name: str) -> None:
+    """Refuses errors that go on from a frame in which nothing was measured.
+
+    What stands there is not a measurement, and would be compared with.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    if isinstance(factor, HumanMotion):
+        weight, known = factor.whitening, lambda x: (x != 0).any(axis=(-1, -2))
+    elif isinstance(factor, RootOrientation | RootPlace):
+        weight, known = factor.sigma, np.isfinite
+    else:
+        return
+    if is_traced((weight, factor.correlation)):
+        return
+    there: np.ndarray = np.asarray(known(np.asarray(weight)))
+    there = np.any(there.reshape(*there.shape[:2], -1), axis=-1)
+    on = np.asarray(factor.correlation)[:, 1:] != 0
+    lost = np.argwhere(on & there[:, 1:] & ~there[:, :-1])
+    if len(lost):
+        person, frame = lost[0]
+        raise ValueError(
+            f"{name}.correlation: found {factor.correlation[person, frame + 1]} in "
+            f"frame {frame + 1} of person {person}, expected 0.0: the frame before is "
+            "not measured (`graph.runs`)."
+        )

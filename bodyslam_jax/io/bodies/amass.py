@@ -1,0 +1,127 @@
+"""AMASS-style motion of one body -> rows for the frames of a video."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.io.bodies.body_records import Rows, Video
+from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
+from bodyslam_jax.io.frame_index import Unfit
+
+_RATES = ("mocap_framerate", "mocap_frame_rate")
+"""What AMASS calls its rate: with SMPL-H, and since it has SMPL-X."""
+_SMPLX = 165
+"""Numbers of a pose of SMPL-X: 55 joints."""
+_SAME_RATE = 0.01
+"""Relative difference of rates that is still the same rate, rounded."""
+_MAX_RATIO = 2.5
+"""Motion and video of durations further apart do not belong together."""
+
+
+def is_amass(data: dict) -> bool:
+    """Whether these are AMASS' arrays, of any of its releases."""
+    rate = any(key in data for key in _RATES)
+    whole = "poses" in data or {"root_orient", "pose_body"} <= set(data)
+    return rate and whole and {"trans", "betas"} <= set(data)
+
+
+def is_smplx(data: dict, width: int) -> bool:
+    """Whether poses of that width, or what the file says, are SMPL-X's."""
+    named = str(np.asarray(data.get("surface_model_type", "")).reshape(-1)[:1])
+    return width == _SMPLX or "smplx" in named
+
+
+def from_amass(data: dict, video: Video) -> Rows:
+    """AMASS style, one body for the whole video, taken to be in the camera frame.
+
+    SMPL's poses (t, 72), SMPL-H's (t, 156) or SMPL-X's (t, 165), whose first 22 joints
+    are the same; `betas` (b,) or (t, b), of which SMPL-X's mean something else and are
+    left out. Both begin together. Another rate is resampled to the times of the video's
+    frames.
+    """
+    if "poses" in data:
+        poses = numbers_of(data, "poses", None)
+    else:
+        parts = (numbers_of(data, k, None) for k in ("root_orient", "pose_body"))
+        poses = np.concatenate([p.reshape(len(p), -1) for p in parts], axis=-1)
+    n = len(poses)
+    if poses.ndim != 2 or poses.shape[1] < 66 or not n:
+        raise Unfit(f"`poses` is {poses.shape}, not (t, 72), (t, 156) or (t, 165)")
+    smplx = is_smplx(data, poses.shape[1])
+    poses, trans = body_pose(poses), numbers_of(data, "trans", (n, 3))
+    if smplx:
+        trans = trans + PELVIS_SMPLX - PELVIS_SMPL
+    key = next(key for key in _RATES if key in data)
+    rate = np.ravel(numbers_of(data, key, None))
+    if len(rate) != 1 or not 0 < rate[0] < np.inf:
+        raise Unfit(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
+    at, slack = _places(n, float(rate[0]), video)
+    video.warn("AMASS-style bodies taken as in the camera's frame, not in a world.")
+    frame = np.flatnonzero(at <= n - 1 + slack)
+    at = np.minimum(at[frame], n - 1)
+    poses, trans = _between(poses, trans, at)
+    betas = np.ravel(numbers_of(data, "betas", None))[: 0 if smplx else 10]
+    betas = np.pad(betas, (0, 10 - len(betas)))
+    return Rows(
+        frame,
+        np.zeros(len(frame), np.int64),
+        poses,
+        np.tile(betas, (len(frame), 1)),
+        trans,
+        shapes_regressed=smplx,
+    )
+
+
+def body_pose(poses: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "t 72"]:
+    """SMPL's poses of those of SMPL, SMPL-H or SMPL-X; without hands for the latter."""
+    width = 72 if poses.shape[1] == 72 else 66
+    return np.pad(poses[:, :width], [(0, 0), (0, 72 - width)])
+
+
+def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
+    """Where in a motion of `n` frames each frame of the video is, and how far beyond
+    its end is still its last frame."""
+    t, fps = video.num_frames, video.fps
+    if t is None:
+        t = n if fps is None else round((n - 1) / rate * fps) + 1
+        return np.arange(t) * (1.0 if fps is None else rate / fps), 0.5
+    if n == t and fps is None:
+        return np.arange(float(n)), 0.5
+    if fps is None:
+        raise Unfit(f"{n} frames at {rate:g}/s, but the video has {t} frames")
+    # Its rate may vary, and that of the frames that are used is another one.
+    times = np.arange(t) / fps if video.times is None else video.times - video.times[0]
+    filmed = float(times[-1]) * t / (t - 1) if t > 1 else 1 / fps
+    moved = n / rate
+    if n == t and abs(moved / filmed - 1) < _SAME_RATE:
+        return np.arange(float(n)), 0.5
+    if not 1 / _MAX_RATIO < moved / filmed < _MAX_RATIO:
+        raise Unfit(
+            f"{n} frames at {rate:g}/s are {moved:.3g} s, but the video has "
+            f"{filmed:.3g} s"
+        )
+    slack = 0.5 * max(1.0, rate / fps)
+    if abs(moved - filmed) * rate > 2 * slack:
+        what = "the rest left out" if moved > filmed else "nobody after its end"
+        video.warn(
+            f"motion of {moved:.3g} s for a video of {filmed:.3g} s: both taken to "
+            f"begin together, {what}."
+        )
+    return times * rate, slack
+
+
+def _between(
+    poses: np.ndarray, trans: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (t, 72) and positions between frames; joints turn by the shortest way."""
+    low = np.floor(at).astype(np.int64)
+    high = np.minimum(low + 1, len(poses) - 1)
+    part = (at - low)[:, None]
+    known = np.asarray(np.isfinite(poses).all(axis=1))[:, None]
+    safe = np.where(known, poses, 0.0)
+    a, b = (Rotation.from_rotvec(safe[k].reshape(-1, 3)) for k in (low, high))
+    turn = (a.inv() * b).as_rotvec() * np.repeat(part, 24, axis=0)
+    between = (a * Rotation.from_rotvec(turn)).as_rotvec().reshape(-1, 72)
+    between = np.where(part > 0, between, poses[low])
+    between = np.where(known[low] & (known[high] | (part == 0)), between, np.nan)
+    return between, (1 - part) * trans[low] + part * trans[high]

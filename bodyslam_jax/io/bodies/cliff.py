@@ -1,0 +1,65 @@
+"""CLIFF's results -> rows for the frames of a video."""
+
+import numpy as np
+
+from bodyslam_jax.io.bodies.body_records import Rows, Video
+from bodyslam_jax.io.bodies.parts import (
+    betas_of,
+    frames_of,
+    frames_of_images,
+    middle,
+    numbers_of,
+    refocused,
+    rotations_of,
+    tell_apart,
+)
+from bodyslam_jax.io.bodies.tool_focal import default_focal
+from bodyslam_jax.io.frame_index import Unfit
+
+
+def from_cliff(data: dict, video: Video) -> Rows:
+    """CLIFF: full-image translation for its own focal length, image names.
+
+    Its bodies are in no order; who is seen in a few frames only is left out.
+    """
+    poses = rotations_of(data, "pose", 24)
+    n = len(poses)
+    if "imgname" in data:
+        names = [str(name) for name in np.ravel(data["imgname"])]
+        image = _image_of_each(data, n, len(names))
+        frame = frames_of_images(names, video, complete=image is not None)
+        if image is not None:
+            frame = frame[image]
+    else:
+        frame = frames_of(data, "frame", n, video.num_frames)
+    trans = numbers_of(data, "global_t", (n, 3))
+    if "focal_l" in data:
+        focal = np.broadcast_to(np.ravel(numbers_of(data, "focal_l", None)), (n,))
+    else:
+        focal = np.full(n, default_focal("CLIFF", video))
+    trans = refocused(trans, focal, middle(video.camera), video.camera)
+    person = tell_apart(frame, trans, video)
+    _, which, count = np.unique(person, return_inverse=True, return_counts=True)
+    least = video.frames_in(video.config.min_duration)
+    keep = count[which] >= min(least, count.max(initial=0))
+    if len(count) > 1:
+        video.warn(
+            f"bodies do not say who is who: {len(np.unique(person[keep]))} people told "
+            f"apart by where they are, {int((~keep).sum())} bodies left out."
+        )
+    betas = betas_of(data, "shape", n)
+    return Rows(frame[keep], person[keep], poses[keep], betas[keep], trans[keep])
+
+
+def _image_of_each(data: dict, n: int, images: int) -> np.ndarray | None:
+    """CLIFF names each image once, and a detection, a row of `detection_all`, begins
+    with the number of its image; None where each of `n` bodies has its own name."""
+    if "detection_all" in data:
+        rows = numbers_of(data, "detection_all", None)
+        image = rows.reshape(len(rows), -1)[:, 0] if rows.size else np.zeros(0)
+        within = (image >= 0) & (image < images) & (image == np.round(image))
+        if len(image) == n and within.all():
+            return image.astype(np.int64)
+    if images != n:
+        raise Unfit(f"{images} image names for {n} bodies")
+    return None

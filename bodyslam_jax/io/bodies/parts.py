@@ -1,0 +1,223 @@
+"""Parts that the readers of regressed bodies share: checks, frames, rotations, cameras.
+
+An `Unfit` says what is wrong with the content; the caller adds the file's name.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.io.bodies.body_records import Rows, Video
+from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
+from bodyslam_jax.io.frame_index import Unfit, frames_of_names
+from bodyslam_jax.io.keypoints.associate import identify
+from bodyslam_jax.types import Intrinsics
+
+PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
+"""J_0 of SMPL's neutral template, m."""
+PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
+"""J_0 of SMPL-X's neutral template, m."""
+_BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
+"""Points in front view of a body's size, about its middle, m."""
+
+
+def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
+    """A float64 array, of the shape given (-1: any length).
+
+    What is not finite in it becomes NaN: the bodies that it is of are left out at the
+    end.
+    """
+    if not isinstance(data, dict) or key not in data:
+        raise Unfit(f"no `{key}`")
+    try:
+        array = np.asarray(data[key], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise Unfit(f"`{key}` does not hold numbers") from None
+    array = np.where(np.isfinite(array), array, np.nan)
+    if shape is not None:
+        fits = array.ndim == len(shape) and all(
+            want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
+        )
+        if not fits:
+            expected = tuple("any" if n < 0 else n for n in shape)
+            raise Unfit(f"`{key}` is {array.shape}, not {expected}")
+    return array
+
+
+def betas_of(data: dict, key: str, n: int) -> np.ndarray:
+    betas = numbers_of(data, key, None)
+    betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
+    if betas.shape[1] < 10:
+        raise Unfit(f"`{key}` has {betas.shape[1]} numbers a body, not 10 or more")
+    return betas[:, :10].copy()
+
+
+def whole_of(array: np.ndarray, name: str) -> np.ndarray:
+    """Numbers of frames or people as integers.
+
+    **Raises:** `Unfit` if one is none.
+    """
+    off = array[~np.isfinite(array) | (array != np.round(array))]
+    if len(off):
+        raise Unfit(f"`{name}` has {off[0]:g} in it, expected whole numbers")
+    return array.astype(np.int64)
+
+
+def people_of(data: dict, n: int) -> np.ndarray:
+    if "person" not in data:
+        return np.zeros(n, dtype=np.int64)
+    return whole_of(numbers_of(data, "person", (n,)), "person")
+
+
+def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarray:
+    if key in data:
+        found = whole_of(np.ravel(numbers_of(data, key, None)), key)
+        if len(found) != n:
+            raise Unfit(f"`{key}` has {len(found)} entries for {n} bodies")
+        return found
+    if num_frames is not None and n != num_frames:
+        raise Unfit(
+            f"{n} bodies without `{key}`, but the video has {num_frames} frames"
+        )
+    return np.arange(n)
+
+
+def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
+    """Frames of bodies found in images of these names."""
+    frames = frames_of_names(
+        names,
+        what="bodies",
+        num_frames=video.num_frames,
+        images=video.images,
+        complete=complete,
+        warn=video.warn,
+    )
+    return np.array([frames[name] for name in names], dtype=np.int64)
+
+
+def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray:
+    """Numbers people where a tool does not say who is who: by where they are in the
+    image, and how large, from frame to frame. One body a frame is one person."""
+    if len(np.unique(frame)) == len(frame):
+        return np.zeros(len(frame), dtype=np.int64)
+    fx, fy, cx, cy = video.camera.params[:4]
+    order = np.argsort(frame, kind="stable")
+    x, y, z = trans[order].T[:, :, None]
+    z = np.maximum(z, 0.1)
+    u = fx * (x + _BOX[0].ravel()) / z + cx
+    v = fy * (y + _BOX[1].ravel()) / z + cy
+    points = np.stack([u, v, np.ones_like(u)], axis=-1)
+    points[~np.isfinite(points).all(axis=-1)] = 0.0
+    first = np.searchsorted(frame[order], np.arange(1, frame.max(initial=0) + 1))
+    found = identify(np.split(points, first), video.frames_in(video.config.max_gap))
+    person = np.empty(len(frame), dtype=np.int64)
+    person[order] = np.concatenate(found)
+    return person
+
+
+def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
+    """Axis-angle (m, 3j) from matrices (m, j, 3, 3) or (j, 3, 3), or as it is."""
+    array = np.asarray(array, dtype=np.float64)
+    if array.shape[-2:] == (3, 3):
+        if joints is not None and array.size % (9 * joints):
+            raise Unfit(f"rotations {array.shape}, not of {joints} joints")
+        rotvec = rotvec_of(array.reshape(-1, 3, 3))
+        count = joints or array.shape[1]
+        return rotvec.reshape(-1, 3 * count)
+    return (
+        array.reshape(len(array), -1)
+        if joints is None
+        else array.reshape(-1, 3 * joints)
+    )
+
+
+def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """Axis-angle of rotation matrices; NaN of those that are not finite."""
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    safe = np.where(finite[:, None, None], matrices, np.eye(3))
+    found = Rotation.from_matrix(safe).as_rotvec()
+    return np.where(finite[:, None], found, np.nan)
+
+
+def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
+    array = numbers_of(data, key, None)
+    if array.shape[1:] not in ((3 * joints,), (joints, 3), (joints, 3, 3)):
+        raise Unfit(f"`{key}` is {array.shape}, not rotations of {joints} joints")
+    return as_rotvec(array, joints)
+
+
+def middle(camera: Intrinsics) -> np.ndarray:
+    """Principal point of tools that put it in the middle of the image, px."""
+    return np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+
+
+def refocused(
+    trans: np.ndarray, focal: np.ndarray, center: np.ndarray, camera: Intrinsics
+) -> np.ndarray:
+    """Moves bodies so that they look the same through the true camera.
+
+    Distance is proportional to focal length for the same size in the image.
+
+    Args:
+        focal: of the tool's camera, px: one number a body, or two (x, y).
+        center: its principal point, px: one for all, or one a body.
+    """
+    if (trans[:, 2] == 0).any():
+        raise Unfit("a body at a distance of 0 from the camera (z = 0)")
+    fx, fy, cx, cy = camera.params[:4]
+    focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
+    center = np.broadcast_to(center, (len(trans), 2))
+    z = trans[:, 2] * fx / focal[:, 0]
+    uv = center + focal * trans[:, :2] / trans[:, 2:]
+    xy = (uv - [cx, cy]) / [fx, fy] * z[:, None]
+    return np.concatenate([xy, z[:, None]], axis=-1)
+
+
+def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n 3 3"]:
+    """Camera matrices for images of the video's size, which a tool may have resized.
+
+    Told by a principal point in the middle of images of the same shape.
+    """
+    whole = 2 * np.median(K[:, :2, 2], axis=0)
+    size = np.array([video.camera.width, video.camera.height])
+    x, y = whole / size
+    if not (x > 0 and y > 0) or abs(np.log(x / y)) > 0.02 or abs(np.log(x)) < 0.2:
+        return K
+    factor = float(2 / (x + y))
+    video.warn(
+        f"bodies of a camera for images of {whole[0]:.0f}x{whole[1]:.0f} px, but the "
+        f"video has {size[0]}x{size[1]} px: its pixels multiplied by {factor:.4g}."
+    )
+    return np.concatenate([factor * K[:, :2], K[:, 2:]], axis=1)
+
+
+def focals(K: np.ndarray) -> np.ndarray:
+    return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
+
+
+def from_crops(
+    frame: np.ndarray,
+    person: np.ndarray,
+    poses: np.ndarray,
+    betas: np.ndarray,
+    crop: np.ndarray,
+    box: np.ndarray,
+    camera: Intrinsics,
+) -> Rows:
+    if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
+        raise Unfit("a weak-perspective camera or box with a size of 0 or less")
+    trans = full_translation(crop, box, camera)
+    root = turn_to_camera(poses[:, :3], box, camera)
+    return Rows(
+        frame, person, np.concatenate([root, poses[:, 3:]], axis=-1), betas, trans
+    )
+
+
+def join(rows: list[Rows]) -> Rows:
+    if not rows:
+        raise Unfit("no person in it")
+    names = ("frame", "person", "poses", "betas", "trans")
+    return Rows(
+        *(np.concatenate([getattr(r, name) for r in rows]) for name in names),
+        shapes_regressed=any(r.shapes_regressed for r in rows),
+    )

@@ -1,0 +1,77 @@
+"""Weak-perspective bodies of cropped images -> bodies in the camera frame.
+
+A network that looks at a crop says how large the body is in it (`s`), where (`tx, ty`),
+and how it is turned relative to the direction in which the crop lies. The full image
+says what that means in metres. Formulas: `cam_crop2full` of CLIFF (Li et al., ECCV
+2022) with the true principal point; the rotation by the crop's ray is what Henning et
+al. (ECCV 2022, Section 3.3) refer to.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.types import Intrinsics
+
+# Crops hold a person, and SPIN's smallest person is far larger than this.
+_SMALLEST = 1e-9
+
+
+def full_translation(
+    camera: Float[np.ndarray, "m 3"],
+    box: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+) -> Float[np.ndarray, "m 3"]:
+    """`trans` (m) of bodies given as `(s, tx, ty)` in square boxes `(cx, cy, side px)`.
+
+    Distortion is ignored: it moves a box's centre, whose own error is larger.
+    """
+    fx, fy, px, py = intrinsics.params[:4]
+    s, tx, ty = camera.T
+    cx, cy, side = box.T
+    scale = side * s + _SMALLEST
+    z = 2 * fx / scale
+    x = tx + 2 * (cx - px) / scale
+    # With fx != fy a row of the crop spans fx / fy as many metres as a column.
+    y = ty * fx / fy + 2 * (cy - py) / scale * fx / fy
+    return np.stack([x, y, z], axis=-1)
+
+
+def crop_camera(
+    trans: Float[np.ndarray, "m 3"],
+    box: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+) -> Float[np.ndarray, "m 3"]:
+    """Inverse of `full_translation`: what a network would have said."""
+    fx, fy, px, py = intrinsics.params[:4]
+    x, y, z = trans.T
+    cx, cy, side = box.T
+    s = 2 * fx / (side * z)
+    return np.stack([s, x - z / fx * (cx - px), y * fy / fx - z / fx * (cy - py)], -1)
+
+
+def turn_to_camera(
+    orientation: Float[np.ndarray, "m 3"],
+    box: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+) -> Float[np.ndarray, "m 3"]:
+    """Root rotations (axis-angle, rad) seen along each crop's ray -> in the camera; NaN
+    where one of the two is not finite.
+
+    The pelvis stays where it is: rotations pivot at `J_0(β) + trans`.
+    """
+    fx, fy, px, py = intrinsics.params[:4]
+    ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
+    known = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
+    ray, turn = np.where(known, ray, 0.0), np.where(known, orientation, 0.0)
+    turned = (ray_rotation(ray) * Rotation.from_rotvec(turn)).as_rotvec()
+    return np.where(known, turned, np.nan)
+
+
+def ray_rotation(xy: Float[np.ndarray, "m 2"]) -> Rotation:
+    """Smallest rotation that takes +z to the ray through `xy` at depth 1."""
+    length = np.linalg.norm(xy, axis=-1, keepdims=True)
+    axis = np.concatenate([-xy[:, 1:], xy[:, :1]], axis=-1)  # z cross ray
+    axis = axis / np.where(length > 0, length, 1.0)
+    turned = np.arctan(length) * np.concatenate([axis, np.zeros_like(length)], -1)
+    return Rotation.from_rotvec(turned)

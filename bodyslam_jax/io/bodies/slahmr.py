@@ -1,0 +1,125 @@
+"""SLAHMR's results -> rows for the frames of a video.
+
+It writes `NAME_ITERATION_world_results.npz` for each phase, and beside them, or one
+folder up, `track_info.json`: which part of the video they are of, and who is seen when.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.io.bodies.body_records import Rows, Video
+from bodyslam_jax.io.bodies.parts import (
+    PELVIS_SMPL,
+    at_size,
+    numbers_of,
+    refocused,
+)
+from bodyslam_jax.io.frame_index import Unfit
+
+_INFO = "track_info"
+
+
+def is_slahmr(data: dict) -> bool:
+    body = {"trans", "root_orient", "pose_body"} <= set(data)
+    return body and np.ndim(data["trans"]) == 3
+
+
+def with_track_info(path: Path, data: Any) -> Any:
+    """The same with what `track_info.json` says, where there is one for it."""
+    if not isinstance(data, dict) or not is_slahmr(data):
+        return data
+    for folder in (path.parent, path.parent.parent):
+        file = folder / "track_info.json"
+        if file.is_file():
+            try:
+                return {**data, _INFO: json.loads(file.read_text())}
+            except (OSError, ValueError) as error:
+                raise ValueError(f"{file}: not a JSON file ({error}).") from None
+    return data
+
+
+@dataclasses.dataclass(frozen=True)
+class _Info:
+    """Which frames of the video results are of."""
+
+    first: int
+    masks: dict[int, np.ndarray]
+    """By the index of a person: in which frames, from `first` on, they are seen."""
+
+    @classmethod
+    def of(cls, data: Any) -> "_Info | None":
+        if data is None:
+            return None
+        start, end = (int(k) for k in data["meta"]["seq_interval"])
+        before = int(data["meta"]["data_interval"][0])
+        masks = {
+            int(track["index"]): np.asarray(track["vis_mask"], float)[start:end] > 0
+            for track in data["tracks"].values()
+        }
+        return cls(before + start, masks)
+
+    def seen(self, people: int, frames: int) -> np.ndarray:
+        found = np.ones((people, frames), dtype=bool)
+        for index, mask in self.masks.items():
+            if index < people:
+                found[index, : len(mask)] = mask[:frames]
+        return found
+
+
+def from_slahmr(data: dict, video: Video) -> Rows:
+    """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
+    if "cam_R" not in data or "cam_t" not in data:
+        raise Unfit(
+            "what SLAHMR starts from, without cameras; give *_world_results.npz"
+        )
+    trans = numbers_of(data, "trans", (-1, -1, 3))
+    p, t = trans.shape[:2]
+    info = _Info.of(data.get(_INFO))
+    if info is None and video.num_frames not in (None, t):
+        raise Unfit(
+            f"{t} frames, but the video has {video.num_frames}; SLAHMR's "
+            "track_info.json beside the file says which"
+        )
+    scale = float(np.ravel(data.get("world_scale", 1.0))[0])
+    R = np.broadcast_to(numbers_of(data, "cam_R", None), (p, t, 3, 3))
+    shift = scale * np.broadcast_to(numbers_of(data, "cam_t", None), (p, t, 3))
+    root = numbers_of(data, "root_orient", (p, t, 3))
+    body = numbers_of(data, "pose_body", None).reshape(p, t, 63)
+    betas = np.broadcast_to(
+        numbers_of(data, "betas", None)[..., :10].reshape(p, -1, 10), (p, t, 10)
+    )
+    # A world transform moves the pelvis, not the model's origin.
+    pelvis = np.einsum("ptij,ptj->pti", R, trans + PELVIS_SMPL) + shift
+    turned = _composed(R.reshape(-1, 3, 3), root.reshape(-1, 3))
+    moved = pelvis - PELVIS_SMPL
+    if "intrins" in data:
+        fx, _, cx, cy = np.ravel(numbers_of(data, "intrins", None))[:4]
+        K = at_size(np.array([[[fx, 0.0, cx], [0.0, fx, cy], [0.0, 0.0, 1.0]]]), video)
+        focal = np.full(p * t, K[0, 0, 0])
+        moved = refocused(moved.reshape(-1, 3), focal, K[0, :2, 2], video.camera)
+    seen = np.ones((p, t), dtype=bool)
+    if "track_mask" in data:
+        seen = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
+    poses = np.concatenate([turned.reshape(p, t, 3), body, np.zeros((p, t, 6))], -1)
+    if info is not None:
+        seen = seen & info.seen(p, t)
+    person, frame = np.nonzero(seen)
+    if info is not None:
+        frame = frame + info.first
+    moved = moved.reshape(p, t, 3)
+    parts = (poses[seen], betas[seen], moved[seen])
+    return Rows(frame, person, *parts, shapes_regressed=False)
+
+
+def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
+    """Axis-angle of R exp(rotvec); NaN where one of the two is not finite."""
+    both = np.hstack([R.reshape(-1, 9), rotvec])
+    known = np.asarray(np.isfinite(both).all(axis=1))[:, None]
+    safe = np.where(known[..., None], R, np.eye(3)), np.where(known, rotvec, 0.0)
+    turned = Rotation.from_matrix(safe[0]) * Rotation.from_rotvec(safe[1])
+    return np.where(known, turned.as_rotvec(), np.nan)

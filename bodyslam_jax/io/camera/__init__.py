@@ -1,0 +1,1 @@
+"""Camera calibrations, camera paths and trajectories that come as files."""

@@ -1,0 +1,210 @@
+"""A camera file, or a guess, -> intrinsics."""
+
+import dataclasses
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
+from bodyslam_jax.types import Intrinsics
+
+_log = logging.getLogger(__name__)
+
+_GUESSED_FOCAL = 1.2
+"""Focal length over the longer side: COLMAP's default, a view of 45 degrees."""
+
+_NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
+
+
+def read_camera(
+    path: Path, size: tuple[int, int] | None = None
+) -> tuple[Intrinsics, float | None]:
+    """Reads `camera.json` (model, size and parameters in COLMAP's order, pixel centres
+    at whole numbers; and the frame rate, 1/s, if the file has one), COLMAP's
+    `cameras.txt` or `cameras.bin`, or nerfstudio's `transforms.json`.
+
+    Args:
+        size: of the video, px: which camera is meant, where a file holds several.
+
+    **Raises:** `ValueError`, naming the file, if something is missing or impossible.
+    """
+    if path.is_dir():
+        names = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
+        inside = [p for name in names if (p := path / name).exists()]
+        if not inside:
+            raise ValueError(f"{path}: none of {', '.join(names)} in this folder.")
+        path = inside[0]
+    if not path.exists():
+        raise ValueError(f"{path}: no such file, expected a camera's.")
+    if path.suffix in (".txt", ".bin"):
+        return _from_cameras(path, read_cameras(path), size), None
+    try:
+        data = json.loads(path.read_text())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: not a JSON file ({error}).") from None
+    if not isinstance(data, dict):
+        raise ValueError(
+            f"{path}: a JSON object expected, {type(data).__name__} found."
+        )
+    if "model" not in data and ("fl_x" in data or "frames" in data):
+        return _from_cameras(path, read_cameras(path), size), None
+    missing = [k for k in ("model", "width", "height", "params") if k not in data]
+    if missing:
+        raise ValueError(f"{path}: no {', '.join(missing)}; only {', '.join(data)}.")
+    model = data["model"]
+    if not isinstance(model, str) or model not in _NUM_PARAMS:
+        raise ValueError(
+            f"{path}: model {model!r}, not one of {', '.join(_NUM_PARAMS)}."
+        )
+    try:
+        params = np.asarray(data["params"], dtype=np.float64)
+        width, height = (_whole(data[k], k) for k in ("width", "height"))
+        fps = None if data.get("fps") is None else float(data["fps"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: numbers expected ({error}).") from None
+    if params.shape != (_NUM_PARAMS[model],):
+        found = (
+            f"{params.size} params" if params.ndim == 1 else "params in no plain list"
+        )
+        raise ValueError(f"{path}: {found} for {model}, not {_NUM_PARAMS[model]}.")
+    intrinsics = _intrinsics(path, model, params, width, height)
+    if fps is not None and not 0.1 <= fps <= 1000:
+        raise ValueError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
+    return intrinsics, fps
+
+
+def _from_cameras(
+    path: Path, cameras: list[FoundCamera], size: tuple[int, int] | None
+) -> Intrinsics:
+    """The camera of a file that the video was taken with."""
+    fitting = [c for c in cameras if size in (None, (c.width, c.height))]
+    chosen = fitting or cameras
+    same = {(c.model, c.width, c.height, tuple(c.params)) for c in chosen}
+    if len(same) > 1:
+        raise ValueError(
+            f"{path}: {len(same)} different cameras, expected the one of this video."
+        )
+    found = chosen[0]
+    if found.model not in (*_NUM_PARAMS, "RADIAL"):
+        raise ValueError(
+            f"{path}: camera model {found.model}, expected one of "
+            f"{', '.join(_NUM_PARAMS)} or RADIAL: undistort the images first."
+        )
+    params = np.asarray(found.params, float)
+    return _intrinsics(path, found.model, params, found.width, found.height)
+
+
+def _intrinsics(
+    path: Path, model: str, params: np.ndarray, width: int, height: int
+) -> Intrinsics:
+    """Checked, as OpenCV has them.
+
+    **Raises:** `ValueError`, naming the file, if they are those of no camera.
+    """
+    params = _from_colmap(model, params)
+    if not np.isfinite(params).all() or (params[:2] <= 0).any():
+        raise ValueError(f"{path}: params {params.tolist()} are not those of a camera.")
+    if width <= 0 or height <= 0:
+        raise ValueError(f"{path}: size {width}x{height} px is not that of an image.")
+    if not (-width < params[2] < 2 * width and -height < params[3] < 2 * height):
+        raise ValueError(
+            f"{path}: principal point {params[2]:g}, {params[3]:g} far outside the "
+            f"image of {width}x{height} px."
+        )
+    return Intrinsics(params, width, height)
+
+
+def _whole(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not float(value).is_integer():
+        raise ValueError(f"{name} {value} is no whole number of pixels")
+    return int(value)
+
+
+def guess_camera(
+    width: int, height: int, image: Path | None = None, pixel_aspect: float = 1.0
+) -> Intrinsics:
+    """Intrinsics of an unknown camera: from the EXIF data of `image`, else typical.
+
+    Args:
+        pixel_aspect: width of a pixel over its height.
+    """
+    longer = max(width * pixel_aspect, height)
+    focal = _focal_from_exif(image, longer) if image else None
+    focal = focal or _GUESSED_FOCAL * longer
+    centre = (width - 1) / 2, (height - 1) / 2
+    params = np.array([focal / pixel_aspect, focal, *centre])
+    return Intrinsics(params, width, height, is_guess=True)
+
+
+def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics:
+    """The camera with a focal length fx that somebody knows, px, to within `sigma`;
+    the shape of its pixels stays."""
+    params = intrinsics.params.copy()
+    params[:2] *= focal / params[0]
+    return dataclasses.replace(
+        intrinsics, params=params, is_guess=False, focal_sigma=sigma
+    )
+
+
+def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
+    """Pixels of points (m, 3) in the camera frame; far away if behind the camera."""
+    front = p_C[:, 2] > 0.05
+    safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
+    K, distortion = as_opencv(intrinsics.params)
+    uv = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    return np.where(front[:, None], uv, 1e5)
+
+
+def rays(
+    uv: np.ndarray, K: np.ndarray, distortion: np.ndarray
+) -> Float[np.ndarray, "m 2"]:
+    """x/z and y/z of pixels (m, 2), distortion undone.
+
+    Not as often as OpenCV does by default, five times, which leaves up to 25 px at the
+    edge of a wide lens.
+    """
+    if not len(uv):
+        return np.zeros((0, 2))
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-7)
+    uv = np.asarray(uv, float)[:, None]
+    return cv2.undistortPointsIter(uv, K, distortion, None, None, stop)[:, 0]
+
+
+def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Camera matrix and distortion coefficients, as cv2 wants them."""
+    fx, fy, cx, cy = params[:4]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return K, params[4:] if len(params) == 8 else np.zeros(4)
+
+
+def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
+    if model == "SIMPLE_PINHOLE":
+        f, cx, cy = params
+        return np.array([f, f, cx, cy])
+    if model == "SIMPLE_RADIAL":
+        f, cx, cy, k = params
+        return np.array([f, f, cx, cy, k, 0.0, 0.0, 0.0])
+    if model == "RADIAL":
+        f, cx, cy, k1, k2 = params
+        return np.array([f, f, cx, cy, k1, k2, 0.0, 0.0])
+    return params
+
+
+def _focal_from_exif(image: Path, longer_side: float) -> float | None:
+    """px, from the 35 mm equivalent that phones write; None where there is none."""
+    from PIL import Image  # comes with matplotlib
+
+    try:
+        with Image.open(image) as opened:
+            equivalent = opened.getexif().get_ifd(0x8769).get(0xA405)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    if not equivalent or not 5 <= float(equivalent) <= 500:
+        return None
+    _log.info("%s: focal length %s mm (35 mm equivalent).", image.name, equivalent)
+    return float(equivalent) / 36.0 * longer_side

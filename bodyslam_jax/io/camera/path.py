@@ -1,0 +1,97 @@
+"""Camera poses that came with the video -> a pose for each of its frames."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from bodyslam_jax.io.camera.colmap import read_poses
+from bodyslam_jax.io.camera.tum import read_tum
+from bodyslam_jax.io.frame_index import Unfit, Warn, frames_of_names
+from bodyslam_jax.types import CameraPath
+
+_FEWEST = 2
+_LONGEST_GAP = 0.5
+"""s between poses of a trajectory within which frames are interpolated."""
+
+
+def read_camera_path(
+    path: Path,
+    *,
+    timestamps: Float[np.ndarray, " t"],
+    metric: bool,
+    images: tuple[str, ...] = (),
+    warn: Warn,
+) -> CameraPath:
+    """Reads a TUM trajectory, COLMAP's images or nerfstudio's transforms.json.
+
+    A trajectory with as many poses as the video has frames is taken frame by frame,
+    any other by its times; images are matched to frames by the numbers in their names.
+
+    **Raises:** `ValueError`, naming the file, if it is none of these or belongs to
+    another video.
+    """
+    if not path.exists():
+        raise ValueError(f"{path}: no such file, expected a camera path.")
+    if path.is_dir():
+        inside = [path / n for n in ("images.bin", "images.txt", "transforms.json")]
+        path = next((p for p in inside if p.exists()), inside[0])
+        if not path.exists():
+            raise ValueError(
+                f"{path.parent}: no images.bin, images.txt in this folder."
+            )
+    count = len(timestamps)
+    if path.suffix in (".bin", ".json") or path.name == "images.txt":
+        names, poses = read_poses(path)
+        try:
+            frames = frames_of_names(
+                names,
+                what="poses",
+                num_frames=count,
+                images=images,
+                complete=False,
+                warn=warn,
+            )
+        except Unfit as error:
+            raise ValueError(f"{path}: {error}.") from None
+        T_WC, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+        at = [frames[name] for name in names]
+        T_WC[at], known[at] = poses, True
+    else:
+        times, poses = read_tum(path)
+        if len(times) < _FEWEST:
+            raise ValueError(f"{path}: one pose, expected {_FEWEST} or more.")
+        T_WC, known = _at_times(times, poses, timestamps)
+    if known.sum() < _FEWEST:
+        raise ValueError(
+            f"{path}: poses for {known.sum()} of the video's {count} frames, expected "
+            f"{_FEWEST} or more: of another video, or another clock?"
+        )
+    if known.sum() < count:
+        warn(f"{path.name}: poses for {known.sum()} of {count} frames.")
+    return CameraPath(T_WC, known, metric)
+
+
+def _at_times(
+    times: Float[np.ndarray, " n"],
+    poses: Float[np.ndarray, "n 4 4"],
+    timestamps: Float[np.ndarray, " t"],
+) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
+    """Poses at the frames' times, and where there are any."""
+    if len(times) == len(timestamps):
+        return poses, np.ones(len(timestamps), bool)
+    if times[0] > timestamps[-1]:
+        times = times - times[0]  # the recorder's own clock, which began with the video
+    after = np.clip(np.searchsorted(times, timestamps), 1, len(times) - 1)
+    gap = times[after] - times[after - 1]
+    inside = (timestamps >= times[0] - 1e-6) & (timestamps <= times[-1] + 1e-6)
+    known = inside & (gap <= _LONGEST_GAP)
+    at = np.clip(timestamps, times[0], times[-1])
+    T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
+    T_WC[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(
+        at
+    ).as_matrix()
+    for axis in range(3):
+        T_WC[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
+    return T_WC, known

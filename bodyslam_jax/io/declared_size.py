@@ -1,0 +1,112 @@
+"""The size of the images that a file says it is about, against that of the video."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.io.frame_index import Unfit, Warn
+
+Size = tuple[float, float]
+"""Width and height, px."""
+
+_SAME_ASPECT = 0.015
+"""Relative difference of two aspects that is left by rounding to even sizes."""
+_BEYOND = 0.1
+"""Share of the points beyond a size from which the points are not in images of it."""
+
+
+def size_in(path: Path, data: Any) -> Size | None:
+    """The size that the header of a file of keypoints names, or None.
+
+    COCO has it with each image; others as `width` and `height`, or as two numbers under
+    one name: `image_size` and `resolution` with the width first, `img_shape` and
+    `ori_shape`, as MMPose and NumPy have it, with the height first.
+
+    **Raises:** `ValueError` if images of one file differ in size.
+    """
+    if not isinstance(data, dict):
+        return None
+    images = data.get("images")
+    found = {
+        size
+        for image in (images if isinstance(images, list) else [])
+        if isinstance(image, dict) and (size := _pair(image)) is not None
+    }
+    if len(found) > 1:
+        (a, b), (c, d) = sorted(found)[:2]
+        raise ValueError(f"{path}: images of {a:g}x{b:g} px and of {c:g}x{d:g} px.")
+    if found:
+        return found.pop()
+    for part in (data, *(data.get(k) for k in ("meta_info", "dataset_meta", "info"))):
+        if isinstance(part, dict) and (size := _pair(part)) is not None:
+            return size
+    return None
+
+
+def _pair(data: dict[str, Any]) -> Size | None:
+    for width, height in (("width", "height"), ("image_width", "image_height")):
+        if width in data and height in data:
+            return _size(data[width], data[height])
+    for key in ("image_size", "img_size", "resolution"):
+        if (two := _two(data.get(key))) is not None:
+            return _size(*two)
+    for key in ("img_shape", "ori_shape", "image_shape"):
+        if (two := _two(data.get(key))) is not None:
+            return _size(*two[::-1])
+    return None
+
+
+def _two(value: Any) -> tuple[Any, Any] | None:
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) not in (2, 3):
+        return None
+    return value[0], value[1]
+
+
+def _size(width: Any, height: Any) -> Size | None:
+    try:
+        size = float(width), float(height)
+    except (TypeError, ValueError):
+        return None
+    return size if all(np.isfinite(n) and n >= 2 for n in size) else None
+
+
+def factor_to(
+    declared: Size,
+    size: tuple[int, int],
+    points: np.ndarray,
+    what: str,
+    warn: Warn,
+) -> float:
+    """What pixels of images of the size `declared` are multiplied by, for those of the
+    video; by `scaled`.
+
+    Args:
+        points: some of them, (n, 2), to see whether they can be in such images.
+
+    **Raises:** `Unfit` if the images are of another aspect, or turned.
+    """
+    (w, h), (width, height) = declared, size
+    if (w, h) == (width, height):
+        return 1.0
+    names = f"images of {w:g}x{h:g} px, but the video has {width}x{height} px"
+    aspect = (w / h) / (width / height)
+    if abs(np.log(aspect)) > _SAME_ASPECT:
+        turned = abs(np.log((h / w) / (width / height))) < _SAME_ASPECT
+        why = "of the video before it was turned upright" if turned else "cropped"
+        raise Unfit(f"{what} of {names}: {why}, or of another video?")
+    factor = float(np.sqrt(width / w * height / h))
+    outside = (points > np.asarray(declared)).any(axis=-1)
+    if factor > 1 and len(points) and outside.mean() > _BEYOND:
+        warn(
+            f"{what} of {names}, though {100 * outside.mean():.0f} % of them are "
+            "beyond that size: taken as pixels of the video."
+        )
+        return 1.0
+    warn(f"{what} of {names}: multiplied by {factor:.4g}.")
+    return factor
+
+
+def scaled(uv: np.ndarray, factor: float) -> np.ndarray:
+    """Pixels of resized images: corners stay where they are, not pixels' centres."""
+    return (uv + 0.5) * factor - 0.5

@@ -1,0 +1,172 @@
+"""Names of images, or of files about them -> frames of the video.
+
+Tools count from 0, from 1 or from where a longer video was cut, and some leave out the
+images in which they found nobody. What the names leave open is assumed with a warning.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+
+from bodyslam_jax.io.video import IMAGE_SUFFIXES
+
+Warn = Callable[[str], None]
+"""Called with what was guessed or left out: one line, for the report."""
+
+_SUFFIX = re.compile(
+    r"(_keypoints)?\.json$|(" + "|".join(map(re.escape, IMAGE_SUFFIXES)) + r")$", re.I
+)
+
+
+_SPARSEST = 100
+"""Times as many frames as are named, above which the numbers are others: times, say."""
+
+
+class Unfit(ValueError):
+    """What is wrong with a file's content; the caller adds the file's name."""
+
+
+def frames_of_names(
+    names: Iterable[str],
+    *,
+    what: str,
+    num_frames: int | None,
+    images: Sequence[str] = (),
+    complete: bool,
+    warn: Warn,
+) -> dict[str, int]:
+    """The frame that each name means.
+
+    Args:
+        names: of all images that a file lists, with somebody in them or not.
+        what: is numbered by them, for messages.
+        num_frames: of the video; None if only the names can say.
+        images: names of the video's frames, if it is a folder of images.
+        complete: whether the file lists images with nobody in them, too.
+
+    **Raises:** `Unfit` if a name has no number, two mean the same frame, or the video
+    is another one.
+    """
+    names = list(dict.fromkeys(names))
+    if not names:
+        return {}
+    stems = [_stem(name) for name in names]
+    place = {_stem(image): k for k, image in enumerate(images)}
+    if all(stem in place for stem in stems):
+        frames = [place[stem] for stem in stems]
+    else:
+        numbers = _numbers(stems)
+        if numbers is None:
+            bare = next(n for n in names if not re.search(r"\d", _stem(n)))
+            raise Unfit(f"no frame number in the name {bare}")
+        _refuse_two_of_one(names, numbers)
+        frames = _by_image(numbers, list(place), what, warn)
+        if frames is None:
+            first = _first(numbers, num_frames, what, complete, warn)
+            frames = [n - first for n in numbers]
+    _refuse_two_of_one(names, frames)
+    return dict(zip(names, frames, strict=True))
+
+
+def gap_among(images: Sequence[str]) -> str | None:
+    """What to warn of where numbers in the names of a video's images leave some out.
+
+    One in ten may: where more are wide, images were thinned to another rate.
+    """
+    numbers = _numbers([_stem(name) for name in images]) or []
+    steps = [b - a for a, b in zip(numbers, numbers[1:])]
+    if not steps or min(steps) < 1:
+        return None
+    # Numbers that are times are never quite even.
+    usual = sorted(steps)[(len(steps) - 1) // 2]
+    wide = [k for k, step in enumerate(steps) if step >= 2 * usual]
+    if not 0 < len(wide) <= max(1, len(steps) // 10):
+        return None
+    return (
+        f"images: none between {images[wide[0]]} and {images[wide[0] + 1]}"
+        + (f", and {len(wide) - 1} more such gaps" if len(wide) > 1 else "")
+        + "; taken as if each followed the last by one frame."
+    )
+
+
+def _stem(name: str) -> str:
+    """The name without folders and known suffixes; other dots belong to it."""
+    return _SUFFIX.sub("", re.split(r"[/\\]", name)[-1])
+
+
+def _numbers(stems: list[str]) -> list[int] | None:
+    """The last number in each name that tells the names apart; None if one has none.
+
+    `000012_cam1` is 12 beside `000013_cam1`.
+    """
+    groups = [re.findall(r"\d+", stem) for stem in stems]
+    if not all(groups):
+        return None
+    if len({re.sub(r"\d+", "#", stem) for stem in stems}) == 1:
+        for column in reversed(list(zip(*groups, strict=True))):
+            found = [int(digits) for digits in column]
+            if len(set(found)) == len(found):
+                return found
+    return [int(g[-1]) for g in groups]
+
+
+def _refuse_two_of_one(names: list[str], numbers: list[int]) -> None:
+    first: dict[int, str] = {}
+    for name, number in zip(names, numbers, strict=True):
+        if number in first:
+            raise Unfit(f"{first[number]} and {name} are both of frame {number}")
+        first[number] = name
+
+
+def _by_image(
+    numbers: list[int], images: list[str], what: str, warn: Warn
+) -> list[int] | None:
+    """Frames by the numbers of the images themselves; None if those are others."""
+    of_images = (_numbers(images) if images else None) or []
+    place = {n: k for k, n in enumerate(of_images)}
+    if len(place) < len(of_images) or not all(n in place for n in numbers):
+        return None
+    frames = [place[n] for n in numbers]
+    if frames != numbers and max(numbers) < len(images):
+        warn(
+            f"{what} numbered {min(numbers)} to {max(numbers)}: taken as the numbers "
+            f"of the images, which begin at {of_images[0]}."
+        )
+    return frames
+
+
+def _first(
+    numbers: list[int], num_frames: int | None, what: str, complete: bool, warn: Warn
+) -> int:
+    """The number of frame 0."""
+    first, last = min(numbers), max(numbers)
+    unbroken = len(set(numbers)) == last - first + 1
+    if num_frames is None:
+        if last > _SPARSEST * (len(numbers) + 10):
+            raise Unfit(f"{what} of frame {last}, but {len(numbers)} names: no numbers")
+        num_frames = len(numbers) if complete and unbroken else last + 1
+    if unbroken and len(numbers) == num_frames:
+        return first  # also a cut-out of a longer video
+    if first >= 1 and last == num_frames:
+        return 1
+    if last >= num_frames:
+        raise Unfit(
+            f"{what} of frames {first} to {last}, but the video has {num_frames} frames"
+        )
+    if first == 0:
+        if complete and unbroken:
+            warn(
+                f"{what} numbered 0 to {last} for {num_frames} frames: taken as "
+                "counted "
+                f"from 0, the first {len(numbers)}; but what writes every frame that "
+                "it "
+                "sees has been given fewer, perhaps every n-th."
+            )
+        return 0
+    # Whoever lists every image would have listed number 0, but some have been deleted
+    # where there are gaps.
+    zero = 1 if complete and unbroken and first == 1 else 0
+    warn(
+        f"{what} numbered {first} to {last} for {num_frames} frames: taken as counted "
+        f"from {zero}."
+    )
+    return zero

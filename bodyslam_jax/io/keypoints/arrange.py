@@ -1,0 +1,143 @@
+"""Points as a file lists them -> BODY_25: broken values, the order, x and y."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.io.frame_index import Warn
+from bodyslam_jax.io.keypoints.files import Listed
+from bodyslam_jax.io.keypoints.layout_evidence import choose_layout
+from bodyslam_jax.io.keypoints.layouts import LAYOUTS, VITPOSE, from_layout, to_body25
+from bodyslam_jax.io.keypoints.lying import lying
+from bodyslam_jax.io.keypoints.names import layout_of
+
+_MOST = 0.5
+"""Share of the people and frames without a usable point from which a file is broken."""
+_USABLE = 4
+"""Points that are enough for a person."""
+_ALL_LIE = 0.85
+"""Share of the people and frames who lie on their side from which it is no posture."""
+_AGREED = 0.7
+_FACE = {0, 15, 16}
+_FEWEST = 10
+
+
+def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "25 3"]]:
+    """For each row of a file its points in BODY_25's order, (u px, v px, confidence).
+
+    Which order they are in is told by the names that the file gives them, else by their
+    number, unless geometry says clearly that it is another of as many points. A value
+    that is no number makes its point a missing one.
+
+    **Raises:** `ValueError`, naming the file, if most is broken, or no known order of
+    so many points is that of a body.
+    """
+    raw = [points for _, points, _ in listed.rows]
+    found: list[np.ndarray] = [np.zeros((25, 3))] * len(raw)
+    counts = np.array([len(points) for points in raw], dtype=np.int64)
+    layout = None if listed.parts is None else layout_of(listed.parts)
+    if listed.parts is not None and layout is None:
+        named = ", ".join(listed.parts[:4])
+        warn(f"keypoints: named {named}, ..., which are no body's: names not used.")
+    points_of = {int(n): np.flatnonzero(counts == n) for n in np.unique(counts)}
+    whole = _whole(path, raw, warn)
+    for num, rows in points_of.items():
+        points = np.stack([whole[k] for k in rows])
+        if listed.row_first:
+            points = points[..., [1, 0, 2]]
+        points, order = _in_order(path, points, layout, listed, warn)
+        from_rows = order is VITPOSE and not listed.row_first
+        points = _right_way_round(points, _FACE <= set(order), from_rows, warn)
+        for k, row in zip(rows, points, strict=True):
+            found[k] = row
+    return found
+
+
+def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
+    """The same with points of confidence 0 where a number is missing or infinite."""
+    broken, total, lost = 0, 0, 0
+    whole = []
+    for points in raw:
+        finite = np.asarray(np.isfinite(points).all(axis=-1))
+        # Without confidence it is no error that there is no place.
+        bad = ~finite & ~(points[:, 2] <= 0)
+        broken, total = broken + int(bad.sum()), total + len(points)
+        lost += bool(bad.any()) and int((finite & (points[:, 2] > 0)).sum()) < _USABLE
+        whole.append(np.where(finite[:, None], points, 0.0))
+    if lost > _MOST * len(raw):
+        raise ValueError(
+            f"{path}: {broken} of {total} keypoints with NaN or infinity, so that "
+            f"{lost} of {len(raw)} people have fewer than {_USABLE} left."
+        )
+    if broken:
+        warn(
+            f"keypoints: {broken} of {total} have NaN, null or infinity in them: taken "
+            "as missing."
+        )
+    return whole
+
+
+def _in_order(
+    path: Path,
+    points: np.ndarray,
+    layout: list[int] | None,
+    listed: Listed,
+    warn: Warn,
+) -> tuple[np.ndarray, list[int]]:
+    """BODY_25, and the layout that it was in."""
+    num = points.shape[1]
+    if layout is not None and listed.parts is not None:
+        if len(layout) != num:
+            raise ValueError(
+                f"{path}: names of {len(layout)} keypoints, but {num} a person."
+            )
+        return from_layout(points, layout), layout
+    known = LAYOUTS.get(num)
+    if known is None:
+        return to_body25(path, points), list(range(25))
+    choice = choose_layout(points, known)
+    usual = next(iter(known))
+    if not choice.known:
+        raise ValueError(
+            f"{path}: {num} keypoints a person in no known order: as "
+            f"{', '.join(known)} limbs are longer than anybody's; give them in "
+            f"{usual}'s order, or in a file that names them (`keypoint_names`)."
+        )
+    if choice.odd:
+        warn(
+            f"keypoints: {num} a person fit a body badly as {usual} (log-likelihood "
+            f"{choice.nats[usual]:.1f} a point, usually more than 1): in another order?"
+        )
+    if choice.changed:
+        warn(
+            f"keypoints: {num} a person taken as {choice.layout}, not as {usual}: by "
+            "the distances between them, log-likelihoods a point "
+            f"{choice.nats[choice.layout]:.1f} and {choice.nats[usual]:.1f}."
+        )
+    return from_layout(points, known[choice.layout]), known[choice.layout]
+
+
+def _right_way_round(
+    points: np.ndarray, has_face: bool, from_rows: bool, warn: Warn
+) -> np.ndarray:
+    """The same with x and y exchanged if that, and no turn, puts people upright.
+
+    Args:
+        from_rows: whether the layout is of a tool that writes (y, x).
+    """
+    found = lying(points, has_face)
+    if len(points) < _FEWEST or found.share < _ALL_LIE:
+        return points
+    share = f"people lie on their side, head to the left, {100 * found.share:.0f} %"
+    if from_rows or found.mirrored >= _AGREED:
+        why = "and easy_ViTPose, whose order this is, writes (y, x)"
+        if not from_rows:
+            why = "and their faces and feet are those of a mirror image"
+        warn(f"keypoints: {share} of the time, {why}: taken as (y, x), not (x, y).")
+        return points[..., [1, 0, 2]]
+    warn(
+        f"keypoints: {share} of the time: if they do not, these are (y, x) in place of "
+        "(x, y), or of the video before it was turned upright."
+    )
+    return points

@@ -1,0 +1,221 @@
+"""Detections in no order -> people: who is who from frame to frame.
+
+Hungarian assignment on a mix of keypoint distance and box overlap, both relative to the
+person's size, against positions predicted at constant velocity.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from bodyslam_jax.config import Association
+from bodyslam_jax.io.keypoints.reader import Detections
+from bodyslam_jax.types import Keypoints
+
+_EXCHANGED = np.array(
+    [0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11]
+    + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
+)
+"""BODY_25 with left and right exchanged."""
+_FEWEST, _MANY = 3, 8
+"""Keypoints from which sizes are compared, and are comparable."""
+_GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
+"""Ratio of sizes from which it is somebody else."""
+_SEEN = 0.05
+"""Confidence from which a keypoint counts in comparing people."""
+
+
+@dataclasses.dataclass
+class _Person:
+    number: int
+    frame: int
+    """When they were last seen."""
+    points: np.ndarray
+    """(25, 3): u px, v px, confidence; what is hidden has gone along with the rest."""
+    velocity: np.ndarray
+    hidden: np.ndarray
+    """(25,): frames since each keypoint was last seen."""
+
+    def predict(self, frame: int) -> np.ndarray:
+        """Keypoints (25, 3) expected in `frame`; motion fades while unseen."""
+        gap = min(frame - self.frame, 5)
+        last = self.points.copy()
+        last[:, :2] += gap * self.velocity
+        return last
+
+    def extend(self, frame: int, points: np.ndarray, max_gap: int) -> None:
+        gap = frame - self.frame
+        seen = points[:, 2] > _SEEN
+        both = seen & (self.points[:, 2] > _SEEN)
+        moved = self.velocity
+        if both.sum() >= _FEWEST:
+            moved = np.median((points - self.points)[both, :2], axis=0) / gap
+            self.velocity = 0.7 * self.velocity + 0.3 * moved
+        # Whoever is half hidden is still as large as before.
+        self.hidden = np.where(seen, 0, self.hidden + gap)
+        kept = ~seen & (self.points[:, 2] > _SEEN) & (self.hidden <= max_gap)
+        points = points.copy()
+        points[kept] = self.points[kept]
+        points[kept, :2] += gap * moved
+        self.frame, self.points = frame, points
+
+
+@dataclasses.dataclass(frozen=True)
+class _Track:
+    """All that was seen of one person."""
+
+    frames: list[int]
+    points: list[np.ndarray]
+
+    def presence(self) -> float:
+        """How much there is to see: confidence times size, over time."""
+        return sum(float(p[:, 2].sum()) * _size(p) for p in self.points)
+
+
+def associate(
+    detections: Detections,
+    config: Association,
+    fps: float,
+    given: list[np.ndarray] | None = None,
+) -> tuple[Keypoints, tuple[str, ...]]:
+    """People found in the detections of `t` frames, the best seen first.
+
+    Whoever is seen for less than `config.min_duration` is dropped, unless that is
+    everybody, and so is who is beyond `config.max_people`.
+
+    Args:
+        given: for each frame who each detection is, where that is known: the same
+            number is the same person, and people keep the order of their numbers.
+    """
+    found = given
+    if found is None:
+        found = identify(detections, max(1, round(config.max_gap * fps)))
+    people = _collect(detections, found)
+    least = min(max(1, round(config.min_duration * fps)), len(detections))
+    kept = [p for p in people if len(p.frames) >= least] or people
+    brief = len(people) - len(kept)
+    best = sorted(kept, key=_Track.presence, reverse=True)[: config.max_people]
+    warnings: list[str] = []
+    if len(kept) > len(best):
+        dropped = len(kept) - len(best)
+        warnings.append(f"{dropped} less visible people dropped (max_people).")
+    if brief:
+        who = "1 person" if brief == 1 else f"{brief} people"
+        warnings.append(
+            f"{who} seen for less than {config.min_duration:g} s dropped "
+            "(min_duration)."
+        )
+    if given is None:
+        warnings += _returns(best)
+    else:
+        best = [p for p in kept if any(p is b for b in best)]
+    uvc = np.zeros((len(best), len(detections), 25, 3))
+    for row, person in zip(uvc, best, strict=True):
+        row[person.frames] = np.stack(person.points)
+    return Keypoints(uvc[..., :2], uvc[..., 2]), tuple(warnings)
+
+
+def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
+    """For each frame who its `n` detections are, (n,): people numbered from 0.
+
+    Args:
+        max_gap: frames that a person may be unseen and still be recognised.
+    """
+    people: list[_Person] = []
+    found = []
+    for frame, seen in enumerate(detections):
+        alive = [p for p in people if frame - p.frame <= max_gap]
+        who = np.full(len(seen), -1)
+        if alive and len(seen):
+            cost = np.array([[_cost(p, frame, d) for d in seen] for p in alive])
+            rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
+            for i, j in zip(rows, columns, strict=True):
+                if cost[i, j] < 1:
+                    alive[i].extend(frame, seen[j], max_gap)
+                    who[j] = alive[i].number
+        for j in np.flatnonzero(who < 0):
+            who[j] = len(people)
+            unseen = np.zeros(len(seen[j]), int)
+            people.append(_Person(len(people), frame, seen[j], np.zeros(2), unseen))
+        found.append(who)
+    return found
+
+
+def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
+    people: dict[int, _Track] = {}
+    for frame, (seen, who) in enumerate(zip(detections, found, strict=True)):
+        for points, number in zip(seen, who.tolist(), strict=True):
+            person = people.setdefault(number, _Track([], []))
+            person.frames.append(frame)
+            person.points.append(points)
+    return [people[number] for number in sorted(people)]
+
+
+def _returns(people: list[_Track]) -> list[str]:
+    """Whoever appears after another has left may be that other, and is said to be."""
+    warnings = []
+    for j, person in enumerate(people):
+        begin = person.frames[0]
+        gone = [i for i, p in enumerate(people) if p.frames[-1] < begin]
+        if gone:
+            i = max(gone, key=lambda i: people[i].frames[-1])
+            warnings.append(
+                f"person {j} may be person {i}: the one begins in frame {begin}, the "
+                f"other was last seen in frame {people[i].frames[-1]}."
+            )
+    return warnings
+
+
+def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
+    """0 for the same place, 1 where it may no longer be the same person."""
+    expected = person.predict(frame)
+    both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    if not both.any():
+        return np.inf
+    size = max(_size(points), _size(expected), 1.0)
+    # The median forgives a swapped or lost limb, which a mean would not; whoever is
+    # named left for right in all of them is the same person, too.
+    other = points[_EXCHANGED]
+    crossed = (other[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    away = lambda p, seen: np.median(np.linalg.norm((p - expected)[seen, :2], axis=-1))
+    distance = away(points, both)
+    if crossed.any():
+        distance = min(distance, away(other, crossed))
+    distance = distance / size
+    gap = frame - person.frame
+    reach = 0.2 + 0.02 * (gap - 1)
+    if not _as_large(points, expected):
+        return np.inf
+    return float(0.7 * distance / reach + 0.3 * (1 - _overlap(points, expected)))
+
+
+def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether somebody may be as large as another, by the keypoints that both show."""
+    both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    if both.sum() < _FEWEST:
+        return True
+    most = _GROWTH if both.sum() >= _MANY else _GROWTH_OF_FEW
+    growth = _size(points[both]) / max(_size(expected[both]), 1.0)
+    return 1 / most < growth < most
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    seen = points[points[:, 2] > _SEEN][:, :2]
+    if not len(seen):
+        return np.zeros((2, 2))
+    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+
+
+def _size(points: np.ndarray) -> float:
+    """Longer side of the box around a person, px."""
+    box = _box(points)
+    return float((box[1] - box[0]).max())
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of the boxes around two people."""
+    p, q = _box(a), _box(b)
+    shared = np.clip(np.minimum(p[1], q[1]) - np.maximum(p[0], q[0]), 0, None).prod()
+    union = (p[1] - p[0]).prod() + (q[1] - q[0]).prod() - shared
+    return float(shared / union) if union > 0 else 0.0

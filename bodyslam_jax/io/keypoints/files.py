@@ -1,0 +1,262 @@
+"""Keypoint files of any common detector, as they are: names of images, and who is seen.
+
+Which frame a name means is for `frame_index.py` to say.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.io.archive import numbers, open_npz
+from bodyslam_jax.io.declared_size import Size, size_in
+from bodyslam_jax.io.keypoints.names import names_in
+
+_JSON_SUFFIX = "_keypoints.json"
+_SMALL = 300
+"""Numbers or names of an array that may say something of all the others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Listed:
+    """The content of a file, before it is known which frames its names mean, and which
+    parts of the body its points are."""
+
+    rows: list[tuple[str, np.ndarray, int]]
+    """Name of the image, keypoints (j, 3), which may not be finite, and who it is, or
+    -1."""
+    names: list[str]
+    """All images that are listed, with somebody in them or not."""
+    complete: bool = True
+    """Whether images with nobody in them are listed, too."""
+    parts: tuple[str, ...] | None = None
+    """Names of the `j` points, if the file has them."""
+    row_first: bool = False
+    """Whether the tool writes (y, x)."""
+    size: Size | None = None
+    """Of the images that the points are in, px, if the file says so."""
+
+
+def read_openpose(folder: Path) -> Listed:
+    files = sorted(folder.glob(f"*{_JSON_SUFFIX}")) or sorted(folder.glob("*.json"))
+    if not files:
+        raise ValueError(f"{folder}: no *{_JSON_SUFFIX} in this folder.")
+    rows = []
+    for file in files:
+        rows += [(file.name, *found) for found in _read_openpose_frame(file)]
+    return Listed(rows, [f.name for f in files])
+
+
+def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
+    data = _load_json(file)
+    people = data.get("people") if isinstance(data, dict) else None
+    if not isinstance(people, list):
+        raise ValueError(f"{file}: no list `people`, so not OpenPose's output.")
+    found = []
+    for person in people:
+        if not isinstance(person, dict):
+            raise ValueError(f"{file}: `people` holds {type(person).__name__}s.")
+        flat = person.get("pose_keypoints_2d", person.get("pose_keypoints"))
+        if flat is None:
+            raise ValueError(f"{file}: a person without `pose_keypoints_2d`.")
+        found.append((_triples(file, flat), _who(file, person, "person_id")))
+    return found
+
+
+def read_json(path: Path) -> Listed:
+    data = _load_json(path)
+    for recognise, read in _JSON_READERS:
+        if recognise(data):
+            return read(path, data)
+    what = list(data)[:5] if isinstance(data, dict) else type(data).__name__
+    raise ValueError(
+        f"{path}: neither AlphaPose, MMPose, COCO nor easy_ViTPose keypoints, but "
+        f"{what}."
+    )
+
+
+def _is_flat_list(data: Any) -> bool:
+    """AlphaPose and COCO results: one entry per person."""
+    return (
+        isinstance(data, list)
+        and len(data) > 0
+        and all(
+            isinstance(e, dict) and {"image_id", "keypoints"} <= set(e) for e in data
+        )
+    )
+
+
+def _read_flat_list(path: Path, data: Any) -> Listed:
+    rows = [
+        (
+            str(e["image_id"]),
+            _triples(path, e["keypoints"]),
+            _who(path, e, "idx", "track_id"),
+        )
+        for e in data
+    ]
+    if all(who == 0 for _, _, who in rows):
+        # What AlphaPose writes for everybody where it does not track.
+        rows = [(name, points, -1) for name, points, _ in rows]
+    return Listed(rows, [name for name, _, _ in rows], complete=False)
+
+
+def _read_coco(path: Path, data: Any) -> Listed:
+    """COCO annotations: images have numbers and names, of which the name counts."""
+    try:
+        name = {i["id"]: str(i.get("file_name", i["id"])) for i in data["images"]}
+        rows = [
+            (
+                name[a["image_id"]],
+                _triples(path, a["keypoints"]),
+                _who(path, a, "track_id"),
+            )
+            for a in data["annotations"]
+            if "keypoints" in a
+        ]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: incomplete COCO annotations ({error}).") from None
+    return Listed(
+        rows, list(name.values()), parts=_parts(data), size=size_in(path, data)
+    )
+
+
+def _read_mmpose(path: Path, data: Any) -> Listed:
+    rows, names = [], []
+    try:
+        for i, info in enumerate(data["instance_info"]):
+            names.append(str(int(info.get("frame_id", i))))
+            for person in info["instances"]:
+                xy = _array(path, person["keypoints"])
+                score = _array(path, person["keypoint_scores"])
+                if xy.shape != (len(score), 2):
+                    raise ValueError(
+                        f"{path}: {xy.shape} keypoints, {len(score)} scores."
+                    )
+                points = np.concatenate([xy, score[:, None]], axis=-1)
+                who = _who(path, person, "track_id")
+                rows.append((names[-1], points, who))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: incomplete MMPose result ({error!r}).") from None
+    return Listed(rows, names, parts=_parts(data), size=size_in(path, data))
+
+
+def _is_by_frame(data: Any) -> bool:
+    """easy_ViTPose: people by number, in a list of frames."""
+    frames = data.get("keypoints") if isinstance(data, dict) else None
+    return isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
+
+
+def _read_by_frame(path: Path, data: Any) -> Listed:
+    """easy_ViTPose: `keypoints`, for each frame `{person: [[y, x, score], ...]}`."""
+    rows = [
+        (str(k), _triples(path, points), _who(path, {"id": person}, "id"))
+        for k, found in enumerate(data["keypoints"])
+        for person, points in found.items()
+    ]
+    return Listed(
+        rows,
+        [str(k) for k in range(len(data["keypoints"]))],
+        parts=_parts(data),
+        row_first=True,
+        size=size_in(path, data),
+    )
+
+
+def _parts(data: Any) -> tuple[str, ...] | None:
+    found = names_in(data)
+    return None if found is None else tuple(found)
+
+
+def _has(*keys: str) -> Callable[[Any], bool]:
+    return lambda data: isinstance(data, dict) and set(keys) <= set(data)
+
+
+_JSON_READERS: list[tuple[Callable[[Any], bool], Callable[[Path, Any], Listed]]] = [
+    (_is_flat_list, _read_flat_list),
+    (_has("annotations", "images"), _read_coco),
+    (_has("instance_info"), _read_mmpose),
+    (_is_by_frame, _read_by_frame),
+]
+
+
+def read_npz(path: Path, num_frames: int | None) -> Listed:
+    """Generic: `keypoints` (t, j, 3) or (h, t, j, 3), or `uv` and `confidence`.
+
+    Without an axis of people it is one person; with one, each is who it is.
+    """
+    with open_npz(path) as archive:
+        if "keypoints" in archive.files:
+            points = numbers(path, archive, "keypoints", finite=False)
+        elif {"uv", "confidence"} <= set(archive.files):
+            uv, confidence = (
+                numbers(path, archive, k, finite=False) for k in ("uv", "confidence")
+            )
+            if uv.shape != (*confidence.shape, 2):
+                raise ValueError(
+                    f"{path}: uv {uv.shape}, confidence {confidence.shape}."
+                )
+            points = np.concatenate([uv, confidence[..., None]], axis=-1)
+        else:
+            raise ValueError(f"{path}: no array `keypoints`, only {archive.files}.")
+        header = {k: archive[k] for k in archive.files if archive[k].size < _SMALL}
+    header = {k: v.tolist() for k, v in header.items() if v.dtype.kind in "fiuU"}
+    if points.ndim == 3:
+        points = points[None]
+    if points.ndim != 4 or points.shape[-1] != 3:
+        raise ValueError(f"{path}: keypoints {points.shape}, not (t, j, 3).")
+    if num_frames is not None and points.shape[1] != num_frames:
+        raise ValueError(
+            f"{path}: keypoints of {points.shape[1]} frames, but the video has "
+            f"{num_frames}."
+        )
+    rows = [
+        (str(k), points[h, k], int(h))
+        for h, k in np.argwhere(~(points[..., 2] <= 0).all(axis=-1))
+    ]
+    return Listed(
+        rows,
+        [str(k) for k in range(points.shape[1])],
+        parts=_parts(header),
+        size=size_in(path, header),
+    )
+
+
+def _load_json(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file}: not a JSON file ({error}).") from None
+
+
+def _array(path: Path, values: Any) -> np.ndarray:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{path}: keypoints that are not numbers.") from None
+    return array
+
+
+def _triples(path: Path, flat: Any) -> np.ndarray:
+    array = _array(path, flat)
+    if array.ndim == 1 and array.size and array.size % 3 == 0:
+        array = array.reshape(-1, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{path}: {array.shape} keypoints, not triples (u, v, score).")
+    return array
+
+
+def _who(path: Path, entry: dict, *keys: str) -> int:
+    """The number that a tool gave a person it followed, alone or in a list; or -1."""
+    value = next((entry[k] for k in keys if k in entry), None)
+    while isinstance(value, list):
+        value = value[0] if value else None
+    if value is None:
+        return -1
+    try:
+        return int(value)
+    except (TypeError, ValueError, OverflowError):
+        return -1  # a name, say; people are then told apart by where they are

@@ -1,0 +1,186 @@
+"""Which order keypoints are in, told by geometry.
+
+Points that are neighbours on a body are near each other in the image, as near as bones
+are long at most. Under each layout every point has neighbours; how likely the distances
+to them are, of a heavy-tailed density as wide as the bone is long, tells layouts apart.
+A point that a layout has no name for is somewhere about the body. No posture, direction
+of view or orientation in the image goes into it, and neither does the number of points
+that are seen. Of real and simulated people the right order is 1.3 nats a point or more,
+a random one 0 ± 0.4 and at most 1.0; two known orders are 0.6 or more apart.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, NUM_PARTS, SPINE
+
+_SEEN = 0.05
+_SURE = 0.3
+_FEWEST_POINTS = 6
+"""Of a person, in a frame, to say anything."""
+_FEWEST_PEOPLE = 5
+_MANY_POINTS = 12
+"""From which an order that fits nobody is no half of a body."""
+_PLAUSIBLE = 1.1
+"""Nats a point: less may be chance."""
+_MARGIN = 0.3
+"""Nats a point by which another order must be better."""
+_AGREED = 0.8
+"""Share of the people and frames that must say the same."""
+_NOBODY, _ODD = 0.1, 0.7
+"""Nats a point, below which a layout explains nothing, no layout at all having 0.4; and
+below which it hardly does."""
+_ALIVE = 0.02
+"""Change of posture, of a person's size, without which it is no person's."""
+_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7)
+"""m, that the seen points of a person are about their middle: half a body is less."""
+_BREADTH = 0.6
+"""m, of what no neighbour tells."""
+
+_BONES = (  # parts of the right side, of the left side, m
+    ((2, 3), (5, 6), 0.28),
+    ((3, 4), (6, 7), 0.25),
+    ((9, 10), (12, 13), 0.40),
+    ((10, 11), (13, 14), 0.40),
+    ((2, 9), (5, 12), 0.50),
+    ((15, 17), (16, 18), 0.09),
+    ((0, 15), (0, 16), 0.05),
+    ((0, 17), (0, 18), 0.11),
+    ((1, 2), (1, 5), 0.17),
+    ((8, 9), (8, 12), 0.10),
+    ((17, 2), (18, 5), 0.25),
+    ((11, 24), (14, 21), 0.07),
+    ((11, 22), (14, 19), 0.17),
+    ((11, 23), (14, 20), 0.16),
+    ((22, 23), (19, 20), 0.08),
+    ((24, 22), (21, 19), 0.22),
+    ((24, 23), (21, 20), 0.20),
+)
+_BETWEEN = (
+    ((2, 5), 0.33),
+    ((9, 12), 0.20),
+    ((15, 16), 0.06),
+    ((17, 18), 0.14),
+    ((0, 1), 0.22),
+    ((1, 8), 0.50),
+    ((HEAD_TOP, 0), 0.15),
+    ((HEAD_TOP, 1), 0.28),
+    ((SPINE, 8), 0.20),
+    ((SPINE, 1), 0.30),
+)
+_NEIGHBOURS = [(a, m) for r, l, m in _BONES for a in (r, l)] + list(_BETWEEN)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Which layout keypoints are in."""
+
+    layout: str
+    changed: bool
+    """Whether it is another one than is assumed by their number."""
+    known: bool
+    """Whether any layout explains them."""
+    odd: bool
+    """Whether the layout hardly explains them, better than chance though."""
+    nats: dict[str, float]
+    """How well each explains them: nats a point."""
+
+
+def choose_layout(
+    points: Float[np.ndarray, "n j 3"], layouts: Mapping[str, list[int]]
+) -> Choice:
+    """The layout of `n` people in frames, of those given, the first the usual one.
+
+    Another than the first is chosen only where it is plausible, much better, and better
+    for nearly everybody, and where postures change.
+    """
+    first = next(iter(layouts))
+    seen = points[..., 2] > _SEEN
+    enough = seen.sum(axis=1) >= _FEWEST_POINTS
+    points, seen = points[enough], seen[enough]
+    if not len(points):
+        return Choice(first, False, True, False, {})
+    nats = {name: likelihood(points, seen, la) for name, la in layouts.items()}
+    mean = {name: float(value.mean()) for name, value in nats.items()}
+    best = max(mean, key=lambda name: mean[name])
+    better = nats[best] > nats[first]
+    if (
+        best != first
+        and mean[best] >= _PLAUSIBLE
+        and mean[best] - mean[first] >= _MARGIN
+        and better.mean() >= _AGREED
+        and _changes(points, seen)
+    ):
+        return Choice(best, True, True, False, mean)
+    many = seen.sum(axis=1) >= _MANY_POINTS
+    least = float(nats[first][many].mean()) if many.sum() >= _FEWEST_PEOPLE else np.inf
+    doubtful = least < _ODD and _changes(points[many], seen[many])
+    none = doubtful and least < _NOBODY and max(mean.values()) < _PLAUSIBLE
+    return Choice(first, False, not none, doubtful and not none, mean)
+
+
+def likelihood(
+    points: Float[np.ndarray, "n j 3"], seen: Bool[np.ndarray, "n j"], layout: list[int]
+) -> Float[np.ndarray, " n"]:
+    """How well a layout explains each of `n` people: nats a point seen, of a density
+    over the plane in which the root mean square from the middle is 0.5."""
+    uv = _normalised(points, seen)
+    num = len(points)
+    place, there = np.zeros((num, NUM_PARTS, 2)), np.zeros((num, NUM_PARTS), dtype=bool)
+    for k, part in enumerate(layout):
+        if part >= 0:
+            place[:, part], there[:, part] = uv[:, k], seen[:, k]
+    pairs = [
+        (a, b, length, ((place[:, a] - place[:, b]) ** 2).sum(axis=-1))
+        for (a, b), length in _NEIGHBOURS
+    ]
+    found = np.full(num, -np.inf)
+    for size in _SCALES:
+        total, count = np.zeros((num, NUM_PARTS)), np.zeros((num, NUM_PARTS))
+        for a, b, length, square in pairs:
+            both = there[:, a] & there[:, b]
+            value = both * _density(square * size**2, 0.8 * length)
+            for part in (a, b):
+                total[:, part] += value
+                count[:, part] += both
+        alone = _density((uv**2).sum(axis=-1) * size**2, _BREADTH)
+        sums = np.zeros(num)
+        for k, part in enumerate(layout):
+            if part >= 0:
+                near = total[:, part] / np.maximum(count[:, part], 1)
+                value = np.where(count[:, part] > 0, near, alone[:, k])
+            else:
+                value = alone[:, k]
+            sums += seen[:, k] * value
+        mean = sums / np.maximum(seen.sum(axis=1), 1)
+        found = np.maximum(found, mean + 2 * np.log(size / 0.5))
+    return found
+
+
+def _density(square: np.ndarray, width: float) -> np.ndarray:
+    """Logarithm of Student's t of two degrees of freedom in the plane, up to 1/2π."""
+    return -2 * np.log(width) - 2 * np.log1p(square / (2 * width**2))
+
+
+def _normalised(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Places about the middle of the points seen, of which the RMS is 1."""
+    count = np.maximum(seen.sum(axis=1), 1)[:, None]
+    uv = (
+        points[..., :2]
+        - ((points[..., :2] * seen[..., None]).sum(axis=1) / count)[:, None]
+    )
+    square = ((uv**2).sum(axis=-1) * seen).sum(axis=1, keepdims=True) / count
+    return uv / np.sqrt(np.maximum(square, 1e-12))[..., None]
+
+
+def _changes(points: np.ndarray, seen: np.ndarray) -> bool:
+    """Whether postures differ: points that always lie alike are no moving person."""
+    often = seen.mean(axis=0) > 0.5
+    if not often.any():
+        return True
+    uv = np.where(seen[..., None], _normalised(points, seen), np.nan)[:, often]
+    away = uv - np.nanmedian(uv, axis=0)
+    return bool(np.nanmedian(np.linalg.norm(away, axis=-1)) > _ALIVE)

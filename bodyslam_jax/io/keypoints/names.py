@@ -1,0 +1,137 @@
+"""Names that files give their keypoints -> parts of the body."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, SPINE
+
+_MIDDLE = {
+    "nose": 0,
+    "neck": 1,
+    "thorax": 1,
+    "midshoulder": 1,
+    "hip": 8,
+    "hips": 8,
+    "midhip": 8,
+    "hipcenter": 8,
+    "hipscenter": 8,
+    "centerhip": 8,
+    "pelvis": 8,
+    "root": 8,
+    "head": HEAD_TOP,
+    "headtop": HEAD_TOP,
+    "tophead": HEAD_TOP,
+    "spine": SPINE,
+    "torso": SPINE,
+}
+_SIDED = {  # right, left
+    "shoulder": (2, 5),
+    "sho": (2, 5),
+    "elbow": (3, 6),
+    "elb": (3, 6),
+    "wrist": (4, 7),
+    "wri": (4, 7),
+    "hip": (9, 12),
+    "knee": (10, 13),
+    "ankle": (11, 14),
+    "ank": (11, 14),
+    "eye": (15, 16),
+    "ear": (17, 18),
+    "bigtoe": (22, 19),
+    "toe": (22, 19),
+    "footindex": (22, 19),
+    "smalltoe": (23, 20),
+    "littletoe": (23, 20),
+    "heel": (24, 21),
+}
+_ELSE = {"hand": (4, 7), "foot": (11, 14)}
+"""What some call wrist and ankle, where nothing else is called so."""
+_RIGHT, _LEFT = {"right", "r"}, {"left", "l"}
+_LIMBS = {2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14}
+_FEWEST = 8
+"""Of the twelve joints of the limbs: as many must be named."""
+
+
+def layout_of(names: Sequence[Any]) -> list[int] | None:
+    """For each name its part, as in `LAYOUTS`; None if these are no body's names."""
+    words = [_words(str(name)) for name in names]
+    layout = [_part(side, rest, _SIDED) for side, rest in words]
+    for place, (side, rest) in enumerate(words):
+        part = _part(side, rest, _ELSE)
+        if part >= 0 and part not in layout:
+            layout[place] = part
+    taken: set[int] = set()
+    for place, part in enumerate(layout):
+        # The first counts: `head` before `head_top`, say.
+        if part in taken:
+            layout[place] = -1
+        taken.add(part)
+    return layout if len(_LIMBS & set(layout)) >= _FEWEST else None
+
+
+def names_in(data: Any) -> list[str] | None:
+    """The names of keypoints that a JSON file's header gives, in order; or None.
+
+    easy_ViTPose has `skeleton`, by index; MMPose `keypoint_id2name` in its metadata;
+    COCO lists of `keypoints` in `categories`; others plain lists.
+    """
+    if not isinstance(data, dict):
+        return None
+    for key in ("meta_info", "dataset_meta", "metadata", "meta", "info"):
+        if (found := names_in(data.get(key))) is not None:
+            return found
+    for key in _KEYS:
+        if (found := _listed(data.get(key))) is not None:
+            return found
+    by_name = data.get("keypoint_name2id")
+    if isinstance(by_name, dict):
+        return _listed({v: k for k, v in by_name.items()})
+    categories = data.get("categories")
+    for category in categories if isinstance(categories, list) else []:
+        if isinstance(category, dict) and (found := _listed(category.get("keypoints"))):
+            return found
+    return None
+
+
+_KEYS = ("keypoint_id2name", "skeleton", "keypoint_names", "keypoints_names")
+_KEYS += ("joint_names", "keypoint_labels", "names", "bodyparts")
+
+
+def _listed(value: Any) -> list[str] | None:
+    """Names in order, of a list or by index; None if it is something else."""
+    if isinstance(value, dict):
+        try:
+            value = {int(k): v for k, v in value.items()}
+        except (TypeError, ValueError):
+            return None
+        if sorted(value) != list(range(len(value))):
+            return None
+        value = [value[k] for k in range(len(value))]
+    if not isinstance(value, list) or not value:
+        return None
+    return value if all(isinstance(name, str) for name in value) else None
+
+
+def _words(name: str) -> tuple[str, str]:
+    """Which side a name says, `r`, `l` or nothing, and the rest of it, joined."""
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name)
+    words = [w for w in re.split(r"[^a-z0-9]+", name.lower()) if w]
+    side = next((w for w in words if w in _RIGHT | _LEFT), "")
+    if side:
+        words.remove(side)
+    elif len(words) == 1 and words[0][:1] in ("l", "r") and words[0][1:] in _SIDED:
+        side, words = words[0][0], [words[0][1:]]
+    elif len(words) == 1:
+        for long in ("right", "left"):
+            if words[0].startswith(long) and words[0] != long:
+                side, words = long, [words[0].removeprefix(long)]
+    if words and words[-1] in ("joint", "keypoint"):
+        words.pop()
+    return side[:1], "".join(words)
+
+
+def _part(side: str, rest: str, sided: dict[str, tuple[int, int]]) -> int:
+    if side and rest in sided:
+        return sided[rest][side == "l"]
+    return _MIDDLE.get(rest, -1) if not side else -1

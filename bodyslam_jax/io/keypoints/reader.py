@@ -1,0 +1,167 @@
+"""Keypoint files of any common detector -> people in BODY_25 order, in pixels.
+
+A reader gives what each frame holds, in no order, and who is who if the file says so;
+`keypoints/associate.py` makes people of it.
+"""
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from bodyslam_jax.io.declared_size import Size, factor_to, scaled
+from bodyslam_jax.io.frame_index import Unfit, Warn, frames_of_names
+from bodyslam_jax.io.keypoints.arrange import arranged
+from bodyslam_jax.io.keypoints.files import read_json, read_npz, read_openpose
+from bodyslam_jax.io.keypoints.turned import turned_back
+
+_log = logging.getLogger(__name__)
+
+Detections = list[np.ndarray]
+"""For each frame the keypoints (n, 25, 3) of `n` people: u px, v px, confidence."""
+
+_SURE = 0.3
+"""Confidence from which a keypoint is where it is said to be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Detected:
+    """What a file of keypoints holds for each frame."""
+
+    points: Detections
+    person: list[np.ndarray] | None = None
+    """For each frame who its `n` people are, (n,): the same number is the same person;
+    None if the file does not say."""
+
+
+def read_detections(
+    path: Path,
+    *,
+    num_frames: int | None,
+    width: int,
+    height: int,
+    images: tuple[str, ...] = (),
+    warn: Warn = _log.warning,
+) -> Detected:
+    """Reads whatever `path` is: a folder of OpenPose JSON files, a JSON file of
+    AlphaPose, MMPose, COCO or easy_ViTPose, or a generic `.npz`.
+
+    Broken values are missing points; points in another order than usual, in (y, x), or
+    in images of another size that the file names, are put right. All is said.
+
+    Args:
+        num_frames: of the video; None for as many as the file has.
+        images: names of the video's frames, if it is a folder of images.
+
+    **Raises:** `ValueError`, naming the file, if it is none of these, is mostly NaN, is
+    in no known order, or belongs to another video.
+    """
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder.")
+    if path.is_dir():
+        listed = read_openpose(path)
+    elif path.suffix.lower() == ".npz":
+        listed = read_npz(path, num_frames)
+        images = ()  # its frames are rows, not names
+    else:
+        listed = read_json(path)
+    try:
+        frames = frames_of_names(
+            listed.names,
+            what="keypoints",
+            num_frames=num_frames,
+            images=images,
+            complete=listed.complete,
+            warn=warn,
+        )
+    except Unfit as error:
+        raise ValueError(f"{path}: {error}.") from None
+    if num_frames is None:
+        num_frames = max(frames.values(), default=-1) + 1
+    by_frame: list[list[tuple[np.ndarray, int]]] = [[] for _ in range(num_frames)]
+    for (name, _, who), points in zip(
+        listed.rows, arranged(path, listed, warn), strict=True
+    ):
+        by_frame[frames[name]].append((points, who))
+    points = [np.array([p for p, _ in f]).reshape(-1, 25, 3) for f in by_frame]
+    person = [np.array([who for _, who in f], dtype=np.int64) for f in by_frame]
+    person = _checked(person, warn)
+    return _to_pixels(path, points, person, (width, height), listed.size, warn)
+
+
+def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:
+    """Who is who, if the file says it of everybody and without contradiction."""
+    said = np.concatenate(person) if person else np.zeros(0)
+    if not (said >= 0).any():
+        return None
+    wrong = "given for some only" if (said < 0).any() else ""
+    for frame, who in enumerate(person):
+        if not wrong and len(np.unique(who)) < len(who):
+            wrong = f"given twice in frame {frame}"
+    if wrong:
+        warn(f"keypoints: people's numbers {wrong}, so told apart by where they are.")
+        return None
+    return person
+
+
+def _to_pixels(
+    path: Path,
+    detections: Detections,
+    person: list[np.ndarray] | None,
+    size: tuple[int, int],
+    declared: Size | None,
+    warn: Warn,
+) -> Detected:
+    """Undoes OpenPose's `--keypoint_scale` and another size that the file declares, and
+    clears what is missing."""
+    counts = [len(d) for d in detections]
+    if not sum(counts):
+        raise ValueError(f"{path}: no person in any frame.")
+    points = np.concatenate(detections)
+    seen = points[..., 2] > 0
+    if not seen.any():
+        raise ValueError(f"{path}: all confidences are zero.")
+    sure = points[..., 2] > _SURE
+    sure = sure if sure.any() else seen
+    if (uv := _relative(points, sure, size, warn)) is not None:
+        points[..., :2] = uv
+    elif declared is not None:
+        try:
+            factor = factor_to(declared, size, points[sure][:, :2], "keypoints", warn)
+        except Unfit as error:
+            raise ValueError(f"{path}: {error}") from None
+        points[..., :2] = scaled(points[..., :2], factor)
+    at = points[points[..., 2] > _SURE][:, :2]
+    outside = ((at < 0) | (at > size)).any(axis=-1)
+    if (turned := turned_back(points, sure, size, warn)) is not None:
+        points[..., :2] = turned
+    elif len(at) and outside.mean() > 0.3:
+        raise ValueError(
+            f"{path}: {100 * outside.mean():.0f} % of the keypoints outside the image "
+            f"of {size[0]}x{size[1]} px: of another video?"
+        )
+    points[~seen] = 0.0
+    split = np.split(points, np.cumsum(counts)[:-1])
+    kept = [(d[..., 2] > 0).any(axis=-1) for d in split]
+    if person is not None:
+        person = [who[k] for who, k in zip(person, kept, strict=True)]
+    return Detected([d[k] for d, k in zip(split, kept, strict=True)], person)
+
+
+def _relative(
+    points: np.ndarray, sure: np.ndarray, size: tuple[int, int], warn: Warn
+) -> np.ndarray | None:
+    """Pixels of points that are relative to the image, in [0, 1] or [-1, 1]; None of
+    those that are not.
+
+    Told by most of the sure points: single ones may be well outside the image.
+    """
+    uv = points[..., :2]
+    low, high = np.quantile(uv[sure], [0.05, 0.95], axis=0)
+    if high.max() > 1.5 or low.min() < -1.5:
+        return None
+    # Half a person beyond the left or top side is rarer than [-1, 1].
+    zero = -1.0 if low.min() < -0.1 else 0.0
+    warn(f"keypoints in [{zero:g}, 1]: taken as relative to the size of the image.")
+    return (uv - zero) / (1 - zero) * (np.asarray(size, dtype=np.float64) - 1)

@@ -1,0 +1,272 @@
+"""Video file or folder of images -> frames, one at a time, and when they were taken."""
+
+import dataclasses
+import logging
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from bodyslam_jax.io.repeats import Repeats, repeats_warning, without_repeats
+from bodyslam_jax.types import Sequence
+
+_log = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+_VIDEO_SUFFIXES = """
+mp4 mov m4v qt avi mkv webm mpg mpeg mpe m1v m2v mpv mts m2ts m2t ts mod tod vob 3gp
+3g2 3gpp wmv asf flv f4v gif ogv ogm ogg divx xvid dv mxf mjpg mjpeg y4m nut rm rmvb
+insv lrv h264 264 avc h265 265 hevc av1 ivf amv dav"""
+VIDEO_SUFFIXES = tuple(f".{name}" for name in _VIDEO_SUFFIXES.split())
+"""Of files that FFmpeg, by which OpenCV reads, takes for videos; in either case."""
+_LEAST_SIDE = 16
+"""px; BRISK's pyramid fails below 6; so small images have nothing to follow."""
+_ODD = 0.2
+"""Width of a pixel over its height below which, or above whose inverse, it is a
+mistake."""
+_QUARTER, _LARGE = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
+_MAX_JITTER = 0.25
+"""Spread of frame intervals, relative to their median, that is still a fixed rate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Footage:
+    """What a video says of itself, after looking at all of it."""
+
+    path: Path
+    timestamps: Float[np.ndarray, " t"]
+    """s, from 0, increasing"""
+    width: int
+    height: int
+    warnings: tuple[str, ...] = ()
+    num_read: int = 0
+    """Frames in the file, of which some may be left out."""
+    picks: Int[np.ndarray, " t"] | None = None
+    """Which of them are used, in order; all without it."""
+    pixel_aspect: float = 1.0
+    """Width of a pixel over its height, as the file says; 1 if it does not."""
+
+
+def look_at(path: Path, fps: float | None = None) -> Footage:
+    """Counts and times the frames of a video file or a folder of images.
+
+    The number of frames in a video's header is often wrong, so every frame is visited.
+    Sizes are those after the rotation that the file asks for.
+
+    Args:
+        fps: of a folder of images (1/s), 30 if not given; a video brings its own times.
+
+    **Raises:** `ValueError`, naming the file, if it is not a readable video.
+    """
+    footage = _look_at_images(path, fps) if path.is_dir() else _look_at_video(path)
+    if min(footage.width, footage.height) < _LEAST_SIDE:
+        raise ValueError(
+            f"{path}: images of {footage.width}x{footage.height} px are too small; "
+            f"expected at least {_LEAST_SIDE}x{_LEAST_SIDE}."
+        )
+    return footage
+
+
+def frames(
+    source: Sequence | Path, *, gray: bool = False
+) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
+    """The images of a sequence in order: BGR, or gray; one in memory at a time.
+
+    Of a `Sequence` only the frames it uses, of a file or folder all.
+
+    **Raises:** `ValueError` if the sequence has no images or one cannot be read.
+    """
+    path = source.frames if isinstance(source, Sequence) else source
+    if path is None:
+        raise ValueError(f"{getattr(source, 'name', source)}: has no video or images.")
+    picks = source.picks if isinstance(source, Sequence) else None
+    images = _read_images(path, gray) if path.is_dir() else _read_video(path, gray)
+    yield from images if picks is None else picked(images, picks)
+
+
+T = TypeVar("T")
+
+
+def picked(items: Iterable[T], picks: Int[np.ndarray, " t"]) -> Iterator[T]:
+    """Those of `items` whose places are in `picks`, which increases."""
+    wanted = set(picks.tolist())
+    return (item for k, item in enumerate(items) if k in wanted)
+
+
+def _read_video(path: Path, gray: bool) -> Iterator[np.ndarray]:
+    capture = _open(path)
+    try:
+        while True:
+            ok, image = capture.read()
+            if not ok:
+                break
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image
+    finally:
+        capture.release()
+
+
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+    """Images of a folder in the order of the numbers in their names."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
+    return sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sorts `frame_10` after `frame_9`."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(p)) if p.isdigit() else (1, p) for p in parts]
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    # FFmpeg only: OpenCV's other backends take `a.txt` for a pattern of image names.
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise ValueError(f"{path}: not a video that OpenCV can read.")
+    return capture
+
+
+def _look_at_video(path: Path) -> Footage:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file.")
+    capture = _open(path)
+    try:
+        ok, image = capture.read()
+        if not ok:
+            raise ValueError(f"{path}: a video without a readable frame.")
+        nominal = float(capture.get(cv2.CAP_PROP_FPS))
+        announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        aspect = _pixel_aspect(capture)
+        times = [float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000]
+        repeats = Repeats()
+        repeats.look(image)
+        while capture.grab():
+            times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000)
+            ok, next_image = capture.retrieve()
+            repeats.look(next_image if ok else None)
+    finally:
+        capture.release()
+    stamps, picks, warnings = _timed(path, np.asarray(times), nominal, repeats)
+    # One frame more or less is what containers get wrong; more is a damaged file.
+    if announced > len(times) + max(2, 0.02 * announced):
+        warnings += (f"{path.name}: {announced} frames announced, {len(times)} read.",)
+    size = (image.shape[1], image.shape[0])
+    return Footage(path, stamps, *size, warnings, len(times), picks, aspect)
+
+
+def _pixel_aspect(capture: cv2.VideoCapture) -> float:
+    """Width of a pixel over its height, of the images as they are read."""
+    across, along = (
+        capture.get(p) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)
+    )
+    if not (across > 0 and along > 0 and _ODD < across / along < 1 / _ODD):
+        return 1.0
+    turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
+    return along / across if turned else across / along
+
+
+def _timed(
+    path: Path, times: Float[np.ndarray, " n"], nominal: float, repeats: Repeats
+) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
+    """`resampled`, of the frames alone that do not repeat the one before."""
+    again = repeats.repeated()
+    if not again.any():
+        return resampled(path, times, nominal)
+    step = np.diff(times)
+    if not np.isfinite(times).all() or (step <= 0).any():
+        times, _, warnings = resampled(path, times, nominal)
+    else:
+        times, warnings = times - times[0], ()
+    stamps, picks = without_repeats(times, again)
+    fps = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else nominal
+    return stamps, picks, (*warnings, repeats_warning(path.name, again, fps))
+
+
+def resampled(
+    path: Path, times: Float[np.ndarray, " n"], nominal: float
+) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
+    """Times from 0 (s), which frames they are of, and what there is to be said.
+
+    Where the rate varies, the frames nearest to the ticks of a clock of the median rate
+    are used: what is denser is thinned out. Frames are not repeated, so gaps stay, with
+    their true times. Unusable times are made up from the nominal rate (1/s).
+    """
+    step = np.diff(times)
+    if len(times) == 1:
+        return np.zeros(1), None, ()
+    if not np.isfinite(times).all() or (step <= 0).any():
+        if not 1 <= nominal <= 1000:
+            nominal = 30.0
+        warning = f"{path.name}: times do not increase; {nominal:g} frames/s taken."
+        return np.arange(len(times)) / nominal, None, (warning,)
+    median = float(np.median(step))
+    times = times - times[0]
+    if np.abs(step - median).max() <= _MAX_JITTER * median:
+        return times, None, ()
+    ticks = np.arange(0.0, times[-1] + 0.5 * median, median)
+    after = np.clip(np.searchsorted(times, ticks), 1, len(times) - 1)
+    nearest = after - (ticks - times[after - 1] < times[after] - ticks)
+    picks = np.unique(nearest)
+    slow, fast = 1 / step.max(), 1 / step.min()
+    text = f"{path.name}: variable frame rate, {slow:.3g} to {fast:.3g} frames/s; "
+    if len(picks) == len(times):
+        return times, None, (text + "all frames used, each at its own time.",)
+    text += f"resampled to {1 / median:.3g}, {len(picks)} of {len(times)} frames used."
+    return times[picks], picks, (text,)
+
+
+def at_rate(footage: Footage, fps: float) -> Footage:
+    """All frames of a video file, one every 1/`fps` s, whatever the file says."""
+    times = np.arange(footage.num_read) / fps
+    kept = tuple(w for w in footage.warnings if "announced" in w)
+    return dataclasses.replace(footage, timestamps=times, picks=None, warnings=kept)
+
+
+def _look_at_images(folder: Path, fps: float | None) -> Footage:
+    images = list_images(folder)
+    if not images:
+        raise ValueError(f"{folder}: no images ({' '.join(IMAGE_SUFFIXES)}).")
+    height, width = _read_image(images[0], gray=True).shape
+    warnings: tuple[str, ...] = ()
+    if fps is None:
+        fps = 30.0
+        warnings = (f"{folder.name}: frame rate not given, 30 frames/s assumed.",)
+    times = np.arange(len(images)) / fps
+    repeats = Repeats()
+    for path in images:
+        data = np.fromfile(path, dtype=np.uint8)
+        # A quarter of the size is decoded in a fraction of the time.
+        flag = _QUARTER if max(width, height) > _LARGE else cv2.IMREAD_GRAYSCALE
+        repeats.look(cv2.imdecode(data, flag) if data.size else None)
+    stamps, picks, more = _timed(folder, times, fps, repeats)
+    return Footage(
+        folder, stamps, width, height, (*warnings, *more), len(images), picks
+    )
+
+
+def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:
+    size = None
+    for path in list_images(folder):
+        image = _read_image(path, gray)
+        size = size or image.shape
+        if image.shape != size:
+            found, expected = _size(image.shape), _size(size)
+            raise ValueError(f"{path}: {found}, but the first image is {expected}.")
+        yield image
+
+
+def _read_image(path: Path, gray: bool) -> np.ndarray:
+    flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
+    # Through memory: `imread` cannot open every path and warns on standard error.
+    data = np.fromfile(path, dtype=np.uint8)
+    image = cv2.imdecode(data, flag) if data.size else None
+    if image is None:
+        raise ValueError(f"{path}: not an image that OpenCV can read.")
+    return image
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]} px"

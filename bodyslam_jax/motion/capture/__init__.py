@@ -1,0 +1,1 @@
+"""Motion capture: clips, their readers, and their retargeting to the body model."""

@@ -1,0 +1,223 @@
+"""BVH files with CMU's joint names, as SMPL rotations.
+
+Following how the CMU data of this project were made: SMPL joint k gets `G_j A_k`, G_j
+the capture bone's global rotation from its rest pose, A_k the smallest rotation from
+SMPL's rest bone to the capture's; limb directions are exact, twist is the capture's.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.body import PARENTS
+from bodyslam_jax.motion.capture.clips import (
+    Clip,
+    leg_length,
+    padded,
+    rest_from_offsets,
+)
+from bodyslam_jax.motion.rotations import matrix, vector
+
+_NAMES = (
+    "Hips LeftUpLeg,LHip RightUpLeg,RHip LowerBack,Spine,Chest LeftLeg,LKnee "
+    "RightLeg,RKnee Spine,Spine1,Chest LeftFoot,LAnkle RightFoot,RAnkle "
+    "Spine1,Spine2,Spine,Chest LeftToeBase,LeftToe RightToeBase,RightToe "
+    "Neck1,Neck LeftShoulder,LCollar RightShoulder,RCollar Head LeftArm,LShoulder "
+    "RightArm,RShoulder LeftForeArm,LElbow RightForeArm,RElbow LeftHand,LWrist "
+    "RightHand,RWrist"
+).split()
+"""For SMPL joints 0 to 21, the BVH joint that turns it; the first one found counts."""
+
+_REST_BONES = {
+    1: (4, (0.08, -0.99, -0.01)),
+    2: (5, (-0.08, -0.99, -0.01)),
+    4: (7, (0.02, -0.99, -0.09)),
+    5: (8, (-0.02, -0.99, -0.09)),
+    7: (10, (0.26, -0.45, 0.85)),
+    8: (11, (-0.26, -0.45, 0.85)),
+    16: (18, (1.0, -0.05, -0.08)),
+    17: (19, (-1.0, -0.05, -0.08)),
+    18: (20, (1.0, 0.03, -0.01)),
+    19: (21, (-1.0, 0.03, -0.01)),
+}
+"""SMPL's rest bones: joint -> (child, direction); the spine is left as it is."""
+
+_PLACES = ("xposition", "yposition", "zposition")
+_TURNS = ("xrotation", "yrotation", "zrotation")
+"""Channels, in lower case: writers of BVH do not agree on capitals."""
+
+_UNITS = (1.0, 0.01, 0.0254, 0.056444, 0.001)
+"""Metres in a unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
+
+
+@dataclasses.dataclass
+class _Joint:
+    name: str
+    parent: int
+    offset: np.ndarray
+    channels: list[str]
+    """In lower case."""
+
+
+def read_bvh(path: Path) -> Clip:
+    """Reads one BVH file with joint names of the CMU conversions (y up).
+
+    The unit of length is the one that makes the legs 0.55 to 1.15 m long.
+
+    **Raises:** `ValueError` if the file is no BVH, is cut short, holds NaN, channels
+    or a frame time that cannot be, or lacks a joint of the legs.
+    """
+    path = Path(path)
+    joints, values, fps = _parse(path)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{path}: NaN or infinite channel; expected numbers.")
+    index = {joint.name: i for i, joint in enumerate(joints)}
+    source = [
+        next((index[name] for name in names.split(",") if name in index), None)
+        for names in _NAMES
+    ]
+    for joint in (0, 1, 2, 4, 5, 7, 8):
+        if source[joint] is None:
+            raise ValueError(
+                f"{path}: no joint {_NAMES[joint].replace(',', ' or ')}; found "
+                f"{', '.join(list(index)[:8])}, ..."
+            )
+    turns = padded(lambda rows: _forward(joints, jnp.asarray(rows)), values)
+    channels, where = joints[0].channels, np.zeros((len(values), 3))
+    if set(_PLACES) <= set(channels):
+        where = values[:, [channels.index(place) for place in _PLACES]]
+    rest = np.zeros((len(joints), 3))
+    for i, joint in enumerate(joints):
+        rest[i] = joint.offset + (rest[joint.parent] if joint.parent >= 0 else 0)
+    smpl_rest = np.full((24, 3), np.nan)
+    for k, j in enumerate(source):
+        smpl_rest[k] = np.nan if j is None else rest[j]
+    for k in range(1, 24):  # a joint that the capture lacks sits on its parent
+        if np.isnan(smpl_rest[k, 0]):
+            smpl_rest[k] = smpl_rest[PARENTS[k]]
+    legs = float(leg_length(smpl_rest))
+    unit = next((u for u in _UNITS if 0.55 < legs * u < 1.15), None)
+    if unit is None:
+        raise ValueError(
+            f"{path}: legs {legs:.3g} units long fit no known unit of length."
+        )
+    smpl_rest, where = smpl_rest * unit, where * unit
+    align = np.tile(np.eye(3), (24, 1, 1))
+    for k, (child, direction) in _REST_BONES.items():
+        align[k] = _smallest_turn(np.array(direction), smpl_rest[child] - smpl_rest[k])
+    rotation = np.zeros((len(values), 24, 3, 3))
+    for k in range(24):
+        j = source[k] if k < 22 else None
+        if j is None:
+            rotation[:, k] = rotation[:, PARENTS[k]]
+        else:
+            rotation[:, k] = turns[:, j] @ align[k]
+    local = rotation.copy()
+    for k in range(1, 24):
+        local[:, k] = np.swapaxes(rotation[:, PARENTS[k]], -1, -2) @ rotation[:, k]
+    poses = padded(_log, local)
+    offsets = np.zeros((24, 3))
+    for k in range(1, 24):
+        offsets[k] = align[PARENTS[k]].T @ (smpl_rest[k] - smpl_rest[PARENTS[k]])
+    return Clip(
+        name=path.stem,
+        subject=path.stem.split("_")[0],
+        motion="other",
+        split="",
+        fps=fps,
+        poses=poses.astype(np.float32),
+        trans=where.astype(np.float32),
+        offsets=offsets.astype(np.float32),
+        leg_length=float(leg_length(rest_from_offsets(offsets, PARENTS))),
+    )
+
+
+def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Smallest rotation matrix that takes one direction to another."""
+    start, end = start / np.linalg.norm(start), end / max(np.linalg.norm(end), 1e-9)
+    axis, cosine = np.cross(start, end), float(start @ end)
+    cross = np.array(
+        [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]]
+    )
+    return np.eye(3) + cross + cross @ cross / max(1 + cosine, 1e-9)
+
+
+@jax.jit
+def _log(matrices: Float[Array, "t j 3 3"]) -> Float[Array, "t j 3"]:
+    return vector(matrices)
+
+
+def _forward(
+    joints: list[_Joint], rows: Float[Array, "t c"]
+) -> Float[Array, "t j 3 3"]:
+    """Global rotations of all joints: in each, the channels in the file's order."""
+    turns, column = [], 0
+    for joint in joints:
+        turn = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (len(rows), 3, 3))
+        for channel in joint.channels:
+            if channel in _TURNS:
+                axis = jnp.asarray(np.eye(3)[_TURNS.index(channel)], rows.dtype)
+                turn = turn @ matrix(jnp.deg2rad(rows[:, column, None]) * axis)
+            column += 1
+        turns.append(turns[joint.parent] @ turn if joint.parent >= 0 else turn)
+    return jnp.stack(turns, 1)
+
+
+def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
+    words = path.read_text(errors="replace").split()
+    try:
+        start = words.index("MOTION")
+        joints, stack, i = [], [-1], 0
+        while i < start:
+            word = words[i]
+            if word in ("ROOT", "JOINT"):
+                joints.append(_Joint(words[i + 1], stack[-1], np.zeros(3), []))
+                i += 1
+            elif word == "End":  # a leaf has no channels and is no joint
+                while words[i] != "}":
+                    i += 1
+            elif word == "{":
+                stack.append(len(joints) - 1)
+            elif word == "}":
+                stack.pop()
+            elif word == "OFFSET":
+                joints[-1].offset = np.array(words[i + 1 : i + 4], float)
+            elif word == "CHANNELS":
+                count = int(words[i + 1])
+                named = words[i + 2 : i + 2 + count]
+                joints[-1].channels = [name.lower() for name in named]
+            i += 1
+        frames = int(words[words.index("Frames:", start) + 1])
+        time = words.index("Time:", start)
+        step = float(words[time + 1])
+        values = np.array(words[time + 2 :], float)
+    except (ValueError, IndexError):
+        raise ValueError(f"{path}: not a BVH file (HIERARCHY and MOTION).") from None
+    for joint in joints:
+        if not np.isfinite(joint.offset).all():
+            raise ValueError(
+                f"{path}: OFFSET {joint.offset.tolist()} of {joint.name}; expected "
+                "numbers."
+            )
+        for channel in joint.channels:
+            if channel not in (*_PLACES, *_TURNS):
+                raise ValueError(
+                    f"{path}: channel {channel!r} of {joint.name}; expected Xposition, "
+                    "Xrotation and the like."
+                )
+    if not 0.001 <= step <= 1:
+        raise ValueError(
+            f"{path}: Frame Time {step:g}; expected 0.001 to 1 s from one to the next."
+        )
+    width = sum(len(joint.channels) for joint in joints)
+    if frames < 1:
+        raise ValueError(f"{path}: {frames} frames; expected one or more.")
+    if values.size != frames * width:
+        raise ValueError(
+            f"{path}: {values.size} numbers; expected {frames} frames of {width}."
+        )
+    return joints, values.reshape(frames, width), 1 / step

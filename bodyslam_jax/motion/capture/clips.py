@@ -1,0 +1,215 @@
+"""Motion capture as SMPL rotations: what a clip is, and how its rate is changed.
+
+Axis-angle (rad) and metres. The root's rotation takes H (x left, y up, z forward) to
+the capture's world, whose heading and up axis do not matter: only displacement seen
+from the body is ever learnt.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.motion.rotations import change, matrix, turned
+
+FPS = 30.0
+"""Rate of every motion model, 1/s."""
+
+LEFT_RIGHT = ((1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21))
+LEFT_RIGHT = (*LEFT_RIGHT, (22, 23))
+"""SMPL's pairs of joints that mirroring swaps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """One continuous recording of one person, `t` frames at a constant rate."""
+
+    name: str
+    subject: str
+    """Whoever shares this string is kept on the same side of every split."""
+    motion: str
+    """Class, such as walk or run."""
+    split: str
+    """`train`, `val` or `other` if the data say so, else empty."""
+    fps: float
+    poses: Float[np.ndarray, "t 24 3"]
+    """Axis-angle, rad; row 0 takes H to the world."""
+    trans: Float[np.ndarray, "t 3"]
+    """Pelvis joint in the world, m."""
+    offsets: Float[np.ndarray, "24 3"] | None
+    """The subject's bones in the rest pose, parent to joint, m; if known."""
+    leg_length: float
+    """Hip to knee to ankle, mean of both sides, m: the unit of displacement."""
+    phase: int = 0
+    """Which of the interleaved decimations of one recording this is."""
+    phases: int = 1
+    """How many of them there are, so that they can be put together again."""
+
+
+def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
+    """Hip to knee to ankle, mean of both sides, of joints in the rest pose (m)."""
+    rest = np.asarray(rest)
+    bone = lambda j, i: np.linalg.norm(rest[..., j, :] - rest[..., i, :], axis=-1)
+    return np.asarray((bone(4, 1) + bone(7, 4) + bone(5, 2) + bone(8, 5)) / 2)
+
+
+def rest_from_offsets(
+    offsets: Float[np.ndarray, "24 3"], parents: Sequence[int]
+) -> Float[np.ndarray, "24 3"]:
+    """Adds bone vectors up the tree: rest joints with the pelvis at the origin."""
+    rest = np.zeros_like(offsets)
+    for joint in range(1, 24):
+        rest[joint] = rest[parents[joint]] + offsets[joint]
+    return rest
+
+
+def hip_centre(clip: Clip) -> Float[np.ndarray, "t 3"]:
+    """The middle of the hip joints in the world, m.
+
+    Body models differ in how high above the hips they put the pelvis joint, captures
+    too: what carries a path from one to another is the hips.
+    """
+    if clip.offsets is None:  # SMPL's mean shape
+        below = np.array([0.0, -0.086, -0.016]) * clip.leg_length / 0.82
+    else:
+        below = (clip.offsets[1] + clip.offsets[2]) / 2
+    return (clip.trans + root_matrices(clip) @ below).astype(np.float32)
+
+
+def root_matrices(clip: Clip) -> Float[np.ndarray, "t 3 3"]:
+    """`C_WH` of every frame."""
+    return padded(_matrix, clip.poses[:, 0])
+
+
+@jax.jit
+def _matrix(angles: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
+    return matrix(angles)
+
+
+def mirror(clip: Clip) -> Clip:
+    """The same motion with left and right exchanged; the world's x changes sign."""
+    order = np.arange(24)
+    for left, right in LEFT_RIGHT:
+        order[[left, right]] = right, left
+    turn, flip = np.array([1, -1, -1]), np.array([-1, 1, 1])
+    offsets = None if clip.offsets is None else clip.offsets[order] * flip
+    return dataclasses.replace(
+        clip,
+        name=clip.name + "-mirrored",
+        poses=clip.poses[:, order] * turn.astype(clip.poses.dtype),
+        trans=clip.trans * flip.astype(clip.trans.dtype),
+        offsets=offsets,
+    )
+
+
+def padded(function: Callable, *arrays: np.ndarray) -> np.ndarray:
+    """Calls a row-wise JAX function on a power-of-two number of rows.
+
+    Clips all differ in length; without this every one of them compiles anew.
+    """
+    rows = len(arrays[0])
+    extra = (1 << max(rows - 1, 1).bit_length()) - rows
+    arrays = tuple(np.concatenate([a, np.repeat(a[-1:], extra, 0)]) for a in arrays)
+    return np.asarray(function(*arrays))[:rows]
+
+
+@jax.jit
+def _slerp(
+    start: Float[Array, "n 24 3"], end: Float[Array, "n 24 3"], at: Float[Array, " n"]
+) -> Float[Array, "n 24 3"]:
+    way = change(start, end) * at[:, None, None]
+    return turned(start, way)
+
+
+def resample(clips: Sequence[Clip], fps: float = FPS) -> tuple[Clip, ...]:
+    """Interpolates clips at exactly `fps`: rotations by slerp, positions linearly.
+
+    Any rate will do (100, 120.00004577, ...); where a new frame falls on an old one
+    it is that one. The last frames are dropped rather than extrapolated.
+    """
+    if not clips:
+        return ()
+    index, fraction, following, new = [], [], [], []
+    offset = 0
+    for clip in clips:
+        ratio = clip.fps / fps  # frames of the clip per new frame
+        nearest = round(ratio)
+        if nearest >= 1 and abs(ratio - nearest) < 1e-3 * ratio:
+            ratio = float(nearest)  # 120.00004577 is meant to be 120
+        t = len(clip.poses)
+        count = int(np.floor((t - 1) / ratio + 1e-6)) + 1
+        position = np.minimum(np.arange(count) * ratio, t - 1)
+        low = position.astype(int)
+        index.append(low + offset)
+        following.append(np.minimum(low + 1, t - 1) + offset)
+        fraction.append(position - low)
+        new.append(count)
+        offset += t
+    low, high = np.concatenate(index), np.concatenate(following)
+    at = np.concatenate(fraction)
+    poses = np.concatenate([clip.poses for clip in clips])
+    trans = np.concatenate([clip.trans for clip in clips])
+    between = padded(_slerp, poses[low], poses[high], at.astype(poses.dtype))
+    between = np.where((at == 0)[:, None, None], poses[low], between)
+    weight = at.astype(trans.dtype)[:, None]
+    moved = trans[low] * (1 - weight) + trans[high] * weight
+    ends = np.cumsum(new)
+    return tuple(
+        dataclasses.replace(
+            clip, fps=fps, poses=between[end - n : end], trans=moved[end - n : end]
+        )
+        for clip, n, end in zip(clips, new, ends, strict=True)
+    )
+
+
+def interleave(clips: Sequence[Clip]) -> tuple[Clip, ...]:
+    """Puts the phases of one recording together again, at their common higher rate.
+
+    Clips of a single phase are returned as they are.
+    """
+    together: dict[str, list[Clip]] = {}
+    for clip in clips:
+        together.setdefault(clip.name, []).append(clip)
+    out = []
+    for group in together.values():
+        group = sorted(group, key=lambda clip: clip.phase)
+        n = group[0].phases
+        if n == 1 or [clip.phase for clip in group] != list(range(n)):
+            out.extend(group)
+            continue
+        t = min(len(clip.poses) for clip in group)
+        weave = lambda arrays: np.stack([a[:t] for a in arrays], 1).reshape(
+            t * n, *arrays[0].shape[1:]
+        )
+        out.append(
+            dataclasses.replace(
+                group[0],
+                fps=group[0].fps * n,
+                poses=weave([clip.poses for clip in group]),
+                trans=weave([clip.trans for clip in group]),
+                phases=1,
+            )
+        )
+    return tuple(out)
+
+
+def split(
+    clips: Sequence[Clip], share: float = 0.2, seed: int = 0
+) -> tuple[tuple[Clip, ...], tuple[Clip, ...]]:
+    """Training and validation clips; no subject is in both.
+
+    Where the data name validation subjects they are it; else a random `share` of the
+    subjects, at least one, unless there is only one.
+    """
+    subjects = sorted({clip.subject for clip in clips})
+    held = {clip.subject for clip in clips if clip.split == "val"}
+    if not held and len(subjects) > 1:
+        count = max(1, round(share * len(subjects)))
+        rng = np.random.default_rng(seed)
+        held = set(rng.permutation(subjects)[:count].tolist())
+    training = tuple(clip for clip in clips if clip.subject not in held)
+    kept = {"val", ""}
+    validation = [c for c in clips if c.subject in held and c.split in kept]
+    return training, tuple(validation)

@@ -1,0 +1,83 @@
+"""Captured motion on the body model: whose shape, and how far a step is for it.
+
+A network must be trained on the skeleton that it is used with, and the root's path
+must fit the legs, or the feet skate and the labels lie.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
+from bodyslam_jax.motion.capture.clips import (
+    Clip,
+    hip_centre,
+    leg_length,
+    root_matrices,
+)
+
+_FITTED = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
+"""Bones, by their lower joint, whose length says something of shape."""
+_TOLERANCE = np.where(np.isin(_FITTED, (4, 5, 7, 8)), 0.01, 0.03)
+"""How well they are to be met, m: legs matter, hips and shoulders are placed by
+captures where their markers were."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A clip on the body model."""
+
+    clip: Clip
+    shape: Float[np.ndarray, " 10"]
+    """β"""
+    trans: Float[np.ndarray, "t 3"]
+    """The body's pelvis joint, m: the path of the hips in proportion to leg length."""
+
+
+def fit_shape(
+    body: BodyModel, offsets: Float[np.ndarray, "24 3"]
+) -> Float[np.ndarray, " 10"]:
+    """β of the body whose limbs are as long as a subject's bones.
+
+    Least squares on lengths (legs 1 cm, others 3 cm) with a standard normal prior on
+    β: lengths do not depend on the rest pose, in which captures and models differ.
+    """
+    zero = np.zeros(10)
+    one = np.concatenate([zero[None], np.eye(10)])
+    rest = np.asarray(rest_joints(body, jnp.asarray(one, body.template.dtype)), float)
+    base, directions = rest[0], rest[1:] - rest[0]
+    parents = np.array(PARENTS)[list(_FITTED)]
+    wanted = np.linalg.norm(offsets, axis=-1)[list(_FITTED)]
+
+    def residual(shape):
+        joints = base + np.tensordot(shape, directions, 1)
+        bones = joints[list(_FITTED)] - joints[parents]
+        lengths = np.linalg.norm(bones, axis=-1)
+        return np.concatenate([(lengths - wanted) / _TOLERANCE, shape])
+
+    return least_squares(residual, zero).x
+
+
+def place(body: BodyModel, clips: Sequence[Clip]) -> tuple[Trial, ...]:
+    """Puts clips on the body model, each subject with its own fitted shape.
+
+    A subject without known bones gets the mean shape.
+    """
+    shapes: dict[bytes, np.ndarray] = {}
+    trials = []
+    for clip in clips:
+        key = b"" if clip.offsets is None else clip.offsets.tobytes()
+        if key not in shapes:
+            offsets = clip.offsets
+            shapes[key] = np.zeros(10) if offsets is None else fit_shape(body, offsets)
+        shape = shapes[key]
+        rest = np.asarray(rest_joints(body, jnp.asarray(shape, body.template.dtype)))
+        ratio = float(leg_length(rest)) / clip.leg_length
+        below = (rest[1] + rest[2]) / 2 - rest[0]
+        trans = ratio * hip_centre(clip) - root_matrices(clip) @ below
+        trials.append(Trial(clip, shape, trans))
+    return tuple(trials)

@@ -1,0 +1,140 @@
+"""Continuing a motion from its last postures, frame by frame."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.motion.network import Window
+from bodyslam_jax.motion.prediction import (
+    MotionModel,
+    check_compatible,
+    in_dtype,
+    leg_length,
+)
+from bodyslam_jax.motion.rotations import (
+    change,
+    matrix,
+    transposed,
+    turned,
+    vector,
+)
+
+_FASTEST = 0.35
+"""Largest turn of a joint in one frame, rad: 600 degrees a second."""
+
+
+class Rollout(eqx.Module):
+    """A motion: the given frames and those that follow."""
+
+    orientation: Float[Array, "t 3 3"]
+    """C_WH, W as given."""
+    body_pose: Float[Array, "t 23 3"]
+    """θ, rad."""
+    trans: Float[Array, "t 3"]
+    """Pelvis joint in W, m; the last given frame is at the origin."""
+
+
+@eqx.filter_jit
+def rollout(
+    model: MotionModel,
+    body: BodyModel,
+    orientation: Float[Array, "p 3 3"],
+    body_pose: Float[Array, "p 23 3"],
+    shape: Float[Array, " 10"],
+    frames: int,
+) -> Rollout:
+    """Continues a motion by `frames` frames from `p` given postures.
+
+    Two postures will do: a window that reaches further back than `p` is filled by
+    repeating the first rate of change backwards. Rates are kept to what people do.
+    """
+    check_compatible(model, body, model.fps)
+    dtype = body_pose.dtype
+    network = in_dtype(model, dtype).network
+    leg = leg_length(body, shape)
+    past = model.past
+    given = len(body_pose)
+    turn, pose = _extended(orientation, body_pose, past)
+
+    def look(turn, pose):
+        joints = local_joints(body, pose, shape) / leg
+        before = turn[-2]
+        seen = lambda x: jnp.einsum("ba,pbc->pac", before, x)
+        world = jnp.einsum("pab,pjb->pja", turn, joints)
+        return network(
+            Window(
+                rotation=seen(turn),
+                body_pose=pose,
+                joints=jnp.einsum("ba,pjb->pja", before, world),
+                shape=shape,
+                leg=leg,
+            )
+        )
+
+    def advance(carry, _):
+        turn, pose = carry  # the last `past` frames
+        # the posture head does not look at the last frame of its window
+        blind = look(
+            jnp.concatenate([turn, turn[-1:]]), jnp.concatenate([pose, pose[-1:]])
+        )
+        turns = change(pose[-1], blind.body_pose)
+        next_pose = turned(pose[-1], _limited(turns))
+        spin = matrix(_limited(blind.rotation))
+        next_turn = turn[-1] @ spin
+        turn = jnp.concatenate([turn, next_turn[None]])
+        pose = jnp.concatenate([pose, next_pose[None]])
+        move = turn[-2] @ look(turn, pose).translation
+        return (turn[1:], pose[1:]), (next_turn, next_pose, move)
+
+    _, (turns, poses, moves) = jax.lax.scan(advance, (turn, pose), None, frames)
+    known = _known_path(look, turn, pose, orientation, body_pose, given)
+    return Rollout(
+        orientation=jnp.concatenate([orientation, turns]),
+        body_pose=jnp.concatenate([body_pose, poses]),
+        trans=jnp.concatenate([known, jnp.cumsum(moves, 0)]),
+    )
+
+
+def _known_path(look, turn, pose, orientation, body_pose, given):
+    """Where the given frames were: predicted too, the last one at the origin."""
+    turns = jnp.concatenate([turn[: len(turn) - min(given, len(turn))], orientation])
+    poses = jnp.concatenate([pose[: len(pose) - min(given, len(pose))], body_pose])
+    size = len(turn) + 1
+    steps = []
+    for k in range(1, given):
+        last = len(turns) - given + k
+        rows = jnp.clip(jnp.arange(last - size + 1, last + 1), 0)
+        steps.append(turns[last - 1] @ look(turns[rows], poses[rows]).translation)
+    path = (
+        jnp.concatenate(
+            [jnp.zeros((1, 3), body_pose.dtype), jnp.cumsum(jnp.stack(steps), 0)]
+        )
+        if steps
+        else jnp.zeros((1, 3), body_pose.dtype)
+    )
+    return path - path[-1]
+
+
+def _limited(angles: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    square = (angles * angles).sum(-1, keepdims=True)
+    norm = jnp.sqrt(jnp.maximum(square, 1e-12))
+    return angles * jnp.minimum(1.0, _FASTEST / norm)
+
+
+def _extended(turn, pose, past):
+    """The last `past` frames; what is missing is extrapolated back, slowing down."""
+    missing = past - len(pose)
+    if missing <= 0:
+        return turn[-past:], pose[-past:]
+    if len(pose) == 1:
+        return jnp.repeat(turn, past, 0), jnp.repeat(pose, past, 0)
+    decay = np.cumsum(0.7 ** np.arange(1, missing + 1))[::-1]
+    decay = jnp.asarray(decay.copy(), pose.dtype)
+    spin = vector(transposed(turn[1]) @ turn[0])
+    back_turn = turn[0] @ matrix(decay[:, None] * spin)
+    rate = change(pose[1], pose[0])
+    back_pose = turned(pose[0][None], decay[:, None, None] * rate)
+    return jnp.concatenate([back_turn, turn]), jnp.concatenate([back_pose, pose])

@@ -1,0 +1,178 @@
+"""The default network: it sees where the joints are, in units of leg length."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bodyslam_jax.motion import rotations
+from bodyslam_jax.motion.network import (
+    Guess,
+    Layer,
+    Normalisation,
+    Window,
+    apply_layers,
+    init_layers,
+    joint_angles,
+    lower_triangle,
+    no_normalisation,
+)
+
+SEEN = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
+"""Joints whose positions the default network sees: legs, spine, head, hands."""
+CONTACTS = (7, 8, 10, 11)
+"""Joints that may stand on the ground: ankles and feet."""
+
+
+class MetricNetwork(eqx.Module):
+    """Where the joints were over the window, and which of them stood still.
+
+    The displacement is a weighted sum over contact joints and past frames of what each
+    joint's motion relative to the pelvis would mean if it stood on the ground (the
+    weights, positive and of sum 1, come from the network), plus a correction.
+    Everything is in leg lengths, so that the size of a person cancels exactly.
+    """
+
+    trunks: tuple[tuple[Layer, ...], ...]
+    """One per member of the ensemble; members are averaged."""
+    heads: tuple[Layer, ...]
+    """Logits of contact weights, then the correction (3)."""
+    spreads: tuple[tuple[Layer, ...], ...]
+    """The error's Cholesky factor from the trunk's last layer."""
+    posture: tuple[Layer, ...]
+    inputs: Normalisation
+    posture_inputs: Normalisation
+    posture_outputs: Normalisation
+    unit: Float[Array, ""]
+    """Typical displacement in leg lengths: scale of the correction."""
+    gain: Float[Array, ""]
+    """Calibration of displacement, found after training; 1 is none."""
+    future: int = eqx.field(static=True, default=1)
+    """1 if displacement may depend on the posture of frame k itself, else 0."""
+    posture_frames: int = eqx.field(static=True, default=6)
+    """How many past frames the predicted posture depends on."""
+
+    @staticmethod
+    def init(
+        key: PRNGKeyArray,
+        past: int,
+        width: tuple[int, ...] = (256, 256, 256),
+        members: int = 1,
+        future: int = 1,
+        posture_frames: int = 6,
+        posture_width: int = 256,
+    ) -> "MetricNetwork":
+        frames = past + future
+        posture_frames = min(posture_frames, past)
+        d = frames * len(SEEN) * 3
+        d_posture = 72 * (posture_frames - 1) + 69
+        keys = jax.random.split(key, 3 * members + 1)
+        outputs = (frames - 1) * len(CONTACTS) + 3
+        return MetricNetwork(
+            trunks=tuple(
+                init_layers(keys[3 * m], (d, *width), np.sqrt(2.0))
+                for m in range(members)
+            ),
+            heads=tuple(
+                init_layers(keys[3 * m + 1], (width[-1], outputs), 0.1)[0]
+                for m in range(members)
+            ),
+            spreads=tuple(
+                init_layers(keys[3 * m + 2], (width[-1], 64, 6), 0.1)
+                for m in range(members)
+            ),
+            posture=init_layers(
+                keys[-1], (d_posture, posture_width, posture_width, 72), 0.1
+            ),
+            inputs=no_normalisation(d),
+            posture_inputs=no_normalisation(d_posture),
+            posture_outputs=no_normalisation(72),
+            unit=jnp.asarray(0.05, jnp.float32),
+            gain=jnp.asarray(1.0, jnp.float32),
+            future=future,
+            posture_frames=posture_frames,
+        )
+
+    def frames(self, window: Window) -> Float[Array, "*b f 24 3"]:
+        """Joints over the frames that displacement depends on."""
+        count = window.joints.shape[-3] - 1 + self.future
+        return window.joints[..., :count, :, :]
+
+    def features(self, window: Window) -> Float[Array, "*b d"]:
+        """Positions over time as cosine coefficients: from slow to fast."""
+        seen = self.frames(window)[..., np.array(SEEN), :]
+        basis = jnp.asarray(cosine_basis(seen.shape[-3]), seen.dtype)
+        flat = seen.reshape(*seen.shape[:-2], -1)
+        out = jnp.einsum("wf,...fd->...wd", basis, flat)
+        return out.reshape(*out.shape[:-2], -1)
+
+    def posture_features(self, window: Window) -> Float[Array, "*b d"]:
+        """How frames up to k-1 differ from frame k-1, and its posture."""
+        angles = joint_angles(window)[..., -1 - self.posture_frames : -1, :, :]
+        change = rotations.change(angles[..., -1:, :, :], angles[..., :-1, :, :])
+        flat = lambda x, n: x.reshape(*x.shape[:-n], -1)
+        return jnp.concatenate([flat(change, 3), flat(angles[..., -1, 1:, :], 2)], -1)
+
+    def moves(
+        self, window: Window, features: Float[Array, "*b d"]
+    ) -> tuple[Float[Array, "m *b 3"], Float[Array, "m *b 6"]]:
+        """Every member's displacement and error, in leg lengths."""
+        contacts = self.frames(window)[..., np.array(CONTACTS), :]
+        still = contacts[..., :-1, :, :] - contacts[..., 1:, :, :]
+        still = still.reshape(*still.shape[:-3], -1, 3)
+        x = self.inputs(features)
+        moves, spreads = [], []
+        for trunk, head, spread in zip(
+            self.trunks, self.heads, self.spreads, strict=True
+        ):
+            hidden = jax.nn.silu(apply_layers(trunk, x))
+            out = head(hidden)
+            weight = jax.nn.softmax(out[..., :-3], -1)
+            stance = jnp.einsum("...i,...ic->...c", weight, still)
+            moves.append(stance + self.unit * out[..., -3:])
+            # the error is learnt beside the mean without bending it
+            spreads.append(apply_layers(spread, jax.lax.stop_gradient(hidden)))
+        return jnp.stack(moves), jnp.stack(spreads)
+
+    def change(self, window: Window) -> Float[Array, "*b 24 3"]:
+        """Rotation of every joint from k-1 to k, in its own frame (rad)."""
+        x = self.posture_inputs(self.posture_features(window))
+        out = self.posture_outputs.undo(apply_layers(self.posture, x))
+        return out.reshape(*out.shape[:-1], 24, 3)
+
+    def __call__(self, window: Window) -> Guess:
+        moves, spreads = self.moves(window, self.features(window))
+        move = self.gain * moves.mean(0)
+        factor = self.unit * lower_triangle(spreads.mean(0))
+        leg = window.leg[..., None]
+        change = self.change(window)
+        last = window.body_pose[..., -2, :, :]
+        turned = rotations.turned(last, change[..., 1:, :])
+        return Guess(
+            translation=move * leg,
+            cholesky=factor * leg[..., None],
+            body_pose=nearest_turn(turned, last),
+            rotation=change[..., 0, :],
+        )
+
+
+def nearest_turn(
+    angles: Float[Array, "*b 3"], reference: Float[Array, "*b 3"]
+) -> Float[Array, "*b 3"]:
+    """Of the two rotation vectors of a rotation, the one nearer to a reference."""
+    square = (angles * angles).sum(-1, keepdims=True)
+    small = square < 1e-6
+    norm = jnp.sqrt(jnp.where(small, 1.0, square))
+    other = jnp.where(small, angles, angles * (1 - 2 * np.pi / norm))
+    distance = lambda x: ((x - reference) ** 2).sum(-1, keepdims=True)
+    return jnp.where(distance(other) < distance(angles), other, angles)
+
+
+def cosine_basis(frames: int) -> Float[np.ndarray, "f f"]:
+    """Orthonormal DCT-II: row 0 is the mean over the window, row 1 the trend, ..."""
+    i = np.arange(frames)
+    basis = np.cos(np.pi * (i[None] + 0.5) * i[:, None] / frames)
+    basis *= np.sqrt(2 / frames)
+    basis[0] /= np.sqrt(2)
+    return basis

@@ -1,0 +1,150 @@
+"""From a sequence of postures to what each step must have been, in metres."""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.body import BodyModel, local_joints, rest_joints
+from bodyslam_jax.motion.network import Window
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import MetricNetwork
+from bodyslam_jax.motion.rotations import turned
+from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
+
+
+class MotionModel(eqx.Module):
+    """A trained network and what it was trained for."""
+
+    network: MetricNetwork | PaperNetwork
+    body: str = eqx.field(static=True)
+    """Kind of body model whose skeleton it knows, such as `default` or `smpl`."""
+    fps: float = eqx.field(static=True)
+    """Frames per second that it expects."""
+    past: int = eqx.field(static=True)
+    """Number of past frames that a prediction needs."""
+    about: str = eqx.field(static=True, default="{}")
+    """The file's header as JSON: data, licence, settings, metrics."""
+
+
+class Prediction(eqx.Module):
+    """What the motion model says of every step from frame k-1 to k, in row k."""
+
+    translation: Float[Array, "t 3"]
+    """Displacement of the pelvis joint in H_{k-1}, m per frame."""
+    covariance: Float[Array, "t 3 3"]
+    """Of `translation`'s error in one frame, m²; errors are correlated in time."""
+    body_pose: Float[Array, "t 23 3"]
+    """θ_k as predicted from frames up to k-1, rad."""
+    rotation: Float[Array, "t 3"]
+    """Rotation vector of C_{H_{k-1}}^T C_{H_k}, from frames up to k-1, rad."""
+    valid: Bool[Array, " t"]
+    """Whether row k had all frames that it needs; if not, its values mean nothing."""
+
+
+@jax.jit
+def leg_length(body: BodyModel, shape: Float[Array, "*b 10"]) -> Float[Array, "*b"]:
+    """Hip to knee to ankle, mean of both sides, of a shaped body (m)."""
+    rest = rest_joints(body, shape)
+    bones = rest[..., np.array([4, 7, 5, 8]), :] - rest[..., np.array([1, 4, 2, 5]), :]
+    return jnp.sqrt((bones**2).sum(-1)).sum(-1) / 2
+
+
+def sequence_windows(
+    body: BodyModel,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    shape: Float[Array, " 10"],
+    past: int,
+) -> Window:
+    """The `t - past` windows of a sequence; the first one's target is frame `past`.
+
+    Root orientations enter relative to the frame before the target only, so the
+    world's heading and its up axis cancel.
+    """
+    leg = leg_length(body, shape)
+    joints = local_joints(body, body_pose, shape) / leg
+    facing = jnp.einsum("tab,tjb->tja", orientation, joints)
+    rows = np.arange(len(body_pose) - past)[:, None] + np.arange(past + 1)
+    before = orientation[rows[:, -2]]
+    return Window(
+        rotation=jnp.einsum("wba,wpbc->wpac", before, orientation[rows]),
+        body_pose=body_pose[rows],
+        joints=jnp.einsum("wba,wpjb->wpja", before, facing[rows]),
+        shape=jnp.broadcast_to(shape, (len(rows), 10)),
+        leg=jnp.broadcast_to(leg, (len(rows),)),
+    )
+
+
+Arrays = TypeVar("Arrays", MotionModel, BodyModel)
+
+
+def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:
+    """The same model with numbers of another precision."""
+    cast = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(cast, model)
+
+
+def check_compatible(model: MotionModel, body: BodyModel, fps: float) -> None:
+    """**Raises:** `ValueError` if the weights are for another body or frame rate."""
+    if model.body != body.kind:
+        raise ValueError(
+            f"the motion model was trained on body {model.body!r}, not {body.kind!r}; "
+            "train one with `bodyslam train-motion`."
+        )
+    if abs(model.fps - fps) > 0.01 * model.fps:
+        raise ValueError(
+            f"the motion model works at {model.fps:g} frames per second, not {fps:g}; "
+            "resample the sequence."
+        )
+
+
+def predict(
+    model: MotionModel,
+    body: BodyModel,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    shape: Float[Array, " 10"],
+    present: Bool[Array, " t"],
+) -> Prediction:
+    """Predicts every step of one person's sequence from postures and shape alone.
+
+    `orientation` takes H to any one frame that is common to the sequence; `body_pose`
+    is θ (rad) at the model's frame rate; `present` says which frames are to be used.
+    Needs no displacement, no heading and no gravity. Section 3.4 of the paper; but the
+    default network sees steady turning taken out (`_turning`), for which it looks at
+    orientations 1.5 seconds ahead.
+
+    **Raises:** `ValueError` if the weights belong to another body model.
+    """
+    check_compatible(model, body, model.fps)
+    t, past, dtype = len(body_pose), model.past, body_pose.dtype
+    if t <= past:
+        identity = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (t, 3, 3))
+        none = jnp.zeros((t, 3), dtype)
+        return Prediction(none, identity, body_pose, none, jnp.zeros(t, bool))
+    rate = jnp.zeros(t, dtype)
+    if isinstance(model.network, MetricNetwork):
+        rate = turning_rate(orientation, present)
+        orientation = straightened(orientation, rate)
+    window = sequence_windows(body, orientation, body_pose, shape, past)
+    guess = in_dtype(model, dtype).network(window)
+    factor = guess.cholesky
+    covariance = jnp.einsum("wab,wcb->wac", factor, factor)
+    rows = np.arange(t - past)[:, None] + np.arange(past + 1)
+    valid = present[rows].all(-1)
+    turn = rate[past:, None] * jnp.array([0.0, 1.0, 0.0], dtype)
+    front = lambda x, fill: jnp.concatenate([fill[:past], x])
+    return Prediction(
+        translation=front(guess.translation, jnp.zeros((t, 3), dtype)),
+        covariance=front(
+            covariance, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (t, 3, 3))
+        ),
+        body_pose=front(guess.body_pose, body_pose),
+        rotation=front(turned(turn, guess.rotation), jnp.zeros((t, 3), dtype)),
+        valid=jnp.concatenate([jnp.zeros(past, bool), valid]),
+    )

@@ -1,0 +1,119 @@
+"""Predictions between frames of any rate by a model that works at 30 frames a second.
+
+Postures are interpolated to the model's own clock (slerp), its steps are summed to a
+path, and the path is read off at the times of the frames.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
+from bodyslam_jax.motion.rotations import change, matrix, turned, vector
+
+
+class Clock(eqx.Module):
+    """How `t` frames lie on the `g` ticks of a motion model, and the ticks on them."""
+
+    frame: Int[Array, " g"]
+    """The frame at or before each tick."""
+    between: Float[Array, " g"]
+    """How far on to the next frame the tick is, 0 to 1."""
+    tick: Int[Array, " t"]
+    """The tick at or before each frame."""
+    beyond: Float[Array, " t"]
+    """How far on to the next tick the frame is, 0 to 1."""
+    steps: Float[Array, " t"]
+    """Ticks that passed since the frame before."""
+    same: bool = eqx.field(static=True)
+    """Whether frames are ticks, and nothing needs to be interpolated."""
+
+
+def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
+    """Lays the model's ticks, `fps` a second, over a video's timestamps (s)."""
+    position = (timestamps - timestamps[0]) * fps
+    t = len(position)
+    same = bool(np.abs(np.diff(position) - 1).max(initial=0) < 0.02)
+    if same:
+        position = np.arange(t, dtype=float)
+    ticks = np.arange(int(np.ceil(position[-1] - 1e-6)) + 1)
+    frame = np.clip(
+        np.searchsorted(position, ticks, side="right") - 1, 0, max(t - 2, 0)
+    )
+    following = np.minimum(frame + 1, t - 1)
+    gap = np.maximum(position[following] - position[frame], 1e-9)
+    between = np.clip((ticks - position[frame]) / gap, 0, 1)
+    tick = np.clip(np.floor(position + 1e-9).astype(int), 0, max(len(ticks) - 2, 0))
+    return Clock(
+        jnp.asarray(frame),
+        jnp.asarray(between),
+        jnp.asarray(tick),
+        jnp.asarray(position - tick),
+        jnp.asarray(np.diff(position, prepend=position[0])),
+        same,
+    )
+
+
+def _lengthened(clock: Clock, frames: int) -> Clock:
+    """For postures padded at the end: what is added stands at the last tick."""
+    more = frames - len(clock.tick)
+    fields = (clock.tick, clock.beyond, clock.steps)
+    tick, beyond, steps = (jnp.pad(x, (0, more), mode="edge") for x in fields)
+    return Clock(clock.frame, clock.between, tick, beyond, steps, clock.same)
+
+
+def predict_between(
+    model: tuple[MotionModel, Clock],
+    body: BodyModel,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    shape: Float[Array, " 10"],
+    present: Bool[Array, " t"],
+) -> Prediction:
+    """`predict` at the frames of a `Clock`: row k is the step from frame k-1 to k.
+
+    Errors of successive ticks are taken as fully correlated within one frame's step.
+    """
+    network, clock = model
+    if clock.same:
+        return predict(network, body, orientation, body_pose, shape, present)
+    clock = _lengthened(clock, len(body_pose))
+    dtype = body_pose.dtype
+    between, beyond = clock.between.astype(dtype), clock.beyond.astype(dtype)
+    steps = clock.steps.astype(dtype)
+    following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
+
+    def at_ticks(angles: Array) -> Array:
+        share = between.reshape(-1, *(1,) * (angles.ndim - 1))
+        step = change(angles[clock.frame], angles[following])
+        return turned(angles[clock.frame], share * step)
+
+    C = matrix(at_ticks(vector(orientation)))
+    pose = at_ticks(body_pose)
+    there = present[clock.frame] & (present[following] | (between == 0))
+    seen = predict(network, body, C, pose, shape, there)
+
+    before = jnp.concatenate([C[:1], C[:-1]])
+    step = jnp.einsum("gij,gj->gi", before, seen.translation)
+    step = jnp.where(seen.valid[:, None], step, 0)
+    missing = jnp.cumsum(~seen.valid)
+    path = jnp.cumsum(step, axis=0) - step[:1]
+    last = jnp.minimum(clock.tick + 1, len(path) - 1)
+    place = path[clock.tick] + beyond[:, None] * (path[last] - path[clock.tick])
+    moved = place - jnp.concatenate([place[:1], place[:-1]])
+    started = jnp.concatenate([orientation[:1], orientation[:-1]])
+    end = jnp.where(beyond > 0, last, clock.tick)
+    start = jnp.concatenate([clock.tick[:1], clock.tick[:-1]])
+    valid = (missing[end] == missing[start]) & (jnp.arange(len(steps)) > 0) & present
+    step = change(pose[end - 1], seen.body_pose[end])
+    previous = jnp.concatenate([body_pose[:1], body_pose[:-1]])
+    return Prediction(
+        translation=jnp.einsum("tji,tj->ti", started, moved),
+        covariance=seen.covariance[end] * (steps**2)[:, None, None]
+        + jnp.where(valid, 0, 1)[:, None, None].astype(dtype) * jnp.eye(3, dtype=dtype),
+        body_pose=turned(previous, steps[:, None, None] * step),
+        rotation=seen.rotation[end] * steps[:, None],
+        valid=valid,
+    )

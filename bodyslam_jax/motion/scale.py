@@ -1,0 +1,103 @@
+"""Scale of a monocular trajectory by regression on the predicted displacements."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.motion.prediction import Prediction
+
+_MODEL_SPREAD = 0.03
+"""The model's own bias from one sequence to another, as a share of displacement:
+no length of a sequence averages it out. Measured on validation subjects, 5° drift."""
+
+_DURATIONS = (1, 5, 15, 30, 60)
+"""Frames over which displacement is compared; sums average the noise of depth."""
+
+
+class Scale(NamedTuple):
+    """Metres per unit of a trajectory, and how well it is known."""
+
+    value: float
+    """NaN if nothing can be said."""
+    standard_error: float
+    """Of `value`: pieces of the sequence disagree, and the model is biased on each
+    sequence by a few per cent; inf if there is only one piece."""
+    per_duration: dict[int, float]
+    """The same estimate from displacements over this many frames each."""
+
+
+def scale_from_motion(
+    prediction: Prediction,
+    orientation: Float[Array | np.ndarray, "t 3 3"],
+    camera: Float[Array | np.ndarray, "t 3"],
+    offset: Float[Array | np.ndarray, "t 3"],
+) -> Scale:
+    """Scale `s` so that people move as their postures say, in closed form.
+
+    `orientation` is `C_WH`; `camera` the unscaled camera centre `r'_WC`; `offset` the
+    pelvis joint relative to the camera, `C_WC r_CH`, in metres. Over every window of
+    frames a to b, `s (r'_b - r'_a) + (offset_b - offset_a)` should equal the sum of
+    predicted displacements turned into the world: linear in `s`. Solved with Cauchy
+    weights, for windows of 1 to 60 frames; the value is the median over durations of 5
+    frames and more, where depth noise weighs less.
+    """
+    turn, r_C, r_CH = (np.asarray(x, float) for x in (orientation, camera, offset))
+    valid = np.asarray(prediction.valid)
+    before = np.concatenate([turn[:1], turn[:-1]])
+    step = np.einsum("tab,tb->ta", before, np.asarray(prediction.translation, float))
+    step = np.where(valid[:, None], step, 0.0)
+    walked = np.cumsum(step, 0)
+    gaps = np.cumsum(~valid)
+    found, errors, told = {}, {}, {}
+    for n in _DURATIONS:
+        if len(r_C) <= n:
+            continue
+        whole = gaps[n:] == gaps[:-n]
+        x = (r_C[n:] - r_C[:-n])[whole]
+        y = (walked[n:] - walked[:-n] - (r_CH[n:] - r_CH[:-n]))[whole]
+        if len(x) < 3 or (x * x).sum() < 1e-12:
+            continue
+        found[n], errors[n] = _robust_ratio(x, y, n)
+        moved = (walked[n:] - walked[:-n])[whole]
+        told[n] = np.sqrt((moved * moved).sum() / (x * x).sum())
+    if not found:
+        return Scale(float("nan"), float("inf"), {})
+    chosen = [n for n in found if n >= 5] or list(found)
+    value = float(np.median([found[n] for n in chosen]))
+    # a short sequence has too few long windows for an error of theirs
+    sure = [n for n in chosen if np.isfinite(errors[n])] or chosen
+    best = min(sure, key=lambda n: abs(found[n] - value))
+    apart = np.std([found[n] for n in chosen])
+    parts = (errors[best], apart, _MODEL_SPREAD * told[best])
+    return Scale(value, float(np.linalg.norm(parts)), found)
+
+
+def _robust_ratio(
+    x: Float[np.ndarray, "m 3"], y: Float[np.ndarray, "m 3"], duration: int
+) -> tuple[float, float]:
+    """`argmin_s Σ ρ(|s x - y|)` with its standard error.
+
+    The error comes from leaving out one block after another (jackknife): blocks of at
+    least a second are nearly independent, single frames are not.
+    """
+
+    def solve(x, y):
+        weight = np.ones(len(x))
+        s = 1.0
+        for _ in range(20):
+            s = (weight * (x * y).sum(-1)).sum() / max(
+                (weight * (x * x).sum(-1)).sum(), 1e-12
+            )
+            residual = np.linalg.norm(s * x - y, axis=-1)
+            width = 1.5 * np.median(residual) + 1e-6
+            weight = 1 / (1 + (residual / width) ** 2)
+        return float(s)
+
+    blocks = len(x) // max(30, duration)
+    if blocks < 2:
+        return solve(x, y), float("inf")
+    label = np.arange(len(x)) * blocks // len(x)
+    left_out = [solve(x[label != b], y[label != b]) for b in range(blocks)]
+    spread = np.sqrt((blocks - 1) * np.var(left_out))
+    return solve(x, y), float(spread)

@@ -1,0 +1,1 @@
+"""How a motion model is trained and judged."""

@@ -1,0 +1,60 @@
+"""Checkpoints of a training: complete or not there at all, and of one run only."""
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import TypeVar
+from zipfile import BadZipFile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.motion.training.sampling import Corpus
+
+Tree = TypeVar("Tree")
+
+
+def fingerprint(settings: MotionTraining, data: Corpus, body: BodyModel) -> str:
+    """Changes with anything that would make a checkpoint another run's."""
+    mark = hashlib.sha256(json.dumps(dataclasses.asdict(settings)).encode())
+    mark.update(body.kind.encode())
+    for array in (data.poses, data.path, data.start):
+        mark.update(np.asarray(array).tobytes())
+    return mark.hexdigest()
+
+
+def save_checkpoint(path: Path, progress: object, mark: str) -> None:
+    """Writes everything, then puts it in place in one step."""
+    leaves = {
+        f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(progress))
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial.npz")
+    with open(partial, "wb") as file:
+        np.savez(file, allow_pickle=False, mark=np.array(mark), **leaves)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:
+    """Reads what `save_checkpoint` wrote.
+
+    **Raises:** `ValueError` if it is damaged or of another run.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            found = str(archive["mark"])
+            leaves = [archive[f"leaf_{i}"] for i in range(len(archive.files) - 1)]
+    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path}: not a training checkpoint ({error}).") from None
+    if found != mark:
+        raise ValueError(
+            f"{path}: checkpoint of other settings or data; remove it to start anew."
+        )
+    return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, leaves))

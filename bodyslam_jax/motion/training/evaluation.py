@@ -1,0 +1,184 @@
+"""How far a motion model can be trusted: its predictions of captured motion, judged."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
+from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.prediction import MotionModel, Prediction, in_dtype, predict
+from bodyslam_jax.motion.rotations import change, matrix, transposed, vector
+from bodyslam_jax.motion.training.measures import Steps, summary
+from bodyslam_jax.motion.training.noise import disturb, drift
+
+
+@eqx.filter_jit
+def _steps(
+    model: MotionModel,
+    body: BodyModel,
+    poses: Float[Array, "c t 24 3"],
+    estimated: Float[Array, "c t 24 3"],
+    trans: Float[Array, "c t 3"],
+    shape: Float[Array, "c 10"],
+    present: Bool[Array, "c t"],
+) -> tuple[Array, ...]:
+    def one(poses, estimated, trans, shape, present):
+        frame = matrix(poses[:, 0])
+        said: Prediction = predict(
+            model,
+            body,
+            matrix(estimated[:, 0]),
+            estimated[:, 1:],
+            shape,
+            present,
+        )
+        before = jnp.concatenate([frame[:1], frame[:-1]])
+        step = jnp.concatenate(
+            [jnp.zeros((1, 3), trans.dtype), jnp.diff(trans, axis=0)]
+        )
+        true = jnp.einsum("tba,tb->ta", before, step)
+        previous = jnp.concatenate([jnp.zeros((1, 3), trans.dtype), true[:-1]])
+        posture = change(said.body_pose, poses[:, 1:])
+        angle = jnp.sqrt((posture**2).sum(-1) + 1e-12).mean(-1)
+        turn = transposed(before) @ frame
+        root = vector(transposed(matrix(said.rotation)) @ turn)
+        gap = local_joints(body, said.body_pose, shape) - local_joints(
+            body, poses[:, 1:], shape
+        )
+        return (
+            said.translation,
+            true,
+            previous,
+            said.covariance,
+            before,
+            angle,
+            jnp.sqrt((root**2).sum(-1)),
+            jnp.sqrt((gap**2).sum(-1)).mean(-1),
+            said.valid,
+        )
+
+    return jax.vmap(one)(poses, estimated, trans, shape, present)
+
+
+def run_trials(
+    model: MotionModel,
+    body: BodyModel,
+    trials: Sequence[Trial],
+    drift_deg: float,
+    *,
+    seed: int = 0,
+    white_deg: float = 0.4,
+    root_drift: float = 0.0,
+) -> Steps:
+    """Predicts all trials from postures with errors of a given size.
+
+    `drift_deg` is the standard deviation of the slow error per joint axis (half as
+    much again at hands and feet); with it come `white_deg` of white noise. The root's
+    orientation errs by `root_drift` times as much.
+    """
+    length = max(len(trial.trans) for trial in trials)
+    length = -(-length // 64) * 64
+    poses = np.zeros((len(trials), length, 24, 3), np.float32)
+    trans = np.zeros((len(trials), length, 3), np.float32)
+    present = np.zeros((len(trials), length), bool)
+    for i, trial in enumerate(trials):
+        t = len(trial.trans)
+        poses[i, :t], trans[i, :t], present[i, :t] = trial.clip.poses, trial.trans, True
+        poses[i, t:], trans[i, t:] = poses[i, t - 1], trans[i, t - 1]
+    shape = np.stack([trial.shape for trial in trials]).astype(np.float32)
+    estimated = poses
+    if drift_deg > 0:
+        estimated = np.asarray(
+            _disturbed(
+                jnp.asarray(poses),
+                jax.random.split(jax.random.key(seed), len(trials)),
+                jnp.deg2rad(jnp.float32(drift_deg)),
+                jnp.deg2rad(jnp.float32(white_deg)),
+                jnp.float32(root_drift),
+            )
+        )
+    chunk = 16
+    model, body = in_dtype(model, jnp.float32), in_dtype(body, jnp.float32)
+    parts = []
+    for i in range(0, len(trials), chunk):
+        rows = np.arange(i, i + chunk).clip(max=len(trials) - 1)
+        out = _steps(
+            model,
+            body,
+            *(jnp.asarray(x[rows]) for x in (poses, estimated, trans, shape, present)),
+        )
+        keep = min(chunk, len(trials) - i)
+        parts.append([np.asarray(x)[:keep] for x in out])
+    return Steps(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+@jax.jit
+def _disturbed(poses, keys, sigma, white, root):
+    noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
+    return disturb(poses, noise.at[:, :, 0].multiply(root))
+
+
+def evaluate_model(
+    model: MotionModel,
+    body: BodyModel,
+    dataset: Sequence[Clip],
+    drift_deg: float = 0.0,
+    *,
+    seeds: int = 3,
+    root_drift: float = 0.0,
+    skip: int = 0,
+    constant: Float[np.ndarray, " 3"] | None = None,
+) -> dict[str, dict[str, float]]:
+    """Measures a model on clips, by motion class and over `all`, with the baselines.
+
+    Clips of any rate; of interleaved phases only the first counts. Noise is drawn
+    `seeds` times. `skip` leaves out the first frames of every clip, so that models
+    with windows of different lengths are compared on the same steps. Keys of the
+    result: `all` and every class, then `constant velocity` (which is told the last
+    displacement; the model is not) over all, and `constant`, a displacement in
+    H_{k-1} (m) that is always predicted, if there is one.
+
+    **Raises:** `ValueError` if no clip is long enough for a prediction.
+    """
+    clips = [clip for clip in dataset if clip.phase == 0]
+    clips = resample(clips, FPS)
+    trials = place(body, clips)
+    draws = range(seeds if drift_deg > 0 else 1)
+    runs = [
+        run_trials(model, body, trials, drift_deg, seed=i, root_drift=root_drift)
+        for i in draws
+    ]
+    steps = Steps(*(np.concatenate(x) for x in zip(*runs, strict=True)))
+    valid = steps.valid.copy()
+    valid[:, : max(skip, 2)] = False
+    steps = steps._replace(valid=valid)
+    if not valid.any():
+        raise ValueError(
+            f"no usable sequence among {len(clips)}: a prediction needs "
+            f"{model.past + 1} frames at {FPS:g} frames per second."
+        )
+    kinds = np.array([trial.clip.motion for trial in trials] * len(draws))
+    select = lambda rows: Steps(*(x[rows] for x in steps))
+    out = {"all": summary(steps)}
+    for kind in sorted(set(kinds)):
+        if steps.valid[kinds == kind].any():
+            out[str(kind)] = summary(select(kinds == kind))
+    out["constant velocity"] = summary(steps, steps.previous)
+    if constant is not None:
+        always = np.broadcast_to(constant, steps.true.shape)
+        out["constant"] = summary(steps, always)
+    return out
+
+
+def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, " 3"]:
+    """Mean displacement of training clips in H_{k-1}, m a frame at 30 fps."""
+    moves = []
+    for clip in resample([clip for clip in dataset if clip.phase == 0], FPS):
+        turn = np.asarray(matrix(jnp.asarray(clip.poses[:-1, 0])))
+        moves.append(np.einsum("tba,tb->ta", turn, np.diff(clip.trans, axis=0)))
+    return np.concatenate(moves).mean(0)

@@ -1,0 +1,181 @@
+"""Tables and pictures of how well motion models predict."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import PARENTS, BodyModel, local_joints
+from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
+from bodyslam_jax.motion.capture.retarget import place
+from bodyslam_jax.motion.continuation import Rollout
+from bodyslam_jax.motion.prediction import MotionModel
+from bodyslam_jax.motion.training.evaluation import (
+    baseline_mean,
+    evaluate_model,
+    run_trials,
+)
+from bodyslam_jax.motion.training.selection import DRIFTS, TARGETS
+
+COLUMNS = (
+    "error_mm step_mm ratio slope slope_30 spread nees coverage_95 corr_1 corr_30 "
+    "posture_deg posture_mm"
+).split()
+
+
+def compare(
+    models: Mapping[str, MotionModel],
+    body: BodyModel,
+    clips: Sequence[Clip],
+    *,
+    training: Sequence[Clip] = (),
+    drifts: Sequence[float] = DRIFTS,
+    seeds: int = 3,
+) -> list[dict[str, str | float]]:
+    """Measures several models on the same steps of the same clips, with baselines.
+
+    One row per model, drift and motion class; constant velocity once; the mean
+    displacement of `training` clips if there are any. `write_table` writes them.
+    """
+    skip = max(model.past for model in models.values()) + 1
+    rows = []
+    for name, model in models.items():
+        for drift_deg in drifts:
+            found = evaluate_model(
+                model, body, clips, drift_deg, seeds=seeds, skip=skip
+            )
+            rows += [
+                {"model": name, "drift": drift_deg, "class": kind, **measures}
+                for kind, measures in found.items()
+                if kind != "constant velocity"
+            ]
+    rows.append(
+        {
+            "model": "constant velocity (told the last displacement)",
+            "drift": 0.0,
+            "class": "all",
+            **found["constant velocity"],
+        }
+    )
+    if training:
+        model = next(iter(models.values()))
+        rows.append(
+            {
+                "model": "mean of the training set",
+                "drift": 0.0,
+                "class": "all",
+                **evaluate_model(
+                    model,
+                    body,
+                    clips,
+                    skip=skip,
+                    constant=baseline_mean(training),
+                )["constant"],
+            }
+        )
+    return rows
+
+
+def write_table(rows: Sequence[Mapping[str, str | float]]) -> str:
+    """Rows of `compare` as a Markdown table."""
+    head = ["model", "drift °", "class", *COLUMNS]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        cells = [str(row["model"]), f"{row['drift']:g}", str(row["class"])]
+        for column in COLUMNS:
+            value = row.get(column)
+            digits = 1 if column.endswith(("_mm", "_deg")) else 3
+            known = isinstance(value, float) and np.isfinite(value)
+            cells.append(f"{value:.{digits}f}" if known else "")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw_errors(
+    model: MotionModel,
+    body: BodyModel,
+    clips: Sequence[Clip],
+    path: Path,
+    drifts: Sequence[float] = DRIFTS,
+) -> None:
+    """Histograms of the translation error in x, y, z of H, as the paper's figure 7."""
+    trials = place(body, resample([c for c in clips if c.phase == 0], FPS))
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure((9, 2.8), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
+    bins = np.linspace(-30, 30, 61)
+    for drift_deg in drifts:
+        steps = run_trials(model, body, trials, drift_deg)
+        error = 1e3 * (steps.predicted - steps.true)[steps.valid]
+        for axis, values in zip(axes, error.T, strict=True):
+            label = f"{drift_deg:g}°: {values.mean():.1f} ± {values.std():.1f}"
+            axis.hist(values, bins, density=True, histtype="step", label=label)
+    for axis, name in zip(axes, ("x (left)", "y (up)", "z (forward)"), strict=True):
+        axis.set(xlabel=f"error in {name}, mm")
+        axis.legend(fontsize=7, title="drift: mean ± sd", title_fontsize=7)
+    axes[0].set_ylabel("density, 1/mm")
+    figure.suptitle("recorded motion, simulated drift of postures", fontsize=9)
+    figure.savefig(path, dpi=120)
+
+
+def draw_rollout(
+    motion: Rollout,
+    body: BodyModel,
+    shape: Float[np.ndarray, " 10"],
+    path: Path,
+    every: int = 15,
+) -> None:
+    """Stick figures of a motion, seen from its right and from above."""
+    dtype = motion.body_pose.dtype
+    local = local_joints(body, motion.body_pose, jnp.asarray(shape, dtype))
+    world = jnp.einsum("tab,tjb->tja", motion.orientation, local)
+    joints = np.asarray(world + motion.trans[:, None])
+    heading = np.asarray(motion.orientation[0, :, 2])
+    up = np.asarray(motion.orientation[0, :, 1])
+    side = np.cross(up, heading)
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure((9, 4), layout="constrained")
+    views = zip(figure.subplots(2, 1, sharex=True), (up, side), strict=True)
+    for axis, vertical in views:
+        for k in range(0, len(joints), every):
+            color = "0.6" if k == 0 else f"C{k // every % 10}"
+            for joint in range(1, 24):
+                ends = joints[k, [joint, PARENTS[joint]]]
+                axis.plot(ends @ heading, ends @ vertical, color=color, lw=1)
+        axis.set_aspect("equal")
+    axis.set(xlabel="m ahead", ylabel="m to the left")
+    figure.axes[0].set(ylabel="m up", title=f"every {every / FPS:.2g} s")
+    figure.savefig(path, dpi=120)
+
+
+def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
+    """Draws loss, validation error and slope over epochs to an image file."""
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure((9, 3), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    epochs = np.arange(1, len(history) + 1)
+    left.plot(epochs, history[:, 0], color="k")
+    left.set(title="training loss", xlabel="epoch")
+    if (history[:, 0] > 0).all():  # a likelihood may be negative
+        left.set_yscale("log")
+    judged = np.isfinite(history[:, 1])
+    at, seen = epochs[judged], history[judged]
+    for i, (drift_deg, target) in enumerate(zip(DRIFTS, TARGETS, strict=True)):
+        (line,) = middle.plot(at, seen[:, 1 + i], label=f"{drift_deg:g}° drift")
+        middle.axhline(target, color=line.get_color(), lw=0.7, ls=":")
+        right.plot(at, seen[:, 4 + i], color=line.get_color())
+    middle.set(title="validation error / step", xlabel="epoch")
+    right.axhline(1, color="k", lw=0.7)
+    right.set(title="validation slope", xlabel="epoch")
+    if len(seen):  # the first epochs may be far out
+        middle.legend()
+        late = seen[len(seen) // 5 :]
+        middle.set_ylim(0, 1.1 * max(*TARGETS, late[:, 1:4].max()))
+        low, high = late[:, 4:].min(), late[:, 4:].max()
+        right.set_ylim(min(low, 0.95) - 0.02, max(high, 1.05) + 0.02)
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,87 @@
+"""What training minimises.
+
+The loss of the paper's preset is its equation 1. The default's is a mean error norm
+(not its square: errors have heavy tails) of single steps and of their mean over a
+segment, with a penalty on the slope of predicted over true displacement, which a
+graph would read as scale; posture and covariance are learnt beside it.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.motion.network import apply_layers, lower_triangle
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import MetricNetwork
+from bodyslam_jax.motion.rotations import change
+from bodyslam_jax.motion.training.sampling import Batch
+
+
+def loss(
+    network: MetricNetwork | PaperNetwork, batch: Batch, settings: MotionTraining
+) -> Float[Array, ""]:
+    """Mean loss of a batch; see the module's docstring."""
+    if isinstance(network, PaperNetwork):
+        return _paper_loss(network, batch)
+    return _metric_loss(network, batch, settings)
+
+
+def _paper_loss(network: PaperNetwork, batch: Batch) -> Float[Array, ""]:
+    """Equation 1: `c_p + λ c_θ`, λ = 1/24, of normalised quantities."""
+    out = network.normalised(network.features(batch.window))
+    move = batch.move * batch.window.leg[..., None]
+    pose = batch.pose.reshape(*move.shape[:-1], 72)
+    error = out - network.outputs(jnp.concatenate([move, pose], -1))
+    square = (error[..., :3] ** 2).sum(-1) + (error[..., 3:] ** 2).sum(-1) / 24
+    return (square * batch.weight).sum() / batch.weight.sum()
+
+
+def _metric_loss(
+    network: MetricNetwork, batch: Batch, settings: MotionTraining
+) -> Float[Array, ""]:
+    weight, window = batch.weight, batch.window
+    total = weight.sum()
+    moves, spreads = network.moves(window, network.features(window))
+    error = (moves - batch.move) / network.unit
+    norm = lambda x, soft: jnp.sqrt((x * x).sum(-1) + soft**2)
+    single = (norm(error, 0.05) * weight).sum((1, 2)) / total
+    # mean error over the segment, turned into one frame
+    turned = jnp.einsum("slab,mslb->msla", batch.frame, error) * weight[..., None]
+    count = weight.sum(-1)
+    mean = turned.sum(2) / jnp.maximum(count, 1.0)[:, None]
+    along = (norm(mean, 0.05) * count).sum(1) / total
+    # slope of predicted over true displacement, by noise level
+    groups = lambda x: (x * weight).reshape(*x.shape[:-2], 4, -1).sum(-1)
+    true = groups((batch.move**2).sum(-1))
+    slope = groups((moves * batch.move).sum(-1)) / jnp.maximum(true, 1e-6)
+    bias = ((slope - 1) ** 2).sum(-1)
+    mean_loss = single + settings.segment_weight * along + settings.slope_weight * bias
+
+    whitened = jax.scipy.linalg.solve_triangular(
+        lower_triangle(spreads.mean(0)),
+        jax.lax.stop_gradient(error.mean(0))[..., None],
+        lower=True,
+    )[..., 0]
+    entries = jnp.clip(spreads.mean(0)[..., :3], -12.0, 6.0)
+    likelihood = 0.5 * (jnp.minimum(whitened**2, 50.0)).sum(-1) + entries.sum(-1)
+
+    features = network.posture_features(window)
+    out = apply_posture(network, features)
+    goal = network.posture_outputs(posture_goal(batch).reshape(*out.shape))
+    posture = ((out - goal) ** 2).mean(-1)
+    return mean_loss.sum() + ((likelihood + posture) * weight).sum() / total
+
+
+def apply_posture(
+    network: MetricNetwork, features: Float[Array, "*b d"]
+) -> Float[Array, "*b 72"]:
+    """Normalised change of posture."""
+    return apply_layers(network.posture, network.posture_inputs(features))
+
+
+def posture_goal(batch: Batch) -> Float[Array, "s l 24 3"]:
+    """The rotation that leads from the (noisy) last posture to the true next one."""
+    last = batch.window.body_pose[..., -2, :, :]
+    turns = change(last, batch.pose[..., 1:, :])
+    return jnp.concatenate([batch.pose[..., :1, :], turns], -2)

@@ -1,0 +1,46 @@
+"""What estimated postures look like: true ones with slowly varying errors.
+
+Regressors err by 10 to 20 degrees, almost all of it slowly (AR(1), rho 0.9 to 0.97 at
+30 fps), with a few tenths of a degree of white noise on top.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bodyslam_jax.motion.rotations import turned
+
+CORRELATION = 0.96
+"""Correlation of the slow error from one frame at 30 fps to the next."""
+
+_EXTREMITIES = (7, 8, 10, 11, 20, 21, 22, 23)
+JOINT_FACTOR = np.where(np.isin(np.arange(24), _EXTREMITIES), 1.5, 1.0)
+"""Hands and feet err half as much again."""
+
+
+def drift(
+    key: PRNGKeyArray, frames: int, sigma: Float[Array, ""], white: Float[Array, ""]
+) -> Float[Array, "{frames} 24 3"]:
+    """A stationary AR(1) error of every joint angle plus white noise.
+
+    `sigma` and `white` are standard deviations per axis, in the unit of the result.
+    """
+    slow, fast = jax.random.split(key)
+    dtype = sigma.dtype
+    innovation = jax.random.normal(slow, (frames, 24, 3), dtype)
+    rest = jnp.asarray(np.sqrt(1 - CORRELATION**2), dtype)
+    innovation = innovation.at[1:].multiply(rest)
+    # x_k = sum_i rho^(k-i) e_i as one product: cheaper than a scan, and exact
+    lag = np.arange(frames)[:, None] - np.arange(frames)
+    decay = np.where(lag >= 0, CORRELATION ** np.maximum(lag, 0), 0.0)
+    walk = jnp.tensordot(jnp.asarray(decay, dtype), innovation, 1)
+    noise = sigma * walk + white * jax.random.normal(fast, (frames, 24, 3), dtype)
+    return noise * jnp.asarray(JOINT_FACTOR, dtype)[:, None]
+
+
+def disturb(
+    poses: Float[Array, "*b 24 3"], noise: Float[Array, "*b 24 3"]
+) -> Float[Array, "*b 24 3"]:
+    """Turns each joint by a further small rotation, in its own frame (rad)."""
+    return turned(poses, noise)

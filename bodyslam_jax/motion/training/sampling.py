@@ -1,0 +1,211 @@
+"""Training data on the device, and random batches of it that look like estimates.
+
+A batch is `s` segments of `n + l` frames, each of another person (β drawn at random),
+another speed, perhaps mirrored, with posture errors of another size: a clean share,
+the rest drifting. Errors are drawn along the segment, so that its `l` windows share
+them as they do in a video.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+
+from bodyslam_jax.body import BodyModel, local_joints, rest_joints
+from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.motion.capture.clips import (
+    FPS,
+    LEFT_RIGHT,
+    Clip,
+    hip_centre,
+    interleave,
+    resample,
+)
+from bodyslam_jax.motion.network import Window
+from bodyslam_jax.motion.prediction import leg_length
+from bodyslam_jax.motion.rotations import matrix, transposed, vector
+from bodyslam_jax.motion.training.noise import disturb, drift
+
+DENSE = 4
+"""Training data are kept at four times the model's rate: phases and speeds."""
+
+_ROOT_SHARE = 0.3
+"""Share of segments in which the root's orientation errs too."""
+
+
+class Corpus(eqx.Module):
+    """All training frames in a row, and where a segment may begin."""
+
+    poses: Float[Array, "n 24 3"]
+    """Axis-angle, rad."""
+    path: Float[Array, "n 3"]
+    """Middle of the hips in the capture's world, in leg lengths of the subject."""
+    start: Int[Array, " c"]
+    """Candidates for a segment's first frame."""
+    last: Int[Array, " c"]
+    """Last frame of the clip that a candidate belongs to."""
+    cumulative: Float[Array, " c"]
+    """Sum of the candidates' probabilities so far."""
+
+    @property
+    def num_windows(self) -> int:
+        return len(self.start)
+
+
+class Batch(eqx.Module):
+    """`s` segments of `l` windows each."""
+
+    window: Window
+    move: Float[Array, "s l 3"]
+    """True displacement in H_{k-1}, leg lengths per step."""
+    frame: Float[Array, "s l 3 3"]
+    """True C_{H_0}^T C_{H_{k-1}}: takes the segment's displacements to one frame."""
+    pose: Float[Array, "s l 24 3"]
+    """True posture of frame k; row 0 is the rotation vector from k-1 to k."""
+    weight: Float[Array, "s l"]
+    """1, or 0 where the clip had ended."""
+
+
+def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
+    """Gathers clips at `DENSE` times the model's rate.
+
+    **Raises:** `ValueError` if no clip of a wanted class is as long as one window.
+    """
+    share = {"walk": 1.0, "run": settings.run_weight}
+    share_of = lambda clip: share.get(clip.motion, settings.other_weight)
+    wanted = [clip for clip in clips if share_of(clip) > 0]
+    if not wanted:
+        raise ValueError(
+            f"no usable sequence among {len(clips)}: none is named walk, run or jog; "
+            "train on all motion with a positive `other_weight`."
+        )
+    dense = resample(interleave(wanted), FPS * DENSE)
+    span = settings.past * max(settings.strides)
+    # A window holds its first and its last frame; the next begins a step later.
+    spacing = 1 if settings.sliding else span + DENSE
+    starts, lasts, weights, offset = [], [], [], 0
+    for clip in dense:
+        t = len(clip.poses)
+        first = np.arange(0, t - span, spacing) + offset
+        starts.append(first)
+        lasts.append(np.full(len(first), offset + t - 1))
+        weights.append(np.full(len(first), share_of(clip)))
+        offset += t
+    weight = np.concatenate(weights)
+    if len(weight) == 0:
+        longest = max(len(clip.poses) / clip.fps for clip in dense)
+        raise ValueError(
+            f"no usable sequence among {len(clips)}: the longest lasts "
+            f"{longest:.2f} s; a window needs {span / DENSE / FPS:.2f} s."
+        )
+    path = [hip_centre(clip) / clip.leg_length for clip in dense]
+    return Corpus(
+        poses=jnp.asarray(np.concatenate([clip.poses for clip in dense]), jnp.float32),
+        path=jnp.asarray(np.concatenate(path), jnp.float32),
+        start=jnp.asarray(np.concatenate(starts), jnp.int32),
+        last=jnp.asarray(np.concatenate(lasts), jnp.int32),
+        cumulative=jnp.asarray(np.cumsum(weight) / weight.sum(), jnp.float32),
+    )
+
+
+@eqx.filter_jit
+def draw(
+    key: PRNGKeyArray, data: Corpus, body: BodyModel, settings: MotionTraining
+) -> Batch:
+    """Draws a batch."""
+    s, l, past = settings.segments, settings.steps, settings.past
+    keys = jax.random.split(key, 8)
+    row = jnp.searchsorted(
+        data.cumulative, jax.random.uniform(keys[0], (s,), jnp.float32)
+    )
+    row = jnp.minimum(row, len(data.start) - 1)
+    strides = jnp.asarray(settings.strides, jnp.int32)
+    stride = strides[jax.random.randint(keys[1], (s,), 0, len(strides))]
+    count = jnp.arange(past + l, dtype=jnp.int32)
+    frames = data.start[row, None] + stride[:, None] * count
+    inside = frames <= data.last[row, None]
+    frames = jnp.minimum(frames, data.last[row, None])
+    poses, path = data.poses[frames], data.path[frames]
+    if settings.mirror:
+        poses, path = _mirrored(jax.random.bernoulli(keys[2], 0.5, (s,)), poses, path)
+    shape = settings.shape_sigma * jax.random.normal(keys[3], (s, 10), jnp.float32)
+    noise = _errors(keys[4:8], s, past + l, settings)
+    estimated = disturb(poses, noise)
+
+    true = matrix(poses[:, :, 0])
+    before, after = true[:, past - 1 : -1], true[:, past:]
+    leg = leg_length(body, shape)
+    rest = rest_joints(body, shape)
+    below = ((rest[:, 1] + rest[:, 2]) / 2 - rest[:, 0]) / leg[:, None]
+    path = path - jnp.einsum("sfab,sb->sfa", true, below)
+    step = path[:, past:] - path[:, past - 1 : -1]
+    turn = vector(transposed(before) @ after)
+    joints = local_joints(body, estimated[:, :, 1:], shape[:, None])
+    window = jax.vmap(_windows, (0, 0, 0, None))(
+        matrix(estimated[:, :, 0]),
+        joints / leg[:, None, None, None],
+        estimated[:, :, 1:],
+        past,
+    )
+    wide = lambda x: jnp.broadcast_to(x[:, None], (s, l, *x.shape[1:]))
+    return Batch(
+        window=Window(*window, shape=wide(shape), leg=wide(leg)),
+        move=jnp.einsum("slba,slb->sla", before, step),
+        frame=jnp.einsum("sba,slbc->slac", before[:, 0], before),
+        pose=jnp.concatenate([turn[:, :, None], poses[:, past:, 1:]], 2),
+        weight=inside[:, past:].astype(jnp.float32),
+    )
+
+
+def _windows(rotation, joints, body_pose, past):
+    turned = jnp.einsum("tab,tjb->tja", rotation, joints)
+    rows = np.arange(len(rotation) - past)[:, None] + np.arange(past + 1)
+    before = rotation[rows[:, -2]]
+    return (
+        jnp.einsum("wba,wpbc->wpac", before, rotation[rows]),
+        body_pose[rows],
+        jnp.einsum("wba,wpjb->wpja", before, turned[rows]),
+    )
+
+
+def _mirrored(
+    which: Bool[Array, " s"],
+    poses: Float[Array, "s f 24 3"],
+    path: Float[Array, "s f 3"],
+) -> tuple[Float[Array, "s f 24 3"], Float[Array, "s f 3"]]:
+    order = np.arange(24)
+    for left, right in LEFT_RIGHT:
+        order[[left, right]] = right, left
+    flip = np.array([1, -1, -1], np.float32)
+    other = poses[:, :, order] * flip
+    return (
+        jnp.where(which[:, None, None, None], other, poses),
+        jnp.where(which[:, None, None], path * -flip, path),
+    )
+
+
+def _errors(
+    keys: Key[Array, " 4"], s: int, frames: int, settings: MotionTraining
+) -> Float[Array, "s f 24 3"]:
+    """Drift in equal steps from none to `drift_deg` after a clean share of segments.
+
+    The root, whose error is another one in video, drifts in some of the segments, by
+    a random share.
+    """
+    clean = settings.clean_share
+    place = np.arange(s) / s
+    level = np.clip((place - clean) / max(1 - clean, 1e-6), 0, None)
+    sigma = jnp.asarray(np.deg2rad(settings.drift_deg) * level, jnp.float32)
+    most = jnp.asarray(
+        np.where(place < 0.7 * clean, 0.0, np.deg2rad(settings.white_deg)), jnp.float32
+    )
+    white = most * jax.random.uniform(keys[0], (s,), jnp.float32)
+    noise = jax.vmap(drift, (0, None, 0, 0))(
+        jax.random.split(keys[1], s), frames, sigma, white
+    )
+    share = settings.root_drift * jax.random.uniform(keys[2], (s,), jnp.float32)
+    share = jnp.where(jax.random.bernoulli(keys[3], _ROOT_SHARE, (s,)), share, 0.0)
+    return noise.at[:, :, 0].multiply(share[:, None, None])

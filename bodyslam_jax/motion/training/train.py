@@ -1,0 +1,258 @@
+"""Training: one `lax.scan` per epoch, resumed after a kill, the same for one seed."""
+
+import dataclasses
+import json
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
+from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.network import Normalisation, normalisation
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import MetricNetwork
+from bodyslam_jax.motion.prediction import MotionModel, in_dtype
+from bodyslam_jax.motion.training.checkpoint import (
+    fingerprint,
+    load_checkpoint,
+    save_checkpoint,
+)
+from bodyslam_jax.motion.training.losses import loss, posture_goal
+from bodyslam_jax.motion.training.sampling import Batch, Corpus, corpus, draw
+from bodyslam_jax.motion.training.selection import calibrated, named, score, validated
+
+logger = logging.getLogger(__name__)
+
+_MEASURED = 20
+"""Batches from which means and standard deviations are taken."""
+
+
+class Progress(eqx.Module):
+    """All that a checkpoint must hold to continue as if nothing had happened."""
+
+    network: MetricNetwork | PaperNetwork
+    average: MetricNetwork | PaperNetwork
+    """Running mean of the weights."""
+    best: MetricNetwork | PaperNetwork
+    """The mean that did best on validation."""
+    optimiser: optax.OptState
+    history: Float[Array, "e 7"]
+    """Per epoch: training loss; validation error ratio, then slope, for `DRIFTS`, NaN
+    where it was not judged."""
+    epoch: Float[Array, ""]
+
+
+def trainable(network):
+    """What the optimiser may change: all arrays but normalisation and calibration."""
+    frozen = lambda x: isinstance(x, Normalisation)
+    mask = jax.tree.map(
+        lambda x: jax.tree.map(lambda _: False, x) if frozen(x) else True,
+        network,
+        is_leaf=frozen,
+    )
+    if isinstance(network, PaperNetwork):
+        return eqx.tree_at(lambda n: n.spread, mask, False)
+    return eqx.tree_at(lambda n: (n.unit, n.gain), mask, (False, False))
+
+
+def _measure(
+    network: MetricNetwork | PaperNetwork, batches: Sequence[Batch]
+) -> MetricNetwork | PaperNetwork:
+    """Sets normalisation from batches of training data."""
+    rows = lambda f: np.concatenate(
+        [np.asarray(f(b)).reshape(b.weight.size, -1) for b in batches]
+    )
+    if isinstance(network, PaperNetwork):
+        move = rows(lambda b: b.move * b.window.leg[..., None])
+        outputs = normalisation(np.concatenate([move, rows(lambda b: b.pose)], -1))
+        inputs = normalisation(rows(lambda b: network.features(b.window)))
+        return eqx.tree_at(lambda n: (n.inputs, n.outputs), network, (inputs, outputs))
+    unit = np.sqrt((rows(lambda b: b.move) ** 2).sum(-1).mean())
+    return eqx.tree_at(
+        lambda n: (n.inputs, n.posture_inputs, n.posture_outputs, n.unit),
+        network,
+        (
+            normalisation(rows(lambda b: network.features(b.window))),
+            normalisation(rows(lambda b: network.posture_features(b.window))),
+            normalisation(rows(posture_goal)),
+            jnp.asarray(unit, jnp.float32),
+        ),
+    )
+
+
+def initial_network(
+    key: PRNGKeyArray, settings: MotionTraining
+) -> MetricNetwork | PaperNetwork:
+    """An untrained network of the kind that `settings` asks for."""
+    if settings.network == "paper":
+        return PaperNetwork.init(key, settings.past, settings.width[0])
+    return MetricNetwork.init(
+        key, settings.past, settings.width, settings.members, settings.future
+    )
+
+
+def optimiser(settings: MotionTraining, steps: int) -> optax.GradientTransformation:
+    """AdamW; gradients' entries are kept below `clip`."""
+    rate = settings.learning_rate
+    schedule = (
+        optax.warmup_cosine_decay_schedule(0.0, rate, min(100, steps // 10 + 1), steps)
+        if settings.decay
+        else rate
+    )
+    adam = optax.adamw(schedule, weight_decay=settings.weight_decay)
+    limit = optax.identity() if settings.clip is None else optax.clip(settings.clip)
+    return optax.chain(limit, adam)
+
+
+def start(network: MetricNetwork | PaperNetwork, settings: MotionTraining) -> Progress:
+    """Before the first epoch."""
+    moving = eqx.filter(network, trainable(network))
+    return Progress(
+        network=network,
+        average=network,
+        best=network,
+        optimiser=optimiser(settings, 1000).init(moving),  # steps do not matter here
+        history=jnp.full((settings.epochs, 7), jnp.nan, jnp.float32),
+        epoch=jnp.zeros((), jnp.float32),
+    )
+
+
+@eqx.filter_jit
+def run_epoch(
+    progress: Progress,
+    data: Corpus,
+    body: BodyModel,
+    settings: MotionTraining,
+    steps: int,
+    epochs: int,
+) -> Progress:
+    """One epoch: draw, differentiate, update, `steps` times in one scan."""
+    update = optimiser(settings, steps * epochs)
+    mask = trainable(progress.network)
+    key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+    key = jax.random.fold_in(key, progress.epoch.astype(jnp.int32))
+    devices = jax.local_devices()
+    count = max(d for d in range(1, len(devices) + 1) if settings.segments % d == 0)
+    mesh = jax.sharding.Mesh(np.array(devices[:count]), ("data",))
+    split = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("data"))
+
+    def step(carry, number):
+        network, average, state = carry
+        batch = draw(jax.random.fold_in(key, number), data, body, settings)
+        if count > 1:
+            batch = jax.lax.with_sharding_constraint(batch, split)
+        moving, fixed = eqx.partition(network, mask)
+        value, gradient = jax.value_and_grad(
+            lambda moving: loss(eqx.combine(moving, fixed), batch, settings)
+        )(moving)
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integers
+            updates, state = update.update(gradient, state, moving)
+        network = eqx.combine(optax.apply_updates(moving, updates), fixed)
+        done = progress.epoch * steps + number.astype(jnp.float32)
+        keep = jnp.minimum(settings.averaging, (1 + done) / (10 + done))
+        average = jax.tree.map(lambda a, b: keep * a + (1 - keep) * b, average, network)
+        return (network, average, state), value
+
+    carry = (progress.network, progress.average, progress.optimiser)
+    carry, values = jax.lax.scan(step, carry, jnp.arange(steps))
+    network, average, state = carry
+    at = progress.epoch.astype(jnp.int32)
+    return dataclasses.replace(
+        progress,
+        network=network,
+        average=average,
+        optimiser=state,
+        history=progress.history.at[at, 0].set(values.mean()),
+        epoch=progress.epoch + 1,
+    )
+
+
+def _validate(
+    progress: Progress,
+    model: MotionModel,
+    body: BodyModel,
+    trials: Sequence[Trial],
+    settings: MotionTraining,
+) -> Progress:
+    """Notes how good the mean weights are; keeps them if none before were better."""
+    epoch = int(progress.epoch) - 1
+    row = validated(model, body, trials)
+    judged = lambda row: score(row, settings.drift_deg)
+    before = [judged(r) for r in np.asarray(progress.history[:epoch, 1:])]
+    better = not any(value <= judged(row) for value in before)  # NaN: was not judged
+    return dataclasses.replace(
+        progress,
+        history=progress.history.at[epoch, 1:].set(jnp.asarray(row, jnp.float32)),
+        best=progress.average if better else progress.best,
+    )
+
+
+def train(
+    clips: Sequence[Clip],
+    body: BodyModel,
+    settings: MotionTraining = MotionTraining(),
+    *,
+    validation: Sequence[Clip] = (),
+    checkpoint: Path | None = None,
+    report: Callable[[int, int, dict[str, float]], None] | None = None,
+    about: dict | None = None,
+) -> tuple[MotionModel, Float[np.ndarray, "e 7"]]:
+    """Trains a motion model; returns it and the history that `draw_history` draws.
+
+    `validation` clips (of other subjects) choose the epoch whose weights are kept and
+    give the covariance its size; without them the last epoch is kept. `checkpoint` is
+    a file that every epoch rewrites, from which the same call continues after a kill;
+    remove it when the weights are safe. `report(epoch, epochs, measures)` is called
+    after each epoch. The same seed gives the same weights on the same machine.
+
+    **Raises:** `ValueError` if no clip is long enough, if a checkpoint belongs to
+    other settings or data, or if training diverges.
+    """
+    body = in_dtype(body, jnp.float32)
+    data = corpus(clips, settings)
+    trials = place(body, resample([c for c in validation if c.phase == 0], FPS))
+    steps = -(-data.num_windows // (settings.segments * settings.steps))
+    key = jax.random.key(settings.seed)
+    network = initial_network(jax.random.fold_in(key, 0), settings)
+    keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
+    network = _measure(network, [draw(k, data, body, settings) for k in keys])
+    progress = start(network, settings)
+    mark = fingerprint(settings, data, body)
+    if checkpoint is not None and checkpoint.exists():
+        progress = load_checkpoint(checkpoint, progress, mark)
+        logger.info("continuing %s at epoch %d", checkpoint, int(progress.epoch))
+    model = lambda network: MotionModel(
+        network, body.kind, FPS, settings.past, json.dumps(about or {})
+    )
+    while int(progress.epoch) < settings.epochs:
+        epoch = int(progress.epoch)
+        progress = run_epoch(progress, data, body, settings, steps, settings.epochs)
+        measures = {"loss": float(progress.history[epoch, 0])}
+        if not np.isfinite(measures["loss"]):
+            raise ValueError(
+                f"training diverged in epoch {epoch + 1}: loss is not finite."
+            )
+        last = epoch + 1 == settings.epochs
+        if trials and (last or (epoch + 1) % settings.validate_every == 0):
+            now = model(progress.average)
+            progress = _validate(progress, now, body, trials, settings)
+            measures |= named(np.asarray(progress.history[epoch, 1:]))
+        elif not trials:
+            progress = dataclasses.replace(progress, best=progress.average)
+        if checkpoint is not None:
+            save_checkpoint(checkpoint, progress, mark)
+        if report is not None:
+            report(epoch + 1, settings.epochs, measures)
+    done = model(progress.best)
+    if trials:
+        done = calibrated(done, body, trials)
+    return done, np.asarray(progress.history)

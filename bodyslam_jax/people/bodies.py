@@ -1,0 +1,98 @@
+"""Bodies in the camera frame, from whatever a sequence tells of its people."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.people.clean_regressed import prepare_bodies
+from bodyslam_jax.people.fit import fit_bodies
+from bodyslam_jax.people.sides import unexchanged
+from bodyslam_jax.types import Bodies, Keypoints, Sequence
+
+
+def estimate_bodies(
+    sequence: Sequence, body: BodyModel, settings: PeopleFit = PeopleFit()
+) -> Bodies:
+    """A regressor's bodies, cleaned; of people without any, bodies fitted to their
+    keypoints; else nobody."""
+    camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
+    if keypoints is not None:
+        keypoints, _ = unexchanged(keypoints, fps)
+    if sequence.bodies is None:
+        if keypoints is None:
+            return nobody(sequence.num_frames)
+        return fit_bodies(keypoints, camera, body, fps, settings)
+    found = prepare_bodies(sequence.bodies, keypoints, camera, body, fps, settings)
+    (others,) = np.nonzero(without_bodies(sequence))
+    if keypoints is None or not len(others):
+        return found
+    depth = None if keypoints.depth is None else keypoints.depth[others]
+    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
+    fitted = fit_bodies(seen, camera, body, fps, settings)
+    for name in ("present", "poses", "shapes", "trans"):
+        getattr(found, name)[others] = getattr(fitted, name)
+    return found
+
+
+def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
+    """The sequence with these people only, in this order; all of them for `()`.
+
+    **Raises:** `ValueError` if one of them is not there.
+    """
+    if not people:
+        return sequence
+    keypoints, bodies = sequence.keypoints, sequence.bodies
+    count = 0
+    if keypoints is not None:
+        count = len(keypoints.uv)
+    elif bodies is not None:
+        count = len(bodies.present)
+    beyond = [h for h in people if h >= count]
+    if beyond:
+        found = f"people 0 to {count - 1}" if count else "nobody"
+        raise ValueError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
+    index = list(dict.fromkeys(people))
+    if keypoints is not None:
+        depth = None if keypoints.depth is None else keypoints.depth[index]
+        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index], depth)
+    if bodies is not None:
+        bodies = dataclasses.replace(
+            bodies,
+            present=bodies.present[index],
+            poses=bodies.poses[index],
+            shapes=bodies.shapes[index],
+            trans=bodies.trans[index],
+        )
+    text = (
+        f"{len(index)} of {count} people are estimated: {', '.join(map(str, index))}."
+    )
+    return dataclasses.replace(
+        sequence,
+        keypoints=keypoints,
+        bodies=bodies,
+        warnings=(*sequence.warnings, text)
+        if len(index) < count
+        else sequence.warnings,
+    )
+
+
+def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:
+    """People of whom no regressor said anything, so that their bodies are fitted."""
+    if sequence.bodies is not None:
+        return np.logical_not(sequence.bodies.present.any(axis=1))
+    count = 0 if sequence.keypoints is None else len(sequence.keypoints.uv)
+    return np.ones(count, bool)
+
+
+def nobody(num_frames: int) -> Bodies:
+    """The bodies of a video that shows none, or whose people are left out."""
+    t = num_frames
+    return Bodies(
+        np.zeros((0, t), bool),
+        np.zeros((0, t, 72)),
+        np.zeros((0, t, 10)),
+        np.zeros((0, t, 3)),
+    )

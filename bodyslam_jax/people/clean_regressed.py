@@ -1,0 +1,297 @@
+"""Bodies that a regressor gave, made fit to start from.
+
+Regressors look at one image at a time: depth jitters by centimetres a frame, now and
+then a body is turned round, frames are missing, β changes. Posture is left as it is:
+smoothing a walk shrinks its steps, and the step is the scale.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import solveh_banded
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
+from bodyslam_jax.people.facing import HALF_TURN, find_turned
+from bodyslam_jax.people.keypoint_errors import (
+    in_pixels,
+    keypoint_sigma,
+    pixels_per_metre,
+)
+from bodyslam_jax.people.person_state import Roots, bodies_from_roots, roots_from_bodies
+from bodyslam_jax.people.rotations import matrices, slerp, vectors
+from bodyslam_jax.people.skeleton import (
+    NUM_SHAPE,
+    Skeleton,
+    make_skeleton,
+    place_points,
+)
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
+
+_BUCKET = 64
+_PLACING_STEPS = 10
+_REGRESSOR_SHAPE_GAIN = 1.2
+"""Regressors draw shapes to the mean, by 0.5 to 0.8 with an error of 0.3, of which this
+is about the best linear estimate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyNoise:
+    """How much of what a regressor says changes from frame to frame by chance.
+
+    From second differences, so motion that accelerates is in it: upper bounds. The
+    larger, slowly varying part of a regressor's error does not show here.
+    """
+
+    orientation: Float[np.ndarray, " h"]
+    """rad, per axis."""
+    posture: Float[np.ndarray, " h"]
+    """rad, per axis, all joints."""
+    depth: Float[np.ndarray, " h"]
+    """m"""
+    shape: Float[np.ndarray, "h 10"]
+    """Spread of β over the frames."""
+
+
+def prepare_bodies(
+    bodies: Bodies,
+    keypoints: Keypoints | None,
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    fps: float,
+    settings: PeopleFit = PeopleFit(),
+) -> Bodies:
+    """One shape per person, no flips, no short gaps, in place, with a smooth depth.
+
+    Where there are keypoints the pelvis is moved, posture held, to where they fit best;
+    the regressor's own depth stays as a measurement beside them. Person h of `bodies`
+    is person h of `keypoints`.
+    """
+    roots = roots_from_bodies(bodies, body)
+    skeleton = make_skeleton(body, settings.detector_bias)
+    prepared = Roots(
+        present=roots.present.copy(),
+        T_CH=roots.T_CH.copy(),
+        body_pose=roots.body_pose.copy(),
+        shape=_shape_gain(bodies, settings) * roots.shape,
+    )
+    for h in range(len(roots.present)):
+        T_CH = prepared.T_CH[h]
+        known = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
+        prepared.present[h] = known
+        where = np.flatnonzero(known)
+        if not len(where):
+            continue
+        uv = np.zeros((len(where), 25, 2))
+        sigma = np.full((len(where), 25), np.inf)
+        if keypoints is not None and h < len(keypoints.uv):
+            uv = keypoints.uv[h, where]
+            sigma = keypoint_sigma(keypoints, intrinsics, h)[where]
+        if np.isfinite(sigma).any():
+            sigma = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
+        orientation, position = _place_person(
+            skeleton, intrinsics, prepared, h, where, uv, sigma, fps, settings
+        )
+        T_CH[where, :3, :3] = orientation
+        T_CH[where, :3, 3] = position
+        _fill_gaps(prepared, h, settings.max_gap * fps)
+        T_CH[~prepared.present[h]] = np.eye(4)
+    return bodies_from_roots(prepared, body)
+
+
+def _shape_gain(bodies: Bodies, settings: PeopleFit) -> float:
+    if settings.regressor_shape_gain is not None:
+        return settings.regressor_shape_gain
+    return _REGRESSOR_SHAPE_GAIN if bodies.shapes_regressed else 1.0
+
+
+def body_noise(bodies: Bodies) -> BodyNoise:
+    """What the regressor's jitter is, from the bodies as they came."""
+    found = []
+    for present, poses, shapes, trans in zip(
+        bodies.present, bodies.poses, bodies.shapes, bodies.trans
+    ):
+        middle = present[1:-1] & present[:-2] & present[2:]
+        if not middle.any():
+            found.append((np.nan, np.nan, np.nan, np.full(10, np.nan)))
+            continue
+        turns = matrices(poses.reshape(len(poses), 24, 3))
+        step = vectors(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
+        change = np.diff(step, axis=0)[middle]
+        depth = np.diff(trans[:, 2], 2)[middle]
+        found.append(
+            (
+                _spread(change[:, 0]) / np.sqrt(6),
+                _spread(change[:, 1:22]) / np.sqrt(6),
+                _spread(depth) / np.sqrt(6),
+                np.array([_spread(b - np.median(b)) for b in shapes[present].T]),
+            )
+        )
+    return BodyNoise(*(np.array(column, float) for column in zip(*found)))
+
+
+def _spread(values: np.ndarray) -> float:
+    """Standard deviation about zero, from the median: outliers do not count."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def _place_person(
+    skeleton: Skeleton,
+    intrinsics: Intrinsics,
+    roots: Roots,
+    person: int,
+    where: np.ndarray,
+    uv: np.ndarray,
+    sigma: np.ndarray,
+    fps: float,
+    settings: PeopleFit,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
+    dtype = skeleton.offset.dtype
+    T_CH = roots.T_CH[person, where]
+    both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ HALF_TURN], axis=1)
+    angles = roots.body_pose[person, where, :21].reshape(-1, 63)
+    depth_sigma = settings.depth_error * T_CH[:, 2, 3]
+    rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
+    length = -len(where) % _BUCKET
+    padded = [
+        jnp.asarray(np.concatenate([a, np.repeat(a[-1:], length, axis=0)]), dtype)
+        for a in rows
+    ]
+    shape = jnp.zeros(NUM_SHAPE, dtype).at[:10].set(roots.shape[person])
+    camera = jnp.asarray(intrinsics.params, dtype)
+    scale = jnp.asarray(settings.robust_scale, dtype)
+    found = _place_bodies(skeleton, camera, shape, scale, *padded)
+    position, predicted = (np.asarray(a[: len(where)], float) for a in found)
+    facing = find_turned(
+        T_CH[:, :3, :3], where / fps, predicted, uv, sigma, settings.robust_scale
+    )
+    each, state = np.arange(len(where)), facing.turned.astype(int)
+    return both[each, state], _smooth(position[each, state], where, fps, settings)
+
+
+@jit_once
+def _place_bodies(
+    skeleton: Skeleton,
+    intrinsics: Float[Array, " i"],
+    shape: Float[Array, " s"],
+    scale: Float[Array, ""],
+    orientation: Float[Array, "t 2 3 3"],
+    angles: Float[Array, "t 63"],
+    position: Float[Array, "t 3"],
+    uv: Float[Array, "t 25 2"],
+    sigma: Float[Array, "t 25"],
+    depth_sigma: Float[Array, " t"],
+) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2 25 2"]]:
+    """Pelvis of each frame for either orientation, by robust Gauss--Newton.
+
+    **Returns:** positions in C, and keypoints of the body there, px.
+    """
+
+    def one(R, points, start, uv, sigma, depth_sigma):
+        rotated = points @ R.T
+        # Without keypoints nothing but the regressor's own place is known.
+        across = jnp.where(jnp.any(sigma < jnp.inf), 3.0, 0.01).astype(start.dtype)
+        prior_sigma = jnp.stack([across, across, depth_sigma])
+
+        def residuals(p):
+            predicted = project(intrinsics, rotated + p)
+            return (predicted - uv) / sigma[:, None]
+
+        def step(_, p):
+            r, jac = residuals(p), jax.jacfwd(residuals)(p)
+            _, weight = robust(jnp.sum(r**2, -1), scale)
+            weighted = jac * weight[:, None, None]
+            prior = 1 / prior_sigma**2
+            hessian = jnp.einsum("kci,kcj->ij", weighted, jac) + jnp.diag(prior)
+            gradient = jnp.einsum("kci,kc->i", weighted, r) + prior * (p - start)
+            moved = p - jnp.linalg.solve(hessian, gradient)
+            return moved.at[2].max(DEPTH_FLOOR)
+
+        p = jax.lax.fori_loop(0, _PLACING_STEPS, step, start)
+        return p, project(intrinsics, rotated + p)
+
+    def frame(R, angles, *rest):
+        _, points = place_points(skeleton, angles, shape)
+        return jax.vmap(lambda R: one(R, points, *rest))(R)
+
+    return jax.vmap(frame)(orientation, angles, position, uv, sigma, depth_sigma)
+
+
+def _smooth(
+    position: Float[np.ndarray, "m 3"],
+    where: np.ndarray,
+    fps: float,
+    settings: PeopleFit,
+) -> Float[np.ndarray, "m 3"]:
+    """Direction and depth as robustly smoothed curves, at the frames `where`."""
+    depth = position[:, 2]
+    mean_depth = float(np.median(depth))
+    slow = (30 / fps) ** 1.5
+    across = settings.position_jitter * slow / mean_depth
+    coordinates = np.column_stack([position[:, :2] / depth[:, None], depth])
+    jitter = (across, across, settings.depth_jitter * slow)
+    x, y, z = (
+        _smooth_curve(values, where, sigma)
+        for values, sigma in zip(coordinates.T, jitter)
+    )
+    return np.column_stack([x * z, y * z, z])
+
+
+def _smooth_curve(
+    values: Float[np.ndarray, " m"], where: np.ndarray, jitter: float
+) -> Float[np.ndarray, " m"]:
+    """Whittaker's smoother with Student weights: second differences of σ `jitter`.
+
+    The measurement noise is what the values' own second differences say, and its slow
+    part is taken to be as large again for about ten frames.
+    """
+    if len(values) < 5:
+        return values
+    total = where[-1] - where[0] + 1
+    index = where - where[0]
+    noise = max(_spread(np.diff(values, 2)) / np.sqrt(6), 0.1 * jitter)
+    sigma = noise * np.sqrt(10.0)
+    difference = np.array([1.0, -2.0, 1.0]) / jitter
+    stiffness = np.zeros((3, total))
+    for a in range(3):
+        for b in range(a, 3):
+            stiffness[2 - (b - a), b : total - 2 + b] += difference[a] * difference[b]
+    filled = np.interp(np.arange(total), index, values)
+    weight = np.zeros(total)
+    weight[index] = sigma**-2
+    smooth = filled
+    for _ in range(10):
+        banded = stiffness.copy()
+        banded[2] += weight + 1e-9 * sigma**-2
+        smooth = solveh_banded(banded, (weight + 1e-9 * sigma**-2) * filled)
+        error = (values - smooth[index]) / sigma
+        weight[index] = sigma**-2 / (1 + error**2 / 4)
+    return smooth[index]
+
+
+def _fill_gaps(roots: Roots, person: int, longest: float) -> None:
+    """Interpolates gaps of up to `longest` frames, in place."""
+    where = np.flatnonzero(roots.present[person])
+    T_CH, pose = roots.T_CH[person], roots.body_pose[person]
+    for a, b in zip(where[:-1], where[1:]):
+        if not 1 < b - a <= longest + 1:
+            continue
+        share = np.arange(1, b - a) / (b - a)
+        gap = slice(a + 1, b)
+        from_, to = np.broadcast_to(T_CH[[a, b], None, :3, :3], (2, len(share), 3, 3))
+        T_CH[gap, :3, :3] = slerp(from_, to, share)
+        T_CH[gap, :3, 3] = T_CH[a, :3, 3] + share[:, None] * (
+            T_CH[b, :3, 3] - T_CH[a, :3, 3]
+        )
+        size = (2, len(share), 23, 3, 3)
+        from_, to = np.broadcast_to(matrices(pose[[a, b]])[:, None], size)
+        joint_share = np.repeat(share[:, None], 23, axis=1)
+        pose[gap] = vectors(slerp(from_, to, joint_share))
+        roots.present[person, gap] = True

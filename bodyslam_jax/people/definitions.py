@@ -1,0 +1,109 @@
+"""What a detector calls hip or knee, beside what the body model calls so.
+
+Every detector has its own idea of where a hip is, the same in all frames of a person.
+The fit to keypoints estimates it with the shape (`_skeleton`: offsets fixed to bones);
+whoever compares keypoints with the model's joints afterwards must know it too: a leg
+that seems 5 % too short bends the knee by 36 degrees.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
+from bodyslam_jax.people.keypoint_errors import in_pixels, keypoint_sigma
+from bodyslam_jax.people.person_state import Roots
+from bodyslam_jax.people.skeleton import (
+    NUM_SHAPE,
+    Skeleton,
+    make_skeleton,
+    pose_points,
+)
+from bodyslam_jax.types import Intrinsics, Keypoints
+
+_BUCKET = 64
+_ROUNDS = 6
+
+
+def as_body_keypoints(
+    keypoints: Keypoints,
+    roots: Roots,
+    chosen: Bool[np.ndarray, " h"],
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    fps: float,
+    settings: PeopleFit = PeopleFit(),
+) -> Keypoints:
+    """Keypoints where the detector would have put them, had it the body's definitions.
+
+    Of the people `chosen`, whose bodies were fitted to these keypoints; others and
+    frames without a body stay as they are. Offsets are a robust linear regression on
+    what the bodies leave of the keypoints, with `_skeleton`'s deviations as a prior;
+    frames whose errors are alike count once.
+    """
+    uv = keypoints.uv.copy()
+    skeleton = make_skeleton(body, 0.0)  # the graph's
+    camera = jnp.asarray(intrinsics.params, skeleton.offset.dtype)
+    focal = float(np.mean(intrinsics.params[:2]))
+    for h in np.flatnonzero(chosen & roots.present.any(axis=1)):
+        where = np.flatnonzero(roots.present[h])
+        T_CH = roots.T_CH[h, where]
+        depth = np.maximum(T_CH[:, 2, 3], DEPTH_FLOOR)
+        sigma = keypoint_sigma(keypoints, intrinsics, int(h))[where]
+        sigma = in_pixels(sigma, focal / depth)
+        alike = max(1.0, settings.correlation_time * fps)
+        shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
+        angles = roots.body_pose[h, where, :21].reshape(-1, 63)
+        rows = (T_CH[:, :3, :3], T_CH[:, :3, 3], angles, uv[h, where])
+        length = -len(where) % _BUCKET
+        last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
+        silent = np.full((length, 25), np.inf)
+        sigma = np.concatenate([sigma * np.sqrt(alike), silent])
+        numbers = (*map(last, rows), sigma, shape, settings.robust_scale)
+        arrays = (jnp.asarray(a, skeleton.offset.dtype) for a in numbers)
+        shift = np.asarray(_shift(skeleton, camera, *arrays), float)
+        uv[h, where] -= shift[: len(where)]
+    return dataclasses.replace(keypoints, uv=uv)
+
+
+@jit_once
+def _shift(
+    skeleton: Skeleton,
+    intrinsics: Float[Array, " i"],
+    orientation: Float[Array, "t 3 3"],
+    position: Float[Array, "t 3"],
+    angles: Float[Array, "t 63"],
+    uv: Float[Array, "t 25 2"],
+    sigma: Float[Array, "t 25"],
+    shape: Float[Array, " s"],
+    scale: Float[Array, ""],
+) -> Float[Array, "t 25 2"]:
+    """How far the detector's definitions move each keypoint in the image, px."""
+
+    def frame(R, p, angles):
+        points = pose_points(skeleton, angles, shape)
+        p_C = points.keypoints @ R.T + p
+        view = jax.vmap(jax.jacfwd(lambda x: project(intrinsics, x)))(p_C)
+        return project(intrinsics, p_C), view @ R @ points.by_shape[..., 10:]
+
+    predicted, jac = jax.vmap(frame)(orientation, position, angles)
+    residual = (uv - predicted) / sigma[..., None]
+    whitened = jac / sigma[..., None, None]
+
+    def fit(_, offsets):
+        left = residual - whitened @ offsets
+        _, weight = robust(jnp.sum(left**2, -1), scale)
+        weighted = whitened * weight[..., None, None]
+        hessian = jnp.einsum("tkci,tkcj->ij", weighted, whitened)
+        right = jnp.einsum("tkci,tkc->i", weighted, residual)
+        return jnp.linalg.solve(hessian + jnp.eye(len(right)), right)
+
+    start = jnp.zeros(jac.shape[-1], jac.dtype)
+    return jac @ jax.lax.fori_loop(0, _ROUNDS, fit, start)

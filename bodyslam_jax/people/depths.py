@@ -1,0 +1,75 @@
+"""Which way round a person is, and which limb is in front: BlazePose's 3-D landmarks.
+
+They are weak evidence. On 180 rendered frames, seen from the side, limbs are 3 to 9 cm
+(1 σ) and up to 10 cm in the mean from where they are along the line of sight, for about
+0.15 s alike; of 267 pairs of knees or ankles one of which is 10 cm nearer all were told
+right, and no body was turned round. So depths do not enter the fit: they help to choose
+among fits which explain the keypoints alike.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.people.found import Found
+from bodyslam_jax.types import Intrinsics, Keypoints
+
+_POINTS = (2, 3, 4, 5, 6, 7, 10, 11, 13, 14)
+"""BODY_25's shoulders, elbows, wrists, knees and ankles."""
+_JOINTS = (17, 19, 21, 16, 18, 20, 5, 8, 4, 7)
+"""SMPL's joints of these."""
+_SIGMA = 0.12
+"""m: mean and scatter of the errors together."""
+_ROBUST = 2.0
+"""Standard deviations from which a depth is taken for an outlier (Cauchy's loss)."""
+_ALIKE = 4.0
+"""Depths that say as much as one that is independent: of successive fitted frames, a
+tenth of a second apart, two; of the limbs of a body two more."""
+
+
+def with_depths(
+    keypoints: Keypoints, found: Found, intrinsics: Intrinsics
+) -> Keypoints:
+    """The keypoints, and how far they are behind the middle of the hips.
+
+    BlazePose sees every person as if on the optical axis: what it says is turned by
+    the angle of their ray.
+    """
+    depth = np.zeros(keypoints.confidence.shape)
+    for h, t in zip(*np.nonzero(keypoints.confidence.any(axis=2)), strict=True):
+        first, last = np.searchsorted(found.frame, [t, t + 1])
+        for row in range(first, last):
+            if np.array_equal(found.points[row, :, :2], keypoints.uv[h, t]):
+                hips = keypoints.uv[h, t, 8]
+                depth[h, t] = _turned(found.relative[row], hips, intrinsics)[:, 2]
+    return dataclasses.replace(keypoints, depth=depth)
+
+
+def depth_costs(
+    depth: Float[np.ndarray, "f 25"], joints: Float[np.ndarray, "f s 24 3"]
+) -> Float[np.ndarray, "f s"]:
+    """-log likelihood of depths, up to a constant, for each of several fits a frame.
+
+    Args:
+        depth: behind the middle of the hips, m; 0 where unknown.
+        joints: relative to the pelvis, in C, m.
+    """
+    said, known = depth[:, None, _POINTS], depth[:, None, _POINTS] != 0
+    away = np.where(known, joints[:, :, _JOINTS, 2] - said, 0.0) / _SIGMA
+    cost = _ROBUST**2 / 2 * np.log1p((away / _ROBUST) ** 2)
+    return cost.sum(axis=2) / _ALIKE
+
+
+def _turned(
+    relative: Float[np.ndarray, "25 3"], uv: np.ndarray, intrinsics: Intrinsics
+) -> Float[np.ndarray, "25 3"]:
+    fx, fy, cx, cy = intrinsics.params[:4]
+    ray = np.array([(uv[0] - cx) / fx, (uv[1] - cy) / fy, 1.0])
+    ray /= np.linalg.norm(ray)
+    axis = np.cross([0.0, 0.0, 1.0], ray)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return relative
+    return Rotation.from_rotvec(axis / sine * np.arcsin(sine)).apply(relative)

@@ -1,0 +1,271 @@
+"""People in a video, by the networks that ship: a search now and then, and in between
+a look at where each person is expected.
+
+MoveNet searches the whole image every third of a second, at a scale for people of at
+least a tenth of its longer side, and every second at one for smaller ones; in the
+frames between it sees a square around each person. Who is found in a search is also
+looked for in the frames since the last one.
+"""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from bodyslam_jax.config import Association, Detect
+from bodyslam_jax.people import blazepose, movenet
+from bodyslam_jax.people.appearance import SIZE, describe
+from bodyslam_jax.people.found import (
+    AGREES,
+    Found,
+    as_body25,
+    find_feet,
+    find_relative,
+)
+from bodyslam_jax.people.linking import link, remarks
+from bodyslam_jax.people.movenet import Region, sure_points
+from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
+from bodyslam_jax.people.regions import behind, covered, regions, square_around
+from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
+from bodyslam_jax.sfm import SILHOUETTE_STEP
+
+_COARSE, _SEARCH, _FINE = 320, 640, 1280
+"""Longer side of the image in MoveNet's input, px: for people who fill the image, for
+most, and for small ones."""
+_FINE_EVERY = 3
+"""Searches between two that look for small people, too."""
+_LARGEST = 250.0
+"""px of MoveNet's input: of larger people it makes several."""
+_SQUARE = 256
+_START, _CONTINUE, _SEEN = 0.22, 0.12, 0.1
+"""MoveNet's score of a person who is new, who was expected there, and of whom nothing
+is to be in the map in any case. Without people it says 0.00 to 0.07."""
+_SOONER = 3
+"""Frames after a search until the next where somebody was lost."""
+_OVERLAP = 0.25
+"""Share of a person's box that others may cover while its colours are the person's."""
+_LITTLE = 0.03
+"""How much there is to see of somebody who is estimated, at least: of what there is of
+the person who is seen best."""
+_BRIEF = 0.2
+"""s: who is seen for less is masked without a word, as it may be nobody."""
+_PRESENCE = 0.5
+_LEAST_FOR_FEET = 60.0
+"""Height of people, px, below which BlazePose is of no use."""
+_Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
+"""COCO keypoints, and a score for each person."""
+
+
+@dataclasses.dataclass
+class _Frame:
+    """What was found in one image, and the image as long as it may be needed."""
+
+    image: UInt8[np.ndarray, "y x 3"]
+    mask: Bool[np.ndarray, "r c"]
+    """At every `SILHOUETTE_STEP`-th pixel, where people are."""
+    known: dict[int, np.ndarray]
+    """By number of the tracklet, COCO keypoints."""
+    others: list[np.ndarray]
+
+
+def find_tracked(
+    images: Iterable[UInt8[np.ndarray, "y x 3"]],
+    fps: float,
+    settings: Detect = Detect(),
+    association: Association = Association(),
+    progress: Callable[[int], None] | None = None,
+) -> Found:
+    """People in the images of a video, and who is who.
+
+    Args:
+        images: BGR, in order; those since the last search are kept in memory.
+        association: how long people are followed while they are not seen (later they
+            are recognised by clothes and size), and who is seen too briefly.
+        progress: called with the number of images done.
+
+    **Raises:** `ValueError` if a network that ships is missing or damaged.
+    """
+    finder = _Finder(fps, settings, association)
+    for k, image in enumerate(images):
+        finder.advance(k, image)
+        if progress is not None:
+            progress(k + 1)
+    return finder.result()
+
+
+class _Finder:
+    """What is remembered from frame to frame."""
+
+    def __init__(self, fps: float, settings: Detect, association: Association) -> None:
+        self.movenet = open_network(MOVENET)
+        self.blazepose = open_network(BLAZEPOSE)
+        self.fps, self.settings, self.association = fps, settings, association
+        self.whom = settings.min_height, settings.max_people
+        self.tracker = Tracker(fps, association.max_gap)
+        self.interval = max(1, round(settings.search_interval * fps))
+        self.next_search, self.last_search, self.searches = 0, -_SOONER, 0
+        self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
+        self.feet: dict[tuple[int, int], np.ndarray] = {}
+        """By tracklet and frame: heel and big toe of both sides (4, 3)."""
+        self.relative: dict[tuple[int, int], np.ndarray] = {}
+        self.others: list[tuple[int, np.ndarray]] = []
+        self.masks: list[np.ndarray] = []
+
+    def advance(self, k: int, image: np.ndarray) -> None:
+        size = tuple(-(-n // SILHOUETTE_STEP) for n in image.shape[:2])
+        now = _Frame(image, np.zeros(size, bool), {}, [])
+        expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
+        found = [self._look(image, r, _SQUARE) for r in regions(expected, *self.whom)]
+        if k >= self.next_search:
+            found += self._search(image)
+            self.last_search, self.next_search = k, k + self.interval
+        points, score = _merged(found)
+        looks = self._looks(image, points)
+        known = len(self.tracker.tracklets)
+        clear = ~behind(points, score)
+        who = self.tracker.update(k, points, looks, clear, clear & (score >= _START))
+        for row, number in zip(points, who.tolist(), strict=True):
+            if number < 0:
+                now.others.append(row)
+                self.others.append((k, row))
+            else:
+                self._note(k, now, number, row)
+        for number in range(known, len(self.tracker.tracklets)):
+            self._look_back(k, number)
+        if any(self._was_lost(t, k) for t in self.tracker.tracklets):
+            sooner = max(k + 1, self.last_search + _SOONER)
+            self.next_search = min(self.next_search, sooner)
+        self.masks.append(np.packbits(now.mask, axis=1))
+        self.recent.append((k, now))
+
+    def result(self) -> Found:
+        everybody = link(self.tracker.tracklets, self.fps)
+        people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
+        people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
+        number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
+        unknown = np.zeros((25, 3))
+        alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
+        rows = [alone(*other) for other in self.others]
+        for tracklet in self.tracker.tracklets:
+            who = number.get(tracklet.number, -1)
+            for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
+                key = tracklet.number, frame
+                body = as_body25(points, self.feet.get(key))
+                rows.append((frame, who, body, self.relative.get(key, unknown)))
+            rows += [alone(*other) for other in between(tracklet)]
+        rows.sort(key=lambda row: row[:2])
+        warnings = remarks(people, self.fps, self.association.max_gap)
+        seen = [sum(len(t.frames) for t in pieces) for pieces in everybody]
+        others = sum(n >= _BRIEF * self.fps for n in seen) - len(people)
+        if others > 0:
+            warnings.append(
+                f"{others} more people, small or seen briefly, are kept out of the map "
+                "and not estimated."
+            )
+        return Found(
+            np.array([row[0] for row in rows], int),
+            np.array([row[2] for row in rows]).reshape(-1, 25, 3),
+            np.array([row[1] for row in rows], int),
+            np.array([row[3] for row in rows]).reshape(-1, 25, 3),
+            np.stack(self.masks),
+            tuple(warnings),
+        )
+
+    def _was_lost(self, tracklet: Tracklet, k: int) -> bool:
+        """Whether somebody who is followed from frame to frame is no longer seen."""
+        large = height(tracklet.points[-1]) >= self.settings.min_height
+        return large and tracklet.frames[-1] == k - 1
+
+    def _is_known(self, pieces: list[Tracklet]) -> bool:
+        """Whether enough is seen of somebody to be estimated."""
+        heights = [height(p) for t in pieces for p in t.points]
+        least = min(self.association.min_duration * self.fps, len(self.masks))
+        return (
+            float(np.median(heights)) >= self.settings.min_height
+            and len(heights) >= least
+        )
+
+    def _search(self, image: np.ndarray) -> list[_Detections]:
+        """People anywhere in the image."""
+        whole = (0, 0, image.shape[1], image.shape[0])
+        longest = max(image.shape[:2])
+        found = [self._look(image, whole, _COARSE)]
+        found.append(self._look(image, whole, _SEARCH))
+        if longest > 1.3 * _SEARCH and self.searches % _FINE_EVERY == 0:
+            found.append(self._look(image, whole, min(longest, _FINE)))
+        self.searches += 1
+        return found
+
+    def _look(self, image: np.ndarray, region: Region, longer: int) -> _Detections:
+        points, score = movenet.find_people(self.movenet, image, region, longer)
+        scale = longer / max(region[2] - region[0], region[3] - region[1])
+        sizes = np.array([movenet.box_size(p) for p in points])
+        kept = score >= _SEEN
+        if longer > _COARSE:
+            kept &= sizes * scale <= _LARGEST
+        return points[kept], score[kept]
+
+    def _looks(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """How people look, where nobody else is in front of them."""
+        boxes = [movenet.box(p) for p in points]
+        looks = np.full((len(points), SIZE), np.nan)
+        for i, row in enumerate(points):
+            others = [covered(boxes[i], b) for j, b in enumerate(boxes) if j != i]
+            if max(others, default=0.0) < _OVERLAP:
+                looks[i] = describe(image, row, movenet.SURE)
+        return looks
+
+    def _note(self, k: int, frame: _Frame, number: int, points: np.ndarray) -> None:
+        """Somebody found in a frame: their feet and silhouette, too."""
+        frame.known[number] = points
+        square = blazepose.turned_square(points, movenet.SURE)
+        if square is None or height(points) < _LEAST_FOR_FEET:
+            return
+        pose = blazepose.read_pose(self.blazepose, frame.image, square)
+        apart = blazepose.disagreement(pose, points)
+        sure = sure_points(points)
+        if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
+            return
+        self.feet[number, k] = find_feet(pose, points, apart)
+        self.relative[number, k] = find_relative(pose)
+        size = frame.image.shape[0], frame.image.shape[1]
+        frame.mask |= blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
+
+    def _look_back(self, k: int, number: int) -> None:
+        """Whether somebody who was just found was there since the last search."""
+        tracklet = self.tracker.tracklets[number]
+        for index, frame in reversed(self.recent):
+            first = tracklet.points[0]
+            near = self._look(frame.image, square_around(first), _SQUARE)
+            points, score = _merged([near])
+            looks = self._looks(frame.image, points)
+            cost = [
+                self.tracker.cost_before(tracklet, p, look)
+                for p, look in zip(points, looks, strict=True)
+            ]
+            best = int(np.argmin(cost)) if cost else 0
+            taken = frame.known.values()
+            if not cost or cost[best] >= 1 or score[best] < _CONTINUE:
+                return
+            if any(movenet.same_person(points[best], p) for p in taken):
+                return
+            tracklet.prepend(index, points[best], looks[best])
+            self._note(index, frame, number, points[best])
+            self.masks[index] = np.packbits(frame.mask, axis=1)
+
+
+def _merged(found: list[_Detections]) -> _Detections:
+    """Everybody once."""
+    if not found:
+        return np.zeros((0, 17, 3)), np.zeros(0)
+    points = np.concatenate([p for p, _ in found])
+    score = np.concatenate([s for _, s in found])
+    kept = movenet.distinct(points, score)
+    return points[kept], score[kept]
+
+
+def _presence(pieces: list[Tracklet]) -> float:
+    """How much there is to see of somebody: confidence times size, over time."""
+    return sum(height(p) * float(p[:, 2].sum()) for t in pieces for p in t.points)

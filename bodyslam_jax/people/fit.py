@@ -1,0 +1,262 @@
+"""Bodies from keypoints alone, in the manner of SMPLify, over a whole clip.
+
+Bogo et al., Keep it SMPL, ECCV 2016, fits each image by itself. Here every few frames
+are (`_starts`), then all frames of a person are fitted together, with one shape and a
+prior on how people move (`_chain`). **Metres come from the stature**: with β near the
+mean the depth is that of an adult of average size, so depth and everything else is off
+by the ratio of statures, 4 to 6 % (1 σ) for adults, and by the focal length's error.
+"""
+
+import logging
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import median_filter
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.people.costs import Fit, Lifted, Scene
+from bodyslam_jax.people.depths import depth_costs
+from bodyslam_jax.people.keypoint_errors import (
+    find_present,
+    in_pixels,
+    keypoint_sigma,
+    pixels_per_metre,
+)
+from bodyslam_jax.people.lift import lift, load_lifter
+from bodyslam_jax.people.multistart import fit_frames
+from bodyslam_jax.people.person_state import Roots, bodies_from_roots
+from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
+from bodyslam_jax.people.rotations import slerp
+from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
+from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
+from bodyslam_jax.people.viterbi import best_path
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
+
+log = logging.getLogger(__name__)
+
+_BUCKET = 64
+"""Frames are padded to a multiple of this, so that few shapes are compiled."""
+_FASTEST = 8.0
+"""m/s across the line of sight, above which it is not the same person."""
+
+
+def fit_bodies(
+    keypoints: Keypoints,
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    fps: float,
+    settings: PeopleFit = PeopleFit(),
+) -> Bodies:
+    """Fits posture, shape and place of every person to their keypoints.
+
+    Confidences are taken relative to the person's own best ones: 1 means something else
+    in every detector. A point outside the image was extrapolated and does not count.
+
+    **Returns:** bodies in the camera frame, one β per person, present where there are
+    keypoints enough or a short gap between such frames.
+    """
+    people, frames = keypoints.confidence.shape[:2]
+    roots = Roots(
+        np.zeros((people, frames), bool),
+        np.tile(np.eye(4), (people, frames, 1, 1)),
+        np.zeros((people, frames, 23, 3)),
+        np.zeros((people, 10)),
+    )
+    scene = make_scene(intrinsics, body, fps, settings)
+    for h in range(people):
+        sigma = keypoint_sigma(keypoints, intrinsics, h)
+        present = find_present(sigma, fps, settings)
+        if not present.any():
+            log.warning("person %d has too few keypoints in every frame", h)
+            continue
+        depth = np.zeros(sigma.shape)
+        if keypoints.depth is not None:
+            depth = keypoints.depth[h]
+        fitted, chain = _fit_person(
+            scene, keypoints.uv[h], sigma, depth, present, fps, settings
+        )
+        roots.present[h] = present
+        roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
+        roots.T_CH[h, fitted, :3, 3] = chain.fit.position
+        roots.body_pose[h, fitted] = scene.prior.decode(chain.fit.latent)
+        roots.T_CH[h, ~present] = np.eye(4)
+        roots.body_pose[h, ~present] = 0.0
+        roots.shape[h] = chain.shape[:10]
+    return bodies_from_roots(roots, body)
+
+
+def make_scene(
+    intrinsics: Intrinsics, body: BodyModel, fps: float, settings: PeopleFit
+) -> Scene:
+    dtype = body.joint_template.dtype
+    number = lambda value: jnp.asarray(value, dtype)
+    return Scene(
+        make_skeleton(body, settings.detector_bias),
+        load_posture_prior(fps, dtype),
+        number(intrinsics.params),
+        number(settings.robust_scale),
+        number(settings.limit_sigma),
+        number(settings.upright_sigma**-2),
+        number(settings.lift_scale or 1.0),
+    )
+
+
+def _fit_person(
+    scene: Scene,
+    uv: Float[np.ndarray, "t 25 2"],
+    sigma: Float[np.ndarray, "t 25"],
+    depth: Float[np.ndarray, "t 25"],
+    present: np.ndarray,
+    fps: float,
+    settings: PeopleFit,
+) -> tuple[slice, Chain]:
+    """**Returns:** the frames from the first to the last present one, and their fit."""
+    where = np.flatnonzero(present)
+    fitted = slice(where[0], where[-1] + 1)
+    uv, sigma = uv[fitted], sigma[fitted]
+    lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
+    sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
+    start, cuts = _start(scene, uv, sigma_px, depth[fitted], lifted, fps, settings)
+
+    focal = float(scene.intrinsics[0])
+    depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
+    sigma_px = in_pixels(sigma, focal / depth)
+    frames_alike = max(1.0, settings.correlation_time * fps)
+    dtype = scene.intrinsics.dtype
+    length = -len(uv) % _BUCKET
+    pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
+    last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
+    # Guesses err for many frames alike, too; padding has none.
+    alike = max(1.0, settings.lift_correlation * fps) ** 0.5
+    wider = np.where(np.arange(len(uv) + length) < len(uv), alike, np.inf)
+    lifted = jax.tree.map(lambda a: last(jnp.asarray(a, dtype)), lifted)
+    evidence = np.sum(np.isfinite(sigma).any(1)) / frames_alike
+    problem = ChainProblem(
+        scene,
+        jnp.asarray(pad(uv, 0.0), dtype),
+        jnp.asarray(pad(sigma_px * np.sqrt(frames_alike), np.inf), dtype),
+        lifted.widened(jnp.asarray(wider, dtype)),
+        make_ties(scene.prior, cuts, len(uv) + length, fps, settings),
+        jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
+    )
+    chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
+    chain, value = solve_chain(problem, chain, settings.max_steps)
+    log.info("fitted %d frames, cost %.1f", len(uv), float(value))
+    return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
+
+
+def guess_postures(
+    scene: Scene,
+    uv: Float[np.ndarray, "t 25 2"],
+    sigma: Float[np.ndarray, "t 25"],
+    fps: float,
+    trusted: bool = True,
+) -> Lifted:
+    """What the network makes of one person's keypoints, in C. Where it sees too few,
+    and everywhere if not `trusted`, deviations are infinite."""
+    dtype = scene.intrinsics.dtype
+    length = -len(uv) % _BUCKET
+    # Beyond the end the last frame stands still, as for frames beyond the first.
+    last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
+    numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
+    lifted, known = lift(load_lifter(), scene.intrinsics, *numbers)
+    lifted = lifted.widened(jnp.where(known & trusted, 1.0, jnp.inf).astype(dtype))
+    return jax.tree.map(lambda a: np.asarray(a[: len(uv)]), lifted)
+
+
+def _start(
+    scene: Scene,
+    uv: np.ndarray,
+    sigma_px: np.ndarray,
+    depth: np.ndarray,
+    lifted: Lifted,
+    fps: float,
+    settings: PeopleFit,
+) -> tuple[Fit, np.ndarray]:
+    """The best path through the fits of every few frames, for all frames.
+
+    **Returns:** the fits, and the frames at which another track begins.
+    """
+    enough = np.sum(np.isfinite(sigma_px), axis=1) >= settings.min_keypoints
+    known = np.flatnonzero(enough)
+    stride = max(1, round(settings.start_interval * fps))
+    chosen = np.unique(
+        [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
+    )
+    fits, costs, joints = fit_frames(
+        scene,
+        uv[chosen],
+        sigma_px[chosen],
+        jax.tree.map(lambda a: a[chosen], lifted),
+    )
+    # Each keypoint's half squared distance is 1 on average if errors are as said.
+    count = np.isfinite(sigma_px[chosen]).sum(axis=1)
+    noise = max(1.0, float(np.sqrt(np.median(costs.min(axis=1) / count))))
+    costs = costs + noise**2 * depth_costs(depth[chosen], joints)
+    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps, noise)
+    fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
+    speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
+    broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST
+    return _interpolate(fit, chosen, broken, len(uv)), chosen[1:][broken]
+
+
+def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) -> Fit:
+    """Between the fitted frames; across a break the earlier one."""
+    wanted = np.arange(total)
+    after = np.clip(np.searchsorted(frame, wanted), 1, max(len(frame) - 1, 1))
+    after = np.minimum(after, len(frame) - 1)
+    before = np.maximum(after - 1, 0)
+    share = (wanted - frame[before]) / np.maximum(frame[after] - frame[before], 1)
+    share = np.clip(share, 0.0, 1.0)
+    if len(broken):
+        share = np.where(broken[np.maximum(after - 1, 0)], share >= 1.0, share)
+    position, latent = (
+        a[before] + share[:, None] * (a[after] - a[before])
+        for a in (fit.position, fit.latent)
+    )
+    orientation = np.asarray(fit.orientation)
+    turned = slerp(orientation[before], orientation[after], share)
+    dtype = fit.position.dtype
+    return Fit(*(jnp.asarray(a, dtype) for a in (turned, position, latent)))
+
+
+def make_ties(
+    prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float, settings: PeopleFit
+) -> Ties:
+    """How frames hang together; nothing crosses a cut.
+
+    The first frame of a track has the posture's stationary prior, the second the
+    first-order autoregression; from the third on the terms are the full ones. Noise in
+    acceleration adds up: velocity changes by σ sqrt(dt), so second differences grow
+    with the time between frames to the power 1.5.
+    """
+    a1, a2 = np.asarray(prior.autoregression, float).T
+    lag = a1 / (1 - a2)
+    innovation = (1 - lag**2) * (1 - a2**2)
+    size = 6 + len(a1)
+    weight, c1, c2 = np.zeros((3, frames, size))
+    jitter = (
+        np.array(
+            [settings.turn_jitter] * 3
+            + [settings.position_jitter] * 2
+            + [settings.depth_jitter]
+        )
+        * (30 / fps) ** 1.5
+    )
+    loose = settings.motion_scale**2
+    weight[:, :6], c1[:, :6], c2[:, :6] = jitter**-2, -2.0, 1.0
+    weight[:, 6:], c1[:, 6:], c2[:, 6:] = 1 / (innovation * loose), -a1, -a2
+    for first in (0, *cuts):
+        weight[first, :6], weight[first, 6:] = 0.0, 1.0
+        c1[first], c2[first] = 0.0, 0.0
+        second = first + 1
+        if second < frames:
+            # Velocity is free but not absurd: ten frames' worth of its changes.
+            weight[second, :6], c1[second, :6] = jitter**-2 / 100, -1.0
+            weight[second, 6:], c1[second, 6:] = 1 / ((1 - lag**2) * loose), -lag
+            c2[second] = 0.0
+    dtype = prior.mean.dtype
+    return Ties(*(jnp.asarray(a, dtype) for a in (weight, c1, c2)))

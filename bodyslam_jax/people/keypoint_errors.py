@@ -1,0 +1,67 @@
+"""How far off keypoints are, and in which frames there are enough of them."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter1d
+
+from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.people.costs import KEYPOINT_SIGMA
+from bodyslam_jax.types import Intrinsics, Keypoints
+
+_BOX_DIAGONAL = 1.75
+"""m: what the keypoints of a standing adult span, nose to toe and arms."""
+_DETECTOR_FLOOR = 1.0
+"""px: no detector is better, however small the person."""
+
+
+def keypoint_sigma(
+    keypoints: Keypoints, intrinsics: Intrinsics, person: int
+) -> Float[np.ndarray, "t 25"]:
+    """Standard deviation of one person's keypoints relative to the body, m; `inf` where
+    there is none."""
+    uv, confidence = keypoints.uv[person], keypoints.confidence[person]
+    size = np.array([intrinsics.width, intrinsics.height])
+    inside = np.all((uv > -0.5) & (uv < size - 0.5), axis=-1)
+    seen = (confidence > 0) & inside
+    if not seen.any():
+        return np.full(confidence.shape, np.inf)
+    sure = np.quantile(confidence[seen], 0.9)
+    relative = np.clip(confidence / sure, 0.1, 1.0)
+    return np.where(
+        seen & (confidence > 0.02 * sure), KEYPOINT_SIGMA / relative, np.inf
+    )
+
+
+def find_present(
+    sigma: Float[np.ndarray, "t 25"], fps: float, settings: PeopleFit
+) -> Bool[np.ndarray, " t"]:
+    """Frames with keypoints enough, and short gaps between them."""
+    enough = np.sum(np.isfinite(sigma), axis=1) >= settings.min_keypoints
+    present = enough.copy()
+    known = np.flatnonzero(enough)
+    for a, b in zip(known[:-1], known[1:]):
+        if b - a - 1 <= settings.max_gap * fps:
+            present[a:b] = True
+    return present
+
+
+def pixels_per_metre(
+    uv: Float[np.ndarray, "t 25 2"], sigma: Float[np.ndarray, "t 25"], fps: float
+) -> Float[np.ndarray, " t"]:
+    """How large the person appears: largest keypoint box within half a second."""
+    seen = np.isfinite(sigma)[..., None]
+    low = np.min(np.where(seen, uv, np.inf), axis=1)
+    high = np.max(np.where(seen, uv, -np.inf), axis=1)
+    diagonal = np.where(seen.any(axis=(1, 2)), np.linalg.norm(high - low, axis=-1), 0.0)
+    largest = maximum_filter1d(diagonal, 2 * round(fps / 2) + 1)
+    known = diagonal[diagonal > 0]
+    # All in one place is nobody, but no reason to fail.
+    overall = np.median(known) if len(known) else _DETECTOR_FLOOR
+    return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
+
+
+def in_pixels(
+    sigma: Float[np.ndarray, "t 25"], scale: Float[np.ndarray, " t"]
+) -> Float[np.ndarray, "t 25"]:
+    """The same in pixels, where a metre is `scale` of them."""
+    return np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)

@@ -1,0 +1,174 @@
+"""What two dimensions say of the third: postures guessed by a network from keypoints.
+
+One view of a limb does not say how far it points towards the camera, but a second of
+motion does: who walks away has legs that swing. After Martinez et al., *A simple yet
+effective baseline for 3d human pose estimation* (ICCV 2017) a few dense layers see the
+keypoints of a second, and say which posture and heading is likely in its middle, and
+how sure that is. The fit takes it for a measurement beside the keypoints, robustly, and
+as one more place to start from.
+
+Learnt by `tools/train_lifter.py` from CMU motion capture and made-up cameras;
+`assets/README.md`.
+"""
+
+import functools
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from bodyslam_jax.geometry.camera import unproject
+from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
+
+ASSET = Path(__file__).parent / "assets" / "lifter.npz"
+SPACING = 0.1
+"""s between the frames that the network sees."""
+REACH = 5
+"""How many of them before, and after."""
+NUM_FEATURES = (2 * REACH + 1) * 25 * 3
+_KEPT = 0.8
+"""Share of hidden units, while training."""
+_NECK, _HIPS = 1, 8
+_SIZE = 0.5
+"""Root mean square of what the network sees of a person, where they are largest."""
+_FEWEST = 6
+"""Keypoints that a frame needs to be seen at all."""
+
+
+class Lifter(eqx.Module):
+    """Dense layers with two skips; `f` features of `h` hidden units; `k` components of
+    posture (`PosturePrior`)."""
+
+    first: Float[Array, "f h"]
+    hidden: Float[Array, "3 h h"]
+    last: Float[Array, "h o"]
+    """`o = 2 k + 7`: posture, root (two columns of its rotation), logarithms of the
+    deviations of each component of posture and of the turn."""
+    bias: Float[Array, "4 h"]
+    last_bias: Float[Array, " o"]
+
+    def __call__(
+        self, x: Float[Array, "*b f"], key: PRNGKeyArray | None = None
+    ) -> Lifted:
+        """With a key some of what is within is dropped, for training."""
+        drop = lambda h, number: h if key is None else _dropped(h, key, number)
+        h = drop(jax.nn.relu(x @ self.first + self.bias[0]), 0)
+        inner = drop(jax.nn.relu(h @ self.hidden[0] + self.bias[1]), 1)
+        h = h + jax.nn.relu(inner @ self.hidden[1] + self.bias[2])
+        h = drop(h + jax.nn.relu(h @ self.hidden[2] + self.bias[3]), 2)
+        out = h @ self.last + self.last_bias
+        k = (out.shape[-1] - 7) // 2
+        return Lifted(
+            orientation=_orthonormal(out[..., k : k + 6]),
+            latent=out[..., :k],
+            latent_sigma=jnp.exp(jnp.clip(out[..., k + 6 : -1], -4.0, 3.0)),
+            turn_sigma=jnp.exp(jnp.clip(out[..., -1], -4.0, 1.0)),
+        )
+
+
+def _dropped(
+    h: Float[Array, "*b h"], key: PRNGKeyArray, number: int
+) -> Float[Array, "*b h"]:
+    keep = jax.random.bernoulli(jax.random.fold_in(key, number), _KEPT, h.shape)
+    return h * keep.astype(h.dtype) / _KEPT
+
+
+def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
+    """Gram and Schmidt (Zhou et al., CVPR 2019)."""
+    unit = lambda v: v / jnp.sqrt(jnp.sum(v**2, -1, keepdims=True) + 1e-12)
+    x, y = unit(columns[..., :3]), columns[..., 3:]
+    y = unit(y - jnp.sum(x * y, -1, keepdims=True) * x)
+    return jnp.stack([x, y, jnp.cross(x, y)], -1)
+
+
+@functools.cache
+def load_lifter(path: Path = ASSET) -> Lifter:
+    """The network that ships with the package, or another, in float32."""
+    with np.load(path, allow_pickle=False) as archive:
+        names = ("first", "hidden", "last", "bias", "last_bias")
+        return Lifter(*(jnp.asarray(archive[n], jnp.float32) for n in names))
+
+
+@eqx.filter_jit
+def lift(
+    lifter: Lifter,
+    intrinsics: Float[Array, " i"],
+    uv: Float[Array, "t 25 2"],
+    sigma: Float[Array, "t 25"],
+    fps: Float[Array, ""],
+) -> tuple[Lifted, Bool[Array, " t"]]:
+    """Guesses in the camera frame for all frames of one person.
+
+    **Arguments:** `sigma`, as `keypoint_sigma` has it: m, `inf` where there is none.
+
+    **Returns:** the guesses, and in which frames enough was seen for one.
+    """
+    x, view, seen = features(intrinsics, uv, sigma, fps)
+    found = lifter(x)
+    orientation = jnp.swapaxes(view, -1, -2) @ found.orientation.astype(view.dtype)
+    found = jax.tree.map(lambda a: a.astype(uv.dtype), found)
+    return eqx.tree_at(lambda f: f.orientation, found, orientation), seen
+
+
+def features(
+    intrinsics: Float[Array, " i"],
+    uv: Float[Array, "t 25 2"],
+    sigma: Float[Array, "t 25"],
+    fps: Float[Array, ""],
+) -> tuple[Float[Array, "t f"], Float[Array, "t 3 3"], Bool[Array, " t"]]:
+    """What the network sees, the turn from C to the frame in which it sees that, and
+    where that is known.
+
+    That frame's z is the ray to the person; in it their trunk is upright, on average
+    over the window, and their size, where largest in it, is 1/2. So neither place nor
+    focal length matter, nor how the camera is turned.
+    """
+    relative = jnp.where(
+        sigma < jnp.inf, jnp.asarray(KEYPOINT_SIGMA, uv.dtype) / sigma, 0
+    )
+    enough = jnp.sum(relative > 0, axis=1) >= _FEWEST
+    mark = jnp.where(enough[:, None], relative, 0)
+    there = mark > 0
+    rays = jnp.where(there[..., None], unproject(intrinsics, uv), 0)
+    length = jnp.sqrt(jnp.sum(rays**2, -1, keepdims=True))
+    middle = jnp.sum(rays / jnp.maximum(length, 1), axis=1)
+    ahead = jnp.array([0.0, 0.0, 1.0], uv.dtype)
+    view = _turn_to_axis(jnp.where(enough[:, None], middle, ahead))
+    turned = jnp.einsum("tij,tkj->tki", view, rays)
+    flat = turned[..., :2] / jnp.maximum(turned[..., 2:], 0.1)
+    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(uv.dtype)
+    size = jnp.sqrt(jnp.sum(flat**2, (1, 2)) / count)
+    trunk = flat[:, _NECK] - flat[:, _HIPS]
+    trunk = jnp.where((there[:, _NECK] & there[:, _HIPS])[:, None], trunk, 0)
+
+    step = jnp.arange(-REACH, REACH + 1, dtype=uv.dtype) * SPACING * fps
+    index = jnp.arange(len(uv))[:, None] + jnp.round(step).astype(int)
+    index = jnp.clip(index, 0, len(uv) - 1)
+    upright = _turn_upright(jnp.sum(trunk[index], axis=1))
+    largest = jnp.maximum(jnp.max(size[index], axis=1), 1e-6)
+    shape = jnp.einsum("tij,twkj->twki", upright[:, :2, :2], flat[index])
+    shape = shape * (_SIZE / largest)[:, None, None, None]
+    x = jnp.concatenate([shape, mark[index][..., None]], -1)
+    x = x.reshape(len(uv), NUM_FEATURES).astype(jnp.float32)
+    return x, upright @ view, enough
+
+
+def _turn_upright(trunk: Float[Array, "t 2"]) -> Float[Array, "t 3 3"]:
+    """About z, so that the trunk points to -y; none where it is not seen."""
+    length = jnp.sqrt(jnp.sum(trunk**2, -1, keepdims=True))
+    up = jnp.array([0.0, -1.0], trunk.dtype)
+    x, y = jnp.where(length > 1e-6, trunk / jnp.maximum(length, 1e-6), up).T
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rows = [[-y, x, zero], [-x, -y, zero], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def _turn_to_axis(ray: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
+    """The smallest rotation that takes each ray to +z; none points to -z."""
+    x, y, z = (ray / jnp.linalg.norm(ray, axis=-1, keepdims=True)).T
+    h = 1 / (1 + z)
+    rows = [[1 - h * x * x, -h * x * y, -x], [-h * x * y, 1 - h * y * y, -y], [x, y, z]]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)

@@ -1,0 +1,68 @@
+"""Bodies as files have them, and as the graph has them."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.body import BodyModel, rest_joints
+from bodyslam_jax.people.rotations import matrices, vectors
+from bodyslam_jax.types import Bodies
+
+
+@dataclasses.dataclass(frozen=True)
+class Roots:
+    """`h` people in `t` frames: pelvis pose in the camera, posture, one shape each."""
+
+    present: Bool[np.ndarray, "h t"]
+    T_CH: Float[np.ndarray, "h t 4 4"]
+    """Translation is the pelvis joint in C, m; identity where absent."""
+    body_pose: Float[np.ndarray, "h t 23 3"]
+    """θ, axis-angle, rad."""
+    shape: Float[np.ndarray, "h 10"]
+    """β, the median over the frames where present."""
+
+
+def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
+    """To the graph's convention: `r_CH = J_0(β) + trans`, one β per person.
+
+    The pelvis stays where the frame's own β put it: trans belongs to that β.
+    """
+    present = np.asarray(bodies.present, bool)
+    pelvis = _pelvis(body, bodies.shapes) + bodies.trans
+    T_CH = np.tile(np.eye(4), (*present.shape, 1, 1))
+    T_CH[..., :3, :3] = matrices(bodies.poses[..., :3])
+    T_CH[..., :3, 3] = pelvis
+    T_CH[~present] = np.eye(4)
+    body_pose = bodies.poses[..., 3:].reshape(*present.shape, 23, 3).astype(float)
+    body_pose = np.where(present[..., None, None], body_pose, 0.0)
+    shape = np.zeros((len(present), 10))
+    for h, there in enumerate(present):
+        if there.any():
+            shape[h] = np.median(bodies.shapes[h, there].astype(float), axis=0)
+    return Roots(present, T_CH, body_pose, shape)
+
+
+def bodies_from_roots(roots: Roots, body: BodyModel) -> Bodies:
+    """Inverse of `roots_from_bodies`, for bodies whose β does not change.
+
+    That β is an estimate, no longer what a regressor said.
+    """
+    frames = roots.present.shape[1]
+    orientation = vectors(roots.T_CH[..., :3, :3])
+    pose = roots.body_pose.reshape(*roots.present.shape, 69)
+    shapes = np.repeat(roots.shape[:, None], frames, axis=1)
+    trans = roots.T_CH[..., :3, 3] - _pelvis(body, shapes)
+    return Bodies(
+        roots.present,
+        np.concatenate([orientation, pose], axis=-1),
+        shapes,
+        np.where(roots.present[..., None], trans, 0.0),
+        shapes_regressed=False,
+    )
+
+
+def _pelvis(body: BodyModel, shapes: np.ndarray) -> np.ndarray:
+    dtype = body.joint_template.dtype
+    return np.asarray(rest_joints(body, jnp.asarray(shapes, dtype))[..., 0, :], float)

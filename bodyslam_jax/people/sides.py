@@ -1,0 +1,103 @@
+"""Keypoints of which a detector exchanged left and right, put right.
+
+Detectors look at one image at a time, and of who is seen from behind they take now and
+then the left leg for the right one, for some frames. In the image nothing moves then,
+but names jump. A hidden Markov chain of two states, named rightly and exchanged, for
+arms and for legs: between two frames the vector from each right joint to the left one
+changes little, or is its own negative if names were exchanged in between. Changes are
+measured in units of those around them.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import median_filter
+
+from bodyslam_jax.people.viterbi import cheapest_states
+from bodyslam_jax.types import Keypoints
+
+ARMS = ((2, 5), (3, 6), (4, 7))
+"""Shoulders, elbows, wrists of BODY_25: right and left."""
+LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
+"""Hips, knees, ankles, big toes, small toes, heels."""
+_CHANGE = 4.0
+"""-log odds of names that are exchanged from this frame on, or no longer."""
+_EXCHANGED = 3.0
+"""-log odds that names are exchanged, for as long as errors last."""
+_LASTING = 1 / 3
+"""s: for about this long they stay the same."""
+_INDEPENDENT = 0.5
+"""Joints of a limb move together: each says as much as this part of one by itself."""
+_SCALE = 5.0
+"""Scale of the robust loss on changes, in their standard deviations."""
+_WINDOW = 7
+"""Frames within which the usual change is measured."""
+_MEDIAN_OF_TWO = 1.177
+"""Median length of a vector with two normal components of deviation 1."""
+_FLOOR = 0.01
+"""Change that nobody measures, of the person's size; and a pixel."""
+_LONGEST = 5
+"""Frames over which names are compared: in more a limb may be anywhere."""
+
+
+def unexchanged(
+    keypoints: Keypoints, fps: float
+) -> tuple[Keypoints, Bool[np.ndarray, "h t 2"]]:
+    """Keypoints with names that make one motion; whose arms and legs were renamed."""
+    uv, confidence = keypoints.uv.copy(), keypoints.confidence.copy()
+    renamed = np.zeros((*confidence.shape[:2], 2), bool)
+    for h in range(len(uv)):
+        for half, pairs in enumerate((ARMS, LEGS)):
+            found = _exchanged(uv[h], confidence[h] > 0, pairs, fps)
+            renamed[h, :, half] = found
+            at = np.flatnonzero(found)[:, None]
+            for i, j in pairs:
+                uv[h, at, [i, j]] = uv[h, at, [j, i]]
+                confidence[h, at, [i, j]] = confidence[h, at, [j, i]]
+    changed = dataclasses.replace(keypoints, uv=uv, confidence=confidence)
+    return changed, renamed
+
+
+def _exchanged(
+    uv: Float[np.ndarray, "t 25 2"],
+    seen: Bool[np.ndarray, "t 25"],
+    pairs: tuple[tuple[int, int], ...],
+    fps: float,
+) -> Bool[np.ndarray, " t"]:
+    """Frames in which these pairs of one person have each other's names."""
+    size = _size(uv, seen)
+    changes = np.full(max(len(uv) - 1, 0), _CHANGE)
+    for i, j in pairs:
+        where = np.flatnonzero(seen[:, i] & seen[:, j])
+        gap = np.diff(where)
+        if len(where) < 3:
+            continue
+        across = uv[where, i] - uv[where, j]
+        on = np.linalg.norm(across[1:] - across[:-1], axis=-1)
+        off = np.linalg.norm(across[1:] + across[:-1], axis=-1)
+        smaller = np.minimum(on, off) / gap
+        usual = median_filter(smaller, min(_WINDOW, len(gap)), mode="nearest")
+        floor = np.hypot(_FLOOR * size, 1.0)
+        sigma = np.hypot(usual * gap / _MEDIAN_OF_TWO, floor)
+        evidence = 0.5 * (_robust(off / sigma) - _robust(on / sigma))
+        near = gap <= _LONGEST
+        changes[where[1:][near] - 1] += _INDEPENDENT * evidence[near]
+    cost = _EXCHANGED * min(1.0, 1 / (fps * _LASTING))
+    return cheapest_states(np.full(len(uv), cost), changes)
+
+
+def _size(uv: Float[np.ndarray, "t 25 2"], seen: Bool[np.ndarray, "t 25"]) -> float:
+    """Of the person in the image, px: the usual box of the keypoints."""
+    known = seen[..., None]
+    low = np.where(known, uv, np.inf).min(axis=1)
+    high = np.where(known, uv, -np.inf).max(axis=1)
+    some = seen.sum(axis=1) > 1
+    extent = np.linalg.norm((high - low)[some], axis=-1)
+    return float(np.median(extent)) if some.any() else 0.0
+
+
+def _robust(whitened: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Geman and McClure's ρ."""
+    squared = whitened**2
+    return squared / (1 + squared / _SCALE**2)

@@ -1,0 +1,200 @@
+"""Who is who from frame to frame, as long as a person is not out of sight for long.
+
+People are expected to go on as they moved, to keep their size and their clothes. Where
+one of the three does not hold nobody is continued: better two pieces of one person,
+which `_linking` joins with all frames known, than one piece of two people.
+"""
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from bodyslam_jax.people.appearance import difference, mean_look
+from bodyslam_jax.people.movenet import box_size, sure_points
+
+_REACH = 0.15
+"""How far from where they are expected people are found a frame later, of their
+height."""
+_REACH_PER_SECOND = 0.8
+"""What is added to that for each second that they were not seen."""
+_FADING = 0.5
+"""Time constant with which an unseen person is taken to stop, s."""
+_SMOOTHING = 0.1
+"""Time constant of the velocity's mean, s."""
+GROWTH = 1.6
+"""Ratio of sizes from which it is somebody else."""
+OTHER_CLOTHES = 30.0
+"""Difference of colours (`_appearance.difference`) from which it is somebody else."""
+_RECENT = 45
+"""Frames over which the look of a person is averaged."""
+_AWHILE = 3
+"""Frames after which somebody who is seen again must be in full view."""
+_FEWEST = 3
+"""Keypoints that two detections must have in common to be compared."""
+_TRUNK = 0.3
+"""Length of the trunk, of the height."""
+
+
+@dataclasses.dataclass
+class Tracklet:
+    """A person without a longer gap: what was seen of them, frame by frame."""
+
+    number: int
+    frames: list[int]
+    points: list[Float[np.ndarray, "17 3"]]
+    looks: list[Float[np.ndarray, " d"]]
+    velocity: Float[np.ndarray, " 2"] = dataclasses.field(
+        default_factory=lambda: np.zeros(2)
+    )
+    """px a frame, at the last one."""
+
+    @property
+    def look(self) -> Float[np.ndarray, " d"]:
+        return mean_look(np.stack(self.looks[-_RECENT:]))
+
+    def expected(self, frame: int, fps: float) -> Float[np.ndarray, "17 3"]:
+        """Keypoints in a later frame, if the person goes on, slowing down."""
+        time = _FADING * fps
+        steps = time * (1 - np.exp(-(frame - self.frames[-1]) / time))
+        points = self.points[-1].copy()
+        points[:, :2] += steps * self.velocity
+        return points
+
+    def extend(
+        self, frame: int, points: np.ndarray, look: np.ndarray, fps: float
+    ) -> None:
+        before = self.points[-1]
+        both = sure_points(points) & sure_points(before)
+        if both.any():
+            gap = frame - self.frames[-1]
+            moved = np.median((points - before)[both, :2], axis=0) / gap
+            share = 1 - np.exp(-gap / (_SMOOTHING * fps))
+            if len(self.frames) == 1:
+                share = 1.0
+            self.velocity = (1 - share) * self.velocity + share * moved
+        self.frames.append(frame)
+        self.points.append(points)
+        self.looks.append(look)
+
+    def prepend(self, frame: int, points: np.ndarray, look: np.ndarray) -> None:
+        """Adds what was found in an earlier frame."""
+        self.frames.insert(0, frame)
+        self.points.insert(0, points)
+        self.looks.insert(0, look)
+
+
+def between(tracklet: Tracklet) -> list[tuple[int, Float[np.ndarray, "17 3"]]]:
+    """Where a person was in the frames in which they were not seen: linear."""
+    found = []
+    ends = zip(tracklet.frames, tracklet.points, strict=True)
+    for (first, a), (last, b) in pairwise(ends):
+        for frame in range(first + 1, last):
+            share = (frame - first) / (last - first)
+            found.append((frame, a + share * (b - a)))
+    return found
+
+
+class Tracker:
+    """Tracklets that grow with each frame's detections."""
+
+    def __init__(self, fps: float, max_gap: float) -> None:
+        self.fps = fps
+        self.max_gap = max_gap * fps
+        self.tracklets: list[Tracklet] = []
+
+    def alive(self, frame: int) -> list[Tracklet]:
+        """Whom a detection in `frame` may still continue."""
+        return [t for t in self.tracklets if frame - t.frames[-1] <= self.max_gap]
+
+    def update(
+        self,
+        frame: int,
+        points: Float[np.ndarray, "n 17 3"],
+        looks: Float[np.ndarray, "n d"],
+        may_return: Bool[np.ndarray, " n"],
+        may_start: Bool[np.ndarray, " n"],
+    ) -> Int[np.ndarray, " n"]:
+        """The number of the tracklet that each detection continues or begins.
+
+        Args:
+            may_return: which detections may be somebody who was not seen for a while.
+            may_start: which detections are sure enough to be somebody new; the others
+                get -1 if they continue nobody.
+        """
+        who = np.full(len(points), -1)
+        alive = self.alive(frame)
+        if alive and len(points):
+            cost = np.array(
+                [
+                    [self.cost(t, frame, p, look) for p, look in zip(points, looks)]
+                    for t in alive
+                ]
+            )
+            away = np.array([frame - t.frames[-1] for t in alive])
+            cost[(away > _AWHILE)[:, None] & ~may_return] = 1e3
+            rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
+            for i, j in zip(rows, columns, strict=True):
+                if cost[i, j] < 1:
+                    alive[i].extend(frame, points[j], looks[j], self.fps)
+                    who[j] = alive[i].number
+        for j in np.flatnonzero((who < 0) & may_start):
+            who[j] = len(self.tracklets)
+            self.tracklets.append(
+                Tracklet(int(who[j]), [frame], [points[j]], [looks[j]])
+            )
+        return who
+
+    def cost(
+        self, tracklet: Tracklet, frame: int, points: np.ndarray, look: np.ndarray
+    ) -> float:
+        """0 for the very same, 1 and more where it is taken for somebody else."""
+        away = frame - tracklet.frames[-1]
+        reach = _REACH + _REACH_PER_SECOND * (away - 1) / self.fps
+        return _unlike(
+            displacement(tracklet.expected(frame, self.fps), points) / reach,
+            height(points) / height(tracklet.points[-1]),
+            difference(tracklet.look, look),
+        )
+
+    def cost_before(
+        self, tracklet: Tracklet, points: np.ndarray, look: np.ndarray
+    ) -> float:
+        """The same for the frame before a tracklet begins."""
+        first = tracklet.points[0]
+        return _unlike(
+            displacement(first, points) / _REACH,
+            height(points) / height(first),
+            difference(tracklet.look, look),
+        )
+
+
+def _unlike(place: float, growth: float, clothes: float) -> float:
+    """A cost below 1 only if each of the three may be: distance in what is within
+    reach, ratio of sizes, difference of clothes (NaN is unknown)."""
+    growth = abs(float(np.log(growth))) / np.log(GROWTH)
+    clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
+    if max(place, growth, clothes) >= 1:
+        return 1e3
+    return 0.6 * place + 0.1 * growth + 0.3 * clothes
+
+
+def displacement(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> float:
+    """How far apart two sets of keypoints are, of the person's height: the median
+    forgives a lost or exchanged limb. Infinite where too few are sure in both."""
+    both = sure_points(a) & sure_points(b)
+    if both.sum() < _FEWEST:
+        return np.inf
+    apart = np.median(np.linalg.norm((a - b)[both, :2], axis=1))
+    return float(apart) / max(height(a), height(b))
+
+
+def height(points: Float[np.ndarray, "17 3"]) -> float:
+    """Size of a person in the image (px), also if bent or partly hidden."""
+    size = max(box_size(points), 1.0)
+    if sure_points(points)[[5, 6, 11, 12]].all():
+        trunk = points[[5, 6], :2].mean(0) - points[[11, 12], :2].mean(0)
+        size = max(size, float(np.linalg.norm(trunk)) / _TRUNK)
+    return size

@@ -1,0 +1,228 @@
+"""Stage results kept on disk, so that an interrupted run is finished, not repeated.
+
+A stage's result is a dataclass of arrays and plain values. It is stored as an `.npz`
+named after a hash of all that it was computed from: another input, other settings,
+other weights in a file that they name, or another state of the package simply do not
+find it.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import logging
+import os
+import typing
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from bodyslam_jax.body import search_paths
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+_EDGE = 1 << 20
+_SOURCE = "source.json"
+_CACHE = ".cache"
+"""The folder of stage results in that of a run."""
+UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
+UNREADABLE += (zipfile.BadZipFile, zlib.error)
+"""What `load` raises of a file that is damaged, or of another state of the package."""
+_FILES = ("body_model", "motion_model", "motion")
+"""Settings that name a file: what it holds counts, and not where it lies."""
+
+
+def fingerprint(*parts: Any) -> str:
+    """A hash of settings, arrays and files (by size and content of their ends).
+
+    Files that settings name count as files, and so does the package as it is.
+    """
+    digest = hashlib.sha256(_package())
+    for part in parts:
+        _update(digest, part)
+    return digest.hexdigest()[:16]
+
+
+def body_model_file(setting: str | None) -> Path | None:
+    """The file or folder that `body_model` of the settings stands for.
+
+    Without a setting it is what was found on this machine, `None` where that is the
+    body that ships.
+    """
+    if setting is not None:
+        return Path(setting)
+    return next((path for path in search_paths() if path.is_file()), None)
+
+
+@functools.cache
+def _package() -> bytes:
+    """A hash of the package's source, and of the models and motion that ship."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    kept = (
+        path for suffix in ("py", "npz", "onnx") for path in root.rglob(f"*.{suffix}")
+    )
+    for path in sorted(kept):
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()
+
+
+def _update(digest: Any, part: Any) -> None:
+    if isinstance(part, np.ndarray):
+        digest.update(str((part.shape, part.dtype)).encode())
+        digest.update(np.ascontiguousarray(part).tobytes())
+    elif isinstance(part, Path):
+        digest.update(str(part.name).encode())
+        if part.is_dir():
+            for item in sorted(part.iterdir()):
+                # A run that is written into its own input is no part of it.
+                run = item.is_dir() and (item / _CACHE).is_dir()
+                if not item.name.startswith(".") and not run:
+                    _update(digest, item)
+        elif part.is_file():
+            size = part.stat().st_size
+            digest.update(str(size).encode())
+            with part.open("rb") as file:
+                digest.update(file.read(_EDGE))
+                file.seek(max(0, size - _EDGE))
+                digest.update(file.read(_EDGE))
+    elif dataclasses.is_dataclass(part) and not isinstance(part, type):
+        digest.update(type(part).__name__.encode())
+        for field in dataclasses.fields(part):
+            digest.update(field.name.encode())
+            value = getattr(part, field.name)
+            if field.name in _FILES and (value is None or isinstance(value, str)):
+                value = _named_file(field.name, value)
+            _update(digest, value)
+    elif isinstance(part, (tuple, list)):
+        digest.update(str(len(part)).encode())
+        for item in part:
+            _update(digest, item)
+    else:
+        digest.update(repr(part).encode())
+
+
+def _named_file(name: str, setting: str | None) -> Path | None:
+    if name == "body_model":
+        return body_model_file(setting)
+    return None if setting is None else Path(setting)  # what ships is the package's
+
+
+@dataclasses.dataclass(frozen=True)
+class Cache:
+    """A folder of stage results; `folder=None` keeps nothing."""
+
+    folder: Path | None
+    source: dict[str, Any] | None = None
+    """What the stages are of, kept beside them for `owner`."""
+
+    def stage(self, name: str, key: str, kind: type[T], compute: Callable[[], T]) -> T:
+        """The result of stage `name`, from disk if `key` is the same as then."""
+        if self.folder is None:
+            return compute()
+        path = self.folder / f"{name}-{key}.npz"
+        if path.exists():
+            try:
+                found = load(path, kind)
+            except UNREADABLE as error:
+                log.warning("%s: not readable (%s); computed again", path, error)
+            else:
+                log.info("%s: taken from an earlier run", name)
+                return found
+        result = compute()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.source is not None:
+            (self.folder / _SOURCE).write_text(json.dumps(self.source))
+        for old in self.folder.glob(f"{name}-*.npz"):
+            old.unlink()
+        save(path, result)
+        return result
+
+    def owner(self) -> dict[str, Any] | None:
+        """The `source` that the folder was begun for, `None` if it was not begun."""
+        if self.folder is None:
+            return None
+        try:
+            return dict(json.loads((self.folder / _SOURCE).read_text()))
+        except (OSError, ValueError, TypeError):
+            return None
+
+
+def save(path: Path, value: Any) -> None:
+    """Writes a dataclass of arrays and plain values; atomic."""
+    arrays: dict[str, np.ndarray] = {}
+    header = _encode(value, "", arrays)
+    blob = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, __header__=blob, **arrays)  # pyright: ignore[reportArgumentType]
+        os.replace(partial, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load(path: Path, kind: type[T]) -> T:
+    """Reads what `save` wrote.
+
+    **Raises:** `ValueError` if `kind` has other fields now than when it was saved.
+    """
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        header = json.loads(archive["__header__"].tobytes())
+        return _decode(header, kind, archive)
+
+
+def _encode(value: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(value, np.ndarray):
+        arrays[prefix or "value"] = value
+        return {"array": prefix or "value"}
+    if dataclasses.is_dataclass(value):
+        return {
+            "fields": {
+                f.name: _encode(getattr(value, f.name), f"{prefix}.{f.name}", arrays)
+                for f in dataclasses.fields(value)
+            }
+        }
+    if isinstance(value, Path):
+        return {"path": str(value)}
+    if isinstance(value, tuple):
+        items = [_encode(v, f"{prefix}.{i}", arrays) for i, v in enumerate(value)]
+        return {"tuple": items}
+    if isinstance(value, np.generic):
+        value = value.item()
+    return {"value": value}
+
+
+def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
+    if "array" in header:
+        return archive[header["array"]]
+    if "path" in header:
+        return Path(header["path"])
+    if "tuple" in header:
+        return tuple(_decode(item, None, archive) for item in header["tuple"])
+    if "fields" in header:
+        fields = header["fields"]
+        # Also where a new field has a default, which need not be what was computed.
+        if not dataclasses.is_dataclass(kind) or fields.keys() != {
+            field.name for field in dataclasses.fields(kind)
+        }:
+            raise ValueError(f"fields {', '.join(fields)} of another version")
+        kinds = typing.get_type_hints(kind)
+        return kind(
+            **{n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}
+        )
+    return header["value"]
+
+
+def _class(annotation: Any) -> Any:
+    """The dataclass in `Class | None`."""
+    for option in (annotation, *typing.get_args(annotation)):
+        if dataclasses.is_dataclass(option):
+            return option
+    return annotation

@@ -1,0 +1,185 @@
+"""The optimum as a result in metres, in an upright world."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import people
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.config import Config
+from bodyslam_jax.export.summary import summarise
+from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
+from bodyslam_jax.types import Cameras, Joint, Result, Sequence
+
+FEET = [10, 11]
+"""SMPL's toe joints."""
+
+
+def assemble(
+    sequence: Sequence,
+    config: Config,
+    body: body_.BodyModel,
+    cameras: Cameras,
+    joint: Joint,
+    seconds: dict[str, float],
+) -> Result:
+    """The optimum in a metric world whose y axis is up; standing feet are at y = 0."""
+    T_WC = joint.cameras.copy()
+    T_WC[:, :3, 3] *= joint.scale
+    joints = _placed(sequence, config, body, joint, T_WC)[2]
+    landmarks = joint.scale * joint.landmarks
+    turn, found = level(
+        T_WC,
+        T_WC @ joint.roots,
+        joints[:, :, FEET],
+        joint.present,
+        landmarks if cameras.kind == "moving" else landmarks[:0],
+        sequence.fps,
+        people.without_bodies(sequence),
+        config.gravity,
+    )
+    T_WC = turn @ T_WC
+    landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
+    poses, trans, joints = _placed(sequence, config, body, joint, T_WC)
+    if joint.present.any():
+        floor = floor_height(body, joint.shapes, joints, joint.present, sequence.fps)
+        for points in (T_WC[:, :3, 3], trans, joints, landmarks):
+            points[..., 1] -= floor
+    result = Result(
+        timestamps=sequence.timestamps,
+        T_WC=T_WC,
+        scale=joint.scale,
+        intrinsics=joint.intrinsics,
+        landmarks=landmarks if cameras.kind == "moving" else np.zeros((0, 3)),
+        poses=poses,
+        trans=trans,
+        betas=joint.shapes,
+        joints=joints,
+        present=joint.present,
+    )
+    summary = summarise(sequence, config, body, cameras, joint, result, found, seconds)
+    return dataclasses.replace(result, summary=summary)
+
+
+_joints = jit_once(body_.joints)
+
+
+def _placed(
+    sequence: Sequence,
+    config: Config,
+    body: body_.BodyModel,
+    joint: Joint,
+    T_WC: Float[np.ndarray, "t 4 4"],
+) -> tuple[
+    Float[np.ndarray, "h t 72"],
+    Float[np.ndarray, "h t 3"],
+    Float[np.ndarray, "h t 24 3"],
+]:
+    """Poses, `trans` and joints of people in the world of these cameras, smoothed."""
+    T_WH = T_WC @ joint.roots
+    root = np.asarray(log(jnp.asarray(T_WH[..., :3, :3])))
+    poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
+    poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
+    shapes = jnp.asarray(joint.shapes)
+    trans = pelvis - np.asarray(body_.rest_joints(body, shapes))[:, None, 0]
+    joints = _joints(body, jnp.asarray(poses), shapes[:, None], jnp.asarray(trans))
+    return poses, trans, np.array(joints)
+
+
+def floor_height(
+    body: body_.BodyModel,
+    shapes: Float[np.ndarray, "h 10"],
+    joints: Float[np.ndarray, "h t 24 3"],
+    present: Bool[np.ndarray, "h t"],
+    fps: float,
+) -> float:
+    """Height of what standing feet stand on, m; if none stand, of the lowest feet.
+
+    `joints` are in a world whose y axis is up, m.
+    """
+    sole = np.median([sole_height(body, shape) for shape in shapes])
+    stances = find_stances(joints[:, :, FEET], present, fps)
+    heights = np.concatenate([places[:, 1] for places in stances])
+    if len(heights):
+        return float(np.median(heights) - sole)
+    lowest = joints[present][:, FEET, 1].min(axis=1)
+    return float(np.quantile(lowest, 0.05) - sole)
+
+
+def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
+    """How far the toe joints lie above the sole of a body that stands, m."""
+    template = np.asarray(body.template, np.float64)[:, 1]
+    skin = template + np.asarray(body.shape_dirs, np.float64)[:, 1] @ shape
+    rest = np.asarray(body_.rest_joints(body, jnp.asarray(shape)))
+    return float(rest[FEET, 1].mean() - skin.min())
+
+
+def _smoothed(sequence, config, present, poses, pelvis):
+    """People's rotations and paths in the world without what is too fast for them."""
+    if config.smoothing_hz is None:
+        return poses, pelvis
+    how = (sequence.fps, config.smoothing_hz)
+    poses, pelvis = poses.copy(), pelvis.copy()
+    for h, there in enumerate(present):
+        joints = poses[h].reshape(-1, 24, 3)
+        poses[h] = low_pass_rotations(joints, there, *how).reshape(-1, 72)
+        pelvis[h] = low_pass(pelvis[h], there, *how)
+    return poses, pelvis
+
+
+def level(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    T_WH: Float[np.ndarray, "h t 4 4"],
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    landmarks: Float[np.ndarray, "l 3"],
+    fps: float,
+    fitted: Bool[np.ndarray, " h"],
+    gravity: tuple[float, ...] = (),
+) -> tuple[Float[np.ndarray, "4 4"], Upright]:
+    """The rigid motion to a world whose y axis is up, and how that is known.
+
+    Cues (see `find_upright`) are taken in a world that is roughly upright already: up
+    is there where a measurement has it (`gravity`: the direction in which things fall,
+    in the first camera's axes), else where people's trunks point on average, or,
+    without people, where the first camera's top does.
+    """
+    up = -T_WC[0, :3, 1]
+    if gravity:
+        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
+    elif present.any():
+        up = T_WH[present][:, :3, 1].sum(axis=0)
+    rough = upright(T_WC, up / np.linalg.norm(up))
+    at = lambda points: points @ rough[:3, :3].T + rough[:3, 3]
+    found = find_upright(
+        T_WH[..., :3, 1] @ rough[:3, :3].T,
+        at(feet),
+        present,
+        at(T_WC[:, :3, 3]),
+        at(landmarks),
+        fps,
+        fitted,
+        np.array([0.0, 1.0, 0.0]) if gravity else None,
+    )
+    return upright(rough @ T_WC, found.up) @ rough, found
+
+
+def upright(
+    T_WC: Float[np.ndarray, "t 4 4"], up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion to a world with y along the unit vector `up` and z ahead of the
+    first camera, which is its origin."""
+    y = up
+    ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
+    if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.
+        ahead = T_WC[0, :3, 1] - y * (y @ T_WC[0, :3, 1])
+    z = ahead / np.linalg.norm(ahead)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([np.cross(y, z), y, z])
+    turn[:3, 3] = -turn[:3, :3] @ T_WC[0, :3, 3]
+    return turn

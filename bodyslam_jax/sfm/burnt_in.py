@@ -1,0 +1,263 @@
+"""Points that are no part of the scene: they stay at one pixel while the scene moves.
+
+Text, logos and displays burnt into a video, dirt on the lens, and parts of the vehicle
+or hand that carries the camera give tracks that are long, strong and wrong. A point
+that stays at its pixel may also be far away, or straight ahead of a camera that goes
+forward, and everything stays where the camera stands. So a point is told by the motion
+of the others: a rotation, or an essential matrix, is fitted to those that move, and a
+point that stays where neither lets it stay, in most pairs of frames in which it is
+seen, is burnt in. Where the camera only translates, any point may stay that is at
+infinity, and is left alone.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.sfm.multiview import fit_rotation, unit_rays
+from bodyslam_jax.types import Intrinsics, Tracks
+
+STILL = 0.5
+"""Displacement up to which a point may be still in images of 1280 px, px."""
+_GAPS = (6, 15, 30, 60)
+"""Frames between the two of a pair."""
+_MOST_ANCHORS = 300
+_TIMES_STILL = 4.0
+"""Displacement of the points that move, of that of those that do not, from which the
+two can be told apart."""
+_FEWEST_MOVERS = 15
+_FEWEST_INCONSISTENT = 2
+_FEWEST_TELLING = (3, 0.1)
+"""Pairs in which all move but some, and their share of those in which some are still:
+fewer may be an instant in which something crosses before a camera that stands."""
+_SHARE_INCONSISTENT = 0.4
+"""Of the pairs in which a point is still: a point of the scene fits nearly always."""
+_FEWEST_ALWAYS, _MEAN_ALWAYS = 6, 0.7
+"""Pairs of a point, and its mean distance in the same unit, that contradict as well."""
+_TOLERANCE = 3.0
+"""Distance from what the motion of the others allows, of their own robust scatter and
+of `STILL`, from which a point contradicts it."""
+_CELLS = 8
+"""Along the longer side: the motion of the camera is seen all over the image."""
+_LEAST_COVER, _LEAST_ROWS = 1.0, 3
+"""Cells that move over cells that only stay, and rows and columns that move: less may
+be traffic before a camera that stands still."""
+_AROUND = 15
+"""Frames before and after a burnt-in point in which its place is masked."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BurntIn:
+    """What stays at its pixel and cannot be of the scene."""
+
+    of_landmark: Bool[np.ndarray, " l"]
+    still: Bool[np.ndarray, " l"]
+    """Tracks that stay at their pixel, of the scene or not."""
+    num_pairs: int
+    """Pairs of frames that could tell."""
+
+    @property
+    def found(self) -> bool:
+        return bool(self.of_landmark.any())
+
+
+def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> BurntIn:
+    """Which tracks stay at their pixel against the motion of all others.
+
+    The displacement that counts as none is `STILL` px (more in larger images), or what
+    the tracks' own noise makes of a point at rest, if that is more.
+    """
+    num = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
+    tested, against = np.zeros(num, np.int64), np.zeros(num, np.int64)
+    stays, pairs = np.zeros(num, np.int64), np.zeros(num, np.int64)
+    total, telling, resting = np.zeros(num), 0, 0
+    size = (intrinsics.width, intrinsics.height)
+    limit = max(still_limit(size), 2.5 * noise_of(tracks))
+    by_frame = _by_frame(tracks, num_frames)
+    K, distortion = as_opencv(intrinsics.params)
+    for a, b in _pairs(num_frames):
+        ids, i, j = np.intersect1d(by_frame[a][0], by_frame[b][0], return_indices=True)
+        at_a, at_b = by_frame[a][1][i], by_frame[b][1][j]
+        moved = np.linalg.norm(at_b - at_a, axis=-1)
+        still = moved < limit
+        pairs[ids] += 1
+        stays[ids[still]] += 1
+        resting += int(still.any())
+        movers = moved > 2 * limit
+        if not still.any() or movers.sum() < _FEWEST_MOVERS:
+            continue
+        if np.median(moved[movers]) < _TIMES_STILL * limit:
+            continue
+        away, fits = _contradiction(
+            rays(at_a, K, distortion),
+            rays(at_b, K, distortion),
+            movers,
+            limit / K[0, 0],
+        )
+        if away is None or not _covers(at_a, fits, still, size):
+            continue
+        telling += 1
+        tested[ids[still]] += 1
+        against[ids[still]] += away[still] > _TOLERANCE
+        total[ids[still]] += np.minimum(away[still], _TOLERANCE)
+    often = against >= np.maximum(_FEWEST_INCONSISTENT, _SHARE_INCONSISTENT * tested)
+    # Or by less, but all the time: a camera held by hand may turn by a little only.
+    always = (tested >= _FEWEST_ALWAYS) & (total > _MEAN_ALWAYS * tested)
+    burnt = often | always
+    burnt &= telling >= max(_FEWEST_TELLING[0], _FEWEST_TELLING[1] * resting)
+    # Tracks that stay for a while only, as where two objects cross, are of the scene.
+    burnt &= stays >= 0.5 * pairs
+    return BurntIn(burnt, (stays >= 0.5 * pairs) & (pairs > 0), telling)
+
+
+def without_burnt_in(
+    tracks: Tracks, intrinsics: Intrinsics, num_frames: int
+) -> tuple[Tracks, float]:
+    """The tracks of the scene alone, and the share of the observations left out."""
+    found = find_burnt_in(tracks, intrinsics, num_frames)
+    if not found.found:
+        return tracks, 0.0
+    kept = ~found.of_landmark[tracks.landmark]
+    _, landmark = np.unique(tracks.landmark[kept], return_inverse=True)
+    left = dataclasses.replace(
+        tracks,
+        frame=tracks.frame[kept],
+        landmark=landmark.astype(np.int64),
+        uv=tracks.uv[kept],
+    )
+    return left, float(1 - kept.mean())
+
+
+def burnt_in_warning(share: float) -> str:
+    return (
+        f"{100 * share:.0f} % of the followed points stay at their pixel while the "
+        "scene moves (text, a logo or a part of the vehicle?): left out."
+    )
+
+
+def still_limit(size: tuple[int, int]) -> float:
+    """Displacement (px) up to which a point is still: KLT errs more in large images."""
+    return STILL * max(1.0, max(size) / 1280)
+
+
+def noise_of(tracks: Tracks) -> float:
+    """Standard deviation (px) of single observations: from second differences of the
+    steadier half of the tracks, so that the motion of the camera counts little."""
+    order = np.lexsort((tracks.frame, tracks.landmark))
+    frame, landmark, uv = (x[order] for x in (tracks.frame, tracks.landmark, tracks.uv))
+    in_row = (landmark[2:] == landmark[:-2]) & (frame[2:] == frame[:-2] + 2)
+    if not in_row.any():
+        return 0.0
+    bend = np.linalg.norm(uv[2:] - 2 * uv[1:-1] + uv[:-2], axis=-1)[in_row]
+    # The lower quartile of a Rayleigh variable is 0.7585 of its parameter.
+    return float(np.quantile(bend, 0.25) / 0.7585 / np.sqrt(6))
+
+
+def masks_of(
+    frame: Int[np.ndarray, " m"],
+    uv: Float[np.ndarray, "m 2"],
+    num_frames: int,
+    size: tuple[int, int],
+    radius: int,
+) -> Iterator[UInt8[np.ndarray, "y x"]]:
+    """Masks (255) around observations, also for a while before and after each.
+
+    Args:
+        size: width and height, px.
+        radius: px
+    """
+    # One entry a place: text lasts, and its points come and go.
+    place = np.round(uv / max(1, radius // 3)).astype(np.int64)
+    _, of = np.unique(place, axis=0, return_inverse=True)
+    of = of.ravel()
+    count = int(of.max()) + 1 if len(of) else 0
+    counts = np.maximum(np.bincount(of, minlength=count), 1)
+    centre = np.stack(
+        [np.bincount(of, uv[:, i], count) / counts for i in range(2)], axis=-1
+    )
+    seen = np.zeros((count, num_frames), dtype=bool)
+    seen[of, frame] = True
+    width = np.ones(2 * _AROUND + 1, dtype=np.uint8)[None]
+    shown = cv2.dilate(seen.astype(np.uint8), width) if count else seen
+    for k in range(num_frames):
+        mask = np.zeros((size[1], size[0]), dtype=np.uint8)
+        for x, y in centre[shown[:, k] > 0]:
+            cv2.circle(mask, (round(float(x)), round(float(y))), radius, 255, -1)
+        yield mask
+
+
+def _pairs(num_frames: int) -> Iterator[tuple[int, int]]:
+    step = max(3, -(-num_frames // _MOST_ANCHORS))
+    step = min(step, 10)
+    for gap in _GAPS:
+        for a in range(0, num_frames - gap, step):
+            yield a, a + gap
+
+
+def _contradiction(
+    xy_a: np.ndarray, xy_b: np.ndarray, movers: np.ndarray, limit: float
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """How far each pair of points is from what the motion of the movers allows, in
+    units of what may be, and which of the movers show that motion.
+
+    A rotation is tried first: any essential matrix with its rotation fits one as well.
+    """
+    a, b = xy_a[movers], xy_b[movers]
+    R, away = fit_rotation(unit_rays(a), unit_rays(b), limit)
+    fits = np.zeros(len(movers), dtype=bool)
+    good = away < 3 * limit
+    if good.mean() > 0.7:
+        fits[movers] = good
+        scatter = max(limit, 1.5 * float(np.median(away)))
+        left = np.linalg.norm(unit_rays(xy_b) - unit_rays(xy_a) @ R.T, axis=-1)
+        return left / scatter, fits
+    E, inlier = cv2.findEssentialMat(
+        a, b, np.eye(3), cv2.USAC_MAGSAC, 0.999, 2 * limit, 500
+    )
+    if E is None or E.shape != (3, 3) or inlier is None or inlier.mean() < 0.5:
+        return None, fits
+    fits[movers] = inlier.ravel() > 0
+    left = sampson(E, xy_a, xy_b)
+    scatter = max(limit, 1.5 * float(np.median(left[fits])))
+    return left / scatter, fits
+
+
+def sampson(
+    E: Float[np.ndarray, "3 3"],
+    xy_a: Float[np.ndarray, "n 2"],
+    xy_b: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " n"]:
+    """First-order distance of each pair from the epipolar constraint, at depth 1."""
+    one = np.ones((len(xy_a), 1))
+    a, b = np.concatenate([xy_a, one], axis=-1), np.concatenate([xy_b, one], axis=-1)
+    at_b, at_a = a @ E.T, b @ E
+    value = np.einsum("ni,ni->n", b, at_b)
+    norm = np.sqrt((at_b[:, :2] ** 2).sum(axis=-1) + (at_a[:, :2] ** 2).sum(axis=-1))
+    return np.abs(value) / np.maximum(norm, 1e-12)
+
+
+def _covers(
+    uv: np.ndarray, movers: np.ndarray, still: np.ndarray, size: tuple[int, int]
+) -> bool:
+    """Whether what moves is spread over the image as a scene is."""
+    cell = max(size) / _CELLS
+    cells = lambda rows: {tuple(c) for c in (uv[rows] // cell).astype(int).tolist()}
+    moving, staying = cells(movers), cells(still)
+    if min(len({cell[i] for cell in moving}) for i in (0, 1)) < _LEAST_ROWS:
+        return False
+    return len(moving) >= max(4, _LEAST_COVER * len(staying - moving))
+
+
+def _by_frame(
+    tracks: Tracks, num_frames: int
+) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]]:
+    order = np.argsort(tracks.frame, kind="stable")
+    bounds = np.searchsorted(tracks.frame[order], np.arange(num_frames + 1))
+    return [
+        (tracks.landmark[order[i:j]], tracks.uv[order[i:j]])
+        for i, j in zip(bounds[:-1], bounds[1:], strict=True)
+    ]

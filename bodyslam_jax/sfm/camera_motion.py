@@ -1,0 +1,180 @@
+"""What kind of camera motion tracks show: none, rotation, translation, or a cut."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.sfm.bundle import Views
+from bodyslam_jax.sfm.multiview import fit_rotation, unit_rays
+
+_FOLLOWED = 0.05
+"""Share of the points that even a quick motion leaves."""
+_MOST_LOST = 0.3
+_LEAP = 10.0, 0.08
+"""Times the usual displacement, and displacement at depth 1, that is none of a hand."""
+
+
+def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
+    """First frames of shots: 0, and those that share too few points with the last."""
+    ordered = np.lexsort((views.frame, views.landmark))
+    frame, landmark = views.frame[ordered], views.landmark[ordered]
+    same = landmark[1:] == landmark[:-1]
+    # A point seen before and after a frame links the two sides, seen there or not.
+    links = np.zeros(num_frames + 1)
+    np.add.at(links, frame[:-1][same] + 1, 1)
+    np.add.at(links, frame[1:][same] + 1, -1)
+    shared = np.cumsum(links)[:num_frames]
+    return [0] + [k for k in range(1, num_frames) if shared[k] < min_shared]
+
+
+def find_jumps(views: Views, num_frames: int, min_shared: int) -> list[int]:
+    """Frames to which almost no point is followed from the frame before, though both
+    have many, or all leap many times as far as from frame to frame elsewhere: a cut,
+    also where points are found again beyond it."""
+    followed = np.zeros(num_frames, dtype=np.int64)
+    ordered = np.lexsort((views.frame, views.landmark))
+    frame, landmark = views.frame[ordered], views.landmark[ordered]
+    on = (landmark[1:] == landmark[:-1]) & (frame[1:] == frame[:-1] + 1)
+    np.add.at(followed, frame[1:][on], 1)
+    count = np.bincount(frame, minlength=num_frames)
+    fewest = np.minimum(count[1:], count[:-1])
+    lost = (fewest >= 2 * min_shared) & (followed[1:] < _FOLLOWED * fewest)
+    xy = views.xy[ordered]
+    step = np.linalg.norm(xy[1:] - xy[:-1], axis=-1)[on]
+    into = frame[1:][on]
+    typical = [
+        np.median(step[into == k]) if followed[k] else 0.0 for k in range(1, num_frames)
+    ]
+    leap = _LEAP[0] * np.median(typical) if typical else 0.0
+    far = np.asarray(typical) / max(leap, _LEAP[1])
+    # Half as far will do where most points are lost as well.
+    lost |= (far > 1) | ((far > 0.5) & (followed[1:] < _MOST_LOST * fewest))
+    return (np.flatnonzero(lost) + 1).tolist()
+
+
+def choose_keyframes(
+    views: Views, first: int, last: int, motion: float, min_shared: int
+) -> Int[np.ndarray, " k"]:
+    """Frames between which points moved by `motion` (at depth 1) or many are new."""
+    by_frame = _by_frame(views)
+    chosen = [first]
+    ids, xy = by_frame.get(first, _nothing())
+    for k in range(first + 1, last + 1):
+        ids_k, xy_k = by_frame.get(k, _nothing())
+        _, a, b = np.intersect1d(ids, ids_k, return_indices=True)
+        if len(ids_k) < min_shared:
+            continue
+        moved = (
+            np.median(np.linalg.norm(xy_k[b] - xy[a], axis=-1)) if len(a) else np.inf
+        )
+        if (
+            moved > motion
+            or len(a) < 0.6 * len(ids)
+            or k == last
+            or k - chosen[-1] > 30
+        ):
+            chosen.append(k)
+            ids, xy = ids_k, xy_k
+    return np.asarray(chosen)
+
+
+def stillness(views: Views, window: int = 10) -> float:
+    """How far points wander in the image, at depth 1: the median over points of the
+    distance between the median places in their first and farthest `window` frames."""
+    ordered = np.lexsort((views.frame, views.landmark))
+    landmark, xy = views.landmark[ordered], views.xy[ordered]
+    starts = np.flatnonzero(np.diff(landmark, prepend=-1))
+    lengths = np.diff(np.append(starts, len(landmark)))
+    long = lengths >= max(2, 0.5 * np.percentile(lengths, 90))
+    wander = []
+    for start, length in zip(starts[long], lengths[long], strict=True):
+        points = xy[start : start + length]
+        parts = np.array_split(points, max(2, length // window))
+        places = np.array([np.median(part, axis=0) for part in parts])
+        wander.append(np.linalg.norm(places - places[0], axis=-1).max())
+    return float(np.median(wander)) if wander else np.inf
+
+
+def rotation_error(
+    views: Views, keyframes: Int[np.ndarray, " k"], scale: float
+) -> Float[np.ndarray, "p 4"]:
+    """How badly a pure rotation explains pairs of keyframes.
+
+    Returns: for each pair of keyframes that share 30 points or more: first, second, the
+    median angle (rad) left after the best rotation, and how many points they share.
+    """
+    by_frame = _by_frame(views)
+    rows = []
+    for i, a in enumerate(keyframes):
+        for b in keyframes[i + 1 :]:
+            _, at_a, at_b = np.intersect1d(
+                by_frame[a][0], by_frame[b][0], return_indices=True
+            )
+            if len(at_a) < 30:
+                continue
+            rays = unit_rays(by_frame[a][1][at_a]), unit_rays(by_frame[b][1][at_b])
+            _, away = fit_rotation(*rays, scale)
+            rows.append((a, b, np.median(away), len(at_a)))
+    return np.asarray(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def rotations_only(
+    views: Views,
+    num_frames: int,
+    num_landmarks: int,
+    scale: float,
+    *,
+    turns: bool = True,
+) -> tuple[
+    Float[np.ndarray, "t 3 3"], Float[np.ndarray, "l 3"], Bool[np.ndarray, " t"]
+]:
+    """Rotations R_CW of a camera that only turns, and directions to the points.
+
+    First frame by frame, then all together: every direction the mean of its rays, every
+    rotation the best for its directions, in turn. With `turns` false the rotations are
+    the identity and only the directions are sought.
+    """
+    by_frame = _by_frame(views)
+    R = np.tile(np.eye(3), (num_frames, 1, 1))
+    direction = np.zeros((num_landmarks, 3))
+    known = np.zeros(num_landmarks, dtype=bool)
+    solved = np.zeros(num_frames, dtype=bool)
+    for k in range(num_frames):
+        ids, xy = by_frame.get(k, _nothing())
+        ray = unit_rays(xy)
+        at = known[ids]
+        if solved.any():
+            R[k] = R[k - 1]
+        if at.sum() >= 6 and turns:
+            R[k] = fit_rotation(direction[ids[at]], ray[at], scale)[0]
+        if at.sum() >= 6 or (not solved.any() and len(ids) >= 6):
+            solved[k] = True
+            new = ids[~at]
+            direction[new] = ray[~at] @ R[k]
+            known[new] = True
+    for _ in range(20):
+        ray_W = np.einsum("mji,mj->mi", R[views.frame], unit_rays(views.xy))
+        away = np.linalg.norm(ray_W - direction[views.landmark], axis=-1)
+        weight = 1 / (1 + (away / scale) ** 2)
+        total = np.zeros_like(direction)
+        np.add.at(total, views.landmark, weight[:, None] * ray_W)
+        length = np.linalg.norm(total, axis=-1, keepdims=True)
+        direction = np.where(length > 0, total / np.maximum(length, 1e-12), direction)
+        for k in np.flatnonzero(solved & turns):
+            ids, xy = by_frame[int(k)]
+            R[k] = fit_rotation(direction[ids], unit_rays(xy), scale)[0]
+    return R, direction, solved
+
+
+def _by_frame(views: Views) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    order = np.argsort(views.frame, kind="stable")
+    frame = views.frame[order]
+    starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    ends = np.append(starts[1:], len(frame))
+    return {
+        int(frame[a]): (views.landmark[order[a:b]], views.xy[order[a:b]])
+        for a, b in zip(starts, ends, strict=True)
+    }
+
+
+def _nothing() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(0, dtype=np.int64), np.zeros((0, 2))

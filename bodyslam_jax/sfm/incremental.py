@@ -1,0 +1,282 @@
+"""Tracks -> cameras and map, up to scale: incremental structure from motion.
+
+The first pair is chosen by what grows from it; every other camera comes from 3D-2D
+RANSAC; points are triangulated again and again as views arrive; a small bundle
+adjustment runs in between. Keyframes first, then the frames between them.
+"""
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+
+from bodyslam_jax.sfm.bundle import Scene
+from bodyslam_jax.sfm.multiview import relative_pose, resect
+from bodyslam_jax.sfm.partial_map import Growing, Mapper
+from bodyslam_jax.types import CameraPath
+
+_log = logging.getLogger(__name__)
+
+_RELAXED = 3
+"""Times that a smaller angle is tried where cameras cannot be located."""
+_THIN, _AROUND = 25, 10
+"""Known points below which a camera is located poorly, and keyframes before and after
+it that show which of two maps is right there."""
+
+
+def build_map(
+    make: Callable[[], "Builder"], keyframes: np.ndarray, pairs: np.ndarray
+) -> tuple["Builder", Growing] | None:
+    """The map that grows best over the keyframes of one shot.
+
+    A camera that moves along a plane that few points show may be taken for one that
+    turns: a map that crosses such a thin place bends there, and no adjustment bends it
+    back. From the other side the place may well be crossed rightly. So both are tried,
+    and the map that explains more of the place is kept, unless it loses cameras.
+
+    Args:
+        make: a builder that has not begun yet.
+        pairs: frames, error of a turning camera and common points of each pair of
+            keyframes, as from `rotation_error`.
+    """
+    builder = make()
+    count = builder.config.max_first_pairs
+    grown = builder.build(keyframes, first_pairs(pairs, count))
+    if grown is None:
+        return None
+    best = builder, grown
+    if builder.thin:
+        thinnest = min(builder.thin, key=lambda k: (builder.thin[k], k))
+        before, after = pairs[:, :2] < thinnest, pairs[:, :2] > thinnest
+        beyond = before if builder.origin > thinnest else after
+        other = make()
+        starts = first_pairs(pairs[beyond.all(axis=1)], count)
+        again = other.build(keyframes, starts)
+        located = lambda growing: np.count_nonzero(growing.registered[keyframes])
+        if (
+            again is not None
+            and other.threshold <= builder.threshold
+            and located(again) >= located(grown)
+        ):
+            at = np.searchsorted(keyframes, sorted(builder.thin | other.thin))
+            away = np.abs(np.arange(len(keyframes))[:, None] - at).min(axis=1)
+            near = keyframes[away <= _AROUND]
+            scores = builder.score(grown, near), other.score(again, near)
+            _log.debug("around frame %d: %.3f, and %.3f from beyond", thinnest, *scores)
+            if scores[1] > scores[0]:
+                best = other, again
+    best[0].finish(best[1], keyframes)
+    return best
+
+
+def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Pairs of keyframes to start from: much parallax, many points, spread in time."""
+    if not len(pairs):
+        return np.zeros((0, 2), dtype=np.int64)
+    enough = np.minimum(pairs[:, 2], np.radians(5.0))
+    score = enough * np.minimum(pairs[:, 3], 100) ** 1.5
+    chosen: list[np.ndarray] = []
+    for i in np.argsort(-score):
+        apart = [np.abs(pairs[i, :2] - c).max() for c in chosen]
+        span = pairs[i, 1] - pairs[i, 0]
+        if not apart or min(apart) > 0.3 * span:
+            chosen.append(pairs[i, :2])
+        if len(chosen) == count:
+            break
+    return np.asarray(chosen).astype(np.int64)
+
+
+class Builder(Mapper):
+    """Grows a reconstruction over the keyframes of one shot."""
+
+    origin = 0
+    """Frame that the map grew from."""
+    thin: dict[int, int]
+    """Keyframes that were located by few points, and by how many."""
+
+    def begin(self, path: CameraPath) -> Growing:
+        """The map that cameras at known places see; they stay where they are."""
+        R_WC, centre = path.T_WC[:, :3, :3], path.T_WC[:, :3, 3]
+        scene = Scene(
+            np.swapaxes(R_WC, 1, 2).copy(),
+            centre.copy(),
+            np.zeros((self.num_landmarks, 3)),
+        )
+        grown = Growing(
+            scene,
+            path.known.copy(),
+            np.zeros(self.num_landmarks, dtype=bool),
+            np.zeros(len(self.views.frame), dtype=bool),
+            np.arange(self.num_landmarks),
+        )
+        self.thin = {}
+        self._triangulate(grown, self._views_of(grown))
+        self._mark(grown)
+        return grown
+
+    def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> Growing | None:
+        """The best of the reconstructions that grow from `pairs` of keyframes.
+
+        Where even the best leaves much unexplained, the points are noisier than
+        thought: it is tried again with twice the tolerance.
+        """
+        self.thin = {}
+        best, score = self._best_start(keyframes, pairs)
+        for _ in range(2):
+            if score > 0.75:
+                break
+            self.threshold *= 2
+            self.pixel *= 2
+            wider, wider_score = self._best_start(keyframes, pairs[:2])
+            if wider_score < score + 0.1:
+                self.threshold /= 2
+                self.pixel /= 2
+                break
+            best, score = wider, wider_score
+        if best is None:
+            return None
+        self.origin, self.thin = int(np.argmax(best.registered)), {}
+        self.joining = self.config.join_tracks
+        self._grow(best, keyframes)
+        for _ in range(_RELAXED):
+            if best.registered[keyframes].all():
+                break
+            # The camera turned on while it hardly moved: what it came to see has but
+            # little parallax.
+            self.min_angle *= 0.6
+            self._triangulate(best, self._views_of(best))
+            self._grow(best, keyframes)
+        return best
+
+    def finish(self, grown: Growing, keyframes: np.ndarray) -> None:
+        """Looks at all joins and outliers again, now that the keyframes are there."""
+        self._settle(grown, keyframes[grown.registered[keyframes]])
+        for _ in range(3):  # outliers sorted anew in between
+            self._refine(grown, self._free(grown))
+            self._triangulate(grown, self._views_of(grown))
+
+    def _best_start(
+        self, keyframes: np.ndarray, pairs: np.ndarray
+    ) -> tuple[Growing | None, float]:
+        best, scores = None, [-1.0]
+        for a, b in pairs:
+            started = self._start(int(a), int(b))
+            if started is None:
+                continue
+            # A few more cameras tell a right start from a wrong one.
+            near = keyframes[np.argsort(np.abs(keyframes - (a + b) / 2))][:8]
+            self._grow(started, near)
+            score = self.score(started, near)
+            _log.debug("start from frames %d and %d: %.2f", a, b, score)
+            if score > max(scores):
+                best = started
+            # Two that agree are as good as it gets with these points.
+            agrees = score > 0.5 and abs(score - max(scores)) < 0.03
+            scores.append(score)
+            if score > 0.9 or agrees:
+                break
+        return best, max(scores)
+
+    def complete(self, grown: Growing, frames: np.ndarray) -> None:
+        """Adds the frames between keyframes, then looks at everything once more."""
+        for k in frames:
+            if not grown.registered[k]:
+                self._register(grown, int(k))
+        self._triangulate(grown, self._views_of(grown))
+        self._mark(grown)
+        grown.shown[self.revisits.track] = self.views.landmark
+
+    def _start(self, a: int, b: int) -> Growing | None:
+        _, i, j = np.intersect1d(
+            self.views.landmark[self.of_frame[a]],
+            self.views.landmark[self.of_frame[b]],
+            return_indices=True,
+        )
+        if len(i) < self.config.min_shared:
+            return None
+        at_a, at_b = self.of_frame[a][i], self.of_frame[b][j]
+        pose = relative_pose(self.views.xy[at_a], self.views.xy[at_b], self.pixel)
+        if pose is None or pose[2].sum() < self.config.min_shared:
+            return None
+        R, t, good = pose
+        scene = Scene(
+            np.tile(np.eye(3), (self.num_frames, 1, 1)),
+            np.zeros((self.num_frames, 3)),
+            np.zeros((self.num_landmarks, 3)),
+        )
+        scene.R_CW[b], scene.centre[b] = R, -R.T @ t
+        grown = Growing(
+            scene,
+            np.isin(np.arange(self.num_frames), [a, b]),
+            np.zeros(self.num_landmarks, dtype=bool),
+            np.zeros(len(self.views.frame), dtype=bool),
+            np.arange(self.num_landmarks),
+        )
+        self._triangulate(grown, np.concatenate([at_a[good], at_b[good]]))
+        if grown.has_point.sum() < self.config.min_shared:
+            return None
+        self._refine(grown, grown.registered & (np.arange(self.num_frames) != a))
+        return grown
+
+    def _grow(self, grown: Growing, frames: np.ndarray) -> None:
+        """Registers `frames`, the one that sees most points first."""
+        waiting = {int(k) for k in frames if not grown.registered[k]}
+        failed: set[int] = set()
+        since, at_last = 0, int(grown.registered.sum())
+        while waiting - failed:
+            visible = {
+                k: int(grown.has_point[self.views.landmark[self.of_frame[k]]].sum())
+                for k in waiting - failed
+            }
+            k = max(visible, key=lambda k: (visible[k], -k))
+            if visible[k] < 6 or not self._register(grown, k):
+                failed.add(k)
+                continue
+            waiting.discard(k)
+            since += 1
+            self._triangulate(grown, self._views_seen_in(grown, k))
+            self._join(grown, k)
+            count = int(grown.registered.sum())
+            if count < 8 or count >= 1.25 * at_last:
+                self._refine(grown, self._free(grown))
+                self._triangulate(grown, self._views_of(grown))
+                since, at_last, failed = 0, count, set()
+            elif since >= 2:
+                self._refine(grown, self._nearest(grown, k, 8))
+                since = 0
+        self._refine(grown, self._free(grown))
+        self._triangulate(grown, self._views_of(grown))
+        self._refine(grown, self._free(grown))
+
+    def _register(self, grown: Growing, k: int) -> bool:
+        at = self.of_frame[k]
+        at = at[grown.has_point[self.views.landmark[at]]]
+        known = np.flatnonzero(grown.registered)
+        nearest = known[np.argmin(np.abs(known - k))]
+        guess = (grown.scene.R_CW[nearest], grown.scene.centre[nearest])
+        found = resect(
+            grown.scene.points[self.views.landmark[at]],
+            self.views.xy[at],
+            self.threshold,
+            guess,
+        )
+        if found is None or found[2].sum() < max(8, 0.3 * len(at)):
+            return False
+        grown.scene.R_CW[k], grown.scene.centre[k] = found[:2]
+        if len(at) < _THIN:
+            self.thin[k] = len(at)
+        grown.registered[k] = True
+        grown.inlier[at] = found[2]
+        return True
+
+    def score(self, grown: Growing, frames: np.ndarray) -> float:
+        """Part of the observations in `frames` that the reconstruction explains."""
+        return self.share_explained(grown, frames)[0]
+
+    def share_explained(self, grown: Growing, frames: np.ndarray) -> tuple[float, int]:
+        """The same, and how many observations could be explained."""
+        at = np.concatenate([self.of_frame[int(k)] for k in frames])
+        # Only landmarks seen twice can be explained at all.
+        seen = np.bincount(self.views.landmark[at], minlength=self.num_landmarks)
+        at = at[seen[self.views.landmark[at]] >= 2]
+        return (float(grown.inlier[at].mean()) if len(at) else 0.0), len(at)

@@ -1,0 +1,249 @@
+"""Places seen again: which tracks show one and the same point of the map.
+
+Whoever follows points begins a new track where a lost one comes back. Left so, a camera
+that turns away and back builds its map anew each time, and the map's size drifts by
+tens of per cent. Once the map tells where a point is, a track that is seen just there,
+from several frames, is taken to be that point.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.sfm.bundle import (
+    Scene,
+    Views,
+    errors,
+    jacobian_of_points,
+    sum_by,
+)
+from bodyslam_jax.sfm.multiview import triangulate
+from bodyslam_jax.sfm.relocalise import Pose, near, relocate, with_moved
+
+_LEAST_VIEWS, _MOST_VIEWS = 2, 8
+"""Registered frames in which a track must have been seen; that are looked at."""
+_WIDE = 10.0
+"""Error, in thresholds, that drift may amount to."""
+_REACH = 2.0
+"""Error, in thresholds, up to which a point is tried: points without much parallax are
+not where they seem to be."""
+_FITS = 0.7
+"""Mean error, in thresholds, of a point that explains two tracks."""
+_RIVAL = 1.5
+"""Times the error of the best point that the next best must have."""
+
+
+class Revisits:
+    """Tracks that were found to be of one point, and the landmark that each shows."""
+
+    def __init__(self, views: Views, num_tracks: int):
+        self.track = views.landmark.copy()
+        """Of each observation; `views.landmark` becomes the landmark's number."""
+        self.views = views
+        self.members: dict[int, list[int]] = {}
+        """Tracks of each landmark that has more than one, its own number first."""
+        self.refused: set[tuple[int, int]] = set()
+        order = np.argsort(self.track, kind="stable")
+        bounds = np.searchsorted(self.track[order], np.arange(num_tracks + 1))
+        self._of_track = [
+            order[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        ]
+
+    def views_of(self, landmark: int) -> Int[np.ndarray, " m"]:
+        """All observations of a landmark, whatever tracks they belong to."""
+        tracks = self.members.get(landmark, [landmark])
+        return np.concatenate([self._of_track[t] for t in tracks])
+
+    def find(
+        self,
+        scene: Scene,
+        frame: int,
+        seen: Int[np.ndarray, " n"],
+        known: Bool[np.ndarray, " l"],
+        registered: Bool[np.ndarray, " t"],
+        threshold: float,
+    ) -> tuple[list[tuple[int, int]], float]:
+        """Landmarks seen in `frame` that lie where another one is, which it does not
+        see: (one, other) pairs; and how far the map has drifted meanwhile, as an error
+        at depth 1.
+
+        Args:
+            seen: landmarks observed in the frame.
+            known: which landmarks have a point.
+            registered: frames whose camera is known.
+            threshold: error at depth 1 up to which an observation fits.
+        """
+        others = known.copy()
+        others[seen] = False
+        others = np.flatnonzero(others)
+        rows = {int(i): self._some_views(int(i), registered) for i in seen}
+        fresh = [i for i, r in rows.items() if len(r) >= _LEAST_VIEWS]
+        if not len(others) or not fresh:
+            return [], 0.0
+        at = [self.views_of(i) for i in fresh]
+        xy = np.array([self.views.xy[r[self.views.frame[r] == frame][0]] for r in at])
+        points = scene.points[others]
+        pose: Pose = (scene.R_CW[frame], scene.centre[frame])
+        i, j = near(points, xy, pose, _WIDE * threshold)
+        found, away = relocate(points[j], xy[i], i, pose, threshold, 1 / _WIDE**2)
+        if found is None:
+            return [], 0.0
+        pose = found
+        i, j = near(points, xy, pose, _REACH * threshold)
+        pairs = [
+            (fresh[a], int(others[b]))
+            for a, b in zip(i, j, strict=True)
+            if (fresh[a], int(others[b])) not in self.refused
+        ]
+        both = with_moved(scene, frame, pose)
+        misfit = self._misfit(both, pairs, registered, threshold)
+        return self._one_each(pairs, misfit), away
+
+    def _some_views(
+        self, landmark: int, registered: np.ndarray
+    ) -> Int[np.ndarray, " m"]:
+        """Observations in registered frames, spread over them; no more than a few."""
+        rows = self.views_of(landmark)
+        rows = rows[registered[self.views.frame[rows]]]
+        if len(rows) > _MOST_VIEWS:
+            rows = rows[np.linspace(0, len(rows) - 1, _MOST_VIEWS).round().astype(int)]
+        return rows
+
+    def _misfit(
+        self,
+        both: Scene,
+        pairs: list[tuple[int, int]],
+        registered: np.ndarray,
+        threshold: float,
+    ) -> Float[np.ndarray, " p"]:
+        """Error of the one point that explains both of a pair best, for that of the two
+        which it explains worse; in thresholds, each observation's no more than 3."""
+        if not pairs:
+            return np.zeros(0)
+        parts = [self._some_views(i, registered) for pair in pairs for i in pair]
+        part = np.repeat(np.arange(len(parts)), [len(rows) for rows in parts])
+        rows = np.concatenate(parts)
+        # The first of a pair is seen by the cameras that were moved.
+        frame = self.views.frame[rows] + (part % 2 == 0) * (len(both.centre) // 2)
+        views = Views(frame, part // 2, self.views.xy[rows])
+        points, _, _ = triangulate(both, views, len(pairs), threshold / 2)
+        error = errors(Scene(both.R_CW, both.centre, points), views) / threshold
+        total = np.bincount(part, np.minimum(error, 3.0), len(parts))
+        mean = total / np.bincount(part, minlength=len(parts))
+        return mean.reshape(-1, 2).max(axis=1)
+
+    def _one_each(
+        self, pairs: list[tuple[int, int]], misfit: np.ndarray
+    ) -> list[tuple[int, int]]:
+        """The best pairs without a rival, in which no landmark would be seen twice in
+        one frame."""
+        rated: dict[int, list[tuple[float, int]]] = {}
+        for (i, j), m in zip(pairs, misfit, strict=True):
+            rated.setdefault(i, []).append((float(m), j))
+        best = []
+        for i, found in rated.items():
+            found.sort()
+            is_clear = len(found) == 1 or found[1][0] >= _RIVAL * found[0][0]
+            if found[0][0] <= _FITS and is_clear:
+                best.append((found[0][0], i, found[0][1]))
+        taken: set[int] = set()
+        chosen = []
+        for _, i, j in sorted(best):
+            if i in taken or j in taken:
+                continue
+            frames = [self.views.frame[self.views_of(k)] for k in (i, j)]
+            if not np.isin(*frames).any():
+                taken |= {i, j}
+                chosen.append((i, j))
+        return chosen
+
+    def join(self, i: int, j: int) -> Int[np.ndarray, " m"]:
+        """Makes landmark `i` part of `j`; returns the observations that changed."""
+        rows = self.views_of(i)
+        self.members[j] = self.members.get(j, [j]) + self.members.pop(i, [i])
+        self.views.landmark[rows] = j
+        return rows
+
+    def part(self, error: Float[np.ndarray, " m"]) -> list[int]:
+        """Takes tracks out again that do not fit.
+
+        Args:
+            error: of each observation, in thresholds; NaN where it has none.
+
+        Returns: these tracks, which are landmarks of their own again.
+        """
+        loose = []
+        for landmark, tracks in list(self.members.items()):
+            for track in tracks[1:]:
+                rows = self._of_track[track]
+                found = np.minimum(error[rows], 3.0)
+                found = found[~np.isnan(found)]
+                if len(found) and found.mean() > _FITS:
+                    tracks.remove(track)
+                    self.views.landmark[self._of_track[track]] = track
+                    self.refused.add((track, landmark))
+                    loose.append(track)
+            if len(tracks) == 1:
+                del self.members[landmark]
+        return loose
+
+
+def cut_tracks(
+    frame: Int[np.ndarray, " m"], track: Int[np.ndarray, " m"], longest: int
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " m"]]:
+    """Cuts tracks that span more than `longest` frames into equal pieces.
+
+    Returns: the track that each piece is of, and the piece of each observation.
+    """
+    if not len(frame):
+        return np.zeros(0, int), np.zeros(0, int)
+    first = np.full(int(track.max()) + 1, frame.max() + 1)
+    last = np.full(len(first), -1)
+    np.minimum.at(first, track, frame)
+    np.maximum.at(last, track, frame)
+    span = last - first + 1
+    count = -(-span // longest)
+    part = (frame - first[track]) * count[track] // span[track]
+    most = max(int(count.max()), 1)
+    key, piece = np.unique(track * most + part, return_inverse=True)
+    return key // most, piece.ravel()
+
+
+def told_by_others(
+    scene: Scene, views: Views, shown: Int[np.ndarray, " l"]
+) -> Float[np.ndarray, "l 3 3"]:
+    """Information on each track's point that other tracks of the same point hold (or
+    pieces of tracks).
+
+    Each track is told a share of the others', such that the shares of a point sum to
+    what all its observations say. Cameras are taken as known; errors are in units of
+    depth 1.
+
+    Args:
+        views: observations that fit, of tracks.
+        shown: the landmark that each track shows.
+    """
+    seen = Views(views.frame, shown[views.landmark], views.xy)
+    J = jacobian_of_points(scene, seen)
+    own = sum_by(views.landmark, np.einsum("mki,mkj->mij", J, J), len(shown))
+    _, point = np.unique(shown, return_inverse=True)
+    tracks = np.unique(views.landmark)
+    count = np.bincount(point[tracks], minlength=len(shown))[point]
+    total = sum_by(point, own, len(shown))[point]
+    return (total - own) / np.maximum(count - 1, 1)[:, None, None]
+
+
+def told_by_other_pieces(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    landmarks: Float[np.ndarray, "l 3"],
+    frame: Int[np.ndarray, " m"],
+    piece: Int[np.ndarray, " m"],
+    of: Int[np.ndarray, " p"],
+) -> Float[np.ndarray, "p 3 3"]:
+    """`told_by_others` for the pieces of tracks of `landmarks`.
+
+    Args:
+        of: the landmark that each piece is of.
+    """
+    C_WC = T_WC[:, :3, :3]
+    scene = Scene(np.swapaxes(C_WC, 1, 2), T_WC[:, :3, 3], landmarks)
+    return told_by_others(scene, Views(frame, piece, np.zeros((len(frame), 2))), of)

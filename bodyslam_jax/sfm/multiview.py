@@ -1,0 +1,213 @@
+"""Two views, many rays, one pose: the geometry that a reconstruction grows by."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.sfm.bundle import Scene, Views, sum_by
+
+
+def relative_pose(
+    xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Rotation R_BA (3, 3), direction of A's centre in B (3,) and inliers (n,).
+
+    Five-point RANSAC, then the decomposition with most points in front.
+    """
+    E, inlier = cv2.findEssentialMat(
+        xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.9999, threshold, 2000
+    )
+    if E is None or E.shape != (3, 3) or inlier is None:
+        return None
+    _, R, t, good, _ = cv2.recoverPose(
+        E, xy_a, xy_b, np.eye(3), distanceThresh=1e4, mask=inlier.copy()
+    )
+    return R, t[:, 0], good.ravel() > 0
+
+
+def fit_rotation(
+    ray_a: Float[np.ndarray, "n 3"], ray_b: Float[np.ndarray, "n 3"], scale: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"]]:
+    """Robust rotation R with `ray_b = R ray_a`, and the angles that remain (rad).
+
+    Args:
+        scale: angle from which a pair is doubted, rad (Cauchy).
+    """
+    weight = np.ones(len(ray_a))
+    R = np.eye(3)
+    for _ in range(10):
+        U, _, Vt = np.linalg.svd((ray_b * weight[:, None]).T @ ray_a)
+        R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        away = np.linalg.norm(ray_b - ray_a @ R.T, axis=-1)
+        weight = 1 / (1 + (away / scale) ** 2)
+    return R, away
+
+
+def unit_rays(xy: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+    rays = np.concatenate([xy, np.ones_like(xy[:, :1])], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def triangulate(
+    scene: Scene, views: Views, num_landmarks: int, scale: float
+) -> tuple[Float[np.ndarray, "l 3"], Float[np.ndarray, " l"], Int[np.ndarray, " l"]]:
+    """Points nearest to all their rays, robustly; all landmarks at once.
+
+    Args:
+        scale: error at depth 1 from which a view is doubted (Cauchy).
+
+    Returns: points, the largest angle (rad) between the first ray and another, and the
+    number of views; a landmark without views has a point without meaning.
+    """
+    ray = np.einsum("mji,mj->mi", scene.R_CW[views.frame], unit_rays(views.xy))
+    centre = scene.centre[views.frame]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]
+    pull = np.einsum("mij,mj->mi", across, centre)
+    count = np.bincount(views.landmark, minlength=num_landmarks)
+    weight = np.ones(len(ray))
+    points = np.zeros((num_landmarks, 3))
+    for _ in range(4):
+        normal = sum_by(views.landmark, weight[:, None, None] * across, num_landmarks)
+        rhs = sum_by(views.landmark, weight[:, None] * pull, num_landmarks)
+        size = np.trace(normal, axis1=1, axis2=2)
+        normal += (1e-12 * size + 1e-30)[:, None, None] * np.eye(3)
+        points = np.linalg.solve(normal, rhs[..., None])[..., 0]
+        p_C = np.einsum(
+            "mij,mj->mi", scene.R_CW[views.frame], points[views.landmark] - centre
+        )
+        z = np.where(p_C[:, 2] > 1e-9, p_C[:, 2], 1e9)
+        error = np.linalg.norm(p_C[:, :2] / z[:, None] - views.xy, axis=-1) / scale
+        distance = np.linalg.norm(p_C, axis=-1) + 1e-12
+        weight = 1 / distance**2 / (1 + error**2)
+    points = _refine_points(scene, views, points, scale)
+    return points, widest_angle(scene, views, points, num_landmarks), count
+
+
+def _refine_points(
+    scene: Scene, views: Views, points: Float[np.ndarray, "l 3"], scale: float
+) -> Float[np.ndarray, "l 3"]:
+    """Gauss-Newton on reprojection errors. The point nearest to the rays is too near:
+    noise of their directions makes up parallax, a fifth where they are 0.5 deg apart.
+    """
+    R = scene.R_CW[views.frame]
+    for _ in range(5):
+        offset = points[views.landmark] - scene.centre[views.frame]
+        p_C = np.einsum("mij,mj->mi", R, offset)
+        front = p_C[:, 2] > 1e-9
+        z = np.where(front, p_C[:, 2], 1.0)[:, None]
+        seen = p_C[:, :2] / z
+        error = views.xy - seen
+        jac = (R[:, :2] - seen[:, :, None] * R[:, 2:]) / z[:, :, None]
+        weight = front / (1 + np.sum((error / scale) ** 2, axis=-1))
+        pull = np.einsum("mki,mk->mi", jac, error) * weight[:, None]
+        across = np.einsum("mki,mkj->mij", jac, jac) * weight[:, None, None]
+        normal = sum_by(views.landmark, across, len(points))
+        size = np.trace(normal, axis1=1, axis2=2)
+        normal += (1e-9 * size + 1e-30)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(
+            normal, sum_by(views.landmark, pull, len(points))[..., None]
+        )[..., 0]
+        points = points + step
+    return points
+
+
+def widest_angle(
+    scene: Scene, views: Views, points: Float[np.ndarray, "l 3"], num_landmarks: int
+) -> Float[np.ndarray, " l"]:
+    """Largest angle (rad) at each point between its first view and another."""
+    to = scene.centre[views.frame] - points[views.landmark]
+    to = to / np.maximum(np.linalg.norm(to, axis=-1, keepdims=True), 1e-12)
+    first = np.full(num_landmarks, len(to))
+    np.minimum.at(first, views.landmark, np.arange(len(to)))
+    apart = np.linalg.norm(to - to[first[views.landmark]], axis=-1)
+    angle = np.zeros(num_landmarks)
+    np.maximum.at(angle, views.landmark, 2 * np.arcsin(np.clip(apart / 2, 0, 1)))
+    return angle
+
+
+def resect(
+    points: Float[np.ndarray, "n 3"],
+    xy: Float[np.ndarray, "n 2"],
+    threshold: float,
+    guess: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]] | None:
+    """Camera (R_CW, centre) that sees `points` at `xy`, and which of them fit.
+
+    Starts from `guess` if that explains most of the points, else from RANSAC.
+    """
+    if len(points) < 6:
+        return None
+    if guess is not None:
+        R, centre = guess
+        good = _fits(R, centre, points, xy, 10 * threshold)
+        if good.sum() >= max(10, 0.6 * len(points)):
+            found = refine_pose(R, centre, points, xy, threshold)
+            if found is not None and found[2].sum() >= max(10, 0.6 * len(points)):
+                return found
+    try:
+        ok, rotvec, t, inlier = cv2.solvePnPRansac(
+            points,
+            xy,
+            np.eye(3),
+            None,
+            iterationsCount=500,
+            reprojectionError=2 * threshold,
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:  # SQPnP gives up at a sample whose points coincide.
+        return None
+    if not ok or inlier is None or len(inlier) < 6:
+        return None
+    R = cv2.Rodrigues(rotvec)[0]
+    return refine_pose(R, -R.T @ t[:, 0], points, xy, threshold)
+
+
+def _fits(
+    R: np.ndarray,
+    centre: np.ndarray,
+    points: np.ndarray,
+    xy: np.ndarray,
+    threshold: float,
+) -> np.ndarray:
+    p_C = (points - centre) @ R.T
+    front = p_C[:, 2] > 1e-6
+    z = np.where(front, p_C[:, 2], 1.0)
+    return front & (np.linalg.norm(p_C[:, :2] / z[:, None] - xy, axis=-1) < threshold)
+
+
+def refine_pose(
+    R: np.ndarray,
+    centre: np.ndarray,
+    points: np.ndarray,
+    xy: np.ndarray,
+    threshold: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Iteratively reweighted Gauss--Newton on one pose; None if it runs away."""
+    start_z = np.median((points - centre) @ R[2])
+    for _ in range(10):
+        p_C = (points - centre) @ R.T
+        front = p_C[:, 2] > 1e-6
+        if front.sum() < 6:
+            return None
+        x, y, z = p_C[front].T
+        r = p_C[front, :2] / z[:, None] - xy[front]
+        root = 1 / np.sqrt(1 + (r**2).sum(axis=-1) / threshold**2)
+        J = np.zeros((len(z), 2, 6))
+        u, v = x / z, y / z
+        J[:, 0, :3] = np.stack([-u * v, 1 + u * u, -v], axis=-1)
+        J[:, 1, :3] = np.stack([-1 - v * v, u * v, u], axis=-1)
+        J[:, 0, 3:] = -(R[0] - u[:, None] * R[2]) / z[:, None]
+        J[:, 1, 3:] = -(R[1] - v[:, None] * R[2]) / z[:, None]
+        A = (J * root[:, None, None]).reshape(-1, 6)
+        b = (r * root[:, None]).ravel()
+        H = A.T @ A
+        H += 1e-9 * np.diag(np.diag(H)) + 1e-12 * np.eye(6)
+        step = -np.linalg.solve(H, A.T @ b)
+        R = cv2.Rodrigues(step[:3])[0] @ R
+        centre = centre + step[3:]
+        if np.linalg.norm(step[3:]) > 100 * abs(start_z) + 1e-9:
+            return None
+        if np.abs(step[:3]).max() < 1e-8:
+            break
+    return R, centre, _fits(R, centre, points, xy, 3 * threshold)

@@ -1,0 +1,219 @@
+"""A map on its way: its points, what fits them, and tracks joined or parted."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from bodyslam_jax.config import Structure
+from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
+from bodyslam_jax.sfm.loop_closure import Revisits
+from bodyslam_jax.sfm.multiview import triangulate, widest_angle
+
+_ENOUGH = 20
+"""Views of known points that tell how far points usually are."""
+_FLAT = 0.5
+"""Share of the smallest angle that a point may itself have."""
+_DRIFTED = 1.0
+"""Error of a place seen again, in thresholds, from which the loop is closed at once."""
+_CLOSING = (8.0, 3.0)
+"""Scales of the loss with which it is, in pixels: what joins must not seem outliers."""
+_ROUNDS, _SETTLED = 6, 0.01
+"""Times that joins are looked at again, and the share of observations of which another
+landmark is then thought that ends it."""
+
+Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
+"""Adjusts the free cameras and all points of `views` in place, as `_bundle.adjust`."""
+
+
+@dataclasses.dataclass
+class Growing:
+    """A reconstruction on its way."""
+
+    scene: Scene
+    registered: Bool[np.ndarray, " t"]
+    has_point: Bool[np.ndarray, " l"]
+    inlier: Bool[np.ndarray, " m"]
+    """Observations that fit, of those in registered frames."""
+    shown: Int[np.ndarray, " l"]
+    """The landmark that each track shows: its own, unless tracks were joined."""
+
+
+class Mapper:
+    """What makes points of views and adjusts them, over the frames of one shot."""
+
+    def __init__(
+        self,
+        views: Views,
+        num_frames: int,
+        num_landmarks: int,
+        focal: float,
+        config: Structure,
+        refine: Refine | None = None,
+    ):
+        self.views = Views(views.frame, views.landmark.copy(), views.xy)
+        self.config = config
+        self.revisits = Revisits(self.views, num_landmarks)
+        self.joining = False
+        self.num_frames, self.num_landmarks = num_frames, num_landmarks
+        self.pixel: float = 1 / focal
+        self.threshold: float = config.max_error / focal
+        self.min_angle = np.radians(config.min_angle)
+        self.refine = refine or self._adjust
+        order = np.argsort(views.frame, kind="stable")
+        bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
+        self.of_frame = [
+            order[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        ]
+
+    def _adjust(self, scene: Scene, views: Views, free: np.ndarray) -> None:
+        adjust(scene, views, free, loss=self.pixel, iterations=10, tolerance=1e-3)
+
+    def _join(self, grown: Growing, k: int) -> None:
+        """Finds points of the map again among those that frame `k` sees."""
+        if not self.joining:
+            return
+        seen = self.views.landmark[self.of_frame[k]]
+        pairs, away = self.revisits.find(
+            grown.scene, k, seen, grown.has_point, grown.registered, self.threshold
+        )
+        for one, other in pairs:
+            rows = self.revisits.join(one, other)
+            grown.has_point[one] = False
+            grown.inlier[rows] = grown.registered[self.views.frame[rows]]
+        if pairs and away > _DRIFTED * self.threshold:
+            self._close(grown)
+
+    def _settle(self, grown: Growing, frames: np.ndarray) -> None:
+        """Joins and parts tracks until that changes little: what was joined wrongly
+        while the map was bent is seen to be once it is less so."""
+        for turn in range(_ROUNDS):
+            if not self.revisits.members:
+                return
+            before = self.views.landmark.copy()
+            self._close(grown)
+            # A track is seen from several keyframes: every other one will do.
+            for k in frames[turn % 2 :: 2]:
+                self._join(grown, int(k))
+            self._refine(grown, self._free(grown))
+            self._triangulate(grown, self._views_of(grown))
+            if np.mean(self.views.landmark != before) < _SETTLED:
+                return
+
+    def _close(self, grown: Growing) -> None:
+        """Spreads what the map has drifted over all that was seen since."""
+        use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
+        for loss in _CLOSING:
+            adjust(
+                grown.scene,
+                self.views[use],
+                self._free(grown),
+                loss=loss * self.pixel,
+                tolerance=1e-3,
+            )
+        self._mark(grown)
+
+    def _views_of(self, grown: Growing) -> np.ndarray:
+        return np.flatnonzero(grown.registered[self.views.frame])
+
+    def _views_seen_in(self, grown: Growing, k: int) -> np.ndarray:
+        """All views of the points that frame `k` sees and that are not known yet."""
+        wanted = np.zeros(self.num_landmarks, dtype=bool)
+        wanted[self.views.landmark[self.of_frame[k]]] = True
+        wanted &= ~grown.has_point
+        use = wanted[self.views.landmark] & grown.registered[self.views.frame]
+        return np.flatnonzero(use)
+
+    def _triangulate(self, grown: Growing, use: np.ndarray) -> None:
+        """Makes points of landmarks that have none, where the views `use` allow it."""
+        use = use[~grown.has_point[self.views.landmark[use]]]
+        if not len(use):
+            return
+        views = self.views[use]
+        points, _, _ = triangulate(grown.scene, views, self.num_landmarks, self.pixel)
+        trial = Scene(grown.scene.R_CW, grown.scene.centre, points)
+        good = errors(trial, views) < self.threshold
+        count = np.bincount(views.landmark, minlength=self.num_landmarks)
+        fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
+        if not good.any():
+            return
+        seen = views[np.flatnonzero(good)]
+        angle = widest_angle(trial, seen, points, self.num_landmarks)
+        new = (fits >= 2) & (fits >= 0.6 * count) & (angle > _FLAT * self.min_angle)
+        new &= self._parallax(trial, seen, grown) > self.min_angle
+        grown.scene.points[new] = points[new]
+        grown.has_point |= new
+        kept = new[views.landmark]
+        grown.inlier[use[kept]] = good[kept]
+
+    def _parallax(self, trial: Scene, views: Views, grown: Growing) -> np.ndarray:
+        """Largest angle (rad) between the rays to each landmark, were it as far away as
+        points usually are that the same cameras see.
+
+        The angle at the point itself would choose points that noise has drawn nearer:
+        the map would shrink, the more so the further it grows.
+        """
+        near = np.isin(np.arange(self.num_frames), views.frame)
+        at = grown.has_point[self.views.landmark] & near[self.views.frame]
+        if np.count_nonzero(at) < _ENOUGH:
+            return widest_angle(trial, views, trial.points, self.num_landmarks)
+        known = self.views[np.flatnonzero(at)]
+        away = grown.scene.points[known.landmark] - grown.scene.centre[known.frame]
+        usual = np.median(np.linalg.norm(away, axis=-1))
+        centre = np.zeros_like(trial.points)
+        centre[views.landmark] = trial.centre[views.frame]
+        ray = trial.points - centre
+        distance = np.linalg.norm(ray, axis=-1, keepdims=True)
+        there = centre + usual * ray / np.maximum(distance, 1e-12)
+        return widest_angle(trial, views, there, self.num_landmarks)
+
+    def _mark(self, grown: Growing) -> None:
+        """Sorts observations into inliers and outliers, and drops poor points."""
+        use = self._views_of(grown)
+        use = use[grown.has_point[self.views.landmark[use]]]
+        error = errors(grown.scene, self.views[use]) / self.threshold
+        good = error < 1
+        grown.inlier[:] = False
+        grown.inlier[use] = good
+        of_all = np.full(len(self.views.frame), np.nan)
+        of_all[use] = error
+        if self.revisits.part(of_all):
+            # Tracks that are their own again have no point yet.
+            still = grown.has_point[self.views.landmark[use]]
+            grown.inlier[use[~still]] = False
+            use, good = use[still], good[still]
+        views = self.views[use]
+        count = np.bincount(views.landmark, minlength=self.num_landmarks)
+        fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
+        angle = widest_angle(
+            grown.scene,
+            views[np.flatnonzero(good)],
+            grown.scene.points,
+            self.num_landmarks,
+        )
+        bad = (fits < 2) | (fits < 0.5 * count) | (angle < _FLAT * self.min_angle)
+        grown.has_point &= ~bad
+        grown.inlier &= grown.has_point[self.views.landmark]
+
+    def _free(self, grown: Growing) -> np.ndarray:
+        """All registered cameras but the first, which holds the frame in place."""
+        free = grown.registered.copy()
+        free[np.argmax(free)] = False
+        return free
+
+    def _nearest(self, grown: Growing, k: int, count: int) -> np.ndarray:
+        known = np.flatnonzero(grown.registered)
+        near = known[np.argsort(np.abs(known - k), kind="stable")][:count]
+        return np.isin(np.arange(self.num_frames), near) & self._free(grown)
+
+    def _refine(self, grown: Growing, free: np.ndarray) -> None:
+        use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
+        if not free.all():
+            # Points that no free camera sees would only cost time.
+            touched = np.zeros(self.num_landmarks, dtype=bool)
+            touched[self.views.landmark[use[free[self.views.frame[use]]]]] = True
+            use = use[touched[self.views.landmark[use]]]
+        if len(use):
+            self.refine(grown.scene, self.views[use], free)
+        self._mark(grown)

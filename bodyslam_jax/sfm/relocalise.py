@@ -1,0 +1,91 @@
+"""Where a camera is by points that were mapped long ago: the map may have drifted."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from bodyslam_jax.sfm.bundle import Scene
+from bodyslam_jax.sfm.multiview import refine_pose
+
+Pose = tuple[np.ndarray, np.ndarray]
+"""R_CW (3, 3) and the centre (3,) of a camera."""
+_LEAST = 10
+"""Points that must agree."""
+_BY_CHANCE = 4.0
+"""Times the points that would agree by chance."""
+_ANNEALED = (6.0, 3.0, 1.5, 1.0)
+"""Scales of the loss in turn, in thresholds."""
+
+
+def near(
+    points: Float[np.ndarray, "p 3"],
+    xy: Float[np.ndarray, "n 2"],
+    pose: Pose,
+    radius: float,
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Rows of `xy` and of `points` that lie within `radius` of each other in an image
+    of depth 1."""
+    R, centre = pose
+    p_C = (points - centre) @ R.T
+    front = np.flatnonzero(p_C[:, 2] > 1e-6)
+    if not len(front):
+        return np.zeros(0, int), np.zeros(0, int)
+    tree = KDTree(p_C[front, :2] / p_C[front, 2:])
+    found = tree.query_ball_point(xy, radius)
+    i = np.repeat(np.arange(len(xy)), [len(n) for n in found])
+    return i, front[np.concatenate([np.asarray(n, int) for n in found])]
+
+
+def relocate(
+    points: Float[np.ndarray, "k 3"],
+    xy: Float[np.ndarray, "k 2"],
+    which: Int[np.ndarray, " k"],
+    pose: Pose,
+    threshold: float,
+    share: float,
+) -> tuple[Pose | None, float]:
+    """Where the camera is by `points`, `None` if too few agree; and how far that is
+    from `pose`: the median shift of the points that agree, at depth 1.
+
+    Most of the pairs may be wrong, but only right ones agree.
+
+    Args:
+        which: which image point a row is of; several rows may share one.
+        share: part of wrong pairs that agree by chance.
+    """
+    least = max(_LEAST, _BY_CHANCE * share * len(xy))
+    agree = lambda seen: len(
+        np.unique(which[np.linalg.norm(seen - xy, axis=-1) < threshold])
+    )
+    here = _project(points, pose)
+    R, centre = pose
+    # Where the map has hardly drifted, no wide loss need be tried.
+    for scale in _ANNEALED[2 if agree(here) > least else 0 :]:
+        found = refine_pose(R, centre, points, xy, scale * threshold)
+        if found is None:
+            return None, 0.0
+        R, centre, _ = found
+    there = _project(points, (R, centre))
+    if agree(there) <= least:
+        return None, 0.0
+    fits = np.linalg.norm(there - xy, axis=-1) < threshold
+    away = np.linalg.norm(there - here, axis=-1)[fits]
+    return (R, centre), float(np.median(away))
+
+
+def _project(points: np.ndarray, pose: Pose) -> np.ndarray:
+    p_C = (points - pose[1]) @ pose[0].T
+    return p_C[:, :2] / np.where(p_C[:, 2] > 1e-6, p_C[:, 2], 1e-6)[:, None]
+
+
+def with_moved(scene: Scene, frame: int, pose: Pose) -> Scene:
+    """All cameras, and once more, moved rigidly as `frame` is to `pose`."""
+    R, centre = pose
+    turn = R.T @ scene.R_CW[frame]
+    R_CW = scene.R_CW @ turn.T
+    moved = (scene.centre - scene.centre[frame]) @ turn.T + centre
+    return Scene(
+        np.concatenate([scene.R_CW, R_CW]),
+        np.concatenate([scene.centre, moved]),
+        scene.points,
+    )

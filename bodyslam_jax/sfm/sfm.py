@@ -1,0 +1,384 @@
+"""Tracks and intrinsics -> a camera pose for every frame and a map, up to scale."""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+from bodyslam_jax.config import Structure
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.sfm.bundle import Scene, Views, errors
+from bodyslam_jax.sfm.camera_motion import (
+    choose_keyframes,
+    find_cuts,
+    find_jumps,
+    rotation_error,
+    rotations_only,
+    stillness,
+)
+from bodyslam_jax.sfm.incremental import Builder, build_map
+from bodyslam_jax.sfm.loop_closure import told_by_others
+from bodyslam_jax.sfm.partial_map import Growing, Refine
+from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
+
+Kind = Literal["moving", "rotation", "static", "failed"]
+
+_EXPLAINED, _TESTED = 0.3, 200
+"""Share of the observations that a known camera path must explain, and how many there
+must be to tell."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and map of `t` frames and `l` landmarks, up to scale."""
+
+    kind: Kind
+    """`moving`: all below holds. `rotation`: the camera only turns, its centre is 0 and
+    the landmarks are directions (distance 1). `static`: it does not even turn.
+    `failed`: nothing could be said; poses are the identity."""
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world. The world is the first registered camera, its unit the median
+    distance of landmarks from it."""
+    registered: Bool[np.ndarray, " t"]
+    """Frames whose pose was estimated; the other poses are interpolated or held."""
+    landmarks: Float[np.ndarray, "l 3"]
+    tracks: Tracks
+    """The observations that fit, of these landmarks."""
+    inlier: Bool[np.ndarray, " m"]
+    """Which of the `m` observations given they are."""
+    landmark_ids: Int[np.ndarray, " l"]
+    """Which of the landmarks given these are; a long track is several landmarks."""
+    elsewhere: Float[np.ndarray, "l 3 3"]
+    """Information that other tracks of the same point hold on each landmark's place,
+    px² per squared unit of the map: to be divided by the variance of a pixel."""
+    error: float
+    """Median reprojection error of the inliers, px."""
+    unit: float = 1.0
+    """The map's unit in that of a camera path that was known."""
+    warnings: tuple[str, ...] = ()
+
+
+def reconstruct(
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    num_frames: int,
+    config: Structure = Structure(),
+    refine: Refine | None = None,
+    *,
+    path: CameraPath | None = None,
+    static: bool = False,
+) -> Reconstruction:
+    """Structure from motion that says what kind of motion there was.
+
+    After a cut only the longest shot is reconstructed; the other frames hold the
+    nearest pose and are not registered. Every frame gets a pose.
+
+    Args:
+        refine: adjusts cameras and points in place, in the stead of the built-in bundle
+            adjustment while the reconstruction grows.
+        path: camera poses that are known: points are triangulated from them.
+        static: whether the camera is known not to move.
+
+    **Raises:** `ValueError` if the points do not fit a path that is known.
+    """
+    K, distortion = as_opencv(intrinsics.params)
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    xy = rays(tracks.uv, K, distortion)
+    views = Views(tracks.frame, tracks.landmark, xy)
+    num_landmarks = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
+    problem = _Problem(
+        tracks,
+        views,
+        intrinsics,
+        num_frames,
+        num_landmarks,
+        focal,
+    )
+
+    if path is not None:
+        return _along(problem, path, config, refine)
+    if static:
+        return _on_a_tripod(problem)
+    first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
+    within = (views.frame >= first) & (views.frame <= last)
+    shot = views[np.flatnonzero(within)]
+    if len(np.unique(shot.frame)) < 2:
+        seen = np.bincount(views.frame, minlength=num_frames) if len(xy) else [0]
+        text = f"too few background points: {np.median(seen):.0f} a frame."
+        if num_frames < 2:
+            text = "one frame shows no motion."
+        return _nothing(problem, "failed", (*warnings, text))
+    still = stillness(shot) * focal
+    if still < config.static_motion:
+        text = f"the camera stands still (points wander {still:.2f} px)."
+        return _fixed(problem, within, "static", None, (*warnings, text))
+    motion = config.keyframe_motion * max(intrinsics.width, intrinsics.height) / focal
+    keyframes = choose_keyframes(shot, first, last, motion, config.min_shared)
+    pairs = rotation_error(shot, keyframes, 1 / focal)
+    away = _turning_error(pairs) * focal / config.rotation_error
+    built = None
+    if away > 1:
+        size = (num_frames, num_landmarks)
+        make = lambda: Builder(shot, *size, focal, config, refine)
+        built = build_map(make, keyframes, pairs)
+    if built is not None:
+        builder, grown = built
+        builder.complete(grown, np.arange(first, last + 1))
+        inlier = np.zeros(len(tracks.frame), dtype=bool)
+        inlier[within] = grown.inlier
+        found = _moving(problem, grown, inlier, (first, last), warnings)
+        extent = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
+        # A wrong focal length makes even a turning camera seem to move a little.
+        if away > 6 or extent > config.min_baseline:
+            return found
+    elif away > 6:
+        text = "no pair of frames has enough parallax to start a map."
+        return _nothing(problem, "failed", (*warnings, text))
+    text = (
+        "the camera turns but hardly moves: no depth from parallax, the scale rests on "
+        "the body alone."
+    )
+    return _fixed(problem, within, "rotation", 1 / focal, (*warnings, text))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    tracks: Tracks
+    views: Views
+    intrinsics: Intrinsics
+    num_frames: int
+    num_landmarks: int
+    focal: float
+
+
+def _on_a_tripod(problem: _Problem) -> Reconstruction:
+    """A camera that is known to stand: located in every frame, points or none."""
+    if len(np.unique(problem.views.frame)) > 1:
+        every = np.ones(len(problem.views.frame), bool)
+        found = _fixed(problem, every, "static", None, ())
+    else:
+        found = _nothing(problem, "static", ())
+    return dataclasses.replace(
+        found,
+        T_WC=np.tile(np.eye(4), (problem.num_frames, 1, 1)),
+        registered=np.ones(problem.num_frames, bool),
+    )
+
+
+def _along(
+    problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
+) -> Reconstruction:
+    """The map of a camera whose path is known, and the frames that the path lacks.
+
+    **Raises:** `ValueError` if most points fit no place in the scene.
+    """
+    size = (problem.num_frames, problem.num_landmarks)
+    builder = Builder(problem.views, *size, problem.focal, config, refine)
+    grown = builder.begin(path)
+    builder.complete(grown, np.arange(problem.num_frames))
+    if not len(tracked := np.unique(problem.views.frame)) or (
+        not grown.has_point.any() and len(problem.views.frame) < _TESTED
+    ):
+        raise ValueError(
+            f"camera path: {len(problem.views.frame)} sightings of points in "
+            f"{len(tracked)} frames, of which no map can be made along it; expected a "
+            "background with texture."
+        )
+    share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
+    if tested < _TESTED or share >= _EXPLAINED:
+        return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
+    shot = problem.views
+    motion = config.keyframe_motion * max(
+        problem.intrinsics.width, problem.intrinsics.height
+    )
+    keyframes = choose_keyframes(
+        shot,
+        int(shot.frame.min()),
+        int(shot.frame.max()),
+        motion / problem.focal,
+        config.min_shared,
+    )
+    pairs = rotation_error(shot, keyframes, 1 / problem.focal)
+    if _turning_error(pairs) * problem.focal < config.rotation_error:
+        text = (
+            "the images show no parallax along the given path: the camera only turns."
+        )
+        every = np.ones(len(shot.frame), bool)
+        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
+    raise ValueError(
+        f"camera path: {100 * share:.0f} % of the points in the images fit it, "
+        f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
+        "world to camera, with other axes, or another focal length?"
+    )
+
+
+def _longest_shot(
+    views: Views, num_frames: int, min_shared: int
+) -> tuple[int, int, tuple[str, ...]]:
+    starts = find_cuts(views, num_frames, min_shared)
+    ends = [*starts[1:], num_frames]
+    lengths = np.subtract(ends, starts)
+    best = int(np.argmax(lengths))
+    if len(starts) == 1:
+        jumps = find_jumps(views, num_frames, min_shared)
+        if not jumps:
+            return 0, num_frames - 1, ()
+        at = ", ".join(str(k) for k in jumps[:4])
+        text = (
+            f"a cut at frame {at}, beyond which the same scene is seen again: cameras "
+            "are located on both sides, but people are not followed across it."
+        )
+        return 0, num_frames - 1, (text,)
+    first, last = starts[best], ends[best] - 1
+    if first == last:
+        return first, last, ()
+    at = ", ".join(str(k) for k in starts[1:5]) + (", ..." if len(starts) > 5 else "")
+    text = (
+        f"cut or lost tracking at frame {at}: only frames {first} to {last} are used."
+    )
+    return first, last, (text,)
+
+
+def _turning_error(pairs: np.ndarray) -> float:
+    """Error (rad) of a pure rotation for the pairs that it explains worst."""
+    if not len(pairs):
+        return np.inf
+    telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
+    return float(np.median(pairs[np.argsort(-telling)[:5], 2]))
+
+
+def _moving(
+    problem: _Problem,
+    grown: Growing,
+    inlier: np.ndarray,
+    shot: tuple[int, int],
+    warnings: tuple[str, ...],
+) -> Reconstruction:
+    """Puts the world into the first camera and the unit at the median distance."""
+    lost = np.arange(shot[0], shot[1] + 1)
+    lost = lost[~grown.registered[lost]]
+    if len(lost):
+        text = f"{len(lost)} frames not located (from {lost[0]}): poses interpolated."
+        warnings = (*warnings, text)
+    registered = grown.registered
+    k0 = int(np.argmax(registered))
+    R0, c0 = grown.scene.R_CW[k0].copy(), grown.scene.centre[k0].copy()
+    views = problem.views[np.flatnonzero(inlier)]
+    ids, of = np.unique(views.landmark, return_inverse=True)
+    points = (grown.scene.points[grown.shown[ids]] - c0) @ R0.T
+    unit = float(np.median(np.linalg.norm(points, axis=-1))) if len(ids) else 1.0
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
+    T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
+    T_WC = interpolate_poses(T_WC, registered)
+    views = Views(views.frame, of, views.xy)
+    elsewhere = told_by_others(grown.scene, views, grown.shown[ids])
+    elsewhere = (problem.focal * unit) ** 2 * (R0 @ elsewhere @ R0.T)
+    return _pack(
+        problem,
+        "moving",
+        T_WC,
+        registered,
+        points / unit,
+        (ids, of),
+        inlier,
+        warnings,
+        elsewhere=elsewhere,
+        unit=unit,
+    )
+
+
+def _fixed(
+    problem: _Problem,
+    within: np.ndarray,
+    kind: Kind,
+    scale: float | None,
+    warnings: tuple[str, ...],
+) -> Reconstruction:
+    """A camera whose centre does not move: rotations if `scale` is given, else none."""
+    shot = problem.views[np.flatnonzero(within)]
+    size = (problem.num_frames, problem.num_landmarks)
+    rotations = rotations_only(shot, *size, scale or 1.0, turns=scale is not None)
+    R_CW, direction, solved = rotations
+    k0 = int(np.argmax(solved))
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R_CW[k0], R_CW)
+    T_WC = interpolate_poses(T_WC, solved)
+    direction = direction @ R_CW[k0].T
+    scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], direction)
+    inlier = within & solved[problem.views.frame]
+    inlier &= errors(scene, problem.views) * problem.focal < 4.0
+    ids, of = np.unique(problem.views.landmark[inlier], return_inverse=True)
+    return _pack(
+        problem, kind, T_WC, solved, direction[ids], (ids, of), inlier, warnings
+    )
+
+
+def _nothing(
+    problem: _Problem, kind: Kind, warnings: tuple[str, ...]
+) -> Reconstruction:
+    T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
+    none = np.zeros(0, dtype=np.int64)
+    nowhere = np.zeros(problem.num_frames, dtype=bool)
+    inlier = np.zeros(len(problem.views.frame), dtype=bool)
+    points = np.zeros((0, 3))
+    return _pack(problem, kind, T_WC, nowhere, points, (none, none), inlier, warnings)
+
+
+def _pack(
+    problem: _Problem,
+    kind: Kind,
+    T_WC: np.ndarray,
+    registered: np.ndarray,
+    landmarks: np.ndarray,
+    which: tuple[np.ndarray, np.ndarray],
+    inlier: np.ndarray,
+    warnings: tuple[str, ...],
+    *,
+    elsewhere: np.ndarray | None = None,
+    unit: float = 1.0,
+) -> Reconstruction:
+    """`which`: the track that each landmark is of; the landmark of each inlier."""
+    ids, landmark = which
+    tracks = Tracks(problem.tracks.frame[inlier], landmark, problem.tracks.uv[inlier])
+    error = 0.0
+    if inlier.any():
+        scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], landmarks)
+        views = problem.views[np.flatnonzero(inlier)]
+        found = errors(scene, Views(views.frame, tracks.landmark, views.xy))
+        error = float(np.median(found)) * problem.focal
+    return Reconstruction(
+        kind=kind,
+        T_WC=T_WC,
+        registered=registered,
+        landmarks=landmarks,
+        tracks=tracks,
+        inlier=inlier,
+        landmark_ids=ids,
+        elsewhere=np.zeros((len(ids), 3, 3)) if elsewhere is None else elsewhere,
+        error=error,
+        unit=unit,
+        warnings=warnings,
+    )
+
+
+def interpolate_poses(
+    T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
+) -> Float[np.ndarray, "t 4 4"]:
+    """Fills poses that are not known: between neighbours, held before and after."""
+    at = np.flatnonzero(known)
+    if not len(at) or known.all():
+        return T_WC
+    filled = T_WC.copy()
+    time = np.clip(np.arange(len(T_WC)), at[0], at[-1])
+    if len(at) == 1:
+        filled[:] = T_WC[at[0]]
+        return filled
+    turns = Slerp(at, Rotation.from_matrix(T_WC[at, :3, :3]))
+    filled[:, :3, :3] = turns(time).as_matrix()
+    for axis in range(3):
+        filled[:, axis, 3] = np.interp(time, at, T_WC[at, axis, 3])
+    filled[at] = T_WC[at]
+    return filled

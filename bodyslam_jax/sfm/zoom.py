@@ -1,0 +1,125 @@
+"""A zoom: its detection where the camera does not travel, and how it is undone.
+
+A camera that only turns and zooms maps directions by a rotation and a scale about the
+principal point. One that goes forward scales near things more than far ones, unless
+there is nothing but one distance: over an interval in which the scale changes by some
+per cent, the two differ by pixels.
+"""
+
+from collections.abc import Iterable, Iterator
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.sfm.bundle import Views
+from bodyslam_jax.sfm.multiview import unit_rays
+from bodyslam_jax.types import Tracks
+
+LEAST_ZOOM = 0.04
+"""Logarithm of the ratio of focal lengths from which there is a zoom."""
+_LINK = 5
+"""Frames between two of the chain."""
+_FEWEST = 20
+_PAIRS = 12
+_BETTER = 3.0
+"""Times that a scale lowers the error of a rotation, or it is not needed."""
+
+
+def turning_zoom(
+    views: Views, num_frames: int, limit: float
+) -> Float[np.ndarray, " t"] | None:
+    """Logarithm of the focal length of a camera that turns and zooms, 0 at first; None
+    if it does not zoom, or if that is not all that it does.
+
+    Args:
+        limit: error at depth 1 that a right model leaves at most (median).
+    """
+    order = np.argsort(views.frame, kind="stable")
+    bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
+    of_frame = [order[i:j] for i, j in zip(bounds[:-1], bounds[1:], strict=True)]
+
+    def pair(a: int, b: int, before: float) -> tuple[float, float, float] | None:
+        """Of frames a and b, the first of which is scaled by `before` already."""
+        ids = views.landmark[of_frame[a]], views.landmark[of_frame[b]]
+        _, i, j = np.intersect1d(*ids, return_indices=True)
+        if len(i) < _FEWEST:
+            return None
+        size = np.exp(-before)
+        xy = size * views.xy[of_frame[a][i]], size * views.xy[of_frame[b][j]]
+        return _turn_and_scale(*xy, limit)
+
+    at = np.unique(np.r_[np.arange(0, num_frames, _LINK), num_frames - 1])
+    log_scale = np.zeros(len(at))
+    for i, (a, b) in enumerate(zip(at[:-1], at[1:], strict=True)):
+        found = pair(int(a), int(b), log_scale[i])
+        log_scale[i + 1] = log_scale[i] + (found[0] if found else 0.0)
+    if np.ptp(log_scale) < LEAST_ZOOM:
+        return None
+    # Pairs that are as far apart in scale as tracks last.
+    change = np.abs(log_scale[:, None] - log_scale)
+    i, j = np.nonzero(np.triu(change >= LEAST_ZOOM))
+    judged = []
+    for k in np.argsort(-change[i, j], kind="stable"):
+        found = pair(int(at[i[k]]), int(at[j[k]]), log_scale[i[k]])
+        if found is not None:
+            judged.append(found[1:])
+        if len(judged) == _PAIRS:
+            break
+    if not judged:
+        return None
+    with_scale, without = np.median(judged, axis=0)
+    if with_scale > limit or without < _BETTER * with_scale:
+        return None
+    return np.interp(np.arange(num_frames), at, log_scale)
+
+
+def _turn_and_scale(
+    xy_a: np.ndarray, xy_b: np.ndarray, scale: float
+) -> tuple[float, float, float]:
+    """Logarithm of the scale, median error with it and with a rotation alone."""
+    away = []
+    for free in (False, True):
+        turn, log_s = np.eye(3), 0.0
+        for _ in range(10):
+            p = unit_rays(xy_a) @ turn.T
+            q = p[:, :2] / p[:, 2:]
+            size = np.exp(log_s)
+            r = size * q - xy_b
+            weight = 1 / (1 + (r**2).sum(axis=-1) / scale**2)
+            J = np.zeros((len(q), 2, 4))
+            x, y = q.T
+            J[:, 0, :3] = np.stack([-x * y, 1 + x * x, -y], axis=-1)
+            J[:, 1, :3] = np.stack([-1 - y * y, x * y, x], axis=-1)
+            J[..., :3] *= size
+            J[..., 3] = size * q * free
+            H = np.einsum("m,mki,mkj->ij", weight, J, J) + 1e-12 * np.eye(4)
+            step = -np.linalg.solve(H, np.einsum("m,mki,mk->i", weight, J, r))
+            turn = cv2.Rodrigues(step[:3])[0] @ turn
+            log_s += float(np.clip(step[3], -0.2, 0.2)) if free else 0.0
+        away.append(float(np.median(np.linalg.norm(r, axis=-1))))
+    return log_s, away[1], away[0]
+
+
+def tracks_without_zoom(
+    tracks: Tracks, zoom: Float[np.ndarray, " t"], centre: Float[np.ndarray, "2"]
+) -> Tracks:
+    """The tracks as one focal length would have them: scaled about the centre (px)."""
+    size = np.exp(-zoom)[tracks.frame][:, None]
+    uv = centre + (tracks.uv - centre) * size
+    return Tracks(tracks.frame, tracks.landmark, uv, tracks.warnings)
+
+
+def without_zoom(
+    images: Iterable[UInt8[np.ndarray, "y x *c"]],
+    zoom: Float[np.ndarray, " t"],
+    centre: Float[np.ndarray, "2"],
+) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
+    """The images as one focal length would have them; black where they show nothing."""
+    for image, log_size in zip(images, zoom, strict=False):
+        size = float(np.exp(-log_size))
+        shift = (1 - size) * np.asarray(centre, float)
+        warp = np.array([[size, 0, shift[0]], [0, size, shift[1]]])
+        yield cv2.warpAffine(
+            image, warp, (image.shape[1], image.shape[0]), flags=cv2.INTER_LINEAR
+        )

@@ -1,0 +1,321 @@
+"""Long walks from short recordings: captured steps, joined and bent along a path.
+
+Trials are joined where their postures and velocities agree (same phase of the gait)
+and blended over a third of a second; the whole body is turned a little every frame to
+follow a path. Neither may make feet slide, so the pelvis is not blended but follows
+from the feet: whichever point of the soles carries the weight moves exactly as it did
+in the recording. World: y up, floor at y = 0.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.motion import FPS, Clip, resample
+from bodyslam_jax.motion.capture.clips import leg_length, mirror
+from bodyslam_jax.simulation.posing import Person
+
+_BLEND = 10
+"""Frames over which two trials are blended."""
+_PLAYED = 18
+"""Frames of a trial that are played between two blends at least."""
+_MAX_CLIPS = 40
+_LOOK_AHEAD = 1.2
+"""How far ahead on the path people walk to, m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """A person's motion over `t` frames at 30 fps."""
+
+    poses: Float[np.ndarray, "t 24 3"]
+    """Axis-angle, rad; row 0 takes H to the world."""
+    pelvis: Float[np.ndarray, "t 3"]
+    """Pelvis joint in the world, m."""
+
+
+def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
+    """The walking trials among `clips` at 30 fps, of validation subjects if any is.
+
+    **Raises:** `ValueError`, naming `source`, if none is long enough to be joined.
+    """
+    long = [
+        c
+        for c in clips
+        if c.motion == "walk"
+        and c.phase == 0
+        and len(c.poses) / c.fps * FPS > 2 * _BLEND + _PLAYED + 4
+    ]
+    kept = [c for c in long if c.split == "val"] or long
+    if not kept:
+        raise ValueError(
+            f"{source}: no walk of more than 1.4 s among {len(clips)} clips; expected "
+            "walking to make long walks of."
+        )
+    kept = kept[:_MAX_CLIPS]
+    is_right = all(c.fps == FPS for c in kept)  # nothing to compile for what ships
+    return tuple(kept) if is_right else resample(kept, FPS)
+
+
+def walk_along(
+    person: Person,
+    clips: Sequence[Clip],
+    path: Float[np.ndarray, "p 2"],
+    num_frames: int,
+    rng: np.random.Generator,
+    max_turn: float = np.radians(60.0),
+) -> Walk:
+    """`num_frames` of walking along the closed `path` (x, z in m).
+
+    `max_turn` (rad/s) limits how quickly the walk is bent; sharper corners are cut.
+    """
+    library = _Library(person, [*clips, *map(mirror, clips)])
+    plan = _join(library, num_frames, rng)
+    yaw = _steer(library, plan, path, max_turn)
+    return _play(library, plan, yaw, path[0])
+
+
+class Soles:
+    """Heel and ball of both feet: the points on which a walker stands."""
+
+    def __init__(self, person: Person):
+        self.person = person
+        floor = person.skin[:, 1].min()
+        self.offset = np.empty((2, 2, 3))
+        for i, (ankle, toe) in enumerate(((7, 10), (8, 11))):
+            foot = person.skin[person.weights[:, ankle] > 0.5]
+            heel = foot[foot[:, 2].argmin()] + [0.0, 0.0, 0.02]
+            for k, point in enumerate((heel, person.rest[toe])):
+                self.offset[i, k] = [point[0], floor, point[2]] - person.rest[ankle]
+
+    def __call__(
+        self, poses: Float[np.ndarray, "t 24 3"], pelvis: Float[np.ndarray, "t 3"]
+    ) -> Float[np.ndarray, "t 4 3"]:
+        """Left heel and ball, right heel and ball in the world, m."""
+        G, x = self.person.joints(poses, pelvis)
+        points = x[:, 7:9, None] + np.einsum("tiab,ikb->tika", G[:, 7:9], self.offset)
+        return points.reshape(-1, 4, 3)
+
+
+def _about_y(angle: Float[np.ndarray, " n"]) -> Rotation:
+    return Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0])
+
+
+class _Library:
+    """All frames of all clips, on the body: what joins and feet need to know."""
+
+    def __init__(self, person: Person, clips: Sequence[Clip]):
+        self.soles = Soles(person)
+        rest = person.rest
+        self.clip = np.repeat(np.arange(len(clips)), [len(c.poses) for c in clips])
+        self.poses = np.concatenate([c.poses for c in clips]).astype(float)
+        root = Rotation.from_rotvec(self.poses[:, 0])
+        # The path of the middle of the hips in proportion to the legs: captures and
+        # models put the pelvis joint at different heights above the hips.
+        below = [
+            c.offsets[1:3].mean(axis=0)
+            if c.offsets is not None
+            else np.array([0.0, -0.086, -0.016]) * c.leg_length / 0.82
+            for c in clips
+        ]
+        ratio = np.array([leg_length(rest) / c.leg_length for c in clips])
+        hips = np.concatenate([c.trans for c in clips])
+        hips = hips + root.apply(np.array(below)[self.clip])
+        self.pelvis = ratio[self.clip, None] * hips
+        self.pelvis -= root.apply((rest[1] + rest[2]) / 2 - rest[0])
+        _, joints = person.joints(self.poses, np.zeros_like(self.pelvis))
+        sole = self.soles(self.poses, self.pelvis)
+        for c in range(len(clips)):
+            rows = self.clip == c
+            # One foot is on the floor at any time; captures drift by centimetres
+            floor = gaussian_filter1d(sole[rows, :, 1].min(axis=1), 5.0)
+            sole[rows, :, 1] -= floor[:, None]
+            self.pelvis[rows, 1] -= floor
+        self._bend_toes(person)
+        self.step = self._differences(self.pelvis)
+        self.sole_step = self._differences(sole)
+        speed = np.linalg.norm(self.sole_step, axis=2) * FPS
+        weight = np.exp(-speed / 0.15 - np.maximum(sole[:, :, 1], 0) / 0.03) + 1e-9
+        self.carries = weight / weight.sum(axis=1, keepdims=True)
+        forward = root.apply([0.0, 0.0, 1.0])
+        self.yaw = np.arctan2(forward[:, 0], forward[:, 2])
+        self.heading = self._smooth_heading()
+        self.features = self._features(joints)
+
+    def _bend_toes(self, person: Person) -> None:
+        """Bends toes that would go through the floor: captures have them rigid."""
+        G, x = person.joints(self.poses, self.pelvis)
+        for ankle, toe in ((7, 10), (8, 11)):
+            tips = np.flatnonzero(person.weights[:, toe] > 0.9)
+            tip = person.skin[tips[person.skin[tips, 2].argmax()]] - person.rest[toe]
+            tip[1] = person.skin[:, 1].min() - person.rest[toe, 1]
+            along = np.einsum("tab,b->ta", G[:, toe], tip)
+            reach = np.linalg.norm(along, axis=1)
+            angle = np.arcsin(along[:, 1] / reach)
+            allowed = np.arcsin(np.clip(-x[:, toe, 1] / reach, -1, 1))
+            up = np.clip(gaussian_filter1d(allowed - angle, 0.7), 0.0, 1.0)
+            axis = np.cross(along, [0.0, 1.0, 0.0])
+            axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+            turned = Rotation.from_rotvec(up[:, None] * axis).as_matrix() @ G[:, toe]
+            local = np.swapaxes(G[:, ankle], 1, 2) @ turned
+            self.poses[:, toe] = Rotation.from_matrix(local).as_rotvec()
+
+    def _differences(self, x: np.ndarray) -> np.ndarray:
+        """From the frame before; a clip's first frame repeats the second's."""
+        d = np.diff(x, axis=0, prepend=x[:1])
+        first = np.flatnonzero(np.diff(self.clip, prepend=-1))
+        d[first] = d[first + 1]
+        return d
+
+    def _smooth_heading(self) -> np.ndarray:
+        """Direction of the path without the sway, yaw in rad."""
+        smooth = np.concatenate(
+            [
+                gaussian_filter1d(self.step[self.clip == c], 8.0, axis=0)
+                for c in range(self.clip[-1] + 1)
+            ]
+        )
+        return np.arctan2(smooth[:, 0], smooth[:, 2])
+
+    def _features(self, joints: np.ndarray) -> np.ndarray:
+        """Joints and their velocities seen from the heading: what must agree, m."""
+        level = _about_y(-self.yaw).as_matrix()
+        joints = np.einsum("tij,tkj->tki", level, joints)
+        velocity = self._differences(joints) * FPS
+        step = np.einsum("tij,tj->ti", level, self.step) * FPS
+        n = len(joints)
+        return np.concatenate(
+            [joints.reshape(n, -1), 0.1 * velocity.reshape(n, -1), 0.3 * step], axis=1
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """For each frame the two library frames that are blended, and how."""
+
+    frame: Int[np.ndarray, "t 2"]
+    share: Float[np.ndarray, "t 2"]
+    """Sums to 1."""
+    yaw: Float[np.ndarray, "t 2"]
+    """By which each is turned so that the parts fit, rad; steering comes on top."""
+
+
+def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan:
+    """Chooses trials and seams: the best few by phase, then at random among them."""
+    clip, half = library.clip, _BLEND // 2
+    count = np.bincount(clip)
+    first = np.cumsum(count) - count
+    place = np.arange(len(clip)) - first[clip]
+    left = count[clip] - place
+    squares = (library.features**2).sum(axis=1)
+    ramp = (np.arange(_BLEND) + 0.5) / _BLEND
+    ramp = ramp * ramp * (3 - 2 * ramp)
+    entries = np.flatnonzero((place >= 1) & (left > 2 * _BLEND + _PLAYED + 2))
+
+    frames, shares, yaws = [], [], []
+
+    def add(a, b, share, yaw_a, yaw_b):
+        frames.append(np.stack([a, b], axis=1))
+        shares.append(np.stack([1 - share, share], axis=1))
+        yaws.append(np.tile([yaw_a, yaw_b], (len(a), 1)))
+
+    now = int(rng.choice(entries[place[entries] < 10]))
+    yaw, total = 0.0, 0
+    while total < num_frames:
+        end = int(first[clip[now]] + count[clip[now]]) - _BLEND
+        leave = np.arange(min(now + _PLAYED, end - 1), end)
+        enter = entries[clip[entries] != clip[now]]
+        d = squares[leave + half][:, None] + squares[enter + half]
+        d = d - 2 * library.features[leave + half] @ library.features[enter + half].T
+        best = {}
+        for column in np.argsort(d.min(axis=0)):
+            best.setdefault(clip[enter[column]], column)
+            if len(best) == 3:
+                break
+        column = int(rng.choice(list(best.values())))
+        a, b = int(leave[d[:, column].argmin()]), int(enter[column])
+        alone = np.arange(now, a)
+        add(alone, alone, np.zeros(len(alone)), yaw, yaw)
+        turn = library.yaw[a : a + _BLEND] - library.yaw[b : b + _BLEND]
+        following = yaw + np.angle(np.exp(1j * turn).mean())
+        k = np.arange(_BLEND)
+        add(a + k, b + k, ramp, yaw, following)
+        total += len(alone) + _BLEND
+        now, yaw = b + _BLEND, following
+    cut = lambda parts: np.concatenate(parts)[:num_frames]
+    return _Plan(cut(frames), cut(shares), cut(yaws))
+
+
+def _steer(
+    library: _Library, plan: _Plan, path: Float[np.ndarray, "p 2"], max_turn: float
+) -> Float[np.ndarray, " t"]:
+    """Yaw to add at each frame so that the walk follows the path (pure pursuit)."""
+    along = np.concatenate([path, path[:1]])
+    length = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(along, axis=0), axis=1))]
+    )
+    at = lambda s: np.array(
+        [np.interp(s % length[-1], length, along[:, i]) for i in (0, 1)]
+    )
+    a, b = plan.frame.T
+    angle = np.exp(1j * (library.heading[plan.frame] + plan.yaw))
+    heading = np.angle((angle * plan.share).sum(axis=1))
+    x, _, z = np.moveaxis(library.step[plan.frame], 2, 0)
+    walked = (np.hypot(x, z) * plan.share).sum(axis=1)
+    position, progress, rate = path[0], 0.0, 0.0
+    start = at(_LOOK_AHEAD) - path[0]
+    yaw = np.empty(len(a))
+    previous = np.arctan2(start[0], start[1]) - heading[0]
+    limit = max_turn / FPS
+    for k in range(len(a)):
+        ahead = progress + np.linspace(0.0, 0.3, 7)
+        gaps = [np.linalg.norm(at(s) - position) for s in ahead]
+        progress = ahead[int(np.argmin(gaps))]
+        to = at(progress + _LOOK_AHEAD) - position
+        off = np.arctan2(to[0], to[1]) - heading[k] - previous
+        off = (off + np.pi) % (2 * np.pi) - np.pi
+        wanted = np.clip(0.2 * off, -limit, limit)
+        rate += np.clip(wanted - rate, -0.2 * limit, 0.2 * limit)
+        previous = previous + rate
+        yaw[k] = previous
+        direction = heading[k] + previous
+        position = position + walked[k] * np.array(
+            [np.sin(direction), np.cos(direction)]
+        )
+    return yaw
+
+
+def _play(
+    library: _Library,
+    plan: _Plan,
+    steering: Float[np.ndarray, " t"],
+    start: Float[np.ndarray, "2"],
+) -> Walk:
+    """Blends the postures, then lets the pelvis follow from the feet."""
+    a, b = plan.frame.T
+    yaw_a, yaw_b = (_about_y(y) for y in plan.yaw.T + steering)
+    share = plan.share[:, 1]
+    poses = np.empty((len(a), 24, 3))
+    for j in range(24):
+        p = Rotation.from_rotvec(library.poses[a, j])
+        q = Rotation.from_rotvec(library.poses[b, j])
+        if j == 0:
+            p, q = yaw_a * p, yaw_b * q
+        way = (p.inv() * q).as_rotvec() * share[:, None]
+        poses[:, j] = (p * Rotation.from_rotvec(way)).as_rotvec()
+
+    sole = library.soles(poses, np.zeros((len(a), 3)))
+    mix = lambda x, y: x * plan.share[:, :1, None] + y * share[:, None, None]
+    turn = lambda R, x: np.einsum("tij,tkj->tki", R.as_matrix(), x)
+    wanted = mix(turn(yaw_a, library.sole_step[a]), turn(yaw_b, library.sole_step[b]))
+    carries = mix(library.carries[a, :, None], library.carries[b, :, None])
+    step = (carries * (wanted - np.diff(sole, axis=0, prepend=sole[:1]))).sum(axis=1)
+    pelvis = np.cumsum(step, axis=0)
+    pelvis += [start[0], 0.0, start[1]] - pelvis[:1]
+    height = library.pelvis[plan.frame, 1]
+    pelvis[:, 1] = (height * plan.share).sum(axis=1)
+    return Walk(poses, pelvis)

@@ -1,0 +1,356 @@
+"""Pictures of the room and the people in it, quick enough for films, in NumPy and cv2.
+
+Every rectangle is cast against all pixels of its outline's bounding box: inverse depth
+and texture coordinates are linear along each row there, so hidden surfaces and the near
+plane take one comparison, and each row may have a camera of its own (rolling shutter).
+All textures lie, at every resolution, in one image, so that a frame is looked up at
+once. The bodies' small triangles go through a z-buffer.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from bodyslam_jax.motion import FPS
+from bodyslam_jax.simulation.atlas import LEVELS, pack, pyramid
+from bodyslam_jax.simulation.outfit import Figure
+from bodyslam_jax.simulation.raster import rasterise, vertex_normals
+from bodyslam_jax.simulation.room import Room, Surface, texture_size
+from bodyslam_jax.simulation.shutter import Shutter, cameras_at
+from bodyslam_jax.simulation.texture import make_texture
+
+_NEAR = 0.05
+_SHRINK = np.float32(0.5) ** np.arange(LEVELS, dtype=np.float32)
+"""Of texture coordinates, level by level."""
+_TEXELS = 130.0
+"""Texels a metre: a camera of 525 px sees them one to one from 4 m."""
+_NOISE = 1.5
+"""Standard deviation of the image noise at medium grey, grey levels."""
+_MOST_INSTANTS = 6
+"""Images that make up one with motion blur."""
+_BLUR_STEP = 2.0
+"""Motion between two of them that is not seen as a step, px."""
+
+Moving = tuple[
+    Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]
+]
+"""Vertices at a frame, their first and second difference, as `_shutter.around`, m."""
+
+
+class Renderer:
+    """A room and people in it, ready to be seen from anywhere."""
+
+    def __init__(
+        self,
+        room: Room,
+        figures: Sequence[Figure],
+        intrinsics: Float[np.ndarray, "4"],
+        size: tuple[int, int],
+        rng: np.random.Generator,
+        shutter: Shutter = Shutter(),
+    ):
+        self.figures = figures
+        self.intrinsics = intrinsics
+        self.size = size
+        self.shutter = shutter
+        self.surfaces = room.faces()
+        self.extents = [texture_size(s, _TEXELS) for s in self.surfaces]
+        textures = [
+            make_texture(rng, int(h), int(w), s.kind, _TEXELS)
+            for s, (h, w) in zip(self.surfaces, self.extents, strict=True)
+        ]
+        azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(45, 75))
+        self.light = np.array(
+            [
+                np.cos(height) * np.cos(azimuth),
+                np.sin(height),
+                np.cos(height) * np.sin(azimuth),
+            ]
+        )
+        """Unit vector to the lamp."""
+        self.ambient = rng.uniform(0.4, 0.6)
+        self.gain = rng.uniform(0.9, 1.1) * rng.uniform(0.95, 1.05, 3)
+        lit = [
+            _lit(texture, surface, self.light)
+            for texture, surface in zip(textures, self.surfaces, strict=True)
+        ]
+        self.atlas, self.places = pack([pyramid(t) for t in lit])
+        noise = _NOISE * rng.standard_normal((size[1] + 64, size[0] + 64, 1))
+        noise = noise + 0.4 * _NOISE * rng.standard_normal((*noise.shape[:2], 3))
+        self.noise = noise.astype(np.float32)
+        self.rng = rng
+
+    def frame(
+        self, T_WC: Float[np.ndarray, "t 4 4"], k: int, people: Sequence[Moving]
+    ) -> tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]:
+        """Image `k` (BGR) of a camera's path, and which person is seen where.
+
+        The second value is 0 for none and h + 1 for person h, in the middle of the
+        exposure.
+        """
+        count = self._instants(T_WC, k, people)
+        rows = self.shutter.row_times(self.size[1])
+        times = self.shutter.instants(count)
+        image = np.zeros((self.size[1], self.size[0], 3), np.float32)
+        who = np.zeros(image.shape[:2], int)
+        normals = [
+            vertex_normals(moving[0], figure.person.faces)
+            for moving, figure in zip(people, self.figures, strict=True)
+        ]
+        for i, offset in enumerate(times):
+            when = rows + offset if self.shutter.readout else np.array([offset])
+            seen, mask = self._instant(
+                cameras_at(T_WC, k, when, FPS), when, people, normals
+            )
+            image += seen
+            if i == count // 2:
+                who = mask
+        image *= (self.gain / count).astype(np.float32)
+        y, x = self.rng.integers(0, 64, 2)
+        width, height = self.size
+        noise = self.noise[y : y + height, x : x + width]
+        # Photons come at random: noise grows with the root of what is seen.
+        image += noise * np.sqrt(np.maximum(image + 20, 0) / 148)
+        return np.clip(image, 0, 255).astype(np.uint8), who
+
+    def _instants(self, T_WC, k: int, people: Sequence[Moving]) -> int:
+        """How many images make up one of that exposure."""
+        span = self.shutter.exposure
+        if span == 0:
+            return 1
+        ends = np.array([-span / 2, span / 2])
+        cameras = cameras_at(T_WC, k, ends, FPS)
+        turn = (np.trace(cameras[0, :3, :3].T @ cameras[1, :3, :3]) - 1) / 2
+        moved = [np.arccos(np.clip(turn, -1, 1)) * self.intrinsics[0]]
+        for moving in people:
+            sample = tuple(term[::97] for term in moving)
+            uv = [
+                self._project(cameras[i : i + 1], ends[i : i + 1], sample)
+                for i in range(2)
+            ]
+            near = (uv[0][:, 2] > _NEAR) & (uv[1][:, 2] > _NEAR)
+            way = np.linalg.norm(uv[1][near, :2] - uv[0][near, :2], axis=1)
+            moved.append(np.percentile(way, 90) if len(way) else 0.0)
+        return int(np.clip(np.ceil(max(moved) / _BLUR_STEP), 1, _MOST_INSTANTS))
+
+    def _instant(self, T, when, people, normals):
+        """An image without noise from the cameras of all rows, or one for all."""
+        inverse_depth, image, floor = self._room(T)
+        for moving in people:
+            self._shadow(image, floor, T, when, moving)
+        who = np.zeros(inverse_depth.shape, int)
+        for h, moving in enumerate(people):
+            self._body(image, inverse_depth, who, T, when, h, moving, normals[h])
+        for h in range(len(people)):
+            _soften(image, who == h + 1)
+        return image, who
+
+    def _project(
+        self,
+        T: Float[np.ndarray, "n 4 4"],
+        when: Float[np.ndarray, " n"],
+        moving: Moving,
+    ) -> Float[np.ndarray, "v 3"]:
+        """Pixel and depth of moving points, each as the row sees it on which it is."""
+        here, first, second = moving
+        at = lambda tau: here + tau * first + tau**2 / 2 * second
+        focal, centre = self.intrinsics[:2], self.intrinsics[2:]
+        depth = lambda p: np.where(abs(p[:, 2:]) < 1e-6, 1e-6, p[:, 2:])
+        middle = len(T) // 2
+        R, eye = T[middle, :3, :3], T[middle, :3, 3]
+        p = (at(FPS * when[middle]) - eye) @ R
+        uv = p[:, :2] / depth(p) * focal + centre
+        for _ in range(2 if len(T) > 1 else 0):  # A row's share of the motion is small.
+            row = np.clip(uv[:, 1], 0, len(T) - 1)
+            low = np.minimum(row.astype(int), len(T) - 2)
+            share = (row - low)[:, None]
+            blend = lambda x: (
+                x[low] + share.reshape(-1, *[1] * (x.ndim - 1)) * (x[low + 1] - x[low])
+            )
+            off = at(FPS * blend(when)[:, None]) - blend(T[:, :3, 3])
+            p = np.einsum("va,vab->vb", off, blend(T[:, :3, :3]))
+            uv = p[:, :2] / depth(p) * focal + centre
+        return np.concatenate([uv, p[:, 2:]], axis=1)
+
+    def _room(self, T):
+        """Inverse depth, colours and which pixels are floor."""
+        width, height = self.size
+        best = np.full((height, width), 1e-3, np.float32)
+        map_x = np.zeros((height, width), np.float32)
+        map_y = np.zeros((height, width), np.float32)
+        floor = np.zeros((height, width), bool)
+        fx, fy, cx, cy = self.intrinsics
+        K_inv = np.array([[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]])
+        R, eye = T[:, :3, :3], T[:, :3, 3]
+        for i, surface in enumerate(self.surfaces):
+            distance = (eye - surface.origin) @ surface.normal
+            if distance.min() <= 1e-6:
+                continue
+            box = self._outline(surface, T)
+            if box is None:
+                continue
+            left, top, right, bottom = box
+            # Ray d meets the plane at depth z: 1/z = -n.d / distance, and texture
+            # coordinate u = (eye - origin).eu + z d.eu, so u/z is linear in d too.
+            h, w = self.extents[i]
+            rays = R @ K_inv
+            c = -(surface.normal @ rays) / distance[:, None]
+            axis_u = surface.edge_u * (w / (surface.edge_u @ surface.edge_u))
+            axis_v = surface.edge_v * (h / (surface.edge_v @ surface.edge_v))
+            off = eye - surface.origin
+            a = axis_u @ rays + (off @ axis_u)[:, None] * c
+            b = axis_v @ rays + (off @ axis_v)[:, None] * c
+            x = np.arange(left, right, dtype=np.float32)
+            y = np.arange(top, bottom)[:, None]
+            own = np.s_[top:bottom] if len(T) > 1 else np.s_[:]
+            linear = lambda k: (
+                k[own, :1].astype(np.float32) * x
+                + (k[own, 1:2] * y + k[own, 2:]).astype(np.float32)
+            )
+            inverse = linear(c)
+            z = 1 / np.maximum(inverse, np.float32(1e-3))
+            u, v = linear(a) * z, linear(b) * z
+            view = best[top:bottom, left:right]
+            hit = (inverse > view) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
+            if not hit.any():
+                continue
+            within = np.flatnonzero(hit)
+            z, u, v = (part.take(within) for part in (z, u, v))
+            # A pixel has `texels z^3` of them; a level further down has a quarter.
+            middle = len(T) // 2
+            texels = abs(np.linalg.det(np.stack([a, b, c])[:, middle]))
+            level = np.zeros(len(z), np.intp)
+            for k in range(1, LEVELS):
+                level += z > (4.0 ** (k - 1) / texels) ** (1 / 3)
+            shrink = _SHRINK.take(level)
+            place_x, place_y = self.places[i].T
+            row, column = np.divmod(within, right - left)
+            pixel = (row + top) * width + (column + left)
+            best.reshape(-1)[pixel] = inverse.take(within)
+            map_x.reshape(-1)[pixel] = u * shrink - 0.5 + place_x.take(level)
+            map_y.reshape(-1)[pixel] = v * shrink - 0.5 + place_y.take(level)
+            floor.reshape(-1)[pixel] = surface.kind == "floor"
+        image = cv2.remap(self.atlas, map_x, map_y, cv2.INTER_LINEAR)
+        return best, image.astype(np.float32), floor
+
+    def _outline(self, surface: Surface, T):
+        """Bounding box, px, of what is in front of the near plane; or `None`.
+
+        With cameras of rows it holds for all of them, with a margin.
+        """
+        corners = np.array(
+            [surface.origin + a * surface.edge_u + b * surface.edge_v
+             for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        )  # fmt: skip
+        kept = []
+        for camera in T[:: max(1, (len(T) - 1) // 2)]:
+            p = (corners - camera[:3, 3]) @ camera[:3, :3]
+            for start, end in zip(p, np.roll(p, -1, axis=0), strict=True):
+                if start[2] > _NEAR:
+                    kept.append(start)
+                if (start[2] > _NEAR) != (end[2] > _NEAR):
+                    cut = (_NEAR - start[2]) / (end[2] - start[2])
+                    kept.append(start + (end - start) * cut)
+        if not kept:
+            return None
+        p = np.array(kept)
+        margin = 0 if len(T) == 1 else 8
+        uv = p[:, :2] / p[:, 2:] * self.intrinsics[:2] + self.intrinsics[2:]
+        low = np.clip(np.floor(uv.min(axis=0)) - margin, 0, self.size).astype(int)
+        high = np.clip(np.ceil(uv.max(axis=0)) + 1 + margin, 0, self.size).astype(int)
+        return None if (high <= low).any() else (*low, *high)
+
+    def _shadow(self, image, floor, T, when, moving: Moving) -> None:
+        """Darkens the floor where the lamp's light does not reach."""
+        flat = np.eye(3) - np.outer([0, 1, 0], self.light / self.light[1])
+        uv = self._project(T, when, tuple(term[::7] @ flat for term in moving))
+        if uv[:, 2].min() < 0.2:
+            return
+        # A shadow is made of discs that overlap: about 7 cm on the floor
+        spot = int(np.clip(0.07 * self.intrinsics[0] / np.median(uv[:, 2]), 3, 41)) | 1
+        pixel = uv[:, :2].round().astype(int) + spot
+        width, height = self.size
+        dark = np.zeros((height + 2 * spot, width + 2 * spot), np.uint8)
+        inside = (pixel >= 0) & (pixel < dark.shape[::-1])
+        column, row = pixel[inside.all(axis=1)].T
+        dark[row, column] = 255
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
+        x, y, w, h = cv2.boundingRect(dark)
+        x, y = max(x - 2 * spot, 0), max(y - 2 * spot, 0)
+        part = np.s_[y : y + h + 4 * spot, x : x + w + 4 * spot]
+        dark[part] = cv2.GaussianBlur(cv2.dilate(dark[part], disc), (0, 0), spot / 3)
+        dark = dark[spot:-spot, spot:-spot]
+        x, y, w, h = cv2.boundingRect(dark)
+        part = np.s_[y : y + h, x : x + w]
+        share = dark[part].astype(np.float32) * floor[part]
+        image[part] *= (1 - (0.55 / 255) * share)[:, :, None]
+
+    def _body(self, image, inverse_depth, who, T, when, h, moving, normal) -> None:
+        """Draws a person with smooth shading, in front of what is behind."""
+        figure = self.figures[h]
+        uv = self._project(T, when, moving)
+        if uv[:, 2].min() < _NEAR:
+            return
+        hits = rasterise(uv[:, :2], 1 / uv[:, 2], figure.person.faces, inverse_depth)
+        if not len(hits.pixel):
+            return
+        lamp = np.clip(normal @ self.light, 0, 1)
+        bright = self.ambient + (1.15 - self.ambient) * lamp + 0.1 * normal[:, 1]
+        corners = bright[figure.person.faces[hits.face]]
+        light = (corners * hits.weights).sum(axis=1, keepdims=True)
+        size = 1 / hits.inverse / self.intrinsics[0]
+        image.reshape(-1, 3)[hits.pixel] = light * figure.albedo(hits, size)
+        inverse_depth.reshape(-1)[hits.pixel] = hits.inverse
+        who.reshape(-1)[hits.pixel] = h + 1
+
+
+def _soften(image: Float[np.ndarray, "r c 3"], mask: Bool[np.ndarray, "r c"]) -> None:
+    """A camera has no hard edges: softens an outline by one pixel, in place."""
+    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+    if not w:
+        return
+    x, y, w, h = max(x - 2, 0), max(y - 2, 0), w + 4, h + 4
+    part, small = (
+        image[y : y + h, x : x + w],
+        mask[y : y + h, x : x + w].astype(np.uint8),
+    )
+    square = np.ones((3, 3), np.uint8)
+    rim = cv2.dilate(small, square) != cv2.erode(small, square)
+    soft = cv2.GaussianBlur(part, (3, 3), 0.7)
+    part[rim] = soft[rim]
+
+
+def _lit(
+    texture: UInt8[np.ndarray, "h w 3"], surface: Surface, to_light: np.ndarray
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The texture under a lamp: sides differ in brightness."""
+    light = {"floor": 1.0, "ceiling": 0.85}.get(surface.kind)
+    if light is None:
+        light = 0.8 + 0.25 * float(surface.normal @ to_light)
+    return np.clip(texture * np.float32(light), 0, 255).astype(np.uint8)
+
+
+def write_video(
+    path: Path,
+    frames: Iterable[UInt8[np.ndarray, "rows cols 3"]],
+    fps: float,
+    size: tuple[int, int],
+) -> None:
+    """Writes frames (BGR) to an .mp4, whole or not at all.
+
+    **Raises:** `ValueError` if OpenCV cannot write one.
+    """
+    partial = path.with_name(f"partial-{path.name}")
+    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    if not writer.isOpened():
+        raise ValueError(f"{path}: OpenCV cannot write MPEG-4 video there.")
+    try:
+        for frame in frames:
+            writer.write(frame)
+    finally:
+        writer.release()
+    os.replace(partial, path)

@@ -1,0 +1,330 @@
+"""Measurements with the errors that real systems make.
+
+Sizes follow published errors of detectors and regressors: HMR-class networks are off by
+about 60 mm after Procrustes alignment and by 18 to 20 m/s² in acceleration, so that
+most of their error must vary slowly; keypoints err by a share of what annotators
+disagree by (COCO's σ), again slowly. Pure white noise would make smoothing look far too
+good.
+
+Of published accelerations one can say that 9 mm of white error would explain them. That
+is not how they are made here: joint rotations err by a constant and by a first-order
+autoregressive part, whose innovations alone come to 18.7 of 19.2 m/s². What is drawn
+anew in every frame (`posture_white`) moves joints by 2 mm, and a variogram over frames
+shows no white part of the error.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.body import KEYPOINT_SPREAD
+from bodyslam_jax.config import Simulation
+from bodyslam_jax.simulation.posing import Person
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """How wrong measurements are; 1 in `rates` is once in every frame."""
+
+    keypoint_share: float
+    """Of annotators' disagreement that a detector's error amounts to."""
+    keypoint_correlation: float
+    """Of its slow part from frame to frame."""
+    outlier_rate: float
+    """Share of keypoints that lie somewhere else."""
+    swap_rate: float
+    """Share of frames in which left and right are exchanged."""
+    gap_rate: float
+    """Share of frames in which the person is not found."""
+    posture_bias: float
+    """Joint rotations, constant part of the error, rad per axis."""
+    posture_drift: float
+    """Joint rotations, slow part, rad per axis."""
+    posture_correlation: float
+    posture_white: float
+    """Joint rotations, white part, rad per axis: little beside the slow part."""
+    root_drift: float
+    """Orientation, slow part, rad per axis."""
+    root_white: float
+    shape_shrink: tuple[float, float]
+    """Factor on the true β, drawn between these."""
+    shape_white: float
+    """Standard deviation added to each β, constant in time."""
+    depth: tuple[float, float]
+    """Relative error of depth, its standard deviation drawn between these; 70 % of it
+    is constant."""
+    depth_white: float
+    """Relative error of depth, white part."""
+    offset: float
+    """Error of the pelvis in the image, px."""
+    track: tuple[float, float]
+    """Standard deviation of a track's pixels, drawn between these, px."""
+    track_outliers: float
+    """Share of observations of tracks that are of something else."""
+
+
+NOISE = {
+    "none": Noise(
+        *(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (1.0, 1.0), 0.0),
+        *((0.0, 0.0), 0.0, 0.0, (0.0, 0.0), 0.0),
+    ),
+    "low": Noise(
+        *(0.12, 0.9, 0.005, 0.002, 0.0, 0.02, 0.03, 0.98, 0.001, 0.03, 0.001),
+        *((0.8, 0.9), 0.15, (0.02, 0.03), 0.002, 1.5, (0.2, 0.4), 0.01),
+    ),
+    "real": Noise(
+        *(0.35, 0.92, 0.025, 0.01, 0.01, 0.07, 0.078, 0.98, 0.002, 0.075, 0.002),
+        *((0.5, 0.8), 0.3, (0.05, 0.10), 0.006, 4.0, (0.5, 1.0), 0.03),
+    ),
+}
+"""`real` is what published systems do, `low` about a third of it."""
+
+
+def noise_of_keypoints(settings: Simulation) -> Noise:
+    """The errors that these settings ask for."""
+    noise = NOISE[settings.keypoint_noise or settings.noise]
+    share = settings.keypoint_errors * noise.keypoint_share
+    rates = {"outlier_rate": settings.outliers, "swap_rate": settings.exchanged}
+    given = {name: rate for name, rate in rates.items() if rate is not None}
+    return dataclasses.replace(noise, keypoint_share=share, **given)
+
+
+def noise_of_bodies(settings: Simulation) -> Noise:
+    """The same for regressed bodies.
+
+    Second differences of an autoregression have the variance (1 - ρ)(6 - 2ρ) of its
+    own, of white noise 6: less jitter is a slower error, more is white noise added.
+    """
+    noise = NOISE[settings.body_noise or settings.noise]
+    lasting, jitter = settings.body_errors, settings.body_jitter
+    rho = noise.posture_correlation
+    added = np.sqrt(max(jitter**2 - 1, 0.0) * (1 - rho) * (6 - 2 * rho) / 6)
+    white = lambda own, drift: float(np.hypot(own, added * drift))
+    return dataclasses.replace(
+        noise,
+        posture_bias=lasting * noise.posture_bias,
+        posture_drift=lasting * noise.posture_drift,
+        root_drift=lasting * noise.root_drift,
+        posture_correlation=1 - min(jitter, 1.0) ** 2 * (1 - rho),
+        posture_white=white(noise.posture_white, noise.posture_drift),
+        root_white=white(noise.root_white, noise.root_drift),
+        depth_white=max(jitter, 1.0) * noise.depth_white,
+    )
+
+
+_HANDS_FEET = np.isin(np.arange(24), (7, 8, 10, 11, 20, 21, 22, 23))
+
+
+def ar1(
+    rng: np.random.Generator, shape: tuple[int, ...], correlation: float
+) -> Float[np.ndarray, "t ..."]:
+    """Stationary first-order autoregressive noise along the first axis, deviation 1."""
+    x = rng.standard_normal(shape)
+    x[1:] *= np.sqrt(1 - correlation**2)
+    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    for k in range(1, len(x)):
+        x[k] += correlation * x[k - 1]
+    return x
+
+
+def project(
+    p_C: Float[np.ndarray, "*b 3"], intrinsics: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "*b 2"]:
+    """Pinhole projection, px; what is behind the camera comes out far away."""
+    z = np.maximum(p_C[..., 2:], 1e-3)
+    return p_C[..., :2] / z * intrinsics[:2] + intrinsics[2:]
+
+
+def detect_keypoints(
+    p_C: Float[np.ndarray, "t 25 3"],
+    joints_C: Float[np.ndarray, "t 24 3"],
+    intrinsics: Float[np.ndarray, "4"],
+    size: tuple[int, int],
+    noise: Noise,
+    rng: np.random.Generator,
+    hidden_by_others: Bool[np.ndarray, "t 25"] | None = None,
+) -> tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]:
+    """Pixels and confidences of BODY_25 keypoints at `p_C` in the camera frame.
+
+    Confidence falls with how wrong the detector is likely to be there and then:
+    occluded joints and bad moments err more and are less sure. Missing is 0 0 0, as is
+    what furniture or another person hides.
+    """
+    t = len(p_C)
+    exact = project(p_C, intrinsics)
+    extent = np.ptp(exact[:, :15], axis=1)
+    scale = np.sqrt(extent.prod(axis=1).clip(100.0))[:, None]
+    sigma = noise.keypoint_share * np.array(KEYPOINT_SPREAD["body25"]) * scale
+    hidden = _self_occlusion(p_C, joints_C, intrinsics)
+    # How bad a moment it is: a factor on the error, which the detector half knows
+    trouble = np.exp(0.4 * ar1(rng, (t, 25), 0.95)) * (1 + 0.9 * hidden)
+    slow = ar1(rng, (t, 25, 2), noise.keypoint_correlation)
+    white = rng.standard_normal((t, 25, 2))
+    error = np.sqrt(0.75) * slow + np.sqrt(0.25) * white
+    uv = exact + (sigma * trouble)[:, :, None] * error
+    known = trouble * np.exp(0.25 * rng.standard_normal((t, 25)))
+    if noise.keypoint_share == 0:
+        known = np.ones((t, 25))
+    confidence = np.clip(0.95 - 0.17 * known, 0.06, 0.97)
+
+    wrong = _episodes(rng, (t, 25), noise.outlier_rate, 5.0)
+    away = np.repeat(rng.normal(0, 0.35, (t // 8 + 1, 25, 2)), 8, axis=0)[:t]
+    uv = np.where(wrong[:, :, None], uv + away * scale[:, :, None], uv)
+    confidence = np.where(
+        wrong, confidence * rng.uniform(0.25, 0.9, (t, 25)), confidence
+    )
+    swapped = _episodes(rng, (t, 2), noise.swap_rate / 2, 4.0)
+    pairs = (((2, 5), (3, 6), (4, 7)), ((9, 12), (10, 13), (11, 14)))
+    pairs = (pairs[0], (*pairs[1], (19, 22), (20, 23), (21, 24)))
+    for half, limbs in enumerate(pairs):
+        at = np.flatnonzero(swapped[:, half])[:, None]
+        for i, j in limbs:
+            uv[at, [i, j]] = uv[at, [j, i]]
+            confidence[at, [i, j]] = confidence[at, [j, i]]
+    lost = _episodes(rng, (t, 1), noise.gap_rate, 6.0)
+    lost = lost | (rng.random((t, 25)) < 0.25 * noise.outlier_rate * trouble)
+    outside = ((uv < 0) | (uv > np.array(size) - 1)).any(axis=2) | (p_C[..., 2] < 0.1)
+    gone = lost | outside
+    if hidden_by_others is not None:
+        gone |= hidden_by_others
+    return np.where(gone[:, :, None], 0.0, uv), np.where(gone, 0.0, confidence)
+
+
+def _self_occlusion(p_C, joints_C, intrinsics) -> Bool[np.ndarray, "t 25"]:
+    """Whether trunk, thigh or head is in front of a keypoint."""
+    bones = ((0, 12, 0.13), (1, 4, 0.07), (2, 5, 0.07), (12, 15, 0.10))
+    uv, at = project(p_C, intrinsics), project(joints_C, intrinsics)
+    hidden = np.zeros(p_C.shape[:2], bool)
+    for a, b, radius in bones:
+        way = at[:, b] - at[:, a]
+        share = ((uv - at[:, a, None]) * way[:, None]).sum(-1)
+        share = np.clip(share / np.maximum((way**2).sum(-1), 1.0)[:, None], 0, 1)
+        nearest = at[:, a, None] + share[..., None] * way[:, None]
+        depth = joints_C[:, a, None, 2] * (1 - share) + joints_C[:, b, None, 2] * share
+        reach = radius * intrinsics[0] / np.maximum(depth, 0.1)
+        close = np.linalg.norm(uv - nearest, axis=-1) < reach
+        hidden |= close & (p_C[..., 2] > depth + 0.10)
+    return hidden
+
+
+def _episodes(rng, shape, rate: float, length: float) -> Bool[np.ndarray, "t n"]:
+    """Runs of about `length` frames that together fill a share `rate` of all frames."""
+    state = rng.random(shape[1:]) < rate
+    out = np.empty(shape, bool)
+    start = rate / max((1 - rate) * length, 1e-9)
+    for k, draw in enumerate(rng.random(shape)):
+        state = np.where(state, draw > 1 / length, draw < start)
+        out[k] = state
+    return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Regressed:
+    """Bodies as a network would give them for some of the frames."""
+
+    frame: Int[np.ndarray, " m"]
+    poses: Float[np.ndarray, "m 72"]
+    """Axis-angle, rad; the root turns the body into the camera frame."""
+    shapes: Float[np.ndarray, "m 10"]
+    trans: Float[np.ndarray, "m 3"]
+    """m, camera frame: the pelvis is at `J_0(β) + trans`."""
+    box: Float[np.ndarray, "m 3"]
+    """The crop that the network saw: centre and side, px."""
+    camera: Float[np.ndarray, "m 3"]
+    """The same as weak perspective `s tx ty` in that crop."""
+    poses_crop: Float[np.ndarray, "m 72"]
+    """`poses` with the root relative to the crop's ray."""
+
+
+def regress_bodies(
+    person: Person,
+    poses_C: Float[np.ndarray, "t 24 3"],
+    pelvis_C: Float[np.ndarray, "t 3"],
+    keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]],
+    intrinsics: Float[np.ndarray, "4"],
+    noise: Noise,
+    rng: np.random.Generator,
+) -> Regressed:
+    """What a regressor says of a `person` with these true poses in the camera frame.
+
+    It sees crops around `keypoints`; frames without enough of them are left out.
+    """
+    t = len(poses_C)
+    level = np.where(_HANDS_FEET, 1.5, 1.0)[:, None]
+    level = level * np.where(np.arange(24) == 0, 0.0, 1.0)[:, None]
+    error = noise.posture_bias * rng.standard_normal((24, 3))
+    error = error + noise.posture_drift * ar1(
+        rng, (t, 24, 3), noise.posture_correlation
+    )
+    error = level * (error + noise.posture_white * rng.standard_normal((t, 24, 3)))
+    slow = ar1(rng, (t, 3), noise.posture_correlation)
+    error[:, 0] = noise.root_drift * slow
+    error[:, 0] += noise.root_white * rng.standard_normal((t, 3))
+    true = Rotation.from_rotvec(poses_C.reshape(-1, 3))
+    wrong = true * Rotation.from_rotvec(error.reshape(-1, 3))
+    poses = wrong.as_rotvec().reshape(t, 72)
+
+    shape = person.shape * rng.uniform(*noise.shape_shrink)
+    shape = shape + noise.shape_white * rng.standard_normal(10)
+    flicker = 0.1 * noise.shape_white * ar1(rng, (t, 10), 0.9)
+    shapes = shape + flicker
+    seen = person.rest_joints(shape)
+    # Whoever takes a person for taller sees them as far away by as much
+    taller = np.ptp(seen[:, 1]) / np.ptp(person.rest[:, 1])
+    sigma = rng.uniform(*noise.depth)
+    depth = 1 + sigma * np.sqrt(0.7) * np.clip(rng.standard_normal(), -1.5, 1.5)
+    depth = depth + sigma * np.sqrt(0.3) * ar1(rng, (t, 1), noise.posture_correlation)
+    depth = taller * depth + noise.depth_white * rng.standard_normal((t, 1))
+    uv = project(pelvis_C, intrinsics) + noise.offset * ar1(rng, (t, 2), 0.8)
+    ray = np.concatenate(
+        [(uv - intrinsics[2:]) / intrinsics[:2], np.ones((t, 1))], axis=1
+    )
+    pelvis = ray * pelvis_C[:, 2:] * depth
+    trans = pelvis - person.rest_joints(shapes)[:, 0]
+
+    box, found = crop_boxes(*keypoints)
+    found &= pelvis[:, 2] > 0.3
+    fx, _, px, py = intrinsics
+    x, y, z = trans.T
+    camera = np.stack(
+        [
+            2 * fx / (box[:, 2] * z),
+            x - z / fx * (box[:, 0] - px),
+            y - z / fx * (box[:, 1] - py),
+        ],
+        axis=1,
+    )
+    poses_crop = poses.copy()
+    root = _to_ray(box[:, :2], intrinsics).inv() * Rotation.from_rotvec(poses[:, :3])
+    poses_crop[:, :3] = root.as_rotvec()
+    frame = np.flatnonzero(found)
+    return Regressed(
+        frame,
+        *(x[frame] for x in (poses, shapes, trans, box, camera, poses_crop)),
+    )
+
+
+def _to_ray(uv: Float[np.ndarray, "t 2"], intrinsics) -> Rotation:
+    """Smallest rotation that takes +z to the ray through a pixel (fx = fy)."""
+    xy = (uv - intrinsics[2:]) / intrinsics[:2]
+    length = np.linalg.norm(xy, axis=1, keepdims=True)
+    axis = np.stack([-xy[:, 1], xy[:, 0], np.zeros(len(xy))], axis=1)
+    return Rotation.from_rotvec(axis / np.maximum(length, 1e-12) * np.arctan(length))
+
+
+def crop_boxes(
+    uv: Float[np.ndarray, "t 25 2"], confidence: Float[np.ndarray, "t 25"]
+) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
+    """SPIN's crops: mean of the sure keypoints, 1.2 times their larger extent.
+
+    The second value says where there were enough of them.
+    """
+    sure = confidence > 0.2
+    found = sure.sum(axis=1) >= 6
+    masked = np.where(sure[:, :, None], uv, np.nan)
+    masked[~found] = 0.0
+    side = 1.2 * (np.nanmax(masked, axis=1) - np.nanmin(masked, axis=1)).max(axis=1)
+    centre = np.nanmean(masked, axis=1)
+    return np.concatenate([centre, np.maximum(side, 10.0)[:, None]], axis=1), found

@@ -1,0 +1,309 @@
+"""The ten named sequences: a walk, a camera, a room, and what is measured of them."""
+
+import dataclasses
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.config import Simulation
+from bodyslam_jax.motion import FPS, Clip, read_motion
+from bodyslam_jax.simulation.camera_paths import (
+    HANDLING,
+    film_following,
+    film_room,
+    floor_path,
+)
+from bodyslam_jax.simulation.gait_synthesis import Walk, walk_along, walking_clips
+from bodyslam_jax.simulation.point_tracks import is_behind, track_points
+from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.room import Room, furnish, put_in_the_way
+from bodyslam_jax.simulation.sensor_noise import (
+    NOISE,
+    Regressed,
+    detect_keypoints,
+    noise_of_bodies,
+    noise_of_keypoints,
+    regress_bodies,
+)
+from bodyslam_jax.types import Tracks
+
+ASSETS = Path(__file__).parent / "assets"
+INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
+"""`fx fy cx cy`, px."""
+SIZE = (640, 480)
+"""Width and height of the image, px."""
+LENGTH = {
+    **{"E1": 600, "E2": 700, "E3": 800, "M1": 700, "M2": 800, "M3": 900, "M4": 1000},
+    **{"D1": 600, "D2": 800, "D3": 1000},
+}
+"""Frames of each sequence at 30 fps."""
+_MOST_PEOPLE = 3
+_AROUND = ("E3", "M2", "M4", "D2")
+"""Where the person walks round the camera; in the others in front of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Actor:
+    """One person of a sequence: what is true of them and what is measured."""
+
+    person: Person
+    """The true body at rest."""
+    walk: Walk
+    """The true motion."""
+    joints: Float[np.ndarray, "t 24 3"]
+    """True joints, world."""
+    keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
+    """Measured pixels and confidences, BODY_25; 0 0 0 is missing."""
+    bodies: Regressed
+    """Measured bodies in the camera frame."""
+
+    @property
+    def poses(self) -> Float[np.ndarray, "t 72"]:
+        """True poses; the root turns the body into the world."""
+        return self.walk.poses.reshape(-1, 72)
+
+    @property
+    def trans(self) -> Float[np.ndarray, "t 3"]:
+        """True pelvis joint minus `J_0(β)`, m, world."""
+        return self.walk.pelvis - self.person.rest[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedSequence:
+    """A sequence with everything that is true about it; world: y up, floor at 0, m."""
+
+    name: str
+    settings: Simulation
+    timestamps: Float[np.ndarray, " t"]
+    """s"""
+    intrinsics: Float[np.ndarray, "4"]
+    """`fx fy cx cy`, px."""
+    size: tuple[int, int]
+    """Width and height of the image, px."""
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """True cameras, camera to world."""
+    person: Person
+    """The true body at rest."""
+    walk: Walk
+    """The true motion."""
+    joints: Float[np.ndarray, "t 24 3"]
+    """True joints, world."""
+    room: Room
+    keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
+    """Measured pixels and confidences, BODY_25; 0 0 0 is missing."""
+    bodies: Regressed
+    """Measured bodies in the camera frame."""
+    tracks: Tracks
+    """Measured tracks of static points."""
+    landmarks: Float[np.ndarray, "l 3"]
+    """True places of the tracks' points, world."""
+    others: tuple[Actor, ...] = ()
+    """Whoever else walks there."""
+
+    @property
+    def seed(self) -> int:
+        """What everything random follows from."""
+        return _seed_of(self.settings)
+
+    @property
+    def actors(self) -> tuple[Actor, ...]:
+        """All people, the one whom the camera is on first."""
+        first = Actor(self.person, self.walk, self.joints, self.keypoints, self.bodies)
+        return (first, *self.others)
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "t 72"]:
+        """True poses of the first person."""
+        return self.actors[0].poses
+
+    @property
+    def trans(self) -> Float[np.ndarray, "t 3"]:
+        """True `trans` of the first person, m."""
+        return self.actors[0].trans
+
+
+def simulate(
+    settings: Simulation = Simulation(), body: BodyModel | None = None
+) -> SimulatedSequence:
+    """Simulates one of the named sequences, or a variant of it.
+
+    **Arguments:**
+
+    - `settings`: which sequence, family, length, seed, motion and noise.
+    - `body`: the body model, whose pose blend shapes are ignored; the default without.
+
+    **Raises:** `FileNotFoundError` or `ValueError`, naming the file, if the motion
+    cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames,
+    for a negative seed, a bias that is no number, a number of people that is not
+    between 1 and 3, or an exposure or readout that is not between 0 and a frame.
+    """
+    length = settings.length
+    num_frames = LENGTH[settings.sequence] if length is None else length
+    if num_frames < 2:
+        raise ValueError(f"length {num_frames}: a sequence needs 2 frames or more.")
+    if settings.seed is not None and settings.seed < 0:
+        raise ValueError(f"seed {settings.seed}: expected 0 or more.")
+    for name in ("keypoint_errors", "body_errors", "body_jitter"):
+        if not 0 <= (factor := getattr(settings, name)) < np.inf:
+            raise ValueError(f"{name} {factor}: expected 0 or more.")
+    for name in ("outliers", "exchanged"):
+        if (share := getattr(settings, name)) is not None and not 0 <= share < 1:
+            raise ValueError(f"{name} {share}: expected a share, 0 to 1.")
+    if not np.isfinite(settings.detector_bias):
+        raise ValueError(
+            f"detector bias {settings.detector_bias}: expected a finite number."
+        )
+    if not 1 <= settings.people <= _MOST_PEOPLE:
+        raise ValueError(
+            f"people {settings.people}: expected 1 to {_MOST_PEOPLE} walkers."
+        )
+    for what in ("exposure", "readout"):
+        value = getattr(settings, what)
+        if not 0 <= value <= 1 / FPS:
+            raise ValueError(f"{what} {value}: expected 0 to {1 / FPS:.4f} s, a frame.")
+    name = f"{settings.sequence}-{settings.family}"
+    seed = _seed_of(settings)
+    # One stream each, so that a noise level changes nothing that is true
+    truth, key, reg, pts = np.random.default_rng(seed).spawn(4)
+    source = settings.motion or str(ASSETS / "walking.npz")
+    clips = walking_clips(read_motion(source), source)
+
+    shape = np.clip(truth.standard_normal(10), -2.0, 2.0)
+    person = Person(body or load_body_model(), shape)
+    handling = HANDLING[settings.sequence[0]]
+    around = settings.sequence in _AROUND
+    path, place = floor_path(settings.family, around, truth)
+    walk = walk_along(person, clips, path, num_frames, truth)
+    if settings.family == "room":
+        T_WC = film_room(walk.pelvis, place, handling, truth)
+    else:
+        T_WC = film_following(walk.pelvis, handling, truth)
+    others = [
+        _other(settings, h, path, around, person, clips, num_frames)
+        for h in range(1, settings.people)
+    ]
+    walks = [walk, *(own for _, own in others)]
+    room = furnish(
+        np.concatenate([one.pelvis for one in walks]),
+        np.tile(T_WC[:, :3, 3], (len(walks), 1)),
+        truth,
+        is_hall=settings.family == "follow",
+    )
+    if settings.hiding:
+        rng = np.random.default_rng([seed, 100])
+        room = put_in_the_way(room, [w.pelvis for w in walks], T_WC[:, :3, 3], rng)
+    return measure(settings, name, person, walk, T_WC, room, (key, reg, pts), others)
+
+
+def _seed_of(settings: Simulation) -> int:
+    name = f"{settings.sequence}-{settings.family}"
+    return zlib.crc32(name.encode()) if settings.seed is None else settings.seed
+
+
+def _other(
+    settings: Simulation,
+    h: int,
+    path: Float[np.ndarray, "p 2"],
+    around: bool,
+    person: Person,
+    clips: tuple[Clip, ...],
+    num_frames: int,
+) -> tuple[Person, Walk]:
+    """Person `h` with a shape and a path of their own beside the first's.
+
+    Who walks in a room has a smaller or larger loop that begins up to an eighth ahead
+    or behind; in a hall, one beside it that begins up to 2.5 m ahead or behind.
+    """
+    rng = np.random.default_rng([_seed_of(settings), h])
+    own = person.of_shape(np.clip(rng.standard_normal(10), -2.0, 2.0))
+    middle = path.mean(axis=0)
+    if settings.family == "room":
+        path = middle + (1 + 0.3 * h if around else 1 - 0.3 * h) * (path - middle)
+        start = int(rng.uniform(-0.12, 0.12) * len(path))
+    else:
+        length = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1).sum()
+        away = path - middle
+        away = away / np.linalg.norm(away, axis=1, keepdims=True)
+        side = (1 if h % 2 else -1) * rng.uniform(0.8, 1.2)
+        path = path + side * away
+        start = int(rng.uniform(-2.5, 2.5) / length * len(path))
+    path = np.roll(path, -start, axis=0)
+    return own, walk_along(own, clips, path, num_frames, rng)
+
+
+def measure(
+    settings: Simulation,
+    name: str,
+    person: Person,
+    walk: Walk,
+    T_WC: Float[np.ndarray, "t 4 4"],
+    room: Room,
+    streams: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
+    others: Sequence[tuple[Person, Walk]] = (),
+) -> SimulatedSequence:
+    """Measures what is true; `streams` are for keypoints, bodies and tracks of the
+    first person, those of the `others` are their own."""
+    R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
+    to_camera = lambda x: np.einsum("tab,tjb->tja", R_CW, x - centre[:, None])
+    everyone = [(person, walk), *others]
+    posed = [p.joints(w.poses, w.pelvis) for p, w in everyone]
+    joints_C = np.stack([to_camera(joints) for _, joints in posed])
+    actors = []
+    for h, ((body, own), (G, joints)) in enumerate(zip(everyone, posed, strict=True)):
+        seed = [_seed_of(settings), h, 1]
+        key, reg = streams[:2] if h == 0 else np.random.default_rng(seed).spawn(2)
+        points = body.keypoints(G, joints, settings.detector_bias)
+        points_C = to_camera(points)
+        hidden = np.zeros(points.shape[:2], bool)
+        if settings.hiding:
+            for k in range(len(T_WC)):
+                hidden[k] = room.is_hidden(centre[k], points[k])
+        for i in range(len(everyone)):
+            if i != h:
+                hidden |= is_behind(points_C, joints_C[i], INTRINSICS)
+        keypoints = detect_keypoints(
+            points_C, joints_C[h], INTRINSICS, SIZE, noise_of_keypoints(settings),
+            key, hidden,
+        )  # fmt: skip
+        if not settings.feet_and_face:
+            for array in keypoints:
+                array[:, [0, *range(15, 25)]] = 0.0
+        poses_C = own.poses.copy()
+        root = Rotation.from_matrix(R_CW) * Rotation.from_rotvec(own.poses[:, 0])
+        poses_C[:, 0] = root.as_rotvec()
+        bodies = regress_bodies(
+            body, poses_C, joints_C[h, :, 0], keypoints, INTRINSICS,
+            noise_of_bodies(settings), reg,
+        )  # fmt: skip
+        actors.append(Actor(body, own, joints, keypoints, bodies))
+    tracks, landmarks = track_points(
+        room, T_WC, joints_C, INTRINSICS, SIZE,
+        NOISE[settings.track_noise or settings.noise], streams[2],
+        life=HANDLING[settings.sequence[0]].track_life,
+    )  # fmt: skip
+    return SimulatedSequence(
+        name=name,
+        settings=settings,
+        timestamps=np.arange(len(T_WC)) / FPS,
+        intrinsics=INTRINSICS,
+        size=SIZE,
+        T_WC=T_WC,
+        person=person,
+        walk=walk,
+        joints=actors[0].joints,
+        room=room,
+        keypoints=actors[0].keypoints,
+        bodies=actors[0].bodies,
+        tracks=tracks,
+        landmarks=landmarks,
+        others=tuple(actors[1:]),
+    )

@@ -1,0 +1,147 @@
+"""A solve that is watched: what it is asked for, or the clock, after each iteration."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from bodyslam_jax.compilation import in_full_precision, is_traced, quick_options
+from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.levenberg_marquardt import lifted
+from bodyslam_jax.solver.padding import pad, unpad
+from bodyslam_jax.solver.schedule import Stage, check_schedule
+from bodyslam_jax.solver.solution import Solution, only, outcome
+from bodyslam_jax.solver.solve import (
+    check_limbs,
+    check_start,
+    method_of,
+    restrict,
+    restrict_to_all,
+)
+
+
+def trace(
+    problem: Problem,
+    state: State,
+    observe: Callable[[State], Any],
+    *,
+    schedule: tuple[Stage, ...] = (Stage(),),
+    damping: float = 1e-4,
+    mixed_precision: bool = False,
+) -> tuple[State, Any]:
+    """Runs each stage for all of its `max_steps` and notes `observe(state)` each time.
+
+    The steps are those of `solve`; after convergence the state stays. Returns the last
+    state and the notes, of `1 + Σ max_steps` rows: the first state's, then one an
+    iteration. Pure; costs the same whatever the states are; maps as `solve` does.
+
+    **Raises:** `ValueError` as `solve`.
+    """
+    _check(problem, state, schedule, damping)
+    settings = observe, schedule, damping, mixed_precision
+    watched = lambda problem, state: _trace(problem, state, *settings)
+    return (in_turn(watched) if is_traced(state) else watched)(problem, state)
+
+
+def _check(problem, state, schedule, damping):
+    check_schedule("structured", schedule)
+    check_start(problem, state, damping)
+    check_limbs(problem)
+
+
+def _trace(problem, state, observe, schedule, damping, mixed):
+    t, l = len(state.cameras), len(state.landmarks)
+    problem, state = pad(problem, state)
+    see = lambda y: observe(unpad(y, t, l))
+    notes = [jax.tree.map(lambda x: x[None], see(state))]
+    for stage in schedule:
+        held = restrict(problem, stage.free)
+        state, seen = _stage(held, state, see, stage, damping, mixed)
+        notes.append(seen)
+    joined = jax.tree.map(lambda *x: jnp.concatenate(x), *notes)
+    return unpad(state, t, l), joined
+
+
+@in_full_precision
+def _stage(problem, state, see, stage, damping, mixed):
+    method = method_of((stage,), damping, state.scale.dtype, mixed=mixed)
+    start = method.init(lifted, state, problem, {}, None, None, frozenset())
+    arrays, static = eqx.partition(start, eqx.is_array)
+
+    def one(carry, _):
+        y, arrays, stopped = carry
+        loop = eqx.combine(arrays, static)
+        moved, following, _ = method.step(lifted, y, problem, {}, loop, frozenset())
+        keep = lambda new, old: jnp.where(stopped, old, new)
+        y = jax.tree.map(keep, moved, y)
+        after = jax.tree.map(keep, eqx.filter(following, eqx.is_array), arrays)
+        done, result = method.terminate(
+            lifted, y, problem, {}, eqx.combine(after, static), frozenset()
+        )
+        ended = stopped | done | (result != optx.RESULTS.successful)
+        return (y, after, ended), see(y)
+
+    carry = state, arrays, jnp.array(False)
+    (state, _, _), seen = jax.lax.scan(one, carry, length=stage.max_steps)
+    return state, seen
+
+
+def clock(
+    problem: Problem,
+    state: State,
+    *,
+    schedule: tuple[Stage, ...] = (Stage(),),
+    damping: float = 1e-4,
+    mixed_precision: bool = False,
+) -> tuple[Solution, tuple[np.ndarray, ...]]:
+    """`solve` with the wall time of each iteration, s, for each stage.
+
+    `solve` itself is one compiled loop in which no clock can be read: a call back to
+    Python would wait for each step, and its program would neither map nor be kept from
+    run to run. Here the same step is a program of its own, called from Python, compiled
+    before the clock runs; only passing the loop's state in and out comes on top.
+
+    **Raises:** `ValueError` as `solve`.
+    """
+    _check(problem, state, schedule, damping)
+    t, l = len(state.cameras), len(state.landmarks)
+    problem, start = pad(problem, state)
+    problem = restrict_to_all(problem, schedule)
+    dtype = state.scale.dtype
+    method = method_of(schedule, damping, dtype, mixed=mixed_precision)
+    loop = _begin(method, problem, start)
+    arrays, static = eqx.partition(loop, eqx.is_array)
+    program = eqx.filter_jit(_advance, compiler_options=quick_options())
+    program = program.lower(method, problem, start, arrays, static).compile()
+    seconds: list[list[float]] = [[] for _ in schedule]
+    y = start
+    while not bool(arrays.finished):
+        stage, before = int(arrays.stage), time.perf_counter()
+        y, arrays = program(method, problem, y, arrays, static)
+        jax.block_until_ready(arrays)
+        seconds[stage].append(time.perf_counter() - before)
+    loop = eqx.combine(arrays, static)
+    _, _, stats = method.postprocess(
+        lifted, y, None, problem, {}, loop, frozenset(), loop.result
+    )
+    solution, _ = outcome(start, y, loop.result, stats)
+    solution = eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, t, l))
+    return only(solution, len(schedule)), tuple(np.asarray(x) for x in seconds)
+
+
+@eqx.filter_jit
+def _begin(method, problem, state):
+    return method.init(lifted, state, problem, {}, None, None, frozenset())
+
+
+@in_full_precision
+def _advance(method, problem, state, arrays, static):
+    loop = eqx.combine(arrays, static)
+    y, loop, _ = method.step(lifted, state, problem, {}, loop, frozenset())
+    return y, eqx.filter(loop, eqx.is_array)

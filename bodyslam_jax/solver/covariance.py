@@ -1,0 +1,257 @@
+"""How sure an estimate is: marginal covariances of what a user asks about.
+
+From the inverse of the normal equations where it is needed (`selected_inverse.py`).
+Coordinates that are held are known exactly.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.compilation import in_full_precision, is_alone, jit_once
+from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.solver.blocks import (
+    CAMERAS,
+    Linearisation,
+    Sizes,
+    own_to_global,
+    sizes_of,
+)
+from bodyslam_jax.solver.covariance_vjp import equations
+from bodyslam_jax.solver.elimination.schur import half_inverse
+from bodyslam_jax.solver.front import window_of
+from bodyslam_jax.solver.linear_system import UNSEEN, damped, diagonals
+from bodyslam_jax.solver.lm_state import Final
+from bodyslam_jax.solver.long_tracks import lasting_spread
+from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.selected_inverse import selected_inverse
+from bodyslam_jax.solver.solve import check_start, method_of, run
+from bodyslam_jax.solver.step import little
+
+
+class Marginals(eqx.Module):
+    """Covariances of one group at a time, in the metric world frame."""
+
+    scale: Float[Array, ""]
+    """Variance of s, (m per unit)^2"""
+    cameras: Float[Array, "t 3 3"]
+    """Of camera centres `s r'`, m^2"""
+    people: Float[Array, "h t 3 3"]
+    """Of pelvis joints in the world, m^2"""
+    intrinsics: Float[Array, "i i"]
+    """px^2; without a coordinate where none is free."""
+    shapes: Float[Array, "h 10 10"]
+    landmarks: Float[Array, "l 3 3"]
+    """Of `s l'`, m^2"""
+
+
+def marginals(problem: Problem, state: State) -> Marginals:
+    """Marginal covariances at a solution: the inverse of `J^T J` and of what keypoints
+    bend (`_curvature`); of `J^T J` alone where the two have none, as away from a
+    minimum.
+
+    They count for as much as the weights do: sigmas that are standard deviations, and
+    correlated errors modelled as such. The equations are set up by the program that
+    `solve` has compiled, in a schedule without steps. Differentiable by problem and
+    state, backwards (`_spread_gradient`).
+
+    **Raises:** `ValueError` if `state` does not fit the problem, as `solve` does.
+    """
+    check_start(problem, state)
+    t, l = len(state.cameras), len(state.landmarks)
+    spread = _differentiable(pad(problem, state), is_alone())
+    cut = {"cameras": spread.cameras[:t], "people": spread.people[:, :t]}
+    return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})
+
+
+@eqx.filter_custom_vjp
+def _differentiable(given: tuple[Problem, State], alone: bool) -> Marginals:
+    problem, state = given
+    method = method_of((), 0.0, state.scale.dtype, keep=True)
+    _, final = run(problem, state, method, alone=alone)
+    return _marginals(problem, state, final)
+
+
+@_differentiable.def_fwd
+def _forward(perturbed, given, alone):
+    return _differentiable(given, alone), None
+
+
+@_differentiable.def_bwd
+def _backward(residuals, cotangent, perturbed, given, alone):
+    return _pulled(given, cotangent)
+
+
+@eqx.filter_jit
+def _pulled(given: tuple[Problem, State], cotangent: Marginals):
+    arrays, static = eqx.partition(given, eqx.is_inexact_array)
+
+    def spread(arrays):
+        problem, state = eqx.combine(arrays, static)
+        return _marginals(problem, state, equations(problem, state))
+
+    found, pull = jax.vjp(spread, arrays)
+    full = jax.tree.map(
+        lambda c, x: jnp.zeros_like(x) if c is None else c,
+        cotangent,
+        found,
+        is_leaf=lambda x: x is None,
+    )
+    return pull(full)[0]
+
+
+@jit_once
+@in_full_precision
+def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
+    sizes = sizes_of(problem, state)
+    lin = final.lin
+    least = jnp.asarray(little(state.scale.dtype), state.scale.dtype)
+    damping = damped(diagonals(lin, sizes), least, UNSEEN)
+    fronts, windows, arrow = selected_inverse(
+        final.factor,
+        final.roots,
+        window_of(lin, sizes),
+        sizes,
+        problem.layout.order,
+    )
+    g = sizes.globals
+    common = arrow[:g, :g] * _outer(_free_globals(problem, sizes))
+    cameras, people = _centres(problem, state, sizes, fronts)
+    landmarks = _landmarks(problem, state, sizes, lin, damping, windows, arrow)
+    i = sizes.intrinsics
+    h = sizes.people
+    shapes = common[1 + i :, 1 + i :].reshape(h, 10, h, 10)
+    return Marginals(
+        scale=common[0, 0],
+        cameras=cameras,
+        people=people,
+        intrinsics=common[1 : 1 + i, 1 : 1 + i],
+        shapes=jnp.stack([shapes[p, :, p] for p in range(h)])
+        if h
+        else jnp.zeros((0, 10, 10), common.dtype),
+        landmarks=landmarks,
+    )
+
+
+def _outer(mask: Array) -> Array:
+    return mask[..., :, None] * mask[..., None, :]
+
+
+def _free_globals(problem: Problem, sizes: Sizes) -> Array:
+    free = problem.free
+    shapes = free.shapes if "shapes" in sizes.variables else 0 * free.shapes
+    scale = free.scale if "scale" in sizes.variables else 0 * free.scale
+    return jnp.concatenate(
+        [scale[None], free.intrinsics[: sizes.intrinsics], shapes.reshape(-1)]
+    )
+
+
+def _centres(problem, state, sizes, fronts):
+    """Covariances of camera centres and pelvis joints, from each chunk's front."""
+    h, n = sizes.people, sizes.chunks
+    head = fronts.shape[-1] - sizes.globals - CAMERAS
+    hb = head // h if h else 0
+    b = CAMERAS // 6
+    frames = jnp.arange(b)
+    scale_at = head + CAMERAS
+    free = problem.free
+    ones = lambda group, x: x if group in sizes.variables else 0 * x
+    s = state.scale * jnp.ones((n, b, 1, 1), state.scale.dtype)
+    eye = jnp.eye(3, dtype=s.dtype)
+    camera = state.cameras.reshape(n, b, 4, 4)
+    free_camera = ones("cameras", free.cameras).reshape(n, b, 6)
+    free_scale = ones("scale", free.scale)
+    by_scale = camera[..., :3, 3:] * free_scale
+    by_centre = s * eye * free_camera[..., None, 3:]
+
+    def spread(jacobian, index):
+        """`J Σ J^T` of each frame, with the columns of J at `index` of the front."""
+        part = fronts[:, index[:, :, None], index[:, None, :]]
+        return jnp.einsum("nbij,nbjk,nblk->nbil", jacobian, part, jacobian)
+
+    at_camera = head + 6 * frames[:, None] + jnp.arange(6)
+    at_scale = jnp.full((b, 1), scale_at)
+    index = jnp.concatenate([at_camera[:, 3:], at_scale], axis=1)
+    cameras = spread(jnp.concatenate([by_centre, by_scale], -1), index)
+    people = []
+    for p in range(h):
+        r_CH = state.roots[p, :, :3, 3].reshape(n, b, 3)
+        base = p * hb + hb - CAMERAS
+        at_root = base + 6 * frames[:, None] + jnp.arange(3, 6)
+        C = camera[..., :3, :3]
+        free_root = ones("roots", free.roots)[p].reshape(n, b, 6)
+        jacobian = jnp.concatenate(
+            [
+                _turned(C, r_CH) * free_camera[..., None, :3],
+                by_centre,
+                C * free_root[..., None, 3:],
+                by_scale,
+            ],
+            axis=-1,
+        )
+        index = jnp.concatenate([at_camera, at_root, at_scale], axis=1)
+        people.append(spread(jacobian, index).reshape(n * b, 3, 3))
+    none = jnp.zeros((0, n * b, 3, 3), s.dtype)
+    return cameras.reshape(n * b, 3, 3), jnp.stack(people) if h else none
+
+
+def _turned(C, r):
+    """`d (C Exp(ω) r) / dω = -C [r]x`"""
+    r = jnp.broadcast_to(r[..., None, :], C.shape)
+    return jnp.cross(r, C)
+
+
+def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows, arrow):
+    """Of landmarks in metres: their own, and the share of the scale."""
+    out = jnp.zeros((len(state.landmarks), 3, 3), state.scale.dtype)
+    free_s = problem.free.scale if "scale" in sizes.variables else 0.0
+    s = state.scale
+    for bucket, table, damp in zip(
+        problem.layout.buckets, lin.landmarks, damping["landmarks"], strict=True
+    ):
+        if bucket.lasting:
+            found = lasting_spread(bucket.landmark.shape, sizes, arrow)
+        else:
+            found = _from_cameras(bucket, table, damp, windows, sizes)
+        spread, with_scale, of_scale = found
+        mask = problem.free.landmarks[bucket.landmark]
+        spread = spread * _outer(mask)
+        with_scale = with_scale * free_s * mask
+        point = state.landmarks[bucket.landmark]
+        mixed = s * (point[..., :, None] * with_scale[..., None, :])
+        total = s**2 * spread + mixed + mixed.swapaxes(-1, -2)
+        square = point[..., :, None] * point[..., None, :]
+        total = total + free_s * of_scale[:, None, None, None] * square
+        out = out.at[bucket.landmark].set(total, mode="drop")
+    return out
+
+
+def _from_cameras(bucket, table, damp, windows, sizes):
+    """`V^-1 + V^-1 W^T Σ W V^-1` of each landmark that went before the cameras, and its
+    covariance with the scale; and the scale's."""
+    rows = half_inverse(table, damp)
+    zero = jnp.zeros_like(rows[0][0])
+    half = jnp.stack(
+        [jnp.stack(row + [zero] * (3 - len(row)), axis=1) for row in rows], axis=1
+    )
+    inverse = jnp.einsum("nkag,nkbg->nabg", half, half)
+    width = bucket.width * CAMERAS
+    common = sizes.bandwidth * CAMERAS + own_to_global(sizes, None)
+    index = jnp.concatenate([jnp.arange(width), common])
+
+    def one(group):
+        chunk, cross, side, inverse = group
+        known = windows[chunk][index[:, None], index[None, :]]
+        count = cross.shape[-1]
+        # The scale moves no landmark of the map: a row of zeros in its place.
+        still = jnp.zeros((1, 3, count), cross.dtype)
+        w = jnp.concatenate([cross.reshape(width, 3, count), still, side])
+        gain = -jnp.einsum("wag,abg->wbg", w, inverse)
+        moved = (known @ gain.reshape(len(index), -1)).reshape(gain.shape)
+        spread = inverse + jnp.einsum("wag,wbg->abg", gain, moved)
+        return spread, moved[width], known[width, width]
+
+    groups = (bucket.first_chunk, table.cross, table.cross_intrinsics, inverse)
+    spread, with_scale, of_scale = jax.lax.map(one, groups)
+    return jnp.moveaxis(spread, 3, 1), jnp.moveaxis(with_scale, 2, 1), of_scale

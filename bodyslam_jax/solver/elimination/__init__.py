@@ -1,0 +1,1 @@
+"""Elimination of landmarks, postures and people from the normal equations."""

@@ -1,0 +1,135 @@
+"""Eliminates landmarks: dense tables in, a block-banded camera matrix out.
+
+With `V = L L^T` a landmark's own 3 x 3 block, `Y = W L^-T` stacks a group's cameras
+(rows) against its landmarks (columns), and the group takes `Y Y^T` from the cameras:
+one matrix product for all pairs of cameras that share landmarks.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph import Problem
+from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes
+from bodyslam_jax.solver.linearise.landmark import frames_of
+from bodyslam_jax.solver.long_tracks import Lasting, lasting_blocks
+
+
+class ReducedCameras(eqx.Module):
+    """What landmarks leave on `n` chunks of cameras (as they stand), and on
+    intrinsics."""
+
+    band: Float[Array, "n c w"]
+    """Row chunk against itself and the next ones, `c = 6 B`, `w = bandwidth * c`."""
+    rhs: Float[Array, "n c"]
+    with_intrinsics: Float[Array, "n c i"]
+    intrinsics: Float[Array, "i i"]
+    intrinsics_rhs: Float[Array, " i"]
+    lasting: Lasting | None
+
+
+def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list[list]:
+    """`L^-1` of each landmark's damped 3 x 3 block, as rows of arrays `n g`."""
+    v = lambda i, j: blocks.own[:, i, j] + (damping[:, i] if i == j else 0.0)
+    l00 = jnp.sqrt(v(0, 0))
+    l10, l20 = v(1, 0) / l00, v(2, 0) / l00
+    l11 = jnp.sqrt(v(1, 1) - l10**2)
+    l21 = (v(2, 1) - l20 * l10) / l11
+    l22 = jnp.sqrt(v(2, 2) - l20**2 - l21**2)
+    i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
+    i10 = -l10 * i00 * i11
+    i21 = -l21 * i11 * i22
+    i20 = -(l20 * i00 + l21 * i10) * i22
+    return [[i00], [i10, i11], [i20, i21, i22]]
+
+
+def eliminate_landmarks(
+    problem: Problem,
+    tables: tuple[LandmarkBlocks, ...],
+    damping: tuple[Array, ...],
+    sizes: Sizes,
+) -> ReducedCameras:
+    """Sums what all groups take away, to be added to the cameras' own blocks; lasting
+    landmarks stay."""
+    dtype = sizes.dtype
+    n, count = sizes.chunks, sizes.intrinsics
+    band = jnp.zeros((n, CAMERAS, sizes.bandwidth * CAMERAS), dtype)
+    side = jnp.zeros((n, CAMERAS, count + 1), dtype)
+    corner = jnp.zeros((count + 1, count + 1), dtype)
+    for bucket, table, damp in zip(
+        problem.layout.buckets, tables, damping, strict=True
+    ):
+        if bucket.lasting:
+            continue
+        half = half_inverse(table, damp)
+        width = bucket.width
+
+        def add(carry, group, width=width):
+            band, side, corner = carry
+            chunk, cross, extra, rows = group
+            zero = jnp.zeros_like(chunk)
+            mix = lambda w: jnp.stack(
+                [sum(w[:, k] * r for k, r in enumerate(row)) for row in rows], axis=1
+            )
+            y = mix(cross.reshape(width * CAMERAS, 3, -1)).reshape(width * CAMERAS, -1)
+            e = mix(extra).reshape(count + 1, -1)
+            for i in range(width):
+                rest = (width - i) * CAMERAS
+                start = (chunk + i, zero, zero)
+                here = slice(i * CAMERAS, (i + 1) * CAMERAS)
+                strip = y[here] @ y[i * CAMERAS :].T
+                known = jax.lax.dynamic_slice(band, start, (1, CAMERAS, rest))
+                band = jax.lax.dynamic_update_slice(band, known - strip[None], start)
+            start = (chunk, zero, zero)
+            known = jax.lax.dynamic_slice(side, start, (width, CAMERAS, count + 1))
+            edge = (y @ e.T).reshape(width, CAMERAS, count + 1)
+            side = jax.lax.dynamic_update_slice(side, known - edge, start)
+            return (band, side, corner - e @ e.T), None
+
+        extra = jnp.concatenate(
+            [table.cross_intrinsics, -table.gradient[:, None]], axis=1
+        )
+        groups = (bucket.first_chunk, table.cross, extra, half)
+        (band, side, corner), _ = jax.lax.scan(add, (band, side, corner), groups)
+    return ReducedCameras(
+        band,
+        side[..., -1],
+        side[..., :-1],
+        corner[:-1, :-1],
+        corner[:-1, -1],
+        lasting_blocks(problem, tables, damping, sizes),
+    )
+
+
+def substitute_landmarks(
+    problem: Problem,
+    tables: tuple[LandmarkBlocks, ...],
+    damping: tuple[Array, ...],
+    cameras: Float[Array, "t 6"],
+    intrinsics: Float[Array, " i"],
+    out: Float[Array, "l 3"],
+) -> Float[Array, "l 3"]:
+    """Steps of the landmarks from those of cameras, as their chunks stand, and of
+    intrinsics, into `out`; but for lasting ones."""
+    for bucket, table, damp in zip(
+        problem.layout.buckets, tables, damping, strict=True
+    ):
+        if bucket.lasting:
+            continue
+        step = cameras[frames_of(bucket.first_chunk, bucket.width)]
+        n, g = len(step), table.own.shape[-1]
+        # In the order that the tables have: `einsum` would have them in another first.
+        taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
+        right = -table.gradient - taken.reshape(n, 3, g)
+        right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
+        moved = solve_landmarks(half_inverse(table, damp), right)
+        out = out.at[bucket.landmark].set(jnp.moveaxis(moved, 1, 2), mode="drop")
+    return out
+
+
+def solve_landmarks(half: list[list], right: Float[Array, "n 3 g"]) -> Array:
+    """`L^-T L^-1` times a right-hand side of each landmark."""
+    forward = [sum(half[i][k] * right[:, k] for k in range(i + 1)) for i in range(3)]
+    back = [sum(half[k][i] * forward[k] for k in range(i, 3)) for i in range(3)]
+    return jnp.stack(back, axis=1)

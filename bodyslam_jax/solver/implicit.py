@@ -1,0 +1,168 @@
+"""Derivatives of a solution, by the implicit function theorem.
+
+At a solution x*(p) the gradient `F(δ, p)` of the cost is 0, so for a cotangent v on the
+solution the cotangent on p is `-(∂F/∂p)^T λ` with `(∂F/∂δ)^T λ = v`. The true second
+derivative of the robust cost is used (Gauss-Newton's would be wrong wherever residuals
+are not 0), solved for by GMRES with the structured factorisation as preconditioner: a
+few products. Nothing is unrolled. Predictions of the motion model are held when F is
+taken, as the solver holds them, but they move with x and p when F is differentiated.
+Where GMRES does not converge the derivative is NaN: the equations are as good as
+singular, or the state is no minimum.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from bodyslam_jax.compilation import (
+    in_full_precision,
+    is_alone,
+    is_traced,
+    quick_options,
+)
+from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
+from bodyslam_jax.kept import kept
+from bodyslam_jax.solver.apart import join_poses
+from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.coupling import with_gradient
+from bodyslam_jax.solver.gmres import gmres
+from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+
+_LITTLE = {"float64": 1e-9, "float32": 1e-5}
+"""Damping of the preconditioner."""
+_RTOL = {"float64": 1e-10, "float32": 1e-5}
+"""Share of the adjoint at which GMRES ends."""
+
+
+def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Problem:
+    """What a cotangent on the solution is on everything in the (padded) problem."""
+    given = problem, state, cotangent
+    if is_traced(given):
+        return in_turn(_program(False))(*given)
+    return _program(is_alone())(*given)
+
+
+@functools.cache
+def _program(alone: bool) -> Callable[..., Problem]:
+    if alone:
+        return kept(_cotangent_of_problem, quick_options)
+    return eqx.filter_jit(_cotangent_of_problem)
+
+
+@in_full_precision
+def _cotangent_of_problem(problem, state, cotangent):
+    problem = _without_single_views(problem)
+    zero = state.zero_step()
+    diagonal = _diagonal(problem, state)
+    mask = jax.tree.map(
+        lambda m, d: jnp.where(d > 0, m, 0.0), mask_of(problem), diagonal
+    )
+    # Standard deviations: in metres and radians, points that nobody sees well would
+    # decide alone when the rest is good enough.
+    unit = jax.tree.map(lambda d: jax.lax.rsqrt(jnp.where(d > 0, d, 1.0)), diagonal)
+    masked = lambda step: jax.tree.map(lambda m, s: m * s, mask, step)
+    _, pull = jax.vjp(state.retract, zero)
+    (right,) = pull(cotangent)
+    right = masked(right)
+    arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+
+    def gradient(step, arrays):
+        whole: Problem = eqx.combine(arrays, static)
+        moved = state.retract(step)
+        seen = whole.predict(moved, frozen=False)
+        fixed = whole.with_prediction(seen)
+
+        # About the place moved to, as the solver holds single coordinates: in the
+        # chart of another place they are others, and what pulls at them is not 0.
+        def cost(d):
+            place = moved.retract(d)
+            return fixed.follow(place).cost(place)
+
+        return jax.grad(cost)(zero)
+
+    _, transpose = jax.vjp(gradient, zero, arrays)
+    precondition = _preconditioner(problem, state)
+    flat, unravel = ravel_pytree(right)
+    scale, _ = ravel_pytree(unit)
+
+    def left_of(scaled, share):
+        step = unravel(scaled * scale)
+        product, _ = transpose(masked(step))
+        # A held coordinate is its own equation.
+        image = jax.tree.map(
+            lambda b, m, p, x: share * b - jnp.where(m > 0, m * p, x),
+            *(right, mask, product, step),
+        )
+        return ravel_pytree(precondition(image))[0] / scale
+
+    adjoint = unravel(scale * gmres(left_of, flat, _RTOL[flat.dtype.name]))
+    _, result = transpose(jax.tree.map(jnp.negative, masked(adjoint)))
+    return result
+
+
+def _without_single_views(problem: Problem) -> Problem:
+    """Drops observations of landmarks seen once: they say nothing about the rest, and
+    leave the landmark's depth, and so the linear system, without a solution.
+
+    Not of landmarks that are held, or known besides: these tell where cameras are.
+    """
+    factors = list(problem.factors)
+    alone = jnp.all(mask_of(problem).landmarks > 0, axis=-1)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            alone &= ~jnp.any(factor.whitening != 0, axis=(-2, -1))
+    for i, factor in enumerate(factors):
+        if isinstance(factor, Reprojection):
+            seen = jnp.isfinite(factor.sigma)
+            count = jnp.zeros(problem.free.landmarks.shape[0], jnp.int32)
+            count = count.at[factor.landmark].add(seen.astype(jnp.int32))
+            once = ((count < 2) & alone)[factor.landmark]
+            sigma = jnp.where(once, jnp.inf, factor.sigma)
+            factors[i] = eqx.tree_at(lambda f: f.sigma, factor, sigma)
+    return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
+
+
+def _diagonal(problem: Problem, state: State) -> Step:
+    """Of `J^T J`: 0 for coordinates that no measurement sees."""
+    problem = problem.refresh(state)
+    sizes = sizes_of(problem, state)
+    diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
+    zero = state.zero_step()
+    count = sizes.intrinsics
+    landmarks = zero.landmarks
+    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
+        moved = jnp.moveaxis(own, 1, 2)
+        landmarks = landmarks.at[bucket.landmark].set(moved, mode="drop")
+    known = {name: diagonal[name] for name in ("pose", "apart") if name in diagonal}
+    return Step(
+        scale=diagonal["globals"][0],
+        cameras=diagonal["camera"],
+        roots=diagonal["root"],
+        poses=join_poses(known, sizes.joints, zero.poses),
+        shapes=diagonal["globals"][1 + count :].reshape(zero.shapes.shape),
+        landmarks=landmarks,
+        intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,
+    )
+
+
+def _preconditioner(problem: Problem, state: State):
+    """`v -> (J^T J)^-1 v`, by the solver's own elimination."""
+    problem = problem.refresh(state)
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state)
+    little = jnp.asarray(_LITTLE[state.scale.dtype.name], state.scale.dtype)
+    damping = damped(diagonals(lin, sizes), little)
+
+    def apply(right: Step) -> Step:
+        there = with_gradient(problem, lin, jax.tree.map(jnp.negative, right))
+        eliminated = eliminate(problem, there, sizes, damping)
+        return solve_step(problem, state, there, sizes, eliminated)
+
+    return apply

@@ -1,0 +1,242 @@
+"""Levenberg-Marquardt on the factor graph, in optimistix's loop.
+
+Steps are damped, and accepted on the true robust cost (`_trial`). The linearisation is
+kept after a rejected step. The motion model's prediction is frozen within a step and
+made anew after each accepted one, unless it is coupled (`_coupling`). Steps that gain
+little know what keypoints bend (`_curvature`). Landmarks that no step would bring back
+are triangulated anew (`_triangulation`).
+
+The stages of a schedule are phases of one loop, and differ by a mask: what they do is
+compiled once, and so is what covariances need of the last linearisation.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
+from bodyslam_jax.solver.blocks import Linearisation, sizes_of
+from bodyslam_jax.solver.coupling import with_coupling
+from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.lm_state import Final, History, Loop
+from bodyslam_jax.solver.retriangulation import triangulate_anew
+from bodyslam_jax.solver.second_order import bend, curvature_if, next_share
+from bodyslam_jax.solver.step import Trial, attempt
+
+MAX_DAMPING = 1e12
+LOST = (10.0, 0.5)
+"""Decrease of the cost for which a landmark is triangulated anew, after the first step
+and later: the cost is a negative log-likelihood."""
+NEAR = 0.01
+"""Share of the cost: landmarks are looked at again after a step that gains no more, as
+cameras are about right then, and at the end."""
+
+
+class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """The structured solver; `y` is a `State`, `args` a padded `Problem`.
+
+    All settings but the length of the history are arrays, so that one compilation
+    serves all schedules of as many stages.
+    """
+
+    free: Float[Array, "s v"]
+    """1 for the groups among `VARIABLES` that a stage moves."""
+    limit: Int[Array, " s"]
+    """Steps at most; a stage with none is left out."""
+    rtol: Float[Array, " s"]
+    """A stage ends when an undisturbed step lowers the cost by less than this share."""
+    atol: Float[Array, " s"]
+    """Or by less than this."""
+    damping: Float[Array, ""]
+    """At the first step of a stage; 0 is Gauss-Newton, with step control left to
+    `GAIN`."""
+    keep: Bool[Array, ""]
+    """Whether to factorise once more at the end, hardly damped, for covariances."""
+    length: int = eqx.field(static=True)
+    """Of the history."""
+    dtype: np.dtype = eqx.field(static=True)
+    """Of blocks and factors."""
+    norm: Callable[..., Any] = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        dtype = y.scale.dtype
+        s, n, k = len(self.limit), self.length, len(args.factors)
+        observations = gather(args)
+        # Filled in by the first step: each part is compiled once.
+        struct = eqx.filter_eval_shape(_first, args, observations, y, self.dtype)
+        empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
+        stage = self._after(jnp.array(-1))
+        return Loop(
+            stage=stage,
+            prediction=empty[1],
+            observations=observations,
+            final=empty[0],
+            stale=jnp.array(True),
+            damping=jnp.asarray(self.damping, dtype),
+            caution=jnp.zeros(len(y.landmarks), dtype),
+            searched=jnp.array(0),
+            growth=jnp.asarray(2.0, dtype),
+            cost=jnp.asarray(jnp.inf, dtype),
+            first_cost=jnp.asarray(jnp.inf, dtype),
+            steps=jnp.zeros(s, int),
+            share=jnp.zeros((), dtype),
+            bent=jnp.array(True),
+            finished=(stage == s) & ~self.keep,
+            result=optx.RESULTS.successful,
+            history=History(
+                jnp.zeros((s, n + 1), dtype),
+                jnp.zeros((s, n + 1, k), dtype),
+                jnp.zeros((s, n), dtype),
+                jnp.zeros((s, n), dtype),
+                jnp.zeros((s, n), bool),
+            ),
+        )
+
+    def _after(self, stage: Int[Array, ""]) -> Int[Array, ""]:
+        """The next stage that takes steps; their number if there is none."""
+        count = len(self.limit)
+        index = jnp.arange(count)
+        return jnp.min(jnp.where((index > stage) & (self.limit > 0), index, count))
+
+    def step(self, fn, y, args, options, state, tags):
+        dtype = y.scale.dtype
+        last = state.stage == len(self.limit)
+        at = jnp.minimum(state.stage, len(self.limit) - 1)
+        args = _held(args, self.free[at])
+        sizes = sizes_of(args, y, self.dtype)
+
+        lin, prediction = jax.lax.cond(
+            state.stale,
+            lambda _: _linearise_anew(args, state.observations, y, self.dtype),
+            lambda _: (state.final.lin, state.prediction),
+            None,
+        )
+        problem: Problem = args.with_prediction(prediction)
+        share = jnp.where(last, state.bent.astype(dtype), state.share)
+        curvature = curvature_if(share > 0, problem, lin, y, sizes)
+        bent = bend(lin, curvature, share)
+        known = jnp.sum(lin.costs)
+        trial = attempt(problem, y, bent, sizes, state.damping, state.caution, last)
+        accept, before = trial.accepted, jnp.sum(trial.terms)
+        enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
+        done = _is_done(trial, known, enough)
+        nth = state.searched
+        near = accept & ((nth == 0) | (known - before < NEAR * known))
+        look = trial.finite & (near & (nth < 2) | done & (nth < 3))
+        least = jnp.where(nth == 0, *LOST).astype(dtype)
+        new_y, terms = jax.lax.cond(
+            look,
+            lambda s, t: triangulate_anew(problem, s, t, least),
+            lambda s, t: (s, t),
+            *(trial.state, trial.terms),
+        )
+        cost = jnp.sum(terms)
+        found = before - cost > enough
+        done = done & ~found
+        damping = trial.next_damping(state.growth)
+        stuck = ~accept & ~done & ~found & (damping > MAX_DAMPING)
+        broken = ~jnp.isfinite(known)
+        row = jnp.where(last, len(self.limit), at)
+        steps = state.steps.at[row].add(1, mode="drop")
+        spent = ~done & (steps[at] >= self.limit[at])
+        result = optx.RESULTS.where(
+            spent, optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.successful
+        )
+        result = optx.RESULTS.where(stuck, optx.RESULTS.nonlinear_divergence, result)
+        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
+        over = done | stuck | broken | spent
+        following = jnp.where(over, self._after(at), state.stage)
+        # Away from a minimum the curvature may have no inverse: then without it.
+        sound = ~state.bent | jnp.isfinite(trial.predicted)
+        share = next_share(state.share, accept, known - before, known)
+        share = jnp.where(self.damping > 0, share, 0.0)  # Gauss-Newton knows none
+        i, old = state.steps[at], state.history
+        put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
+        history = History(
+            put(put(old.cost, i, known), i + 1, cost),
+            put(put(old.terms, i, lin.costs), i + 1, terms),
+            put(old.damping, i, trial.damping),
+            put(old.step, i, jnp.sqrt(trial.length)),
+            put(old.accepted, i, accept | found),
+        )
+        loop = Loop(
+            stage=following,
+            prediction=prediction,
+            observations=state.observations,
+            final=final_of(lin, trial.eliminated),
+            stale=accept | found | over | last,
+            damping=jnp.where(over, self.damping, damping).astype(dtype),
+            caution=trial.caution,
+            searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
+            growth=jnp.where(accept | over, 2.0, 2 * state.growth).astype(dtype),
+            cost=cost,
+            first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
+            steps=steps,
+            share=jnp.where(over, 0.0, share).astype(dtype),
+            bent=state.bent & ~last,
+            finished=(last & sound) | ((following == len(self.limit)) & ~self.keep),
+            result=optx.RESULTS.where(last, state.result, result),
+            history=history,
+        )
+        return new_y, loop, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        result = optx.RESULTS.where(
+            state.finished, state.result, optx.RESULTS.successful
+        )
+        return state.finished, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        names = ("history", "cost", "first_cost", "steps", "final")
+        return y, aux, {name: getattr(state, name) for name in names}
+
+
+def _held(problem: Problem, free: Float[Array, " v"]) -> Problem:
+    """The problem with whole groups held besides those that are."""
+    parts = {n: free[i] * getattr(problem.free, n) for i, n in enumerate(VARIABLES)}
+    return eqx.tree_at(lambda p: p.free, problem, Step(**parts))
+
+
+def _is_done(
+    trial: Trial, known: Float[Array, ""], enough: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a step would gain less than is worth another one."""
+    # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
+    eps = float(jnp.finfo(known.dtype).eps)
+    floor = 8 * eps * known + eps**1.25
+    small = trial.predicted <= jnp.maximum(enough, floor)
+    undisturbed = trial.accepted & (trial.damping <= 1e-2)
+    return trial.finite & ((trial.predicted <= floor) | (small & undisturbed))
+
+
+def _first(problem, observations, state, dtype):
+    lin, prediction = _linearise_anew(problem, observations, state, dtype)
+    sizes = sizes_of(problem, state, dtype)
+    extra = damped(diagonals(lin, sizes), jnp.ones_like(state.scale))
+    return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
+
+
+def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
+    """What a solve leaves of a factorisation."""
+    people = eliminated.people
+    return Final(lin, eliminated.factor, None if people is None else people.roots)
+
+
+def _linearise_anew(problem, observations, state, dtype):
+    seen = problem.predict(state)
+    problem = problem.with_prediction(seen)
+    lin = linearise(problem, observations, state, dtype)
+    return with_coupling(problem, lin, state), seen
+
+
+def lifted(state: State, problem: Problem) -> list[Array]:
+    """Lifted residuals of all factors, as a stock solver sees them."""
+    return [lift(f.loss, residual_of(f, state)) for f in problem.factors]

@@ -1,0 +1,81 @@
+"""How far to go along a step: trials on the true robust cost.
+
+A trial leaves behind the landmarks that the step throws off, so that a few bad points
+do not hold up the step of all others.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.graph import Problem, Reprojection, State
+from bodyslam_jax.solver.retriangulation import cost_by_landmark, tracks_of
+
+
+def search(problem, state, move, slope, predicted, terms):
+    """The full step, and the one that a parabola through its cost finds better.
+
+    Robust losses bend more than `J^T J` knows: full steps then overshoot to and fro.
+    The second evaluation is a few per cent of an iteration. Returns the better state,
+    landmarks left behind, the share of the step, the terms there, and actual over
+    predicted decrease of the full step.
+    """
+    known = jnp.sum(terms)
+
+    def one(carry, _):
+        share, place, thrown, best, best_terms, full = carry
+        moved = state.retract(jax.tree.map(lambda x: share * x, move))
+        moved, off, new = _settle(problem, state, moved)
+        cost = jnp.sum(new)
+        cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        better = cost < jnp.sum(best_terms)
+        best = jnp.where(better, share, best)
+        best_terms = jnp.where(better, new, best_terms)
+        place = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, place)
+        thrown = jnp.where(better, off, thrown)
+        full = jnp.where(jnp.isnan(full), cost, full)
+        # cost(a) = known - slope a + bend a^2, through the full step
+        bend = full - known + slope
+        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
+        vertex = jnp.where(bend > 0, vertex, 2.0)
+        share = jnp.clip(vertex, 0.1, 2.0)
+        return (share, place, thrown, best, best_terms, full), None
+
+    one_ = jnp.ones_like(known)
+    none = jnp.zeros(len(state.landmarks), bool)
+    start = (one_, state, none, one_, terms, jnp.nan * one_)
+    found, _ = jax.lax.scan(one, start, length=2)
+    _, place, thrown, best, best_terms, full = found
+    gain = (known - full) / jnp.where(predicted > 0, predicted, 1.0)
+    return place, thrown, best, best_terms, jnp.clip(gain, -1.0, 2.0)
+
+
+def _settle(
+    problem: Problem, state: State, moved: State
+) -> tuple[State, Bool[Array, " l"], Float[Array, " k"]]:
+    """A trial in which landmarks that the step throws off stay behind; which they are;
+    and its costs.
+
+    A point that few frames see, or that an outlier pulls, may be sent behind the
+    cameras; given the cameras its cost is its own, so that it need not hold up the
+    step of all others.
+    """
+    tracks = tracks_of(problem)
+    keep = jnp.zeros(len(state.landmarks), bool)
+    of_tracks = jnp.zeros_like(state.scale)
+    if tracks is not None:
+        # One map over both: cameras are gathered once for all observations.
+        both = jnp.stack([state.landmarks, moved.landmarks])
+        at = lambda x: eqx.tree_at(lambda s: s.landmarks, moved, x)
+        found = jax.vmap(lambda x: cost_by_landmark(problem, tracks, at(x)))(both)
+        here, there = zip(*found, strict=True)
+        keep = ~(there[0] + there[1] <= here[0] + here[1])
+        landmarks = jnp.where(keep[:, None], state.landmarks, moved.landmarks)
+        moved = eqx.tree_at(lambda s: s.landmarks, moved, landmarks)
+        of_tracks = 0.5 * jnp.sum(jnp.where(keep, here[0], there[0]))
+    costs = [
+        of_tracks if isinstance(f, Reprojection) else f.cost(moved)
+        for f in problem.follow(moved).factors
+    ]
+    return moved, keep, jnp.stack(costs)

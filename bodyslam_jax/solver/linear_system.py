@@ -1,0 +1,213 @@
+"""One damped step of the joint problem, by elimination.
+
+`(H + λ diag H) δ = -J^T r`: landmarks first, then inner postures, then the chunks of
+cameras and people from one end to the other, globals and lasting landmarks at the end;
+and back. A coordinate that no measurement sees has a zero row, gets 1 on its diagonal,
+and stays where it is.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph import Problem, State, Step
+from bodyslam_jax.solver.apart import (
+    apart_diagonal,
+    join_poses,
+    solve_apart,
+    split_poses,
+)
+from bodyslam_jax.solver.block_cholesky import Factor, back_substitute, factorise
+from bodyslam_jax.solver.blocks import (
+    CAMERAS,
+    Linearisation,
+    Sizes,
+    cast,
+    own_to_global,
+)
+from bodyslam_jax.solver.elimination.person import (
+    People,
+    eliminate_people,
+    substitute_people,
+)
+from bodyslam_jax.solver.elimination.schur import (
+    eliminate_landmarks,
+    substitute_landmarks,
+)
+from bodyslam_jax.solver.front import Window, window_of
+from bodyslam_jax.solver.long_tracks import move_lasting
+from bodyslam_jax.solver.reduced_system import assemble
+
+
+class Eliminated(eqx.Module):
+    """All that back-substitution needs."""
+
+    damping: dict
+    window: Window
+    people: People | None
+    factor: Factor
+
+
+def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
+    """The diagonal of `J^T J`, by group; landmarks in the order of the tables."""
+    dtype = lin.globals.dtype
+    t = sizes.chunks * CAMERAS // 6
+    diagonal = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).astype(dtype)
+    camera = jnp.zeros((t, 6), dtype)
+    for key in (("alone", "alone", 0), ("camera", "camera", 0)):
+        if key in lin.blocks:
+            camera = camera + diagonal(lin.blocks[key]).reshape(-1, t, 6).sum(axis=0)
+    root = jnp.zeros((sizes.people, t, 6), dtype)
+    if ("root", "root", 0) in lin.blocks:
+        root = diagonal(lin.blocks["root", "root", 0])
+    result = {
+        "globals": diagonal(lin.globals),
+        "camera": camera,
+        "root": root,
+        "landmarks": tuple(
+            jnp.moveaxis(jnp.diagonal(table.own, axis1=1, axis2=2), 2, 1).astype(dtype)
+            for table in lin.landmarks
+        ),
+    }
+    if "pose" in lin.gradient:
+        result["pose"] = _pose_diagonal(lin)
+    if "apart" in lin.gradient:
+        result["apart"] = apart_diagonal(lin)
+    return result
+
+
+def _pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
+    total = jnp.zeros_like(lin.gradient["pose"])
+    flat = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).reshape(*x.shape[:2], -1)
+    if 0 in lin.limbs:
+        found = [flat(x) for x in lin.limbs[0]]
+        total = total + jnp.concatenate(found, axis=-1).astype(total.dtype)
+    joint = lin.blocks.get(("joint", "joint", 0))
+    if joint is not None:
+        total = total + flat(joint).astype(total.dtype)
+    return total
+
+
+UNSEEN = 1e-12
+"""Weight of a coordinate that no measurement sees, for covariances: next to nothing."""
+
+
+def damped(
+    diagonal: dict,
+    damping: Float[Array, ""],
+    unseen: float | Float[Array, ""] = 1.0,
+) -> dict:
+    """What Marquardt's damping adds to the diagonal; `unseen` where that is 0."""
+    tiny = jnp.finfo(damping.dtype).tiny ** 0.5
+    add = lambda d: jnp.where(d > tiny, damping * d, unseen)
+    return jax.tree.map(add, diagonal)
+
+
+@eqx.filter_jit
+def eliminate(
+    problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
+) -> Eliminated:
+    """Factorises the damped normal equations, in the precision of `sizes`."""
+    lin, damping = cast((lin, damping), sizes.dtype)
+    reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
+    window = window_of(lin, sizes)
+    people = None
+    if sizes.people:
+        people = eliminate_people(lin, sizes, window, damping)
+    kept = None if people is None else people.kept
+    order = problem.layout.order
+    chunks = assemble(lin, sizes, reduced, kept, window, damping, order)
+    return Eliminated(damping, window, people, factorise(chunks, sizes))
+
+
+@eqx.filter_jit
+def solve_step(
+    problem: Problem,
+    state: State,
+    lin: Linearisation,
+    sizes: Sizes,
+    eliminated: Eliminated,
+) -> Step:
+    """The step that solves the factorised equations, in the state's own precision."""
+    h, n = sizes.people, sizes.chunks
+    lin, zero = cast((lin, state.zero_step()), sizes.dtype)
+    steps, common = back_substitute(eliminated.factor, sizes)
+    head = steps.shape[1] - CAMERAS
+    of_cameras = lambda x: x[:, head:].reshape(n * CAMERAS // 6, 6)
+    as_they_stand = of_cameras(steps)
+    if problem.layout.order is not None:
+        steps = steps[jnp.argsort(problem.layout.order)]
+    cameras = of_cameras(steps)
+    roots, poses = zero.roots, zero.poses
+    if eliminated.people is not None:
+        steps = steps[:, :head].reshape(n, h, -1).swapaxes(0, 1)
+        own = jnp.stack([common[own_to_global(sizes, p)] for p in range(h)])
+        roots, moved = substitute_people(
+            eliminated.people, sizes, eliminated.window, steps, cameras, own
+        )
+        found = {} if moved is None else {"pose": moved}
+        if "apart" in lin.gradient:
+            found["apart"] = solve_apart(lin, eliminated.damping["apart"])
+        poses = join_poses(found, sizes.joints, poses)
+    i = sizes.intrinsics
+    intrinsics = common[1 : 1 + i] if i else zero.intrinsics
+    landmarks = substitute_landmarks(
+        problem,
+        lin.landmarks,
+        eliminated.damping["landmarks"],
+        as_they_stand,
+        common[1 : 1 + i],
+        move_lasting(problem, common[sizes.globals :], zero.landmarks),
+    )
+    step = Step(
+        scale=common[0],
+        cameras=cameras,
+        roots=roots,
+        poses=poses,
+        shapes=common[1 + i : sizes.globals].reshape(h, 10),
+        landmarks=landmarks,
+        intrinsics=intrinsics,
+    )
+    return cast(step, state.scale.dtype)
+
+
+def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
+    """`δ^T diag(H) δ`"""
+    total = jnp.sum(diagonal["camera"] * step.cameras**2)
+    total = total + jnp.sum(diagonal["root"] * step.roots**2)
+    total = total + jnp.sum(diagonal["globals"] * _globals(diagonal, step) ** 2)
+    for name, moved in split_poses(step.poses, problem.layout.joints).items():
+        if name in diagonal:
+            total = total + jnp.sum(diagonal[name] * moved**2)
+    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
+        moved = step.landmarks[bucket.landmark]
+        total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
+    return total
+
+
+def slope_along(problem, lin, step):
+    """`g^T δ`"""
+    total = jnp.sum(lin.globals_gradient * _globals({"globals": lin.globals}, step))
+    gradient = lin.gradient
+    if "camera_alone" in gradient:
+        total = total + jnp.sum(gradient["camera_alone"] * step.cameras)
+    if "camera" in gradient:
+        total = total + jnp.sum(gradient["camera"] * step.cameras)
+    if "root" in gradient:
+        total = total + jnp.sum(gradient["root"] * step.roots)
+    for name, moved in split_poses(step.poses, problem.layout.joints).items():
+        if name in gradient:
+            total = total + jnp.sum(gradient[name] * moved)
+    for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
+        moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
+        total = total + jnp.sum(table.gradient * moved)
+    return total
+
+
+def _globals(like, step):
+    """Globals in one vector; intrinsics only if they are among them."""
+    count = like["globals"].shape[0] - 1 - step.shapes.size
+    return jnp.concatenate(
+        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
+    )

@@ -1,0 +1,55 @@
+"""The normal equations at a state: `J^T J` and `J^T r`, formed where they are not 0.
+
+Factors over frames give blocks between variables of nearby frames
+(`linearise/frame.py`), landmarks dense tables, frames by landmarks of a group
+(`linearise/landmark.py`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.graph import (
+    AbstractFrameFactor,
+    LandmarkPrior,
+    Problem,
+    Reprojection,
+    State,
+)
+from bodyslam_jax.solver.blocks import Linearisation, Observations, Sums, sizes_of
+from bodyslam_jax.solver.linearise.frame import linearise_frames
+from bodyslam_jax.solver.linearise.landmark import add_prior, linearise_landmarks
+
+
+@eqx.filter_jit
+def linearise(
+    problem: Problem,
+    observations: Observations | None,
+    state: State,
+    dtype: np.dtype | None = None,
+) -> Linearisation:
+    """All blocks at a state; held coordinates have zero rows and columns.
+
+    Blocks are kept in `dtype`, gradients and costs in the state's own.
+    """
+    sums = Sums(sizes_of(problem, state, dtype), state)
+    landmarks, priors = (), []
+    for factor in problem.factors:
+        if isinstance(factor, Reprojection):
+            landmarks = linearise_landmarks(problem, factor, observations, state, sums)
+        elif isinstance(factor, LandmarkPrior):
+            priors.append(factor)
+            sums.costs.append(factor.cost(state))
+        elif isinstance(factor, AbstractFrameFactor):
+            linearise_frames(problem, factor, state, sums)
+    for prior in priors:
+        landmarks = add_prior(problem, prior, state, landmarks)
+    return Linearisation(
+        sums.blocks,
+        sums.limbs,
+        sums.gradient,
+        sums.globals,
+        sums.globals_gradient,
+        landmarks,
+        jnp.stack(sums.costs),
+    )

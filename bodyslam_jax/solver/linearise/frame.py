@@ -1,0 +1,243 @@
+"""The blocks of factors over frames, from the variables that each factor touches.
+
+All derivatives of one frame, those by globals and the residual stand side by side; one
+Gram matrix a frame then holds every block and every gradient.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph import (
+    AbstractFrameFactor,
+    Frame,
+    Problem,
+    State,
+    inverse_right_jacobian,
+    squared_norm,
+)
+from bodyslam_jax.solver.apart import groups_of, pick, split_poses
+from bodyslam_jax.solver.blocks import Sums, shifted
+from bodyslam_jax.solver.elimination.limbs import diagonal, squares
+
+_RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
+_GROUP = {
+    "pose": "poses",
+    "root": "roots",
+    "camera": "cameras",
+    "shape": "shapes",
+    "scale": "scale",
+    "intrinsics": "intrinsics",
+}
+_LOCAL = ("pose", "root", "camera")
+_COMMON = ("scale", "intrinsics", "shape")
+
+
+def linearise_frames(
+    problem: Problem, factor: AbstractFrameFactor, state: State, sums: Sums
+) -> None:
+    """Adds all blocks of one factor to `sums`; held coordinates have zeros."""
+    touches = [t for t in factor.touches if _GROUP[t[0]] in problem.variables]
+    if not touches:
+        sums.costs.append(factor.cost(state))
+        return
+    joint = factor.per_joint
+    residual, parts = _derivatives(factor, touches, state, sums)
+    s = squared_norm(residual)
+    sums.costs.append(0.5 * jnp.sum(factor.loss.rho(s)))
+    root_weight = jnp.sqrt(factor.loss.weight(s))[..., None]
+    if not factor.of_people:
+        residual, root_weight = residual[None], root_weight[None]
+        parts = {touch: part[None] for touch, part in parts.items()}
+    # One more axis for the joints that do not interact; the rows of a frame in one.
+    lead = residual.shape[: 3 if joint else 2]
+    rows = lambda x, *width: x.reshape(*lead, -1, *width)
+    weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
+    # Postures first: their limbs do not touch each other (`_add_products`).
+    local = sorted((t for t in touches if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
+    columns = []
+    for touch in local:
+        free = _free_of(problem, *touch, joint)
+        part = parts[touch]
+        if touch[0] == "pose" and not joint:
+            part, free = (pick(x, sums.sizes.joints, width=3) for x in (part, free))
+        columns.append(rows(part, part.shape[-1]) * free[..., None, :])
+    common = [name for name in _COMMON if (name, 0) in touches]
+    if common:
+        widths = dict(scale=1, intrinsics=sums.sizes.intrinsics, shape=10)
+        for name in _COMMON:
+            if name in common:
+                free = _free_of_shared(problem, name, factor.of_people)
+                columns.append(rows(parts[name, 0], widths[name]) * free)
+            else:
+                columns.append(jnp.zeros((*weight.shape[:-1], widths[name]), s.dtype))
+    columns.append(rows(residual, 1))
+    _add_products(sums, local, bool(common), columns, weight, factor)
+
+
+def _derivatives(factor, touches, state, sums):
+    """The residual of all frames, and its derivative by each of the touches."""
+    known = factor.jacobians(state)
+    if known is not None:
+        return known
+    local = [t for t in touches if t[0] in _LOCAL]
+    common = [t for t in touches if t[0] not in _LOCAL]
+    width = {"pose": 3 if factor.per_joint else 69, "root": 6, "camera": 6}
+    width |= {"scale": 1, "intrinsics": sums.sizes.intrinsics, "shape": 10}
+    ordered = [*local, *common]
+    ends = [sum(width[n] for n, _ in ordered[: i + 1]) for i in range(len(ordered))]
+    parts = {
+        touch: slice(end - width[touch[0]], end)
+        for touch, end in zip(ordered, ends, strict=True)
+    }
+
+    def one(data, window, shared, turns):
+        known = factor.jacobian(data, window, shared)
+        if known is not None:
+            return known
+
+        def moved(step):
+            if factor.per_joint:
+                step = jnp.broadcast_to(step, (23, ends[-1]))
+            frames, rest = list(window), shared
+            for name, lag in local:
+                change = step[..., parts[name, lag]]
+                frames[lag] = _move(frames[lag], name, change, turns[lag])
+            for name, _ in common:
+                rest = _move_shared(rest, name, step[..., parts[name, 0]])
+            residual = factor.local(data, tuple(frames), rest)
+            return residual, residual
+
+        zero = jnp.zeros(ends[-1], state.scale.dtype)
+        jac, residual = jax.jacfwd(moved, has_aux=True)(zero)
+        return residual, {touch: jac[..., part] for touch, part in parts.items()}
+
+    turns: tuple = (None,) * factor.num_lags
+    if any(name == "pose" for name, _ in local):
+        turn = inverse_right_jacobian(state.poses)
+        turns = tuple(shift_back(turn, lag) for lag in range(factor.num_lags))
+    return factor.map_frames(one, state, turns)
+
+
+def _add_products(sums, local, has_common, columns, weight, factor):
+    joint, of_people = factor.per_joint, factor.of_people
+    ends = [sum(c.shape[-1] for c in columns[: i + 1]) for i in range(len(columns))]
+    parts = [slice(e - c.shape[-1], e) for e, c in zip(ends, columns, strict=True)]
+    whole = jnp.concatenate(columns, axis=-1) * weight
+    jac = whole.astype(sums.sizes.dtype)
+    # Of one posture with itself, which has most coordinates, limbs are worked on alone.
+    alone = not joint and [name for name, _ in local].count("pose") == 1
+    skip = ends[0] if alone else 0
+    gram = _products(jac[..., skip:], jac)
+    if jac.dtype == whole.dtype:
+        slope = gram[..., -1, :]
+    else:
+        slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
+    # A term of frame k about frame k - lag.
+    shift = lambda x, lag: shifted(x, -lag, 1)
+    spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
+    turned = lambda x: x.swapaxes(-1, -2)
+    beyond = lambda part: slice(part.start - skip, part.stop - skip)
+    squeeze = (lambda x: x) if of_people else (lambda x: x[0])
+    for i, (name, lag) in enumerate(local):
+        own = shift(slope[..., parts[i]], lag)
+        if joint:
+            for group, part in split_poses(own, sums.sizes.joints).items():
+                sums.add_gradient(group, part)
+        else:
+            sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
+        for j, (other, other_lag) in enumerate(local):
+            here, there = (_RANK[name], lag), (_RANK[other], other_lag)
+            if here > there:
+                continue
+            if alone and i == j == 0:
+                limbs = squares(sums.sizes.widths, jac[..., :skip])
+                sums.add_limbs(0, [shift(x, lag) for x in limbs])
+                continue
+            block = shift(turned(gram[..., beyond(parts[j]), parts[i]]), lag)
+            if joint:
+                # Joints that do not interact here stay so: 3 x 3 each.
+                for group, joints in groups_of(sums.sizes.joints).items():
+                    group = "joint" if group == "pose" else group
+                    part = pick(block, joints, 2)
+                    sums.add((group, group, other_lag - lag), part)
+                continue
+            key = (name, other) if of_people else ("alone", "alone")
+            if key == ("pose", "pose"):
+                sums.add_limbs(other_lag - lag, diagonal(sums.sizes.widths, block))
+            else:
+                sums.add((*key, other_lag - lag), squeeze(block))
+        if has_common:
+            block = shift(turned(gram[..., beyond(spread), parts[i]]), lag)
+            sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
+    if has_common:
+        n = sums.sizes.own_globals if of_people else 1 + sums.sizes.intrinsics
+        total = jnp.sum(gram[..., beyond(spread), spread], axis=1).astype(whole.dtype)
+        down = jnp.sum(slope[..., spread], axis=1)
+        for person in range(total.shape[0]):
+            sums.add_globals(
+                person if of_people else None,
+                total[person, :n, :n],
+                down[person, :n],
+            )
+
+
+def _products(a: Float[Array, "*b r p"], b: Float[Array, "*b r q"]) -> Array:
+    """Of all columns of one with those of the other; few rows fused."""
+    if a.shape[-2] > 3:
+        return jnp.einsum("...ra,...rb->...ab", a, b)
+    term = lambda r: a[..., r, :, None] * b[..., r, None, :]
+    return sum((term(r) for r in range(1, a.shape[-2])), term(0))
+
+
+def shift_back(x: Float[Array, "h t *b"], lag: int) -> Float[Array, "h t *b"]:
+    """What frame k - lag holds, at frame k; the first repeats."""
+    return x[:, jnp.maximum(jnp.arange(x.shape[1]) - lag, 0)]
+
+
+def _move(frame, name, step, turn):
+    """First order in the step, which is all that a derivative at 0 sees."""
+    if name == "pose":
+        step = jnp.einsum("jab,jb->ja", turn, step.reshape(23, 3))
+        return Frame(frame.camera, frame.root, frame.pose + step)
+    if name == "root":
+        return Frame(frame.camera, _nudge(frame.root, step), frame.pose)
+    return Frame(_nudge(frame.camera, step), frame.root, frame.pose)
+
+
+def _nudge(pose, step):
+    """`retract_pose` to first order."""
+    rotation = pose[:3, :3]
+    rotation = rotation + jnp.cross(rotation, jnp.broadcast_to(step[:3], (3, 3)))
+    top = jnp.concatenate([rotation, (pose[:3, 3] + step[3:])[:, None]], axis=1)
+    return jnp.concatenate([top, pose[3:]], axis=0)
+
+
+def _move_shared(shared, name, step):
+    changed = getattr(shared, name)
+    changed = changed + (step[0] if name == "scale" else step)
+    return eqx.tree_at(lambda s: getattr(s, name), shared, changed)
+
+
+def _free_of(problem, name, lag, joint):
+    """Mask of a variable `lag` frames back; people share the cameras'."""
+    if name == "camera":
+        free = problem.free.cameras[None]
+    elif name == "root":
+        free = problem.free.roots
+    else:
+        free = problem.free.poses
+        free = free if joint else free.reshape(*free.shape[:2], 69)
+    if lag:
+        free = jnp.concatenate([free[:, :lag], free[:, :-lag]], axis=1)
+    return free
+
+
+def _free_of_shared(problem, name, of_people):
+    if name == "scale":
+        return problem.free.scale[None]
+    if name == "intrinsics":
+        return problem.free.intrinsics
+    free = problem.free.shapes[:, None, None, :]
+    return free if of_people else free[0]

@@ -1,0 +1,181 @@
+"""The blocks of landmarks: dense tables of frames by landmarks of a group.
+
+All buckets are linearised at once, as pieces of one chunk's frames by `g` landmarks.
+What observations say is worked out in the camera frame (`linearise/projection.py`).
+Cameras take the sum over their landmarks, which is then turned to the axes of their
+steps.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from bodyslam_jax.graph import CHUNK, LandmarkPrior, Problem, Reprojection, State
+from bodyslam_jax.solver.blocks import LandmarkBlocks, Observations, Sums
+from bodyslam_jax.solver.linearise.projection import (
+    Pixels,
+    cross,
+    dot,
+    see,
+    symmetric,
+    times,
+    transposed,
+)
+
+
+def gather(problem: Problem) -> Observations | None:
+    """Measurements of landmarks in the order of the tables; `None` without any."""
+    buckets = problem.layout.buckets
+    factor = next((f for f in problem.factors if isinstance(f, Reprojection)), None)
+    if factor is None or not buckets:
+        return None
+    row = jnp.concatenate([_cut(b.row) for b in buckets])
+    landmark = jnp.concatenate([jnp.repeat(b.landmark, b.width, 0) for b in buckets])
+    chunks = [
+        b.first_chunk[:, None] + np.arange(b.width, dtype=np.int32) for b in buckets
+    ]
+    chunk = jnp.concatenate([c.reshape(-1) for c in chunks])
+    order = problem.layout.order
+    return Observations(
+        pixel=jnp.moveaxis(factor.pixel[row], -1, 2),
+        weight=1 / factor.sigma[row],
+        chunk=chunk if order is None else order[chunk],
+        landmark=landmark,
+    )
+
+
+def _cut(table: Int[Array, "n f g"]) -> Int[Array, "u b g"]:
+    return table.reshape(-1, CHUNK, table.shape[-1])
+
+
+def frames_of(first_chunk: Int[Array, " n"], width: int) -> Int[Array, "n f"]:
+    """Frames that each group spans, as their chunks stand."""
+    within = jnp.arange(width * CHUNK, dtype=first_chunk.dtype)
+    return first_chunk[:, None] * CHUNK + within
+
+
+def linearise_landmarks(
+    problem: Problem,
+    factor: Reprojection,
+    seen: Observations | None,
+    state: State,
+    sums: Sums,
+) -> tuple[LandmarkBlocks, ...]:
+    """Tables of all buckets; what cameras and intrinsics gather goes to `sums`."""
+    sizes = sums.sizes
+    dtype = sizes.dtype
+    if seen is None:
+        sums.costs.append(jnp.zeros((), state.scale.dtype))
+        return ()
+    pixels = see(problem, factor, seen, state, sizes)
+    sums.costs.append(pixels.cost)
+    if sizes.intrinsics:
+        # The scale, first of the globals, moves no pixel.
+        sums.add_globals(
+            None,
+            jnp.pad(pixels.intrinsics, ((1, 0), (1, 0))),
+            jnp.pad(pixels.intrinsics_slope, (1, 0)),
+        )
+    free_c = jnp.zeros((len(seen.chunk), CHUNK, 6), dtype)
+    if "cameras" in sizes.variables:
+        _add_cameras(problem, seen, state, pixels, sums)
+        free_c = problem.free.cameras.reshape(-1, CHUNK, 6)[seen.chunk].astype(dtype)
+    free = jnp.moveaxis(problem.free.landmarks[seen.landmark], 2, 1)
+    free_l = free.astype(dtype)
+    C = [[x.astype(dtype) for x in column] for column in pixels.C]
+    rows = transposed(C)
+    # P^T P C^T, and C times that
+    by_l = [times(pixels.square, row) for row in rows]
+    moved = symmetric(lambda i, j: dot(rows[i], by_l[j]))
+    turned = transposed([cross(x, pixels.point) for x in by_l])
+    side = [jnp.stack(x, 2) for x in turned] + [-jnp.stack(x, 2) for x in moved]
+    table = jnp.stack(side, 2) * free_c[..., None, None] * free_l[:, None, None]
+    down = lambda vector: jnp.stack([jnp.sum(x, axis=1) for x in vector], 1)
+    own = jnp.stack([down(x) for x in moved], 1) * free_l[:, None] * free_l[:, :, None]
+    common = [down(times(C, x)) * free_l for x in pixels.by_intrinsics]
+    slope = down(times(pixels.C, pixels.slope)) * free
+    tables, start = [], 0
+    for bucket in problem.layout.buckets:
+        n, f, g = bucket.row.shape
+        here = slice(start, start + n * bucket.width)
+        start = here.stop
+        over = lambda x, here=here, n=n: (
+            x[here].reshape(n, -1, *x.shape[1:]).sum(axis=1)
+        )
+        none = [jnp.zeros((n, 0, 3, g), dtype)]
+        mixed = [over(x)[:, None] for x in common]
+        tables.append(
+            LandmarkBlocks(
+                cross=table[here].reshape(n, f, 6, 3, g),
+                cross_intrinsics=jnp.concatenate(mixed or none, axis=1),
+                own=over(own),
+                gradient=over(slope),
+            )
+        )
+    return tuple(tables)
+
+
+def _add_cameras(
+    problem: Problem, seen: Observations, state: State, pixels: Pixels, sums: Sums
+) -> None:
+    """Adds what all landmarks of a frame say of its camera."""
+    sizes, point = sums.sizes, pixels.point
+    chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
+    belongs = chunk == seen.chunk
+    # As a product: a scatter would take its pieces one by one.
+    of_frames = lambda x: (belongs.astype(x.dtype) @ x.reshape(len(x), -1)).reshape(
+        -1, *x.shape[2:]
+    )
+    total = lambda columns: jnp.stack(
+        [jnp.stack([jnp.sum(x, axis=-1) for x in column], -1) for column in columns], -1
+    )
+    # By the turn and by the place in the camera's axes: dp_C = [p]x ω - C^T dr'
+    half = [cross(x, point) for x in pixels.square]
+    rows = transposed(half)
+    both = symmetric(lambda i, j: cross(rows[i], point)[j])
+    corner, side = total(both), -total(half)
+    upper = jnp.concatenate([corner, side], axis=-1)
+    lower = jnp.concatenate([side.swapaxes(-1, -2), total(pixels.square)], axis=-1)
+    free = problem.free.cameras
+    C, none = state.cameras[:, :3, :3], jnp.zeros_like(state.cameras[:, :3, :3])
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=C.dtype), C.shape)
+    turn = jnp.block([[eye, none], [none, C]]) * free[..., None]
+    low = turn.astype(sizes.dtype)
+    block = of_frames(jnp.concatenate([upper, lower], axis=-2))
+    sums.add(("alone", "alone", 0), low @ block @ low.swapaxes(-1, -2))
+    both_ways = lambda x: [*cross(x, point), *(-y for y in x)]
+    slope = of_frames(total([both_ways(pixels.slope)]))
+    sums.add_gradient("camera_alone", (turn @ slope)[..., 0])
+    if sizes.intrinsics:
+        mixed = low @ of_frames(total([both_ways(x) for x in pixels.by_intrinsics]))
+        sums.add(("alone", "globals", 0), jnp.pad(mixed, ((0, 0), (0, 0), (1, 10))))
+
+
+def add_prior(
+    problem: Problem,
+    prior: LandmarkPrior,
+    state: State,
+    tables: tuple[LandmarkBlocks, ...],
+) -> tuple[LandmarkBlocks, ...]:
+    """The tables with what is known of their landmarks besides."""
+    free = problem.free.landmarks
+    error = prior.residual(state)
+    weight = prior.loss.weight(jnp.sum(error**2, axis=-1))[:, None]
+    jacobian = prior.whitening * free[:, None, :]
+    own = jnp.einsum("lki,lkj->lij", weight[..., None] * jacobian, jacobian)
+    gradient = jnp.einsum("lki,lk->li", jacobian, weight * error)
+    of = lambda x, bucket: jnp.moveaxis(
+        x.at[bucket.landmark].get(mode="fill", fill_value=0.0), 1, -1
+    )
+    return tuple(
+        eqx.tree_at(
+            lambda t: (t.own, t.gradient),
+            table,
+            (
+                table.own + of(own.astype(table.own.dtype), bucket),
+                table.gradient + of(gradient, bucket),
+            ),
+        )
+        for bucket, table in zip(problem.layout.buckets, tables, strict=True)
+    )

@@ -1,0 +1,249 @@
+"""`solve`: a problem and a first state in, the best state and how it was found out."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from bodyslam_jax.compilation import (
+    in_full_precision,
+    is_alone,
+    is_traced,
+    quick_options,
+)
+from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
+from bodyslam_jax.kept import kept
+from bodyslam_jax.solver import baselines
+from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.implicit import cotangent_of_problem
+from bodyslam_jax.solver.levenberg_marquardt import (
+    StructuredLevenbergMarquardt,
+    lifted,
+)
+from bodyslam_jax.solver.lm_state import Final
+from bodyslam_jax.solver.padding import pad, unpad
+from bodyslam_jax.solver.schedule import Solver, Stage, check_names, check_schedule
+from bodyslam_jax.solver.solution import Solution, only, outcome
+
+HISTORY = 64
+"""The length of a history is a multiple of this: schedules share a compilation."""
+
+
+def solve(
+    problem: Problem,
+    state: State,
+    *,
+    solver: Solver = "structured",
+    schedule: tuple[Stage, ...] = (Stage(),),
+    damping: float = 1e-4,
+    mixed_precision: bool = False,
+) -> Solution:
+    """Minimises the cost of a problem from a first state.
+
+    - `solver`: `structured` is the one for real videos. The others are baselines for
+      small problems: `optimistix` and `jaxopt_lm` (Levenberg-Marquardt), `jaxopt_gn`
+      (Gauss-Newton) and `adam` (first-order steps, as many as a stage has).
+    - `schedule`: stages one after another, each with its free variables, most steps
+      and tolerances; `PAPER_SCHEDULE` is the paper's.
+    - `damping`: of the first step of each stage, as a share of each variable's own
+      curvature; later steps adapt it, and once they gain little know what keypoints
+      bend, too, which `J^T J` leaves out. 0 is Gauss-Newton: full steps of `J^T J`, as
+      long as they lower the cost. Baselines have their own.
+    - `mixed_precision`: of `structured`, solves for steps in single precision, in two
+      thirds of the time for long videos; residuals, gradients and costs, and so where
+      it ends, keep that of `state`. Flat directions are damped a little more.
+
+    Pure: jits, differentiates, and maps over problems or states of one shape: one after
+    another on a CPU, which is no slower there, at once elsewhere; `over_devices` gives
+    each device a share. Threads may solve at the same time.
+
+    Derivatives, of `structured`, are those of `state` and `cost` with respect to all of
+    `problem`, by the implicit function theorem; a solution does not depend on where it
+    started. What the last stage holds counts as given, also where an earlier one moved
+    it. They are NaN where their equations could not be solved.
+
+    **Raises:** `ValueError` if `state` does not have the sizes and the precision the
+    problem was made for, is not finite, or has poses that are not rigid, if there is no
+    factor, or no stage that takes a step, if `damping` is negative, if factors put in
+    later see joints together that those it was made with did not, or if a baseline is
+    to mix precisions. Failure to converge is a `status`, and so is what is not finite
+    within `jit`.
+    """
+    check_schedule(solver, schedule)
+    check_start(problem, state, damping)
+    if solver != "structured":
+        if mixed_precision:
+            raise ValueError(f"mixed_precision: {solver} has one precision only.")
+        return _solve_baseline(problem, state, solver, schedule)
+    check_limbs(problem)
+    padded, start = pad(problem, jax.lax.stop_gradient(state))
+    given = padded, start, schedule, damping, mixed_precision
+    solution = _differentiable(*given, is_alone())
+    sizes = len(state.cameras), len(state.landmarks)
+    return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *sizes))
+
+
+def check_start(problem: Problem, state: State, damping: float = 0.0) -> None:
+    """Refuses a problem that measures nothing, and a state that does not fit.
+
+    **Raises:** `ValueError` that says where, what was found and what was expected.
+    """
+    if not is_traced(damping) and not 0 <= damping < np.inf:
+        raise ValueError(f"damping: {damping}, expected 0 or more, and finite.")
+    if not problem.factors:
+        raise ValueError("problem.factors: found none, expected one or more.")
+    check_state(state, problem.free)
+
+
+def check_limbs(problem: Problem) -> None:
+    """Refuses factors that were put in later, where the layout does not hold them."""
+    known = [set(limb) for limb in problem.layout.limbs]
+    more = [x for x in limbs_of(problem.factors) if not any(set(x) <= y for y in known)]
+    if more and not is_traced(problem):
+        raise ValueError(
+            f"problem.factors: they see joints {list(more[0])} together, which those "
+            "that the problem was made with did not; make it anew with `make_problem`."
+        )
+
+
+def method_of(
+    schedule: tuple[Stage, ...],
+    damping: float,
+    dtype,
+    *,
+    keep: bool = False,
+    mixed: bool = False,
+) -> StructuredLevenbergMarquardt:
+    """The solver of a schedule: of two stages at least, of which one may be idle, so
+    that one stage, two, and none (for covariances) are the same program."""
+    idle = Stage(max_steps=0)
+    stages = (*schedule, *(idle,) * (2 - len(schedule)))
+    longest = max(stage.max_steps for stage in stages)
+    return StructuredLevenbergMarquardt(
+        free=jnp.asarray([[v in s.free for v in VARIABLES] for s in stages], dtype),
+        limit=jnp.asarray([s.max_steps for s in stages]),
+        rtol=jnp.asarray([s.rtol for s in stages], dtype),
+        atol=jnp.asarray([s.atol for s in stages], dtype),
+        damping=jnp.asarray(damping, dtype),
+        keep=jnp.asarray(keep),
+        length=HISTORY * max(1, -(-longest // HISTORY)),
+        dtype=np.dtype(np.float32 if mixed else dtype),
+    )
+
+
+def run(
+    problem: Problem,
+    state: State,
+    method: StructuredLevenbergMarquardt,
+    *,
+    alone: bool = False,
+) -> tuple[Solution, Final]:
+    """All stages on a padded problem, and the equations where they end.
+
+    `alone` is what `is_alone()` said before anything was traced.
+    """
+    given = problem, state, method
+    if is_traced(given):
+        return in_turn(_program(False))(*given)
+    return _program(alone)(*given)
+
+
+@functools.cache
+def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
+    return kept(_run, quick_options) if alone else eqx.filter_jit(_run)
+
+
+@in_full_precision
+def _run(problem, state, method):
+    found = optx.least_squares(
+        lifted, method, state, problem, max_steps=None, throw=False
+    )
+    return outcome(state, found.value, found.result, found.stats)
+
+
+@eqx.filter_custom_vjp
+def _differentiable(problem, state, schedule, damping, mixed, alone):
+    return _solve(problem, state, schedule, damping, mixed, alone)
+
+
+def _solve(problem, state, schedule, damping, mixed, alone):
+    method = method_of(schedule, damping, state.scale.dtype, mixed=mixed)
+    solution, _ = run(restrict_to_all(problem, schedule), state, method, alone=alone)
+    return only(solution, len(schedule))
+
+
+@_differentiable.def_fwd
+def _forward(perturbed, problem, state, schedule, damping, mixed, alone):
+    solution = _solve(problem, state, schedule, damping, mixed, alone)
+    return solution, solution.state
+
+
+@_differentiable.def_bwd
+def _backward(
+    found, cotangent, perturbed, problem, state, schedule, damping, mixed, alone
+):
+    arrive = cotangent.state
+    full = jax.tree.map(
+        lambda c, x: jnp.zeros_like(x) if c is None else c,
+        arrive,
+        found,
+        is_leaf=lambda x: x is None,
+    )
+    # A stage without steps has moved nothing.
+    taken = [stage for stage in schedule if stage.max_steps] or schedule
+    now = restrict(problem, taken[-1].free)
+    given = cotangent_of_problem(now, found, full)
+    given = dataclasses.replace(given, variables=problem.variables)
+    if cotangent.cost is not None:
+        # At a minimum the state's own share of the cost's derivative is 0.
+        arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+        by_cost = jax.grad(lambda a: eqx.combine(a, static).refresh(found).cost(found))
+        more = by_cost(arrays)
+        given = jax.tree.map(lambda a, b: a + cotangent.cost * b, given, more)
+    return given
+
+
+def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
+    """The same problem with only these groups free.
+
+    **Raises:** `ValueError` for a name that is not among `VARIABLES`.
+    """
+    check_names(free)
+    variables = tuple(name for name in problem.variables if name in free)
+    return dataclasses.replace(problem, variables=variables)
+
+
+def restrict_to_all(problem: Problem, schedule: tuple[Stage, ...]) -> Problem:
+    """The same problem with only the groups free that some stage moves."""
+    return restrict(problem, tuple(name for stage in schedule for name in stage.free))
+
+
+def _solve_baseline(problem, state, solver, schedule):
+    program = _baseline(is_alone() and not is_traced((problem, state)))
+    first = cost = _cost(problem, state)
+    counts, result = [], optx.RESULTS.successful
+    for stage in schedule:
+        if not stage.max_steps:
+            counts.append(jnp.array(0))
+            continue
+        held = restrict(problem, stage.free)
+        state, cost, count, result = program(solver, held, state, stage)
+        counts.append(count)
+    return Solution(state, result, cost, (), tuple(counts), first)
+
+
+@functools.cache
+def _baseline(alone: bool) -> Callable[..., Any]:
+    run = baselines.run
+    return kept(run, quick_options) if alone else eqx.filter_jit(run)
+
+
+@eqx.filter_jit
+def _cost(problem, state):
+    return problem.refresh(state).follow(state).cost(state)

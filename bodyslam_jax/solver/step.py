@@ -1,0 +1,133 @@
+"""One damped step, tried on the true robust cost; the damping after it.
+
+Marquardt's damping, in proportion to each variable's own curvature, with Nielsen's
+update. Landmarks that the step would have thrown off are damped by themselves.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.solver.blocks import Linearisation, Sizes
+from bodyslam_jax.solver.line_search import search
+from bodyslam_jax.solver.linear_system import (
+    UNSEEN,
+    Eliminated,
+    damped,
+    diagonals,
+    eliminate,
+    quadratic,
+    slope_along,
+    solve_step,
+)
+
+GAIN = 1e-4
+"""Least share of the predicted decrease at which a step is accepted."""
+CAUTION = (1e-2, 1e4)
+"""Least and greatest damping of a landmark that a step would have thrown off."""
+SHRINK = 0.1
+"""Least factor of the damping after a good step."""
+
+
+class Trial(NamedTuple):
+    """A step that was tried, and what the true cost says of it."""
+
+    eliminated: Eliminated
+    damping: Float[Array, ""]
+    """With which the step was found."""
+    length: Float[Array, ""]
+    """Squared, in standard deviations."""
+    predicted: Float[Array, ""]
+    """Decrease of the cost, by the linear part."""
+    finite: Bool[Array, ""]
+    accepted: Bool[Array, ""]
+    state: State
+    """After the step, if it is accepted."""
+    terms: Float[Array, " k"]
+    """Cost by factor there."""
+    gain: Float[Array, ""]
+    """Actual over predicted decrease of the full step."""
+    caution: Float[Array, " l"]
+    """Of landmarks, for the next step."""
+
+    def next_damping(self, growth: Float[Array, ""]) -> Float[Array, ""]:
+        """Less after a good step, more by `growth` after one that was not accepted."""
+        least = least_damping(self.eliminated.factor.half.dtype)
+        shrink = jnp.maximum(1 - (2 * self.gain - 1) ** 3, SHRINK)
+        shrink = jnp.where(self.gain < 0.25, 2.0, shrink)
+        lower = jnp.maximum(self.damping * shrink, least)
+        return jnp.where(
+            self.accepted, lower, jnp.maximum(self.damping, least) * growth
+        )
+
+
+def attempt(
+    problem: Problem,
+    state: State,
+    lin: Linearisation,
+    sizes: Sizes,
+    damping: Float[Array, ""],
+    caution: Float[Array, " l"],
+    last: Bool[Array, ""],
+) -> Trial:
+    """Solves for a step and tries it; with `last` only factorises, hardly damped."""
+    damping = jnp.where(last, little(sizes.dtype), damping)
+    diagonal = diagonals(lin, sizes)
+    extra = damped(
+        diagonal, damping, jnp.where(last, UNSEEN, 1.0).astype(damping.dtype)
+    )
+    least = jnp.where(last, 0.0, caution)
+    extra["landmarks"] = tuple(
+        jnp.maximum(more, least[bucket.landmark][:, None] * own)
+        for more, own, bucket in zip(
+            extra["landmarks"],
+            diagonal["landmarks"],
+            problem.layout.buckets,
+            strict=True,
+        )
+    )
+    eliminated = eliminate(problem, lin, sizes, extra)
+    move = solve_step(problem, state, lin, sizes, eliminated)
+    length = quadratic(problem, diagonal, move)
+    slope = -slope_along(problem, lin, move)
+    predicted = 0.5 * (quadratic(problem, extra, move) + slope)
+    finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
+    move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
+    slope = jnp.where(finite, slope, 0.0)
+    there, thrown, share, terms, gain = search(
+        problem, state, move, slope, predicted, lin.costs
+    )
+    decrease = jnp.sum(lin.costs) - jnp.sum(terms)
+    accepted = finite & (predicted > 0) & (decrease > GAIN * share * predicted)
+    more = jnp.clip(10 * caution, *CAUTION)
+    after = jnp.where(thrown, more, 0.1 * caution)
+    return Trial(
+        eliminated=eliminated,
+        damping=damping,
+        length=length,
+        predicted=predicted,
+        finite=finite,
+        accepted=accepted,
+        state=jax.tree.map(lambda a, b: jnp.where(accepted, a, b), there, state),
+        terms=jnp.where(accepted, terms, lin.costs),
+        gain=gain,
+        caution=jnp.where(accepted, after, caution),
+    )
+
+
+def least_damping(dtype) -> float:
+    """In double precision far below the stiffness of the softest bend of a long path of
+    cameras, which falls with the fourth power of its length: 1e-10 of a camera's own at
+    1,000 frames. In single precision as little as rounding leaves positive: with a
+    tenth of it every third factorisation fails, and steps are no fewer.
+    """
+    return 1e-12 if dtype == jnp.float64 else 3e-7
+
+
+def little(dtype) -> float:
+    """Damping that keeps a direction which nothing determines finite, and its variance
+    enormous."""
+    return 1e-11 if dtype == jnp.float64 else 1e-6

@@ -1,0 +1,182 @@
+"""Bodies over an image: the painter's algorithm on a coarser mesh.
+
+Triangles are drawn farthest first, without those that reach behind the camera.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from bodyslam_jax.body import BodyModel, vertices
+from bodyslam_jax.compilation import jit_once
+from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.types import Result
+from bodyslam_jax.view.style import PEOPLE, Image
+
+_CELL = 0.025
+"""Size of the cells in which vertices are merged, m."""
+_NEAR = 0.05
+"""Triangles that come nearer to the camera's plane than this are not drawn, m."""
+_CHUNK = 16
+"""Frames whose meshes are computed together."""
+
+
+def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Image:
+    """One frame's bodies over its image, at the image's own size.
+
+    **Raises:** `IndexError` if the result has no such frame.
+    """
+    num_frames = len(result.timestamps)
+    if not 0 <= frame < num_frames:
+        raise IndexError(f"frame {frame}, expected 0 to {num_frames - 1}.")
+    coarse = coarse_body(body)
+    people = next(meshes(result, coarse, slice(frame, frame + 1)))
+    return draw_people(image, people, np.asarray(coarse.faces), np.ones(2))
+
+
+def coarse_body(body: BodyModel) -> BodyModel:
+    """The same body with about a quarter of its vertices.
+
+    Vertices in one cell of a grid over the rest pose are merged into the first of them:
+    a subset, so that shape, skinning and joints stay those of the whole body. Keypoints
+    on the skin move within their cells.
+    """
+    template = np.asarray(body.template)
+    cells = np.floor(template / _CELL).astype(np.int64)
+    _, kept, cluster = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    # In the body's own order, as runs of vertices are skinned together.
+    order = np.argsort(kept)
+    kept = kept[order]
+    into = np.argsort(order)[cluster.reshape(-1)]
+    faces = into[np.asarray(body.faces)]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    arrays = lambda m: (
+        [m.template, m.shape_dirs, m.pose_dirs, m.skin_joint] + [m.skin_weight]
+    )
+    chosen = lambda x: jnp.asarray(np.asarray(x)[kept])
+    coarse = eqx.tree_at(arrays, body, [chosen(x) for x in arrays(body)])
+    place = lambda vertex: int(np.searchsorted(kept, vertex))
+    runs = tuple((place(i), place(j), joints) for i, j, joints in body.blocks)
+    regressor = np.zeros((len(kept), 24), body.dtype)
+    np.add.at(regressor, into, np.asarray(body.joint_regressor).T)
+    return dataclasses.replace(
+        coarse,
+        blocks=runs,
+        joint_regressor=jnp.asarray(regressor.T),
+        faces=jnp.asarray(faces, body.faces.dtype),
+        picks=jnp.asarray(into[np.asarray(body.picks)], body.picks.dtype),
+    )
+
+
+class _Mesh(eqx.Module):
+    """One person in one frame."""
+
+    person: int
+    p_C: np.ndarray
+    """Vertices in the camera frame, m."""
+    uv: np.ndarray
+    """px"""
+
+
+@jit_once
+def _pose(
+    body: BodyModel,
+    poses: Float[Array, "t 72"],
+    betas: Float[Array, " 10"],
+    trans: Float[Array, "t 3"],
+    T_WC: Float[Array, "t 4 4"],
+    intrinsics: Float[Array, " i"],
+) -> tuple[Float[Array, "t v 3"], Float[Array, "t v 2"]]:
+    p_W = vertices(body, poses, betas, trans)
+    p_C = jnp.einsum("tji,tvj->tvi", T_WC[:, :3, :3], p_W - T_WC[:, None, :3, 3])
+    return p_C, project(intrinsics, p_C)
+
+
+def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[_Mesh]]:
+    """The people present in each frame, computed for some frames at a time."""
+    cast = lambda x: jnp.asarray(x, body.template.dtype)
+    chosen = np.arange(len(result.timestamps))[frames]
+    for start in range(0, len(chosen), _CHUNK):
+        index = chosen[start : start + _CHUNK]
+        padded = np.pad(index, (0, _CHUNK - len(index)), mode="edge")
+        drawn = []
+        for h in range(len(result.poses)):
+            if not result.present[h, index].any():
+                continue
+            p_C, uv = _pose(
+                body,
+                cast(result.poses[h, padded]),
+                cast(result.betas[h]),
+                cast(result.trans[h, padded]),
+                cast(result.T_WC[padded]),
+                cast(result.intrinsics),
+            )
+            drawn.append((h, np.asarray(p_C), np.asarray(uv)))
+        for k, frame in enumerate(index):
+            yield [
+                _Mesh(h, p_C[k], uv[k])
+                for h, p_C, uv in drawn
+                if result.present[h, frame]
+            ]
+
+
+def draw_people(
+    image: Image,
+    people: list[_Mesh],
+    faces: Int[np.ndarray, "f 3"],
+    zoom: np.ndarray,
+) -> Image:
+    """Shaded bodies, those behind first, blended into the image."""
+    height, width = image.shape[:2]
+    depth, corners, colors = [], [], []
+    for mesh in people:
+        # Pixel centres are whole numbers, so the image's edge is at -1/2.
+        uv = (mesh.uv + 0.5) * zoom - 0.5
+        a, b, c = (mesh.p_C[faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        faces_camera = np.sum(normal * a, 1) < 0
+        before = np.minimum(np.minimum(a[:, 2], b[:, 2]), c[:, 2]) > _NEAR
+        triangle = uv[faces]
+        inside = np.all(triangle.max(1) >= -0.5, 1) & np.all(
+            triangle.min(1) <= [width - 0.5, height - 0.5], 1
+        )
+        shown = faces_camera & before & inside
+        light = _lit(normal, faces, len(uv))[shown]
+        base = np.array(PEOPLE[mesh.person % len(PEOPLE)]) * 0.6 + 255 * 0.4
+        depth.append((a + b + c)[shown, 2])
+        corners.append(triangle[shown])
+        colors.append(light[:, None] * base)
+    if not depth or not sum(map(len, depth)):
+        return image
+    order = np.argsort(-np.concatenate(depth))
+    triangles = np.concatenate(corners)[order]
+    # Sixteenths of a pixel; far-off corners must not overflow in OpenCV.
+    triangles = np.round(np.clip(triangles, -4000, 4000) * 16).astype(np.int32)
+    shades = np.concatenate(colors)[order].astype(int).tolist()
+    drawn = image.copy()
+    for triangle, shade in zip(triangles, shades, strict=True):
+        cv2.fillConvexPoly(drawn, triangle, shade, cv2.LINE_8, 4)
+    return cv2.addWeighted(drawn, 0.8, image, 0.2, 0)
+
+
+_LIGHT = np.array([-0.5, -0.62, -0.6])
+"""Towards the light, from above and behind the camera, in its frame."""
+
+
+def _lit(
+    normal: Float[np.ndarray, "f 3"], faces: Int[np.ndarray, "f 3"], num_vertices: int
+) -> Float[np.ndarray, " f"]:
+    """Brightness of each face, smooth: of the mean normal around its corners."""
+    around = np.zeros((num_vertices, 3))
+    for axis in range(3):
+        weight = np.repeat(normal[:, axis], 3)
+        around[:, axis] = np.bincount(faces.ravel(), weight, num_vertices)
+    smooth = around[faces].sum(1)
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+    return 0.3 + 0.7 * np.clip(smooth @ _LIGHT, 0, 1)
