@@ -31,7 +31,7 @@ from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.experiments.scenario import make_case
 from bodyslam_jax.experiments.scoring import trajectories
 from bodyslam_jax.motion import load_motion_model, make_clock, predict_between
-from bodyslam_jax.pipeline.joint_stage import COUPLED
+from bodyslam_jax.pipeline.joint_stage import COUPLED_OUTPUTS
 
 WAYS = ("frozen", "refreshed", "displacement", "full")
 WRONG = (0.8, 1.2)
@@ -49,7 +49,7 @@ def problem_for(prepared, way):
     problem = prepared.problem
     if way == "frozen":
         return dataclasses.replace(problem, motion=None)
-    motion = dataclasses.replace(problem.motion, coupled=COUPLED[way])
+    motion = dataclasses.replace(problem.motion, coupled=COUPLED_OUTPUTS[way])
     return dataclasses.replace(problem, motion=motion)
 
 
@@ -138,9 +138,11 @@ def drift(args, config):
         for way in args.ways:
             problem = problem_for(prepared, way)
             rest = ("shapes",) if args.hold_shape else ()
-            cameras = graph.hold(problem.free, "cameras", "landmarks", *rest)
+            cameras = graph.set_constant(problem.free, "cameras", "landmarks", *rest)
             free = dataclasses.replace(problem, free=cameras)
-            held = dataclasses.replace(problem, free=graph.hold(cameras, "scale"))
+            held = dataclasses.replace(
+                problem, free=graph.set_constant(cameras, "scale")
+            )
             right, _ = settled(held, at(1.0))
             reference = predicted(motion, right)
             weight = prepared.roots.present[..., None].astype(float)

@@ -60,7 +60,7 @@ def errors(simulated, weights):
     factors = [f for f in factors if not isinstance(f, MUTED)]
     free = initialisation.free_people(state)
     problem = graph.make_problem(factors, state, free=free)
-    held = graph.hold(problem.free, "scale", "cameras", "intrinsics")
+    held = graph.set_constant(problem.free, "scale", "cameras", "intrinsics")
     problem = dataclasses.replace(problem, free=held)
     solution, _ = solve_stage(problem, state, config, "people alone")
     shape = solution.state.shapes[0]

@@ -36,7 +36,7 @@ from solver_clock import timed
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver import Stage, over_devices, solve
+from bodyslam_jax.solver import Stage, solve, vmap_over_devices
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import cast, sizes_of
 from bodyslam_jax.solver.elimination.person import eliminate_people
@@ -115,10 +115,10 @@ def scales(frames, rtol, repeats, factors=(0.4, 0.63, 0.79, 1.26, 1.59, 2.5)):
     starts = [eqx.tree_at(lambda s: s.scale, start, start.scale * f) for f in factors]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
     one = lambda problem, s: solve(problem, s, schedule=(Stage(rtol=rtol),))
-    mapped = over_devices(one, (None, 0))
+    mapped = vmap_over_devices(one, (None, 0))
     found, _, (wall, cpu) = timed(lambda: mapped(problem, batch), repeats)
-    in_turn = lambda: [one(problem, s) for s in starts]
-    turn, _, (turn_wall, turn_cpu) = timed(in_turn, repeats)
+    sequential_vmap = lambda: [one(problem, s) for s in starts]
+    turn, _, (turn_wall, turn_cpu) = timed(sequential_vmap, repeats)
     alone = [float(s.cost) for s in turn]
     print(
         f"{frames} frames, {len(factors)} scales: on {len(jax.devices())} devices "

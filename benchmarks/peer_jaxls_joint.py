@@ -95,11 +95,11 @@ def of_frames(factor, state):
         there = (frame - lag) % frames
         return VARIABLES[name](there if name == "camera" else person * frames + there)
 
-    touches = [touch for touch in factor.touches if touch[0] != "intrinsics"]
+    keys = [touch for touch in factor.keys if touch[0] != "intrinsics"]
 
     @jaxls.Cost.factory
     def cost(values, variables, data):
-        known = {t: values[v] for t, v in zip(touches, variables, strict=True)}
+        known = {t: values[v] for t, v in zip(keys, variables, strict=True)}
         window = tuple(
             Frame(*(known.get((name, lag)) for name in LOCAL))
             for lag in range(factor.num_lags)
@@ -107,10 +107,10 @@ def of_frames(factor, state):
         shared = Shared(
             known.get(("scale", 0)), known.get(("shape", 0)), state.intrinsics
         )
-        return lifted(factor, factor.local(data, window, shared))
+        return lifted(factor, factor.frame_residual(data, window, shared))
 
     data = jax.tree.map(lambda x: x[person, frame], factor.data())
-    return cost(tuple(variable(*touch) for touch in touches), data)
+    return cost(tuple(variable(*touch) for touch in keys), data)
 
 
 def main(frames, steps, rtol, target):

@@ -178,7 +178,7 @@ def person(truth, missing, rng, array, loss, noise):
         shape_sigma[0, 0, 0] * rng.standard_normal((h, 1, 10))
     )
     return [
-        g.JointReprojection(
+        g.KeypointReprojection(
             body=body,
             pixel=array(pixel),
             sigma=array(sigma),
@@ -187,14 +187,18 @@ def person(truth, missing, rng, array, loss, noise):
         g.HumanMotion(
             translation=moved + array(slow(0.01, 0.8, (h, t, 3))),
             whitening=g.whitening_of(covariance, valid),
-            correlation=g.runs(valid, 0.8).astype(truth.scale.dtype),
+            correlation=g.ar1_correlation(valid, 0.8).astype(truth.scale.dtype),
         ),
-        g.Posture(
+        g.BodyPosePrior(
             rotation=posture,
             sigma=array(np.full((h, t, 23), 0.17 * noise)),
-            correlation=g.runs(jnp.ones((h, t), bool), 0.96).astype(truth.scale.dtype),
+            correlation=g.ar1_correlation(jnp.ones((h, t), bool), 0.96).astype(
+                truth.scale.dtype
+            ),
         ),
-        g.Shape(shape=measured + array(np.zeros((h, t, 10))), sigma=array(shape_sigma)),
+        g.ShapePrior(
+            shape=measured + array(np.zeros((h, t, 10))), sigma=array(shape_sigma)
+        ),
     ]
 
 
@@ -244,6 +248,6 @@ def start_of(problem, truth, rng, array):
     )
     moved = moved_by(truth, jax.tree.map(lambda s, m: s * m, step, problem.free))
     for factor in problem.factors:
-        if isinstance(factor, g.Posture):
+        if isinstance(factor, g.BodyPosePrior):
             moved = eqx.tree_at(lambda s: s.poses, moved, factor.rotation)
     return moved

@@ -30,7 +30,7 @@ _HOME = {
     "evaluate": "evaluation",
     "load_body_model": "body",
     "load_motion_model": "motion",
-    "over_devices": "solver",
+    "vmap_over_devices": "solver",
     "read_sequence": "io",
     "run": "pipeline",
     "solve": "solver",

@@ -18,7 +18,14 @@ from bodyslam_jax import evaluation, export, initialisation, people, view
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline import joint_stage
 from bodyslam_jax.pipeline.to_metric import assemble
-from bodyslam_jax.types import Cameras, Joint, Result, ScaleStart, Sequence, Tracks
+from bodyslam_jax.types import (
+    JointEstimate,
+    Result,
+    ScaleStart,
+    Sequence,
+    SfmResult,
+    Tracks,
+)
 
 log = logging.getLogger(__name__)
 
@@ -102,19 +109,19 @@ def _files(
         export.write_files(Path(folder), result, config)
 
 
-def _cameras(sequence: Sequence) -> Cameras:
+def _cameras(sequence: Sequence) -> SfmResult:
     """A camera that stands still and sees nothing."""
     t = sequence.num_frames
     nothing = np.zeros(0, np.int64)
-    return Cameras(
+    return SfmResult(
         kind="static",
         T_WC=np.tile(np.eye(4), (t, 1, 1)),
         registered=np.ones(t, bool),
         landmarks=np.zeros((0, 3)),
         tracks=Tracks(nothing, nothing, np.zeros((0, 2))),
         keep=nothing.astype(bool),
-        elsewhere=np.zeros((0, 3, 3)),
-        places=np.zeros((0, 3)),
+        prior_information=np.zeros((0, 3, 3)),
+        prior_mean=np.zeros((0, 3)),
         pixel_sigma=1.0,
         intrinsics=np.asarray(sequence.intrinsics.params, float),
         focal_sigma=float("nan"),
@@ -123,13 +130,13 @@ def _cameras(sequence: Sequence) -> Cameras:
     )
 
 
-def _joint(sequence: Sequence) -> Joint:
+def _joint(sequence: Sequence) -> JointEstimate:
     """People who stand before that camera."""
     assert sequence.bodies is not None
     h, t = sequence.bodies.present.shape
     roots = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (h, t, 1, 1))
     roots[..., 2, 3] = _DISTANCE
-    return Joint(
+    return JointEstimate(
         scale=1.0,
         start=ScaleStart(),
         scale_sigma=1.0,

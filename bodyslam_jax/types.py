@@ -149,7 +149,7 @@ class Sequence:
 
 
 @dataclasses.dataclass(frozen=True)
-class Cameras:
+class SfmResult:
     """The up-to-scale reconstruction after bundle adjustment."""
 
     kind: str
@@ -162,9 +162,10 @@ class Cameras:
     """Observations of `landmarks`."""
     keep: Bool[np.ndarray, " m"]
     """Observations that fit."""
-    elsewhere: Float[np.ndarray, "l 3 3"]
-    """Information on `places` from other sightings, px² per squared unit of the map."""
-    places: Float[np.ndarray, "l 3"]
+    prior_information: Float[np.ndarray, "l 3 3"]
+    """Information on `prior_mean` from other sightings, px² per squared unit of the
+    map."""
+    prior_mean: Float[np.ndarray, "l 3"]
     """Where all sightings of the same point place each landmark."""
     pixel_sigma: float
     """Robust standard deviation of those, px."""
@@ -243,7 +244,7 @@ class ScaleStart:
 
 
 @dataclasses.dataclass(frozen=True)
-class Joint:
+class JointEstimate:
     """The graph's optimum."""
 
     scale: float

@@ -114,7 +114,7 @@ def _bent_along(problem, state, way):
 
         return jnp.vdot(jax.lax.stop_gradient(jax.grad(loss)(p_C)), p_C)
 
-    keypoints = [f for f in problem.factors if isinstance(f, g.JointReprojection)]
+    keypoints = [f for f in problem.factors if isinstance(f, g.KeypointReprojection)]
     slope = jax.grad(lambda step: sum(along(step, f) for f in keypoints))
     return jax.jvp(slope, (state.zero_step(),), (way,))[1]
 
@@ -131,7 +131,7 @@ def bent(problem, state):
     flat, unravel = ravel_pytree(zero)
     place = jax.tree.map(np.asarray, unravel(jnp.arange(len(flat), dtype=float)))
     found = np.zeros((len(flat), len(flat)))
-    if not any(isinstance(f, g.JointReprojection) for f in problem.factors):
+    if not any(isinstance(f, g.KeypointReprojection) for f in problem.factors):
         return found
     people, frames = state.roots.shape[:2]
     of_frames = lambda s: np.concatenate(

@@ -119,7 +119,7 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
     shape_sigma = np.full((h, t, 10), np.inf)
     shape_sigma[:, 0] = 0.5
     return [
-        g.JointReprojection(
+        g.KeypointReprojection(
             body=body,
             pixel=pixel + noise * normal(*pixel.shape),
             sigma=jnp.asarray(sigma),
@@ -128,14 +128,14 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
         g.HumanMotion(
             translation=moved + 0.003 * noise * normal(h, t, 3),
             whitening=g.whitening_of(covariance, valid),
-            correlation=g.runs(valid, correlation),
+            correlation=g.ar1_correlation(valid, correlation),
         ),
-        g.Posture(
+        g.BodyPosePrior(
             rotation=posture,
             sigma=jnp.full((h, t, 23), 0.15),
-            correlation=g.runs(there, correlation),
+            correlation=g.ar1_correlation(there, correlation),
         ),
-        g.Shape(
+        g.ShapePrior(
             shape=state.shapes[:, None] + jnp.zeros((h, t, 1)),
             sigma=jnp.asarray(shape_sigma),
         ),
@@ -167,25 +167,27 @@ def extra_factors(rng, state, seen=None):
     steps = {
         "translation": 0.1 * normal(h, t, 3),
         "whitening": g.whitening_of(0.02 * jnp.eye(3) + jnp.zeros((h, t, 3, 3)), moved),
-        "correlation": g.runs(moved, 0.8),
+        "correlation": g.ar1_correlation(moved, 0.8),
     }
     turned = 0.3 * normal(h, t, 3)
     return [
         landmark_prior(rng, state, seen),
         g.HumanMotion(**steps, body=body),
         g.HumanMotion(**steps, correlated=False),
-        g.Posture(
+        g.BodyPosePrior(
             rotation=state.poses + 0.1 * normal(h, t, 23, 3),
             sigma=jnp.full((h, t, 23), 0.3),
-            correlation=g.runs(there, 0.9),
+            correlation=g.ar1_correlation(there, 0.9),
             correlated=False,
         ),
-        g.OrientationChange(rotation=0.05 * normal(h, t, 3), sigma=late(h, t, skip=1)),
+        g.RelativeOrientation(
+            rotation=0.05 * normal(h, t, 3), sigma=late(h, t, skip=1)
+        ),
         g.CameraPrior(cameras=state.cameras, sigma=jnp.full((t, 6), 0.3)),
         g.IntrinsicsPrior(
             intrinsics=state.intrinsics[None], sigma=jnp.full((1, i), 20.0)
         ),
-        g.SquarePixels(sigma=jnp.array([3.0])),
+        g.AspectRatioPrior(sigma=jnp.array([3.0])),
         g.ScalePrior(scale=jnp.full(t, 1.6), sigma=jnp.full(t, jnp.inf).at[2].set(0.2)),
         g.Stature(
             template=jnp.asarray(1.7),
@@ -196,19 +198,19 @@ def extra_factors(rng, state, seen=None):
         g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
         g.RootSmoothness(sigma=late(h, t, skip=2), body=body),
-        g.RootTurning(sigma=late(h, t, skip=2)),
+        g.AngularAccelerationPrior(sigma=late(h, t, skip=2)),
         g.RootOrientation(
             orientation=state.roots[..., :3, :3] @ jaxlie.SO3.exp(turned).as_matrix(),
             sigma=jnp.full((h, t), 0.2),
-            correlation=g.runs(there, 0.9),
+            correlation=g.ar1_correlation(there, 0.9),
         ),
-        g.RootPlace(
+        g.RootPositionPrior(
             place=state.roots[..., :3, 3] + 0.1,
             sigma=jnp.full((h, t, 2), 0.05),
-            correlation=g.runs(there, 0.9),
+            correlation=g.ar1_correlation(there, 0.9),
         ),
         g.StanceFoot(body=body, sigma=late(h, t, 4, skip=1)),
-        g.UpDirection(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
+        g.UprightPrior(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
             body=body,
             plane=jnp.array([0.1, -0.99, 0.1, 1.2]),

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.evaluation import before_after
-from bodyslam_jax.types import Cameras, Result, Tracks
+from bodyslam_jax.types import Result, SfmResult, Tracks
 
 BODY = load_body_model()
 T = 30
@@ -42,21 +42,21 @@ def _result(T_WC: np.ndarray) -> Result:
     )
 
 
-def _cameras(kind: str = "moving") -> Cameras:
+def _cameras(kind: str = "moving") -> SfmResult:
     """The wobbling path in a world of its own: turned, moved, three times as small."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     T_WC = turn @ _path(WOBBLE)
     T_WC[:, :3, 3] = T_WC[:, :3, 3] / 3 + [1.0, 2.0, 3.0]
     none = np.zeros(0, np.int64)
-    return Cameras(
+    return SfmResult(
         kind=kind,
         T_WC=T_WC,
         registered=np.ones(T, bool),
         landmarks=np.zeros((0, 3)),
         tracks=Tracks(none, none, np.zeros((0, 2))),
         keep=none.astype(bool),
-        elsewhere=np.zeros((0, 3, 3)),
+        prior_information=np.zeros((0, 3, 3)),
         places=np.zeros((0, 3)),
         pixel_sigma=1.0,
         intrinsics=np.ones(4),

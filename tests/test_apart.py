@@ -47,14 +47,14 @@ def test_every_joint_turns_keypoints_where_blend_shapes_do_or_the_body_is_traced
 
 
 @pytest.mark.parametrize(
-    "layout, without", [("coco17", ()), ("body25", g.JointReprojection)]
+    "layout, without", [("coco17", ()), ("body25", g.KeypointReprojection)]
 )
 def test_steps_do_not_depend_on_which_joints_are_solved_apart(layout, without):
     """With fewer keypoints, and with none at all."""
     problem, state, _ = make(9, frames=12, people=2, landmarks=30)
     factors = [f for f in problem.factors if not isinstance(f, without)]
     for i, factor in enumerate(factors):
-        if isinstance(factor, g.JointReprojection):
+        if isinstance(factor, g.KeypointReprojection):
             count = len(KEYPOINT_NAMES[layout])
             pixel, sigma = factor.pixel[:, :, :count], factor.sigma[:, :, :count]
             parts = {"pixel": pixel, "sigma": sigma, "layout": layout}
@@ -116,7 +116,7 @@ def test_limbs_are_what_factors_see_together():
 
 def test_factors_put_in_later_that_see_more_joints_are_refused():
     problem, _, start = make(frames=12, people=1)
-    bare = [f for f in problem.factors if not isinstance(f, g.JointReprojection)]
+    bare = [f for f in problem.factors if not isinstance(f, g.KeypointReprojection)]
     other = dataclasses.replace(g.make_problem(bare, start), factors=problem.factors)
     with pytest.raises(
         ValueError, match=r"see joints \[0, 3, 6, 9\] together.* make it anew with"

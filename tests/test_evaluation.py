@@ -442,9 +442,9 @@ def test_truth_between_our_frames_is_interpolated():
 
 def test_nothing_in_common_is_said():
     truth = _truth(num_frames=20)
-    elsewhere = dataclasses.replace(truth, timestamps=truth.timestamps + 1e3)
+    prior_information = dataclasses.replace(truth, timestamps=truth.timestamps + 1e3)
     with pytest.raises(ValueError, match="0.000 to 0.633 s.*1000.000 to 1000.633 s"):
-        evaluation.evaluate(truth, elsewhere)
+        evaluation.evaluate(truth, prior_information)
 
 
 def test_people_are_told_apart():

@@ -322,7 +322,7 @@ def test_bad_files_of_emdb_are_refused(
 BAD_3DPW = {
     "fewer": ({"trans": [np.zeros((NUM, 3))]}, "trans: 1 entries, not of 2 people"),
     "nobody": ({"poses": []}, "poses: 0 entries, not of at least one"),
-    "elsewhere": ({"sequence": "../walk"}, "sequence: '../walk', not the name"),
+    "prior_information": ({"sequence": "../walk"}, "sequence: '../walk', not the name"),
     "scalar": ({"poses": np.array(3)}, "poses: a ndarray, not a list"),
     "number": ({"poses": 3}, "poses: a int, not a list"),
     "lengths": ({"trans": [np.zeros((NUM, 3)), np.zeros((2, 3))]}, r"trans: \(2, 3\)"),

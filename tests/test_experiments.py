@@ -105,11 +105,11 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     assert not still.free.scale.any() and still.free.poses.all()
     held, state = experiments.VARIANTS["β held at the regressor's"](problem, start)
     assert not held.free.shapes.any() and held.free.poses.all()
-    (said,) = (factor for factor in problem.factors if isinstance(factor, g.Shape))
+    (said,) = (factor for factor in problem.factors if isinstance(factor, g.ShapePrior))
     regressed = said.shape[0][np.isfinite(np.asarray(said.sigma)[0]).all(axis=-1)]
     assert not np.allclose(start.shapes[0], regressed.mean(axis=0))
     np.testing.assert_allclose(state.shapes[0], regressed.mean(axis=0))
-    low = g.carrying(scenes.body_model(), start, jnp.ones((1, 12), bool))
+    low = g.stance_mask(scenes.body_model(), start, jnp.ones((1, 12), bool))
     assert low.shape == (1, 12, 4) and not low[:, 0].any()
     assert (low.sum(axis=-1) <= 1).all()
 
@@ -145,7 +145,7 @@ def test_weights_scale_residuals_and_missing_stays_missing(scene):
 
     before, after = costs(jnp.zeros(len(names))), costs(log)
     for name, value in before.items():
-        share = 4.0 if name in ("HumanMotion", "Shape") else 1.0
+        share = 4.0 if name in ("HumanMotion", "ShapePrior") else 1.0
         np.testing.assert_allclose(value, share * after[name], rtol=1e-12)
     slope = jax.jit(jax.grad(lambda log: sum(costs(log).values())))
     assert np.isfinite(slope(jnp.zeros(len(names)))).all()

@@ -9,7 +9,7 @@ import pytest
 
 from bodyslam_jax.config import Association
 from bodyslam_jax.io import read_sequence
-from bodyslam_jax.io.frame_index import Unfit, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
 from bodyslam_jax.io.keypoints.associate import associate
 from bodyslam_jax.io.keypoints.reader import read_detections
 
@@ -115,7 +115,7 @@ def test_where_counting_begins(numbers, num_frames, complete, first, warned):
     ],
 )
 def test_refuses_names_that_cannot_be(names, message):
-    with pytest.raises(Unfit, match=message):
+    with pytest.raises(InvalidContent, match=message):
         frames_of_names(
             names, what="keypoints", num_frames=20, complete=True, warn=pytest.fail
         )

@@ -17,7 +17,7 @@ from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.features import match, spread
 from bodyslam_jax.sfm.incremental import Builder, build_map
 from bodyslam_jax.sfm.multiview import resect
-from bodyslam_jax.sfm.partial_map import Growing
+from bodyslam_jax.sfm.partial_map import PartialMap
 from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.sfm.sfm import interpolate_poses
 from bodyslam_jax.simulation import as_sequence, simulate
@@ -524,7 +524,7 @@ def test_points_that_noise_draws_nearer_are_not_preferred():
     known = np.arange(count) < 100
     builder = Builder(views, num, count, 500.0, Structure(min_angle=0.5))
     every = np.ones(len(frame), bool)
-    grown = Growing(
+    grown = PartialMap(
         scene,
         np.ones(num, bool),
         known.copy(),

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation, Structure
-from bodyslam_jax.sfm import cut_tracks, reconstruct, told_by_other_pieces
+from bodyslam_jax.sfm import reconstruct, split_tracks, told_by_other_pieces
 from bodyslam_jax.sfm.bundle import Scene, Views, errors, jacobian_of_points
 from bodyslam_jax.sfm.loop_closure import Revisits, told_by_others
 from bodyslam_jax.sfm.relocalise import near, relocate, with_moved
@@ -194,16 +194,16 @@ def test_what_other_tracks_tell_sums_to_what_all_views_say(scene):
 def test_long_tracks_are_cut_into_pieces_that_know_of_each_other(scene):
     frame = np.concatenate([np.arange(10), np.arange(3, 6), [0, 9]])
     track = np.repeat([4, 2, 7], [10, 3, 2])
-    of, piece = cut_tracks(frame, track, 4)
+    of, piece = split_tracks(frame, track, 4)
     assert of.tolist() == [2, 4, 4, 4, 7, 7]
     for p in range(len(of)):
         seen = frame[piece == p]
         assert np.ptp(seen) < 4 and (track[piece == p] == of[p]).all()
-    assert cut_tracks(frame, track, 10)[0].tolist() == [2, 4, 7]
-    assert cut_tracks(frame[:0], track[:0], 4)[0].size == 0
+    assert split_tracks(frame, track, 10)[0].tolist() == [2, 4, 7]
+    assert split_tracks(frame[:0], track[:0], 4)[0].size == 0
     # What a piece is told are the views of the other one.
     views = seen_by_all(scene)
-    of, piece = cut_tracks(views.frame, views.landmark, 3)
+    of, piece = split_tracks(views.frame, views.landmark, 3)
     T_WC = np.tile(np.eye(4), (6, 1, 1))
     T_WC[:, :3, :3] = np.swapaxes(scene.R_CW, 1, 2)
     T_WC[:, :3, 3] = scene.centre
@@ -235,7 +235,7 @@ def test_a_camera_that_turns_back_keeps_the_size_of_its_map():
         scale = np.trace(np.diag(D) @ S) / (x**2).sum()
         away = np.linalg.norm(y - scale * x @ (U @ S @ Vt).T, axis=1)
         error[joined] = np.sqrt((away**2).mean())
-        told = found.elsewhere.any(axis=(1, 2))
+        told = found.prior_information.any(axis=(1, 2))
         assert told.mean() > 0.5 if joined else not told.any()
     assert error[True] < 0.005  # m
     assert error[True] < 0.6 * error[False]

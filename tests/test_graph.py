@@ -47,7 +47,7 @@ def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
 def test_lifted_residual_has_the_loss_as_norm_and_its_gradient(loss, rng):
     residual = jnp.asarray(3 * rng.standard_normal((7, 2)))
     rho = lambda r: jnp.sum(loss.rho(jnp.sum(r**2, axis=-1)))
-    lifted = lambda r: jnp.sum(g.lift(loss, r) ** 2)
+    lifted = lambda r: jnp.sum(g.robustify(loss, r) ** 2)
     assert jnp.allclose(lifted(residual), rho(residual), rtol=1e-12)
     assert jnp.allclose(jax.grad(lifted)(residual), jax.grad(rho)(residual))
     zero = jnp.zeros((1, 2))
@@ -139,7 +139,7 @@ def test_curvature_of_keypoints_is_what_residuals_bend(rng):
             poses=0.3 * normal(1, 3, 23, 3),
         )
     )
-    (factor,) = [f for f in problem.factors if isinstance(f, g.JointReprojection)]
+    (factor,) = [f for f in problem.factors if isinstance(f, g.KeypointReprojection)]
     weight = factor.loss.weight(jnp.sum(factor.residual(state) ** 2, axis=-1))
     assert weight.min() < 0.5
     turns, by_shape = eqx.filter_jit(lambda f, s: f.curvature(s))(factor, state)
@@ -171,9 +171,7 @@ def every_factor(rng):
 def test_every_residual_has_the_derivative_of_finite_differences(rng):
     factors, state = every_factor(rng)
     classes = {
-        x
-        for x in vars(g).values()
-        if isinstance(x, type) and issubclass(x, g.AbstractFactor)
+        x for x in vars(g).values() if isinstance(x, type) and issubclass(x, g.Factor)
     }
     classes = {x for x in classes if not inspect.isabstract(x)}
     assert {type(factor) for factor in factors} == classes, "a class without a test"
@@ -200,12 +198,17 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
         if c is not None:
             assert jnp.abs(s - c).max() < 1e-10 * scale, type(factor).__name__
     known = {type(f) for f, c in zip(factors, closed) if c is not None}
-    assert known == {g.JointReprojection, g.HumanMotion, g.Posture, g.GroundContact}
+    assert known == {
+        g.KeypointReprojection,
+        g.HumanMotion,
+        g.BodyPosePrior,
+        g.GroundContact,
+    }
 
 
 def along(factor, state, step):
     """The derivative along a step by the closed form, if there is one."""
-    if not isinstance(factor, g.AbstractFrameFactor):
+    if not isinstance(factor, g.FrameFactor):
         return None
     found = factor.jacobians(state)
     if found is None:
@@ -239,10 +242,10 @@ def test_posture_residual_of_correlated_errors_is_white(rng):
     state = scenes.truth(rng, frames=t, people=1, landmarks=0)
     state = eqx.tree_at(lambda s: s.poses, state, 1e-3 * jnp.asarray(error)[None])
     there = jnp.ones((1, t), bool)
-    factor = g.Posture(
+    factor = g.BodyPosePrior(
         rotation=jnp.zeros((1, t, 23, 3)),
         sigma=jnp.full((1, t, 23), 1e-3),
-        correlation=g.runs(there, rho),
+        correlation=g.ar1_correlation(there, rho),
     )
     whitened = factor.residual(state)
     assert abs(jnp.var(whitened) - 1) < 0.01
@@ -252,10 +255,10 @@ def test_posture_residual_of_correlated_errors_is_white(rng):
 def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
     """Neither its placeholder, nor, in derivatives, its infinite deviation."""
     state = scenes.truth(rng, 4, 1, 2)
-    factor = g.Posture(
+    factor = g.BodyPosePrior(
         rotation=state.poses + 0.1,
         sigma=jnp.full((1, 4, 23), 0.3).at[0, 1, 4].set(jnp.inf),
-        correlation=g.runs(jnp.ones((1, 4), bool), 0.9),
+        correlation=g.ar1_correlation(jnp.ones((1, 4), bool), 0.9),
     )
     other = eqx.tree_at(
         lambda f: f.rotation, factor, factor.rotation.at[0, 1, 4].set(2.0)
@@ -264,7 +267,9 @@ def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
     begins = factor.residual(state)[0, 2, 4]
     error = g.rotation_between(factor.rotation, state.poses)
     assert jnp.allclose(begins, error[0, 2, 4] / 0.3, rtol=1e-12)
-    one_by_one = factor.map_frames(lambda d, w, s, _: factor.local(d, w, s), state)
+    one_by_one = factor.map_frames(
+        lambda d, w, s, _: factor.frame_residual(d, w, s), state
+    )
     assert jnp.allclose(one_by_one, factor.residual(state), rtol=1e-12)
 
     def cost(correlation):
@@ -278,7 +283,7 @@ def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
 
 def test_runs_start_anew_after_a_gap():
     there = jnp.array([[True, True, False, True, True]])
-    assert g.runs(there, 0.9).tolist() == [[0.0, 0.9, 0.0, 0.0, 0.9]]
+    assert g.ar1_correlation(there, 0.9).tolist() == [[0.0, 0.9, 0.0, 0.0, 0.9]]
 
 
 def test_motion_residual_is_linear_in_scale_and_blind_to_the_world(rng):

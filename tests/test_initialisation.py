@@ -45,7 +45,7 @@ def test_nothing_is_added_that_is_not_asked_for():
 
 def test_people_turn_as_predicted_where_that_means_something():
     state, (turning,) = made(fps=15.0, orientation_sigma=0.05)
-    assert isinstance(turning, graph.OrientationChange)
+    assert isinstance(turning, graph.RelativeOrientation)
     np.testing.assert_allclose(turning.rotation[0], [[0.0] * 3] + [[0.1] * 3] * 3)
     np.testing.assert_allclose(turning.sigma[0], [np.inf, 0.1, 0.1, 0.1])
     problem = graph.make_problem([turning], state)
@@ -57,7 +57,7 @@ def test_the_lowest_point_of_the_feet_stands_while_its_owner_is_there():
     there = np.array([[True, True, True, False]])
     state, (stance,) = made(there=there, stance_sigma=0.01)
     assert isinstance(stance, graph.StanceFoot)
-    low = graph.carrying(stance.body, state, jnp.asarray(there))
+    low = graph.stance_mask(stance.body, state, jnp.asarray(there))
     np.testing.assert_array_equal(jnp.isfinite(stance.sigma), low)
     assert low.any() and not low[0, 0].any() and not low[0, 3].any()
     np.testing.assert_allclose(stance.sigma[low], 0.01)

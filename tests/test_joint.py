@@ -14,11 +14,11 @@ from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.pipeline import joint_stage
 from bodyslam_jax.types import (
     Bodies,
-    Cameras,
     Intrinsics,
     Keypoints,
     ScaleStart,
     Sequence,
+    SfmResult,
     Tracks,
 )
 
@@ -36,17 +36,17 @@ def _sequence(bodies: Bodies | None) -> Sequence:
     return Sequence("walk", None, np.arange(T) / 30, lens, bodies=bodies)
 
 
-def _cameras() -> Cameras:
+def _cameras() -> SfmResult:
     none = np.zeros(0, np.int64)
-    return Cameras(
+    return SfmResult(
         kind="moving",
         T_WC=np.tile(np.eye(4), (T, 1, 1)),
         registered=np.ones(T, bool),
         landmarks=np.zeros((0, 3)),
         tracks=Tracks(none, none, np.zeros((0, 2))),
         keep=none.astype(bool),
-        elsewhere=np.zeros((0, 3, 3)),
-        places=np.zeros((0, 3)),
+        prior_information=np.zeros((0, 3, 3)),
+        prior_mean=np.zeros((0, 3)),
         pixel_sigma=1.0,
         intrinsics=np.array([500.0, 500.0, 320.0, 240.0]),
         focal_sigma=float("nan"),
@@ -135,7 +135,7 @@ def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
     roots = people.roots_from_bodies(given, body)
     weights = GraphWeights(root_direction=0.02, root_depth=0.1, root_correlation=0.0)
     factors = initialisation.people_factors(_sequence(given), roots, weights, body)
-    (place,) = (f for f in factors if isinstance(f, graph.RootPlace))
+    (place,) = (f for f in factors if isinstance(f, graph.RootPositionPrior))
     state = initialisation.first_state(
         _cameras().T_WC, np.zeros((0, 3)), roots, _cameras().intrinsics
     )
@@ -151,7 +151,7 @@ def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
     seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
     both = dataclasses.replace(_sequence(given), keypoints=seen)
     factors = initialisation.people_factors(both, roots, weights, body)
-    assert not any(isinstance(f, graph.RootPlace) for f in factors)
+    assert not any(isinstance(f, graph.RootPositionPrior) for f in factors)
 
 
 def test_people_whom_no_keypoint_shows_stay_where_a_regressor_has_them():
@@ -172,7 +172,7 @@ def test_people_whom_no_keypoint_shows_stay_where_a_regressor_has_them():
     )
     roots = people.roots_from_bodies(given, body)
     factors = initialisation.people_factors(sequence, roots, GraphWeights(), body)
-    (place,) = (f for f in factors if isinstance(f, graph.RootPlace))
+    (place,) = (f for f in factors if isinstance(f, graph.RootPositionPrior))
     placed = np.asarray(np.isfinite(np.asarray(place.sigma)).all(axis=-1))
     # Person 1 from a second after the last keypoint on, and nobody else.
     assert not placed[0].any() and not placed[1, :30].any() and placed[1, 30:].all()
@@ -205,7 +205,7 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, shot):
     assert free[shot].sum() == 11
     np.testing.assert_array_equal(prepared.roots.present[0], located)
     for factor in prepared.problem.factors:
-        if isinstance(factor, graph.JointReprojection):
+        if isinstance(factor, graph.KeypointReprojection):
             assert np.isinf(np.asarray(factor.sigma)[0, ~located]).all()
 
 
@@ -285,7 +285,7 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
             _sequence(_bodies()), keypoints=seen, timestamps=np.arange(T) / fps
         )
         found = initialisation.people_factors(sequence, roots, weights, body)
-        (one,) = (f for f in found if isinstance(f, graph.JointReprojection))
+        (one,) = (f for f in found if isinstance(f, graph.KeypointReprojection))
         return np.asarray(one.sigma[0, 0, 10]), one.loss
 
     plain, loss = factor(30, 1.0)
@@ -308,7 +308,7 @@ def test_metres_are_not_known_where_nobody_tells_them():
     assert np.isnan(sigma(np.nan, moving=True, told=False))
 
 
-def _tracked() -> Cameras:
+def _tracked() -> SfmResult:
     """The same cameras, of which two landmarks are known, to 0.6 px."""
     frame = np.repeat(np.arange(T), 2)
     landmark = np.tile(np.arange(2), T)
@@ -319,8 +319,8 @@ def _tracked() -> Cameras:
         landmarks=points,
         tracks=Tracks(frame, landmark, uv),
         keep=np.arange(2 * T) > 0,
-        elsewhere=np.tile(np.eye(3), (2, 1, 1)),
-        places=points,
+        prior_information=np.tile(np.eye(3), (2, 1, 1)),
+        prior_mean=points,
         pixel_sigma=0.6,
     )
 
@@ -360,7 +360,7 @@ def test_keypoints_of_the_papers_preset_saturate_at_the_same_distance():
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
     weights = GraphWeights.paper()
     found = initialisation.people_factors(sequence, roots, weights, body)
-    (factor,) = (f for f in found if isinstance(f, graph.JointReprojection))
+    (factor,) = (f for f in found if isinstance(f, graph.KeypointReprojection))
     for pixels in (3.0, 100.0, 1000.0):
         cost = factor.loss.rho((pixels / factor.sigma) ** 2)
         expected = confidence**2 * 1e4 * pixels**2 / (1e4 + pixels**2)
@@ -398,8 +398,8 @@ def test_displacements_of_the_papers_preset_are_in_metres():
         # λ_mm = 100 of an error that is the whole step, as nobody moves.
         found = factor.residual(other)
         np.testing.assert_allclose(found[0, 1:], [-10 * step] * (T - 1), rtol=1e-9)
-        assert ("shape", 0) not in factor.touches
-    assert ("shape", 0) in make(GraphWeights(), state.shapes).touches
+        assert ("shape", 0) not in factor.keys
+    assert ("shape", 0) in make(GraphWeights(), state.shapes).keys
 
 
 @pytest.mark.parametrize("coupling", ["frozen", "refreshed"])
@@ -416,7 +416,9 @@ def test_postures_are_held_to_predictions_only_where_there_are_any(
     config = dataclasses.replace(Config.paper(), motion_coupling=coupling)
     body = load_body_model(dtype=jnp.float64)
     prepared = joint_stage.prepare(sequence, _cameras(), _bodies(), body, config)
-    (factor,) = (f for f in prepared.problem.factors if isinstance(f, graph.Posture))
+    (factor,) = (
+        f for f in prepared.problem.factors if isinstance(f, graph.BodyPosePrior)
+    )
     known = np.isfinite(np.asarray(factor.sigma)).all(axis=-1)
     np.testing.assert_array_equal(known, valid)
     held = prepared.problem.motion is None
@@ -446,7 +448,7 @@ def test_a_posture_that_may_not_be_predicted_is_not_held():
         for factor in initialisation.people_factors(
             sequence, roots, weights, body, **known
         )
-        if isinstance(factor, graph.Posture)
+        if isinstance(factor, graph.BodyPosePrior)
     )
     held = lambda factor: jnp.isfinite(factor.sigma).all(axis=-1)[0]
     known = held(make())

@@ -239,7 +239,7 @@ def a_person(frames=4):
     T_CH = np.tile(np.eye(4), (1, frames, 1, 1))
     T_CH[0, :, :3, 3] = [0.5, 0.1, 4.0]
     present = np.ones((1, frames), bool)
-    return people.Roots(
+    return people.PersonState(
         present, T_CH, np.zeros((1, frames, 23, 3)), np.full((1, 10), 0.3)
     )
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from bodyslam_jax.solver import over_devices
+from bodyslam_jax.solver import vmap_over_devices
 
 SETUP = """
 import jax
@@ -41,14 +41,14 @@ def scaled(x, rate, name):
 
 
 def test_a_batch_on_one_device_is_vmap():
-    spread = over_devices(scaled, (0, None, None))
+    spread = vmap_over_devices(scaled, (0, None, None))
     found = spread(jnp.arange(6.0).reshape(3, 2), jnp.array(2.0), "sum")
     assert found["name"] == "sum"
     assert found["sum"].tolist() == [2.0, 10.0, 18.0]
 
 
 def test_what_cannot_be_shared_out_is_said():
-    spread = over_devices(scaled, (0, 0, None))
+    spread = vmap_over_devices(scaled, (0, 0, None))
     with pytest.raises(ValueError, match=r"leading axes.*\(2,\), \(3,\)"):
         spread(jnp.ones((3, 2)), jnp.ones(2), "sum")
     with pytest.raises(ValueError, match=r"leading axes.*\(\), \(3,\)"):
@@ -56,7 +56,7 @@ def test_what_cannot_be_shared_out_is_said():
     with pytest.raises(ValueError, match="2 arguments, expected 0 or None"):
         spread(jnp.ones((3, 2)), jnp.ones(3))
     with pytest.raises(ValueError, match="leading axes"):
-        over_devices(jnp.sum, (None,))(jnp.ones(3))
+        vmap_over_devices(jnp.sum, (None,))(jnp.ones(3))
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="devices of a CPU")

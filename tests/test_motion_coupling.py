@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 import bodyslam_jax.graph as g
 from bodyslam_jax import motion, simulation
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.pipeline.joint_stage import COUPLED
+from bodyslam_jax.pipeline.joint_stage import COUPLED_OUTPUTS
 from bodyslam_jax.solver import Stage, solve
 from bodyslam_jax.solver.apart import split_poses
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
@@ -64,7 +64,7 @@ def make(coupled, factors=lambda found: found):
 def held_to_prediction(factors):
     """Postures against the motion model's, as in the paper."""
     change = lambda f: (
-        dataclasses.replace(f, predicted=True) if isinstance(f, g.Posture) else f
+        dataclasses.replace(f, predicted=True) if isinstance(f, g.BodyPosePrior) else f
     )
     return [change(f) for f in factors]
 
@@ -113,9 +113,9 @@ def test_the_coupled_optimum_is_that_of_a_dense_solver():
 
 def test_every_way_to_follow_the_estimate_is_known():
     hints = typing.get_type_hints(Config)
-    assert set(COUPLED) == set(typing.get_args(hints["motion_coupling"]))
+    assert set(COUPLED_OUTPUTS) == set(typing.get_args(hints["motion_coupling"]))
     names = {field.name for field in dataclasses.fields(Seen)}
-    assert names == set(COUPLED["full"])
+    assert names == set(COUPLED_OUTPUTS["full"])
 
 
 def test_what_is_not_coupled_has_no_derivative():
@@ -209,7 +209,7 @@ def walk(scale):
         motion.predict_between, (model, clock), body, jnp.ones((1, 60), bool)
     )
     problem = g.make_problem(factors, state, motion=predictor)
-    held = g.hold(problem.free, "scale", "cameras", "shapes")
+    held = g.set_constant(problem.free, "scale", "cameras", "shapes")
     wrong = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(scale))
     return dataclasses.replace(problem, free=held), wrong
 
@@ -253,11 +253,11 @@ def test_postures_that_nothing_holds_do_follow_a_wrong_scale(monkeypatch):
     """So that the test above could see it."""
 
     def loosen(problem):
-        problem = g.mute(problem, g.JointReprojection)
-        held = g.hold(problem.free, "roots")
+        problem = g.disable(problem, g.KeypointReprojection)
+        held = g.set_constant(problem.free, "roots")
         problem = dataclasses.replace(problem, free=held)
         where = lambda p: p.factors[2].sigma
-        assert isinstance(problem.factors[2], g.Posture)
+        assert isinstance(problem.factors[2], g.BodyPosePrior)
         return eqx.tree_at(where, problem, 10 * where(problem))
 
     longer, _ = follows(("translation",), loosen, monkeypatch)

@@ -87,7 +87,7 @@ def test_focal_length_of_fronto_parallel_motion_is_reported(turns):
         sigma=jnp.array([[60.0, 60.0, 1e-3, 1e-3]]),
     )
     factors = [scenes.reprojection(rng, truth, 0.0), prior]
-    factors += [g.SquarePixels(sigma=jnp.array([1e-3]))]
+    factors += [g.AspectRatioPrior(sigma=jnp.array([1e-3]))]
     problem = g.make_problem(factors, truth, free_intrinsics=True)
     jacobian, _ = dense(problem, truth)
     normal = jacobian.T @ jacobian + 1e-9 * np.eye(jacobian.shape[1])

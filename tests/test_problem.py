@@ -37,7 +37,7 @@ def eye(n, *lead):
 
 
 @functools.cache
-def fitting() -> tuple[g.State, dict[str, g.AbstractFactor]]:
+def fitting() -> tuple[g.State, dict[str, g.Factor]]:
     """A state and factors of each kind that has a check of its own; nothing is true."""
     state = g.State(
         scale=jnp.ones(()),
@@ -53,18 +53,18 @@ def fitting() -> tuple[g.State, dict[str, g.AbstractFactor]]:
     factors = [
         g.Reprojection(track % T, track, zeros(M, 2), ones(M), g.Cauchy(1.5)),
         g.LandmarkPrior(zeros(L, 3), zeros(L, 3, 3)),
-        g.JointReprojection(
+        g.KeypointReprojection(
             body, zeros(1, T, 25, 2), ones(1, T, 25), g.GemanMcClure(jnp.array(3.0))
         ),
         g.HumanMotion(zeros(1, T, 3), zeros(1, T, 3, 3), zeros(1, T), body=body),
-        g.Posture(zeros(1, T, 23, 3), ones(1, T, 23), zeros(1, T)),
+        g.BodyPosePrior(zeros(1, T, 23, 3), ones(1, T, 23), zeros(1, T)),
         g.CameraPrior(eye(4, T), ones(T, 6)),
         g.IntrinsicsPrior(state.intrinsics[None], ones(1, 4)),
-        g.SquarePixels(ones(1)),
+        g.AspectRatioPrior(ones(1)),
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
-        g.RootPlace(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
+        g.RootPositionPrior(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
         g.StanceFoot(body, ones(1, T, 4).at[:, 0].set(jnp.inf)),
-        g.UpDirection(jnp.array([0.0, -1, 0]), ones(1, T)),
+        g.UprightPrior(jnp.array([0.0, -1, 0]), ones(1, T)),
         g.GroundContact(body, jnp.array([0.0, -1, 0, 1.5]), ones(1, T)),
     ]
     return state, {type(factor).__name__: factor for factor in factors}
@@ -131,29 +131,39 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("Reprojection", "loss", g.Cauchy(float("nan")), "not finite"),
         ("LandmarkPrior", "place", lambda x: x[:5], "(5, 3), expected (6, 3)"),
         ("LandmarkPrior", "whitening", ones(L, 3, 3), "1 landmarks have a prior"),
-        ("JointReprojection", "pixel", NAN, "not finite"),
-        ("JointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
-        ("JointReprojection", "sigma", ones(1, T, 24), "expected (1, 3, 25)"),
-        ("JointReprojection", "layout", "coco", "layout: found 'coco'"),
+        ("KeypointReprojection", "pixel", NAN, "not finite"),
+        ("KeypointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
+        ("KeypointReprojection", "sigma", ones(1, T, 24), "expected (1, 3, 25)"),
+        ("KeypointReprojection", "layout", "coco", "layout: found 'coco'"),
         (
-            "JointReprojection",
+            "KeypointReprojection",
             "bias",
             float("nan"),
             "bias: 1 of 1 values are not finite",
         ),
         ("HumanMotion", "translation", SHORT, "(1, 2, 3), expected (1, 3, 3)"),
         ("HumanMotion", "correlation", ones(1, T), "found 1.0, expected between"),
-        ("Posture", "correlation", 1.5 * ones(1, T), "found 1.5, expected between"),
-        ("Posture", "sigma", ones(1, 1, 23), "(1, 1, 23), expected (1, 3, 23)"),
+        (
+            "BodyPosePrior",
+            "correlation",
+            1.5 * ones(1, T),
+            "found 1.5, expected between",
+        ),
+        ("BodyPosePrior", "sigma", ones(1, 1, 23), "(1, 1, 23), expected (1, 3, 23)"),
         ("CameraPrior", "cameras", lambda x: 2 * x, "3 of 3 are no rigid poses"),
         ("IntrinsicsPrior", "intrinsics", zeros(1, 8), "(1, 8), expected (1, 4)"),
-        ("SquarePixels", "sigma", ones(T), "(3,), expected (1,)"),
+        ("AspectRatioPrior", "sigma", ones(T), "(3,), expected (1,)"),
         ("RootOrientation", "orientation", zeros(1, T, 3, 3), "no rigid rotations"),
-        ("RootPlace", "place", zeros(1, T, 3), "a depth of 0.0 m, expected above 0"),
+        (
+            "RootPositionPrior",
+            "place",
+            zeros(1, T, 3),
+            "a depth of 0.0 m, expected above 0",
+        ),
         ("StanceFoot", "sigma", ones(1, T, 3), "(1, 3, 3), expected (1, 3, 4)"),
         ("StanceFoot", "points", (19, 21, 22, 25), "19 to 25, expected 0 to 24"),
-        ("UpDirection", "up", ones(4), "(4,), expected (3,)"),
-        ("UpDirection", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
+        ("UprightPrior", "up", ones(4), "(4,), expected (3,)"),
+        ("UprightPrior", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
         ("GroundContact", "plane", lambda x: x / 1.5, "length 0.6667, expected 1"),
     ],
 )
@@ -275,8 +285,8 @@ def test_under_a_transformation_shapes_alone_are_looked_at():
 def test_what_is_missing_may_be_zero_and_costs_nothing(quick_compilation):
     state, factors = fitting()
     missing = {}
-    for name in ("CameraPrior", "RootOrientation", "RootPlace"):
-        factor = changed(factors[name], factors[name].frame_fields[0], jnp.zeros_like)
+    for name in ("CameraPrior", "RootOrientation", "RootPositionPrior"):
+        factor = changed(factors[name], factors[name].time_fields[0], jnp.zeros_like)
         never = lambda x: jnp.full_like(x, jnp.inf)
         missing[name] = changed(factor, "sigma", never)
     make(**missing)
@@ -362,9 +372,9 @@ def test_a_mask_takes_the_precision_of_the_state():
 
 EARLY = {
     "RootSmoothness": lambda: g.RootSmoothness(ones(1, T)),
-    "RootTurning": lambda: g.RootTurning(ones(1, T)),
+    "AngularAccelerationPrior": lambda: g.AngularAccelerationPrior(ones(1, T)),
     "CameraSmoothness": lambda: g.CameraSmoothness(ones(T, 2)),
-    "OrientationChange": lambda: g.OrientationChange(zeros(1, T, 3), ones(1, T)),
+    "RelativeOrientation": lambda: g.RelativeOrientation(zeros(1, T, 3), ones(1, T)),
 }
 
 
@@ -372,13 +382,13 @@ EARLY_FRAMES = [
     ("HumanMotion", "whitening", 0),
     ("HumanMotion", "correlation", 0),
     ("HumanMotion", "correlation", 1),
-    ("Posture", "correlation", 0),
+    ("BodyPosePrior", "correlation", 0),
     ("RootOrientation", "correlation", 0),
-    ("RootPlace", "correlation", 0),
-    ("OrientationChange", "sigma", 0),
+    ("RootPositionPrior", "correlation", 0),
+    ("RelativeOrientation", "sigma", 0),
     ("RootSmoothness", "sigma", 0),
     ("RootSmoothness", "sigma", 1),
-    ("RootTurning", "sigma", 1),
+    ("AngularAccelerationPrior", "sigma", 1),
     ("StanceFoot", "sigma", 0),
     ("CameraSmoothness", "sigma", 1),
 ]
@@ -399,7 +409,9 @@ def test_weights_of_frames_without_an_earlier_one_are_refused(name, field, at):
     make(**{name: one(first + 1)})
 
 
-@pytest.mark.parametrize("name", ["RootOrientation", "RootPlace", "HumanMotion"])
+@pytest.mark.parametrize(
+    "name", ["RootOrientation", "RootPositionPrior", "HumanMotion"]
+)
 def test_errors_that_go_on_from_what_was_not_measured_are_refused(name):
     factor = fitting()[1][name]
     where = "whitening" if name == "HumanMotion" else "sigma"
@@ -437,7 +449,7 @@ def test_added_frames_weigh_nothing_to_any_factor():
     longer = dataclasses.replace(longer, cameras=longer.cameras.at[T:, 0, 3].add(0.3))
     checked = 0
     for name, factor in factors.items():
-        if isinstance(factor, g.AbstractFrameFactor):
+        if isinstance(factor, g.FrameFactor):
             padded = g.pad_factor(factor, state, 2)
             assert not isinstance(padded, Masked), name
             found, expected = padded.cost(longer), factor.cost(state)
@@ -448,12 +460,12 @@ def test_added_frames_weigh_nothing_to_any_factor():
 
 def test_a_loss_has_one_scale_or_one_for_each_keypoint():
     state, factors = fitting()
-    keypoints = factors["JointReprojection"]
-    assert isinstance(keypoints, g.JointReprojection)
+    keypoints = factors["KeypointReprojection"]
+    assert isinstance(keypoints, g.KeypointReprojection)
     each = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0 * ones(1, T, 25)))
     one = dataclasses.replace(keypoints, loss=g.GemanMcClure(3.0))
     moved = dataclasses.replace(state, roots=state.roots.at[..., 2, 3].set(4.0))
-    make(JointReprojection=each)
+    make(KeypointReprojection=each)
     np.testing.assert_allclose(each.cost(moved), one.cost(moved), rtol=1e-12)
     for a, b in zip(each.curvature(moved), one.curvature(moved), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
@@ -464,4 +476,4 @@ def test_a_loss_has_one_scale_or_one_for_each_keypoint():
     with pytest.raises(
         ValueError, match=r"scale: shape \(25,\), expected one number, "
     ):
-        make(JointReprojection=wrong)
+        make(KeypointReprojection=wrong)

@@ -29,6 +29,6 @@ def test_long_tracks_are_cut_only_after_they_have_shown_the_path():
     assert max(np.ptp(frames) for frames in seen if len(frames)) < 9
     assert len(cut.landmarks) > 1.5 * len(whole.landmarks)
     # A piece knows of the others, and is where all of them together are.
-    told = np.trace(cut.elsewhere, axis1=1, axis2=2)
+    told = np.trace(cut.prior_information, axis1=1, axis2=2)
     assert np.mean(told > 0) > 0.6  # tracks that were not cut know of none
-    np.testing.assert_array_equal(cut.places, cut.landmarks)
+    np.testing.assert_array_equal(cut.prior_mean, cut.landmarks)

@@ -26,7 +26,7 @@ from bodyslam_jax.solver import (
     solve,
     trace,
 )
-from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import sizes_of
 from bodyslam_jax.solver.gmres import RESTART, gmres
 from bodyslam_jax.solver.linearise import linearise
@@ -152,7 +152,7 @@ def test_gauss_newton_reaches_the_same_optimum():
 
 def test_last_steps_know_what_keypoints_bend():
     problem, _, start = make(2, people=1, frames=12, noise=5.0)
-    robust = g.Reprojection, g.JointReprojection
+    robust = g.Reprojection, g.KeypointReprojection
     # What weights of robust losses bend is left out, and would hide the rest.
     factors = tuple(
         dataclasses.replace(f, loss=g.Squared()) if isinstance(f, robust) else f
@@ -198,7 +198,7 @@ def test_a_share_of_the_curvature_of_all_keypoints_joins_the_equations(dtype):
         linearise, problem, gather(problem), state, sizes.dtype
     )
     lin = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), like)
-    (keypoints,) = (f for f in problem.factors if isinstance(f, g.JointReprojection))
+    (keypoints,) = (f for f in problem.factors if isinstance(f, g.KeypointReprojection))
     twice = dataclasses.replace(problem, factors=(*problem.factors, keypoints))
     bent = eqx.filter_jit(curvature_of)
     one, two = (bent(p, lin, state, sizes) for p in (problem, twice))
@@ -385,7 +385,7 @@ def test_a_cpu_maps_in_turn():
     def turn(x, name):
         return {name: jax.lax.cond(x > 0, lambda: 2 * x, lambda: -x), "name": name}
 
-    mapped = jax.vmap(lambda x: in_turn(turn)(x, "y")["y"])
+    mapped = jax.vmap(lambda x: sequential_vmap(turn)(x, "y")["y"])
     x = jnp.array([1.0, -3.0])
     assert mapped(x).tolist() == [2.0, 3.0]
     assert "cond[" in str(jax.make_jaxpr(mapped)(x))
@@ -602,10 +602,10 @@ def test_marginal_covariances_are_mapped_over():
 def test_factors_that_reach_too_far_are_refused():
     class Far(g.CameraSmoothness):
         @property
-        def touches(self):
+        def keys(self):
             return ("camera", 0), ("camera", CHUNK)
 
-        def local(self, data, window, shared):
+        def frame_residual(self, data, window, shared):
             return (window[0].camera - window[CHUNK].camera)[:3, 3] / data[0]
 
     problem, state, start = make()
@@ -921,7 +921,7 @@ def test_derivatives_where_landmarks_or_single_coordinates_are_held():
     )
     every = jax.tree.map(jnp.ones_like, state.zero_step())
     every = dataclasses.replace(every, scale=jnp.zeros(()))
-    held = g.hold(every, "landmarks", "intrinsics")
+    held = g.set_constant(every, "landmarks", "intrinsics")
     yaw = dataclasses.replace(held, cameras=held.cameras.at[:, 1].set(0.0))
     exact = (Stage(rtol=1e-15, max_steps=200),)
     by_map = (Stage(free=("cameras",), rtol=1e-15, max_steps=200),)
@@ -929,7 +929,7 @@ def test_derivatives_where_landmarks_or_single_coordinates_are_held():
     cases = (
         (held, exact),
         (yaw, exact),
-        (g.hold(every, "intrinsics"), by_map),
+        (g.set_constant(every, "intrinsics"), by_map),
     )
     for free, schedule in cases:
         problem = g.make_problem([factor], state, free=free)
@@ -952,7 +952,7 @@ def test_marginal_covariances_are_differentiable(people):
     problem, _, start = make(people=people, known=True)
     state = solve(problem, start).state
     spread = marginals(problem, state)
-    kind = g.JointReprojection if people else g.Reprojection
+    kind = g.KeypointReprojection if people else g.Reprojection
     at = next(i for i, f in enumerate(problem.factors) if isinstance(f, kind))
     sigma = problem.factors[at].sigma
     seen = jnp.isfinite(sigma)

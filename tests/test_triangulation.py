@@ -88,7 +88,7 @@ def test_cost_never_rises_and_what_is_held_or_says_nothing_stays():
     found, lower = triangulate_anew(problem, start, terms, 0.1)
     assert (lower.sum() < terms.sum()) and (lower <= terms + 30).all()
     assert np.allclose(lower, terms_of(problem, found))
-    held = dataclasses.replace(problem, free=g.hold(problem.free, "landmarks"))
+    held = dataclasses.replace(problem, free=g.set_constant(problem.free, "landmarks"))
     same, as_before = triangulate_anew(held, start, terms, 0.1)
     assert (same.landmarks == start.landmarks).all() and np.allclose(as_before, terms)
     # One sighting each: any depth fits.

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyslam_jax import evaluation
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.types import Cameras, Result
+from bodyslam_jax.types import Result, SfmResult
 
 ALONE = "cameras alone, arbitrary scale"
 JOINT = "joint estimate, in metres"
@@ -19,7 +19,7 @@ _HEADLINE = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "scale")
 
 
 def errors(
-    result: Result, cameras: Cameras, truth: Result, body: BodyModel
+    result: Result, cameras: SfmResult, truth: Result, body: BodyModel
 ) -> dict[str, dict[str, float | str]]:
     """What `bodyslam evaluate` says, before and after the joint estimate.
 

@@ -13,7 +13,7 @@ from bodyslam_jax import graph
 def rebuild(
     problem: graph.Problem,
     state: graph.State,
-    factors: list[graph.AbstractFactor],
+    factors: list[graph.Factor],
     free: graph.Step | None = None,
 ) -> graph.Problem:
     """A problem of other `factors`, with the predictor of this one."""
@@ -34,7 +34,7 @@ def without_map(
     bare = eqx.tree_at(lambda s: s.landmarks, state, state.landmarks[:0])
     free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
     if hold_cameras:
-        free = graph.hold(free, "cameras")
+        free = graph.set_constant(free, "cameras")
     of_map = (graph.Reprojection, graph.LandmarkPrior, graph.GroundContact)
     kept = [f for f in problem.factors if not isinstance(f, of_map)]
     return rebuild(problem, bare, kept, free), bare

@@ -93,7 +93,7 @@ def _recover_one(
     return solver.trace(problem, start, observe, schedule=schedule)
 
 
-_recover = solver.over_devices(_recover_one, (0, *(None,) * 7))
+_recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 7))
 
 
 def _h_ate(state, truth: Trajectories, body, present, registered):

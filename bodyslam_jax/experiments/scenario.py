@@ -14,7 +14,7 @@ from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments.scoring import score, truth_of
 from bodyslam_jax.pipeline import joint_stage, sfm_stage
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
-from bodyslam_jax.types import Bodies, Cameras, Sequence
+from bodyslam_jax.types import Bodies, Sequence, SfmResult
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Case:
     sequence: Sequence
     truth: evaluation.Trajectories
     body: body_.BodyModel
-    cameras: Cameras
+    cameras: SfmResult
     bodies: Bodies
     config: Config
 

@@ -37,19 +37,21 @@ _FPS = 30.0
 """Of the simulated sequences."""
 
 
-def without(*kinds: type[graph.AbstractFactor]) -> Variant:
+def without(*kinds: type[graph.Factor]) -> Variant:
     """The problem without these terms; s is held where nothing is left to see it.
 
     Where they measure nothing, it is the very problem that was given.
     """
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
-        muted = graph.mute(problem, *kinds)
+        muted = graph.disable(problem, *kinds)
         if eqx.tree_equal(muted, problem):
             return problem, state
         seeing = [f for f in problem.factors if isinstance(f, _SEE_SCALE)]
         if all(isinstance(f, kinds) for f in seeing):
-            muted = dataclasses.replace(muted, free=graph.hold(muted.free, "scale"))
+            muted = dataclasses.replace(
+                muted, free=graph.set_constant(muted.free, "scale")
+            )
         return muted, state
 
     return variant
@@ -59,7 +61,7 @@ def held(*names: str) -> Variant:
     """The problem with these groups of variables as they are at the start."""
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
-        free = graph.hold(problem.free, *names)
+        free = graph.set_constant(problem.free, *names)
         return dataclasses.replace(problem, free=free), state
 
     return variant
@@ -75,7 +77,7 @@ def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
 
 def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
     """β as the regressor has it, not as people alone have moved it, and held there."""
-    (said,) = (f for f in problem.factors if isinstance(f, graph.Shape))
+    (said,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
     known = jnp.isfinite(said.sigma)
     count = known.sum(axis=1, dtype=said.shape.dtype)
     mean = jnp.where(known, said.shape, 0.0).sum(axis=1) / jnp.maximum(count, 1)
@@ -85,7 +87,7 @@ def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
 
 def beside(
     make: Callable[
-        [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.AbstractFactor | None
+        [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.Factor | None
     ],
 ) -> Variant:
     """One more term, if there is anything for it to say."""
@@ -104,7 +106,7 @@ def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     if motion is not None:
         return motion.body, motion.present
     for factor in problem.factors:  # where predictions stay as they are
-        if isinstance(factor, graph.JointReprojection):
+        if isinstance(factor, graph.KeypointReprojection):
             return factor.body, jnp.isfinite(factor.sigma).any(axis=-1)
     raise ValueError("the problem has no people; expected a moving person.")
 
@@ -120,11 +122,11 @@ VARIANTS: dict[str, Variant] = {
     "no smooth path": without(graph.RootSmoothness),
     "no landmarks": without_landmarks,
     "no places seen again": without(graph.LandmarkPrior),
-    "no keypoints": without(graph.JointReprojection),
-    "no regressed postures": without(graph.Posture),
+    "no keypoints": without(graph.KeypointReprojection),
+    "no regressed postures": without(graph.BodyPosePrior),
     "no regressed orientation": without(graph.RootOrientation),
-    "no steady turning": without(graph.RootTurning),
-    "no regressed shape": without(graph.Shape),
+    "no steady turning": without(graph.AngularAccelerationPrior),
+    "no regressed shape": without(graph.ShapePrior),
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
     "with stance foot": beside(

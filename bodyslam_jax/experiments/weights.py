@@ -26,15 +26,15 @@ from bodyslam_jax.experiments.scoring import errors, trajectories
 from bodyslam_jax.pipeline import joint_stage, stage_cache
 
 log = logging.getLogger(__name__)
-WEIGHTS: dict[str, tuple[type[graph.AbstractFactor], str]] = {
-    "keypoint": (graph.JointReprojection, "sigma"),
-    "keypoint loss": (graph.JointReprojection, "loss"),
+WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
+    "keypoint": (graph.KeypointReprojection, "sigma"),
+    "keypoint loss": (graph.KeypointReprojection, "loss"),
     "motion": (graph.HumanMotion, "whitening"),
-    "posture": (graph.Posture, "sigma"),
-    "shape": (graph.Shape, "sigma"),
+    "posture": (graph.BodyPosePrior, "sigma"),
+    "shape": (graph.ShapePrior, "sigma"),
     "orientation": (graph.RootOrientation, "sigma"),
-    "turning": (graph.RootTurning, "sigma"),
-    "upright": (graph.UpDirection, "sigma"),
+    "turning": (graph.AngularAccelerationPrior, "sigma"),
+    "upright": (graph.UprightPrior, "sigma"),
     "smooth path": (graph.RootSmoothness, "sigma"),
     "ground": (graph.GroundContact, "sigma"),
     "landmark": (graph.Reprojection, "sigma"),
@@ -122,9 +122,7 @@ def reweighted(
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
 
 
-def _scaled(
-    factor: graph.AbstractFactor, field: str, by: Array
-) -> graph.AbstractFactor:
+def _scaled(factor: graph.Factor, field: str, by: Array) -> graph.Factor:
     if field == "loss":
         return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)  # pyright: ignore
     old = getattr(factor, field)

@@ -16,7 +16,7 @@ from bodyslam_jax.diagnostics import figures, plausibility
 from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS, Reason
 from bodyslam_jax.geometry import camera
 from bodyslam_jax.geometry.gravity import Upright
-from bodyslam_jax.types import Cameras, Joint, Result, ScaleStart, Sequence
+from bodyslam_jax.types import JointEstimate, Result, ScaleStart, Sequence, SfmResult
 
 _CUES_APART = 1.25
 """Factor between the sizes that motion and ground tell, from which a line says so."""
@@ -31,8 +31,8 @@ def summarise(
     sequence: Sequence,
     config: Config,
     body: body_.BodyModel,
-    cameras: Cameras,
-    joint: Joint,
+    cameras: SfmResult,
+    joint: JointEstimate,
     result: Result,
     up: Upright,
     seconds: dict[str, float],
@@ -158,7 +158,7 @@ def summarise(
     }
 
 
-def _missing(result: Result, cameras: Cameras) -> list[Reason]:
+def _missing(result: Result, cameras: SfmResult) -> list[Reason]:
     """What there is no result without, or only a part of one."""
     found = []
     if not np.isfinite(result.T_WC).all() or not np.isfinite(result.joints).all():
@@ -208,7 +208,9 @@ def _missing(result: Result, cameras: Cameras) -> list[Reason]:
     return found
 
 
-def _scale_unknown(result: Result, cameras: Cameras, start: ScaleStart) -> list[Reason]:
+def _scale_unknown(
+    result: Result, cameras: SfmResult, start: ScaleStart
+) -> list[Reason]:
     """Where nothing tells how large the map is, although there are people in it."""
     if cameras.kind != "moving" or not result.present.any():
         return []
@@ -244,8 +246,8 @@ def _scale_unknown(result: Result, cameras: Cameras, start: ScaleStart) -> list[
 def _implausible(
     sequence: Sequence,
     body: body_.BodyModel,
-    cameras: Cameras,
-    joint: Joint,
+    cameras: SfmResult,
+    joint: JointEstimate,
     result: Result,
     up: Upright,
     scale_sigma: float,
@@ -278,7 +280,7 @@ def _implausible(
     return found + plausibility.judge(WORLD_CHECKS, told)
 
 
-def _known_to(share: float, cameras: Cameras) -> str:
+def _known_to(share: float, cameras: SfmResult) -> str:
     """How well the camera's metres are known, to stand behind them."""
     if cameras.kind != "moving" or np.isnan(share):
         return ""
@@ -359,7 +361,7 @@ def describe(sequence: Sequence) -> dict[str, Any]:
     }
 
 
-def focal_length(sequence: Sequence, cameras: Cameras) -> dict[str, Any]:
+def focal_length(sequence: Sequence, cameras: SfmResult) -> dict[str, Any]:
     """The focal length used, and how it was come by; px.
 
     `focal_sigma_px` is `None` unless a guess could be refined.
@@ -392,7 +394,7 @@ def versions() -> dict[str, str]:
 
 
 def per_frame(
-    sequence: Sequence, body: body_.BodyModel, cameras: Cameras, joint: Joint
+    sequence: Sequence, body: body_.BodyModel, cameras: SfmResult, joint: JointEstimate
 ) -> dict[str, list[float | None]]:
     """How well each frame is explained: mean pixel errors, tracks and inliers."""
     t = sequence.num_frames
@@ -419,7 +421,7 @@ def per_frame(
 
 
 def _projected_keypoints(
-    body: body_.BodyModel, joint: Joint
+    body: body_.BodyModel, joint: JointEstimate
 ) -> Float[np.ndarray, "h t 25 2"]:
     """Where the keypoints of the estimated bodies are in the images, px."""
     shapes = jnp.asarray(joint.shapes)[:, None]
@@ -429,7 +431,7 @@ def _projected_keypoints(
     return np.asarray(camera.project(jnp.asarray(joint.intrinsics), p_C))
 
 
-def _turned(sequence: Sequence, joint: Joint, person: int) -> float:
+def _turned(sequence: Sequence, joint: JointEstimate, person: int) -> float:
     """How far a person is turned from the body given; NaN where none is."""
     if sequence.bodies is None:
         return np.nan
@@ -439,7 +441,9 @@ def _turned(sequence: Sequence, joint: Joint, person: int) -> float:
     return figures.turned_from_body(np.asarray(turn), np.asarray(given, float))
 
 
-def _misfits(sequence: Sequence, body: body_.BodyModel, joint: Joint) -> list[float]:
+def _misfits(
+    sequence: Sequence, body: body_.BodyModel, joint: JointEstimate
+) -> list[float]:
     """Worst distance of each person's keypoints from the body, of its size; NaN where
     there are no keypoints."""
     if sequence.keypoints is None or not joint.present.any():

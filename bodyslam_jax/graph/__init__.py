@@ -1,50 +1,52 @@
 """What is estimated, and why: state, error terms, problem."""
 
-from bodyslam_jax.graph.edit import hold as hold
-from bodyslam_jax.graph.edit import mute as mute
+from bodyslam_jax.graph.edit import disable as disable
+from bodyslam_jax.graph.edit import set_constant as set_constant
 from bodyslam_jax.graph.factor import JOINTS as JOINTS
-from bodyslam_jax.graph.factor import AbstractFactor as AbstractFactor
-from bodyslam_jax.graph.factor import AbstractFrameFactor as AbstractFrameFactor
+from bodyslam_jax.graph.factor import Factor as Factor
 from bodyslam_jax.graph.factor import Frame as Frame
+from bodyslam_jax.graph.factor import FrameFactor as FrameFactor
 from bodyslam_jax.graph.factor import Limbs as Limbs
 from bodyslam_jax.graph.factor import Shared as Shared
 from bodyslam_jax.graph.factor import residual_of as residual_of
-from bodyslam_jax.graph.factors.body_pose import Posture as Posture
-from bodyslam_jax.graph.factors.body_pose import Shape as Shape
+from bodyslam_jax.graph.factors.body_pose import BodyPosePrior as BodyPosePrior
+from bodyslam_jax.graph.factors.body_pose import ShapePrior as ShapePrior
 from bodyslam_jax.graph.factors.body_pose import Stature as Stature
 from bodyslam_jax.graph.factors.body_pose import rotation_between as rotation_between
+from bodyslam_jax.graph.factors.camera import AspectRatioPrior as AspectRatioPrior
 from bodyslam_jax.graph.factors.camera import CameraPrior as CameraPrior
 from bodyslam_jax.graph.factors.camera import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph.factors.camera import IntrinsicsPrior as IntrinsicsPrior
 from bodyslam_jax.graph.factors.camera import ScalePrior as ScalePrior
-from bodyslam_jax.graph.factors.camera import SquarePixels as SquarePixels
 from bodyslam_jax.graph.factors.ground import GroundContact as GroundContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion
 from bodyslam_jax.graph.factors.human_motion import (
-    OrientationChange as OrientationChange,
+    RelativeOrientation as RelativeOrientation,
 )
 from bodyslam_jax.graph.factors.landmark import LandmarkPrior as LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import (
-    JointReprojection as JointReprojection,
+    KeypointReprojection as KeypointReprojection,
 )
 from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
+from bodyslam_jax.graph.factors.root import (
+    AngularAccelerationPrior as AngularAccelerationPrior,
+)
 from bodyslam_jax.graph.factors.root import RootOrientation as RootOrientation
-from bodyslam_jax.graph.factors.root import RootPlace as RootPlace
+from bodyslam_jax.graph.factors.root import RootPositionPrior as RootPositionPrior
 from bodyslam_jax.graph.factors.root import RootSmoothness as RootSmoothness
-from bodyslam_jax.graph.factors.root import RootTurning as RootTurning
-from bodyslam_jax.graph.factors.root import UpDirection as UpDirection
+from bodyslam_jax.graph.factors.root import UprightPrior as UprightPrior
 from bodyslam_jax.graph.factors.stance import BODY25_FEET as BODY25_FEET
 from bodyslam_jax.graph.factors.stance import StanceFoot as StanceFoot
-from bodyslam_jax.graph.factors.stance import carrying as carrying
+from bodyslam_jax.graph.factors.stance import stance_mask as stance_mask
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout
 from bodyslam_jax.graph.layout import round_up as round_up
-from bodyslam_jax.graph.losses import AbstractLoss as AbstractLoss
 from bodyslam_jax.graph.losses import BlakeZisserman as BlakeZisserman
 from bodyslam_jax.graph.losses import Cauchy as Cauchy
 from bodyslam_jax.graph.losses import GemanMcClure as GemanMcClure
+from bodyslam_jax.graph.losses import Loss as Loss
 from bodyslam_jax.graph.losses import Squared as Squared
-from bodyslam_jax.graph.losses import lift as lift
+from bodyslam_jax.graph.losses import robustify as robustify
 from bodyslam_jax.graph.losses import squared_norm as squared_norm
 from bodyslam_jax.graph.ordering import CHUNK as CHUNK
 from bodyslam_jax.graph.padding import extend as extend
@@ -64,5 +66,5 @@ from bodyslam_jax.graph.state import retract_pose as retract_pose
 from bodyslam_jax.graph.state import retract_rotation as retract_rotation
 from bodyslam_jax.graph.state import world_from_root as world_from_root
 from bodyslam_jax.graph.validation import check_state as check_state
-from bodyslam_jax.graph.whitening import runs as runs
+from bodyslam_jax.graph.whitening import ar1_correlation as ar1_correlation
 from bodyslam_jax.graph.whitening import whitening_of as whitening_of

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 
-from bodyslam_jax.graph.factor import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.camera import AbstractIntrinsicsFactor
 from bodyslam_jax.graph.factors.landmark import LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
@@ -14,7 +14,7 @@ from bodyslam_jax.graph.problem import Problem
 from bodyslam_jax.graph.state import Step
 
 
-def mute(problem: Problem, *kinds: type[AbstractFactor]) -> Problem:
+def disable(problem: Problem, *kinds: type[Factor]) -> Problem:
     """The problem with its terms of these kinds weighing nothing.
 
     Their measurements become missing ones.
@@ -25,14 +25,14 @@ def mute(problem: Problem, *kinds: type[AbstractFactor]) -> Problem:
     return eqx.tree_at(lambda p: p.factors, problem, factors)
 
 
-def _missing(factor: AbstractFactor, problem: Problem) -> AbstractFactor:
+def _missing(factor: Factor, problem: Problem) -> Factor:
     if isinstance(factor, Reprojection):
         values = {"sigma": jnp.inf}
     elif isinstance(factor, LandmarkPrior):
         values = {"whitening": 0.0}
     elif isinstance(factor, AbstractIntrinsicsFactor) and hasattr(factor, "sigma"):
         values = {"sigma": jnp.inf}
-    elif isinstance(factor, AbstractFrameFactor) and factor.padding:
+    elif isinstance(factor, FrameFactor) and factor.padding:
         values = factor.padding
     else:
         free = problem.free
@@ -44,7 +44,7 @@ def _missing(factor: AbstractFactor, problem: Problem) -> AbstractFactor:
     return factor
 
 
-def hold(free: Step, *names: str) -> Step:
+def set_constant(free: Step, *names: str) -> Step:
     """The same mask with groups of variables held, by their names in `State`."""
     held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
     return dataclasses.replace(free, **held)

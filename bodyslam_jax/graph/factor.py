@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph.losses import AbstractLoss, squared_norm
+from bodyslam_jax.graph.losses import Loss, squared_norm
 from bodyslam_jax.graph.state import State
 
 JOINTS = tuple(range(23))
@@ -25,7 +25,7 @@ JOINTS = tuple(range(23))
 Limbs = tuple[tuple[int, ...], ...]
 """Groups of joints."""
 
-Touch = tuple[str, int]
+Key = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
 
 
@@ -45,10 +45,10 @@ class Shared(eqx.Module):
     intrinsics: Float[Array, " i"]
 
 
-class AbstractFactor(eqx.Module):
+class Factor(eqx.Module):
     """Measurements of one kind, and how far a state is from explaining them."""
 
-    loss: eqx.AbstractVar[AbstractLoss]
+    loss: eqx.AbstractVar[Loss]
 
     @abc.abstractmethod
     def residual(self, state: State) -> Float[Array, "*m d"]:
@@ -61,19 +61,19 @@ class AbstractFactor(eqx.Module):
 
 
 @eqx.filter_jit
-def residual_of(factor: AbstractFactor, state: State) -> Array:
+def residual_of(factor: Factor, state: State) -> Array:
     """`factor.residual(state)`, traced once wherever it is needed."""
     return factor.residual(state)
 
 
-class AbstractFrameFactor(AbstractFactor):
+class FrameFactor(Factor):
     """A factor for each frame of each person, or of the camera."""
 
     of_people: eqx.AbstractClassVar[bool]
-    frame_fields: eqx.AbstractClassVar[tuple[str, ...]]
+    time_fields: eqx.AbstractClassVar[tuple[str, ...]]
     """Fields with leading axes `h t` (or `t`): what is padded to a common length."""
     padding: ClassVar[Mapping[str, float] | None] = None
-    """The value of a field of `frame_fields` with which a frame weighs nothing, such as
+    """The value of a field of `time_fields` with which a frame weighs nothing, such as
     `{"sigma": jnp.inf}`; other fields repeat their last frame. The solver adds frames,
     so that videos of about the same length share a program. Without it, residuals of
     added frames are masked, whatever fields are called (`Masked`)."""
@@ -82,7 +82,7 @@ class AbstractFrameFactor(AbstractFactor):
 
     @property
     @abc.abstractmethod
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         """Among `camera`, `root`, `pose` with a lag, and `scale`, `shape`,
         `intrinsics` with lag 0."""
 
@@ -91,20 +91,20 @@ class AbstractFrameFactor(AbstractFactor):
         """Measurements, leading axes `h t` (or `t`, for a factor of the camera)."""
 
     @abc.abstractmethod
-    def local(
+    def frame_residual(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
     ) -> Float[Array, "*m d"]:
         """The residual of one frame; `window[lag]` is the frame that far back."""
 
     def jacobian(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
-    ) -> tuple[Float[Array, "*m d"], dict[Touch, Float[Array, "*m d n"]]] | None:
+    ) -> tuple[Float[Array, "*m d"], dict[Key, Float[Array, "*m d n"]]] | None:
         """The residual and, if known in closed form, its derivative by each touch."""
         return None
 
     def jacobians(
         self, state: State
-    ) -> tuple[Float[Array, "*b d"], dict[Touch, Float[Array, "*b d n"]]] | None:
+    ) -> tuple[Float[Array, "*b d"], dict[Key, Float[Array, "*b d n"]]] | None:
         """The same for all frames at once, leading axes `h t` (or `t`)."""
         return None
 
@@ -115,7 +115,7 @@ class AbstractFrameFactor(AbstractFactor):
 
     @property
     def num_lags(self) -> int:
-        return 1 + max(lag for _, lag in self.touches)
+        return 1 + max(lag for _, lag in self.keys)
 
     def frame_of_row(self, num_frames: int) -> Int[Array, " t"]:
         """The frame whose variables stand in each row of `map_frames`."""
@@ -149,4 +149,4 @@ class AbstractFrameFactor(AbstractFactor):
         return jax.vmap(one)(self.data(), extra, state.roots, state.poses, state.shapes)
 
     def residual(self, state: State) -> Float[Array, "*m d"]:
-        return self.map_frames(lambda d, w, s, _: self.local(d, w, s), state)
+        return self.map_frames(lambda d, w, s, _: self.frame_residual(d, w, s), state)

@@ -4,10 +4,10 @@ A loss takes `s`, the squared norm of one measurement's whitened residual
 (dimensionless), and gives the cost in the same unit: `rho(s) = s` near 0. Scales are
 therefore in standard deviations; a scale `c` in pixels is `c / sigma`.
 
-Least-squares solvers see a loss through `lift`: `[sqrt(w) r, sqrt(rho - w s)]` with
-`w = rho'(s)` held constant. Its squared norm is exactly `rho`, its gradient exactly
-`rho' J^T r`, and its Gauss-Newton Hessian `rho' J^T J` is positive. The more usual
-`r sqrt(rho / s)` has a bad Hessian.
+Least-squares solvers see a loss through `robustify`: `[sqrt(w) r, sqrt(rho - w s)]`
+with `w = rho'(s)` held constant. Its squared norm is exactly `rho`, its gradient
+exactly `rho' J^T r`, and its Gauss-Newton Hessian `rho' J^T J` is positive. The more
+usual `r sqrt(rho / s)` has a bad Hessian.
 """
 
 import abc
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-class AbstractLoss(eqx.Module):
+class Loss(eqx.Module):
     """A function of the squared norm of a whitened residual."""
 
     @abc.abstractmethod
@@ -29,7 +29,7 @@ class AbstractLoss(eqx.Module):
         """The derivative of `rho`: 1 at 0, or nearly, and never negative."""
 
 
-class Squared(AbstractLoss):
+class Squared(Loss):
     """`rho(s) = s`"""
 
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
@@ -39,7 +39,7 @@ class Squared(AbstractLoss):
         return jnp.ones_like(s)
 
 
-class Cauchy(AbstractLoss):
+class Cauchy(Loss):
     """`rho(s) = c^2 log(1 + s / c^2)`, as in Ceres."""
 
     scale: float | Float[Array, ""]
@@ -53,7 +53,7 @@ class Cauchy(AbstractLoss):
         return 1 / (1 + s / self.scale**2)
 
 
-class GemanMcClure(AbstractLoss):
+class GemanMcClure(Loss):
     """`rho(s) = c^2 s / (c^2 + s)`: saturates at `c^2`.
 
     Bogo et al. (2016) apply it to x and y apart, with c = 100 px; here it takes the
@@ -61,7 +61,7 @@ class GemanMcClure(AbstractLoss):
     """
 
     scale: float | Float[Array, "..."]
-    """c, standard deviations; of `JointReprojection` one for each measurement, too:
+    """c, standard deviations; of `KeypointReprojection` one for each measurement, too:
     `c / sigma` of a c in px that is the same for all."""
 
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "..."]:
@@ -73,7 +73,7 @@ class GemanMcClure(AbstractLoss):
         return (c2 / (c2 + s)) ** 2
 
 
-class BlakeZisserman(AbstractLoss):
+class BlakeZisserman(Loss):
     """`rho(s) = 2 log((1 + ε) / (exp(-s / 2) + ε))`, `ε = exp(-c^2 / 2)`: saturates
     near `c^2`.
 
@@ -116,7 +116,7 @@ def squared_norm(residual: Float[Array, "*m d"]) -> Float[Array, "*m"]:
     )
 
 
-def lift(loss: AbstractLoss, residual: Float[Array, "*m d"]) -> Float[Array, "*m d+1"]:
+def robustify(loss: Loss, residual: Float[Array, "*m d"]) -> Float[Array, "*m d+1"]:
     """Residuals whose squared norm is the robust cost (see the module)."""
     s = squared_norm(residual)
     fixed = jax.lax.stop_gradient(s)

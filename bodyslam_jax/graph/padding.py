@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import AbstractArray, Array, Bool
 
 from bodyslam_jax.compilation import is_traced
-from bodyslam_jax.graph.factor import AbstractFrameFactor
-from bodyslam_jax.graph.losses import AbstractLoss
+from bodyslam_jax.graph.factor import FrameFactor
+from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State
 
 _MOVED = 0.01
@@ -27,7 +27,7 @@ _SAME = {"float64": 1e-8, "float32": 1e-3}
 """How much costs may differ, as a share of their own."""
 
 
-class Masked(AbstractFrameFactor):
+class Masked(FrameFactor):
     """A factor of which only some frames count: the residual of the others is 0.
 
     Frames that do not count repeat the last one that does, measurement and variables
@@ -35,11 +35,11 @@ class Masked(AbstractFrameFactor):
     are the same, and derivatives are finite wherever those of the factor are.
     """
 
-    factor: AbstractFrameFactor
+    factor: FrameFactor
     present: Bool[Array, "*h t"]
     """Which frames count, of each person if it is of people; those that do not are the
     last."""
-    frame_fields = ("present",)
+    time_fields = ("present",)
     padding = {"present": False}
 
     @property
@@ -51,12 +51,12 @@ class Masked(AbstractFrameFactor):
         return self.factor.per_joint
 
     @property
-    def loss(self) -> AbstractLoss:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.factor.loss
 
     @property
-    def touches(self):
-        return self.factor.touches
+    def keys(self):
+        return self.factor.keys
 
     @property
     def limbs(self):
@@ -73,9 +73,9 @@ class Masked(AbstractFrameFactor):
         given = jax.tree.map(lambda x: jnp.take(x, row, axis), self.factor.data())
         return self.present, given
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         present, given = data
-        return _where(present, self.factor.local(given, window, shared))
+        return _where(present, self.factor.frame_residual(given, window, shared))
 
     def jacobian(self, data, window, shared):
         present, given = data
@@ -89,9 +89,7 @@ def _where(present: Array, x: Array) -> Array:
     return jnp.where(present, x, jnp.zeros_like(x))
 
 
-def pad_factor(
-    factor: AbstractFrameFactor, state: State, frames: int
-) -> AbstractFrameFactor:
+def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
     """The same factor with `frames` more frames than `state` has; they weigh nothing.
 
     A loss whose scale is one for each measurement gets longer, too.
@@ -100,7 +98,7 @@ def pad_factor(
     axis = len(lead) - 1
     fill = factor.padding or {}
     padded = factor
-    for name in factor.frame_fields:
+    for name in factor.time_fields:
         values = extend(getattr(factor, name), axis, frames, fill.get(name, "edge"))
         padded = eqx.tree_at(lambda f, n=name: getattr(f, n), padded, values)
     longer = lambda x: (
@@ -116,9 +114,9 @@ def pad_factor(
     return Masked(padded, jnp.asarray(present))
 
 
-def _is_over_frames(factor: AbstractFrameFactor) -> bool:
+def _is_over_frames(factor: FrameFactor) -> bool:
     """Whether its rows are the frames: not, if it maps them in a way of its own."""
-    return type(factor).map_frames is AbstractFrameFactor.map_frames
+    return type(factor).map_frames is FrameFactor.map_frames
 
 
 def extend_state(state: State, frames: int) -> State:
@@ -144,7 +142,7 @@ def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
     return jnp.asarray(grow(x, widths, constant_values=np.asarray(fill, x.dtype)))
 
 
-def check_padding(factor: AbstractFrameFactor, state: State) -> None:
+def check_padding(factor: FrameFactor, state: State) -> None:
     """Refuses a factor of one's own that frames which measure nothing would change.
 
     What fields are called does not matter, but all arrays over frames must be named.
@@ -155,12 +153,12 @@ def check_padding(factor: AbstractFrameFactor, state: State) -> None:
     name = type(factor).__name__
     if type(factor).__module__.partition(".")[0] == __name__.partition(".")[0]:
         return
-    fields = factor.frame_fields
+    fields = factor.time_fields
     for field in factor.padding or {}:
         if field not in fields:
             raise ValueError(
                 f"{name}.padding: found {field!r}, expected fields among "
-                f"`frame_fields`, {list(fields)}."
+                f"`time_fields`, {list(fields)}."
             )
     axes = ["h", "t"] if factor.of_people else ["t"]
     for field in dataclasses.fields(factor):

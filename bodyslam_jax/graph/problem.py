@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.compilation import is_traced
-from bodyslam_jax.graph.factor import AbstractFactor, AbstractFrameFactor, Limbs
-from bodyslam_jax.graph.factors.body_pose import Posture
-from bodyslam_jax.graph.factors.human_motion import HumanMotion, OrientationChange
+from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
+from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
+from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
 from bodyslam_jax.graph.factors.landmark import LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.layout import Layout, make_layout
@@ -57,7 +57,7 @@ class MotionPredictor(eqx.Module):
 class Problem(eqx.Module):
     """What `solve` minimises: the sum of the costs of its factors."""
 
-    factors: tuple[AbstractFactor, ...]
+    factors: tuple[Factor, ...]
     free: Step
     """1 where a coordinate may move, 0 where it is held."""
     motion: MotionPredictor | None
@@ -133,21 +133,21 @@ def _with_prediction(factor, seen):
     if isinstance(factor, HumanMotion) and "translation" in seen:
         unit = 1 if factor.body is None else seen["leg"]
         return eqx.tree_at(lambda f: f.translation, factor, seen["translation"] / unit)
-    if isinstance(factor, OrientationChange) and "rotation" in seen:
+    if isinstance(factor, RelativeOrientation) and "rotation" in seen:
         return eqx.tree_at(lambda f: f.rotation, factor, seen["rotation"])
-    if isinstance(factor, Posture) and factor.predicted and "body_pose" in seen:
+    if isinstance(factor, BodyPosePrior) and factor.predicted and "body_pose" in seen:
         return eqx.tree_at(lambda f: f.rotation, factor, seen["body_pose"])
     return factor
 
 
-def limbs_of(factors: Sequence[AbstractFactor]) -> Limbs:
+def limbs_of(factors: Sequence[Factor]) -> Limbs:
     """Joints that factors see together, narrow limbs first; none that only its own
     measurements and those of other frames tie to anything."""
     found: list[set[int]] = []
     for factor in factors:
-        if not isinstance(factor, AbstractFrameFactor) or factor.per_joint:
+        if not isinstance(factor, FrameFactor) or factor.per_joint:
             continue
-        if not any(name == "pose" for name, _ in factor.touches):
+        if not any(name == "pose" for name, _ in factor.keys):
             continue
         for joints in map(set, factor.limbs):
             near = [limb for limb in found if limb & joints]
@@ -157,7 +157,7 @@ def limbs_of(factors: Sequence[AbstractFactor]) -> Limbs:
 
 
 def make_problem(
-    factors: Sequence[AbstractFactor],
+    factors: Sequence[Factor],
     state: State,
     *,
     motion: MotionPredictor | None = None,
@@ -181,7 +181,7 @@ def make_problem(
     for factor in factors:
         check_factor(factor, sizes)
         check_precision(factor, state)
-        if isinstance(factor, AbstractFrameFactor):
+        if isinstance(factor, FrameFactor):
             check_padding(factor, state)
     if motion is not None:
         check_shapes(motion, "motion", dict(sizes))
@@ -205,8 +205,8 @@ def make_problem(
         touched = {
             name
             for factor in factors
-            if isinstance(factor, AbstractFrameFactor)
-            for name, _ in factor.touches
+            if isinstance(factor, FrameFactor)
+            for name, _ in factor.keys
         }
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
         free = Step(

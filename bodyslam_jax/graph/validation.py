@@ -15,15 +15,15 @@ from jaxtyping import AbstractArray, Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.compilation import is_traced
-from bodyslam_jax.graph.factor import AbstractFactor, AbstractFrameFactor
+from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.camera import CameraPrior
 from bodyslam_jax.graph.factors.ground import GroundContact
 from bodyslam_jax.graph.factors.landmark import LandmarkPrior
-from bodyslam_jax.graph.factors.reprojection import JointReprojection, Reprojection
+from bodyslam_jax.graph.factors.reprojection import KeypointReprojection, Reprojection
 from bodyslam_jax.graph.factors.root import (
     RootOrientation,
-    RootPlace,
-    UpDirection,
+    RootPositionPrior,
+    UprightPrior,
 )
 from bodyslam_jax.graph.factors.stance import StanceFoot
 from bodyslam_jax.graph.state import State, Step
@@ -64,23 +64,23 @@ def check_state(state: State, free: Step | None = None) -> Sizes:
     return sizes
 
 
-def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
+def check_factor(factor: Factor, sizes: Sizes) -> None:
     """Refuses measurements that do not fit a state with axes of these `sizes`.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
     name = type(factor).__name__
     of_landmarks = isinstance(factor, Reprojection | LandmarkPrior)
-    if not of_landmarks and not isinstance(factor, AbstractFrameFactor):
+    if not of_landmarks and not isinstance(factor, FrameFactor):
         raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     sizes = dict(sizes)
     check_loss(factor.loss, f"{name}.loss")
     scale = np.shape(getattr(factor.loss, "scale", 0.0))
-    each = isinstance(factor, JointReprojection)
+    each = isinstance(factor, KeypointReprojection)
     if scale and not (each and scale == factor.sigma.shape):
         expected = f"one number, or {factor.sigma.shape}" if each else "one number"
         raise ValueError(f"{name}.loss.scale: shape {scale}, expected {expected}.")
-    if isinstance(factor, JointReprojection):
+    if isinstance(factor, KeypointReprojection):
         if factor.layout not in KEYPOINT_NAMES:
             raise ValueError(
                 f"{name}.layout: found {factor.layout!r}, expected one of "
@@ -91,7 +91,7 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
         sizes["f"] = len(factor.points)
         _check_range(f"{name}.points", np.array(factor.points, int), 25)
     check_shapes(factor, name, sizes)
-    if isinstance(factor, AbstractFrameFactor):
+    if isinstance(factor, FrameFactor):
         _check_frames(factor, name, sizes)
     _check_values(factor, name)
     check_early(factor, name)
@@ -106,9 +106,9 @@ def check_factor(factor: AbstractFactor, sizes: Sizes) -> None:
         _check_rotations(factor.cameras, f"{name}.cameras", known)
     if isinstance(factor, GroundContact):
         _check_unit(factor.plane[:3], f"{name}.plane")
-    if isinstance(factor, UpDirection):
+    if isinstance(factor, UprightPrior):
         _check_unit(factor.up, f"{name}.up")
-    if isinstance(factor, RootPlace) and not is_traced(factor.place):
+    if isinstance(factor, RootPositionPrior) and not is_traced(factor.place):
         depth = np.asarray(factor.place)[..., 2][_known(factor.sigma)]
         if not (depth > 0).all():
             raise ValueError(
@@ -169,7 +169,7 @@ def _check_frames(factor, name, sizes):
     """Of factors whose annotations do not say so, too."""
     axes = "ht" if factor.of_people else "t"
     lead = tuple(sizes[axis] for axis in axes)
-    for field in factor.frame_fields:
+    for field in factor.time_fields:
         shape = getattr(factor, field).shape
         if shape[: len(lead)] != lead:
             raise ValueError(
@@ -193,7 +193,7 @@ def _check_values(module, name):
             bad = int(np.sum(~np.isfinite(values)))
             text = f"{where}: {bad} of {values.size} values are not finite."
             if np.isposinf(values[~np.isfinite(values)]).all() and path[0].name in (
-                getattr(module, "frame_fields", ())
+                getattr(module, "time_fields", ())
             ):
                 text += f" If inf is a missing one, say so: `padding` of {name}."
             raise ValueError(text)

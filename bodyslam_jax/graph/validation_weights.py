@@ -8,38 +8,38 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax.compilation import is_traced
-from bodyslam_jax.graph.factor import AbstractFactor
-from bodyslam_jax.graph.factors.body_pose import Posture
+from bodyslam_jax.graph.factor import Factor
+from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
 from bodyslam_jax.graph.factors.camera import CameraSmoothness
-from bodyslam_jax.graph.factors.human_motion import HumanMotion, OrientationChange
+from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
 from bodyslam_jax.graph.factors.root import (
+    AngularAccelerationPrior,
     RootOrientation,
-    RootPlace,
+    RootPositionPrior,
     RootSmoothness,
-    RootTurning,
 )
 from bodyslam_jax.graph.factors.stance import StanceFoot
-from bodyslam_jax.graph.losses import AbstractLoss
+from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
 
 _EARLY = (
     (HumanMotion, "whitening", 1, 0.0),
     # Of the first prediction too: the one before has none.
     (HumanMotion, "correlation", 2, 0.0),
-    (Posture, "correlation", 1, 0.0),
+    (BodyPosePrior, "correlation", 1, 0.0),
     (RootOrientation, "correlation", 1, 0.0),
-    (RootPlace, "correlation", 1, 0.0),
-    (OrientationChange, "sigma", 1, np.inf),
+    (RootPositionPrior, "correlation", 1, 0.0),
+    (RelativeOrientation, "sigma", 1, np.inf),
     (StanceFoot, "sigma", 1, np.inf),
     (CameraSmoothness, "sigma", 2, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
-    (RootTurning, "sigma", 2, np.inf),
+    (AngularAccelerationPrior, "sigma", 2, np.inf),
 )
 """How many of the first frames look back to where there is none, and what a field must
 be there: windows repeat the first frame, which would be taken for a measurement."""
 
 
-def check_precision(factor: AbstractFactor, state: State) -> None:
+def check_precision(factor: Factor, state: State) -> None:
     """Refuses measurements of more digits than a state has, which would pass them on.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
@@ -74,7 +74,7 @@ def check_loss(loss: Any, where: str) -> None:
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
-    if not isinstance(loss, AbstractLoss):
+    if not isinstance(loss, Loss):
         raise ValueError(
             f"{where}: found {loss!r:.60}, expected a loss such as `Squared()`."
         )
@@ -90,7 +90,7 @@ def check_loss(loss: Any, where: str) -> None:
         raise ValueError(f"{where}.scale: found {values.min()}, expected above 0.")
 
 
-def check_early(factor: AbstractFactor, name: str) -> None:
+def check_early(factor: Factor, name: str) -> None:
     """Refuses weights of frames that look back to where there is none.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
@@ -111,7 +111,7 @@ def check_early(factor: AbstractFactor, name: str) -> None:
             )
 
 
-def check_runs(factor: AbstractFactor, name: str) -> None:
+def check_runs(factor: Factor, name: str) -> None:
     """Refuses errors that go on from a frame in which nothing was measured.
 
     What stands there is not a measurement, and would be compared with.
@@ -120,7 +120,7 @@ def check_runs(factor: AbstractFactor, name: str) -> None:
     """
     if isinstance(factor, HumanMotion):
         weight, known = factor.whitening, lambda x: (x != 0).any(axis=(-1, -2))
-    elif isinstance(factor, RootOrientation | RootPlace):
+    elif isinstance(factor, RootOrientation | RootPositionPrior):
         weight, known = factor.sigma, np.isfinite
     else:
         return
@@ -135,5 +135,5 @@ def check_runs(factor: AbstractFactor, name: str) -> None:
         raise ValueError(
             f"{name}.correlation: found {factor.correlation[person, frame + 1]} in "
             f"frame {frame + 1} of person {person}, expected 0.0: the frame before is "
-            "not measured (`graph.runs`)."
+            "not measured (`graph.ar1_correlation`)."
         )

@@ -17,7 +17,7 @@ def innovation(
 
 
 @jax.jit
-def runs(
+def ar1_correlation(
     present: Bool[Array, "h t"], correlation: float | Float[Array, ""]
 ) -> Float[Array, "h t"]:
     """ρ where this frame and the one before are measured, 0 at the start of a run."""

@@ -23,7 +23,7 @@ def optional_factors(
     fps: float,
     body: BodyModel,
     weights: GraphWeights,
-) -> list[graph.AbstractFactor]:
+) -> list[graph.Factor]:
     """People turn as the motion model predicts, the foot that carries stands, the
     camera keeps its velocity: those of them that `weights` switch on."""
     factors = (
@@ -36,12 +36,12 @@ def optional_factors(
 
 def turn_factor(
     seen: motion.Prediction, fps: float, weights: GraphWeights
-) -> graph.OrientationChange | None:
+) -> graph.RelativeOrientation | None:
     """`orientation_sigma`: turns are as the motion model predicts them."""
     if not _is_on(weights.orientation_sigma):
         return None
     sigma = weights.orientation_sigma * 30.0 / fps
-    return graph.OrientationChange(
+    return graph.RelativeOrientation(
         rotation=jnp.where(seen.valid[..., None], seen.rotation, 0.0),
         sigma=jnp.where(seen.valid, sigma, jnp.inf),
     )
@@ -57,7 +57,7 @@ def stance_factor(
     """`stance_sigma`: the lowest point of the feet, as the state has it, stands."""
     if not _is_on(weights.stance_sigma):
         return None
-    stands = graph.carrying(body, state, jnp.asarray(there))
+    stands = graph.stance_mask(body, state, jnp.asarray(there))
     sigma = jnp.where(stands, weights.stance_sigma * 30.0 / fps, jnp.inf)
     return graph.StanceFoot(body, sigma, loss=graph.Cauchy(jnp.asarray(_STANCE_LOSS)))
 

@@ -12,7 +12,7 @@ from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights, Measured
-from bodyslam_jax.people import Roots
+from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Sequence, Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
@@ -46,15 +46,15 @@ def map_factor(
 
 
 def revisit_factor(
-    places: Float[np.ndarray, "l 3"],
-    elsewhere: Float[np.ndarray, "l 3 3"],
+    prior_mean: Float[np.ndarray, "l 3"],
+    prior_information: Float[np.ndarray, "l 3 3"],
     sigma: float,
 ) -> graph.LandmarkPrior:
     """Where other sightings of the same points place landmarks (`sfm.loop_closure`)."""
-    size, axes = np.linalg.eigh(elsewhere)
+    size, axes = np.linalg.eigh(prior_information)
     whitening = np.sqrt(np.maximum(size, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
     return graph.LandmarkPrior(
-        place=jnp.asarray(places, float), whitening=jnp.asarray(whitening / sigma)
+        place=jnp.asarray(prior_mean, float), whitening=jnp.asarray(whitening / sigma)
     )
 
 
@@ -62,13 +62,13 @@ def path_factors(
     path: Float[np.ndarray, "t 4 4"] | None,
     known: Bool[np.ndarray, " t"] | None,
     scale: float = float("nan"),
-) -> list[graph.AbstractFactor]:
+) -> list[graph.Factor]:
     """Camera poses that came with the video, and metres per unit of the map if they
     are in metres; none without them."""
     if path is None or known is None:
         return []
     sigma = np.repeat(np.where(known, PATH_SIGMA, np.inf)[:, None], 6, axis=1)
-    factors: list[graph.AbstractFactor] = []
+    factors: list[graph.Factor] = []
     factors.append(graph.CameraPrior(jnp.asarray(path), jnp.asarray(sigma)))
     if np.isfinite(scale):
         once = np.full(len(known), np.inf)
@@ -99,7 +99,7 @@ def stature_factor(
 
 
 def keypoint_sigma(
-    sequence: Sequence, roots: Roots, weights: GraphWeights
+    sequence: Sequence, roots: PersonState, weights: GraphWeights
 ) -> Float[np.ndarray, "h t 25"]:
     """Standard deviation of each keypoint, px; `inf` where there is none.
 
@@ -146,13 +146,13 @@ def _keypoint_loss(
 
 def people_factors(
     sequence: Sequence,
-    roots: Roots,
+    roots: PersonState,
     weights: GraphWeights,
     body: BodyModel,
     *,
     shape: Float[np.ndarray, "h 10"] | None = None,
     predicted: Bool[Array, "h t"] | None = None,
-) -> list[graph.AbstractFactor]:
+) -> list[graph.Factor]:
     """Keypoints, postures, shapes and smooth paths of `h` people.
 
     Args:
@@ -160,7 +160,7 @@ def people_factors(
         predicted: of which frames the motion model has a prediction
             (`Prediction.valid`); only there are postures held to it, if they are to be.
     """
-    factors: list[graph.AbstractFactor] = []
+    factors: list[graph.Factor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
         keypoints, _ = people.unexchanged(sequence.keypoints, sequence.fps)
@@ -175,7 +175,7 @@ def people_factors(
         ).uv
         sigma = keypoint_sigma(sequence, roots, weights)
         factors.append(
-            graph.JointReprojection(
+            graph.KeypointReprojection(
                 body=body,
                 pixel=jnp.asarray(pixel, float),
                 sigma=jnp.asarray(sigma),
@@ -183,7 +183,7 @@ def people_factors(
             )
         )
     per_frame = 30.0 / sequence.fps
-    between = lambda rho: graph.runs(there, rho**per_frame)
+    between = lambda rho: graph.ar1_correlation(there, rho**per_frame)
     where = lambda mask, sigma: jnp.where(mask, sigma, jnp.inf)
     held = there
     if weights.posture_predicted:
@@ -192,7 +192,7 @@ def people_factors(
             predicted = jnp.asarray(_in_a_row(roots.present, count))
         held = there & predicted
     factors.append(
-        graph.Posture(
+        graph.BodyPosePrior(
             rotation=jnp.asarray(roots.body_pose),
             sigma=where(held[..., None], weights.posture_sigma) * jnp.ones(23),
             correlation=between(weights.posture_correlation),
@@ -202,7 +202,9 @@ def people_factors(
     )
     placed = _placed_by_regressor(sequence, roots)
     if placed.any():
-        rho = graph.runs(jnp.asarray(placed), weights.root_correlation**per_frame)
+        rho = graph.ar1_correlation(
+            jnp.asarray(placed), weights.root_correlation**per_frame
+        )
         factors.append(_place_factor(roots, placed, rho, weights))
     measured = roots.shape if shape is None else shape
     factors.append(_shape_factor(roots.present, measured, weights))
@@ -217,7 +219,7 @@ def people_factors(
     three = jnp.asarray(_in_a_row(roots.present, 3))
     if weights.root_turning is not None:
         sigma = where(three, weights.root_turning * per_frame**2)
-        factors.append(graph.RootTurning(sigma))
+        factors.append(graph.AngularAccelerationPrior(sigma))
     if weights.root_smoothness is not None:
         leg = motion.leg_length(body, jnp.asarray(roots.shape))[:, None]
         sigma = where(three, weights.root_smoothness * per_frame**2 / leg)
@@ -225,7 +227,9 @@ def people_factors(
     return factors
 
 
-def _placed_by_regressor(sequence: Sequence, roots: Roots) -> Bool[np.ndarray, "h t"]:
+def _placed_by_regressor(
+    sequence: Sequence, roots: PersonState
+) -> Bool[np.ndarray, "h t"]:
     """Where nothing but a regressor tells where people are: no keypoint of theirs is
     within a second. Keypoints tell it better, and gaps between them are short."""
     if sequence.keypoints is None or sequence.bodies is None:
@@ -236,14 +240,14 @@ def _placed_by_regressor(sequence: Sequence, roots: Roots) -> Bool[np.ndarray, "
 
 
 def _place_factor(
-    roots: Roots,
+    roots: PersonState,
     placed: Bool[np.ndarray, "h t"],
     correlation: Float[Array, "h t"],
     weights: GraphWeights,
-) -> graph.RootPlace:
+) -> graph.RootPositionPrior:
     there = placed[..., None]
     sigma = np.array([weights.root_direction, weights.root_depth])
-    return graph.RootPlace(
+    return graph.RootPositionPrior(
         place=jnp.asarray(np.where(there, roots.T_CH[..., :3, 3], [0.0, 0.0, 1.0])),
         sigma=jnp.asarray(np.where(there, sigma, np.inf)),
         correlation=correlation,
@@ -254,14 +258,14 @@ def _shape_factor(
     present: Bool[np.ndarray, "h t"],
     measured: Float[np.ndarray, "h 10"],
     weights: GraphWeights,
-) -> graph.Shape:
+) -> graph.ShapePrior:
     counted = present.astype(float)
     if not weights.shape_each_frame:
         counted = np.zeros_like(counted)
         counted[np.arange(len(counted)), present.argmax(axis=1)] = 1.0
     sigma = np.where(counted > 0, weights.shape_sigma, np.inf)
     shape = np.broadcast_to(measured[:, None], (*counted.shape, 10))
-    return graph.Shape(
+    return graph.ShapePrior(
         shape=jnp.asarray(shape),
         sigma=jnp.asarray(np.repeat(sigma[..., None], 10, axis=-1)),
     )
@@ -299,7 +303,7 @@ def motion_factor(
     return graph.HumanMotion(
         translation=step,
         whitening=whitening,
-        correlation=graph.runs(seen.valid, weights.motion_correlation),
+        correlation=graph.ar1_correlation(seen.valid, weights.motion_correlation),
         correlated=weights.motion_correlation > 0,
         body=body if weights.motion_in_legs else None,
     )

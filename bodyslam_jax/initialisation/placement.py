@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax import graph
-from bodyslam_jax.people import Roots
+from bodyslam_jax.people import PersonState
 
 
 def first_state(
     cameras: Float[np.ndarray, "t 4 4"],
     landmarks: Float[np.ndarray, "l 3"],
-    roots: Roots,
+    roots: PersonState,
     intrinsics: Float[np.ndarray, " i"],
 ) -> graph.State:
     """The state before any scale is known: s = 1."""
@@ -29,9 +29,9 @@ def first_state(
     )
 
 
-def no_people(num_frames: int) -> Roots:
+def no_people(num_frames: int) -> PersonState:
     """An empty list of people, for cameras alone."""
-    return Roots(
+    return PersonState(
         np.zeros((0, num_frames), bool),
         np.zeros((0, num_frames, 4, 4)),
         np.zeros((0, num_frames, 23, 3)),

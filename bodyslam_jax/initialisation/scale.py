@@ -14,7 +14,7 @@ from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.initialisation.upright import mean_up
-from bodyslam_jax.people import Roots
+from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Keypoints, ScaleStart
 
 _FEET = (11, 14, 19, 20, 21, 22, 23, 24)
@@ -60,7 +60,7 @@ def scale_start(
 
 def ground_contact(
     state: graph.State,
-    roots: Roots,
+    roots: PersonState,
     registered: Bool[np.ndarray, " t"],
     keypoints: Keypoints | None,
     body: BodyModel,

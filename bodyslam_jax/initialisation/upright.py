@@ -26,7 +26,7 @@ def upright_factor(
     there: Bool[np.ndarray, "h t"],
     fps: float,
     weights: GraphWeights,
-) -> graph.UpDirection | None:
+) -> graph.UprightPrior | None:
     """Trunks lean by `upright_sigma` about their mean; `None` if nobody is upright.
 
     The mean is of the measured trunks, so that an error that they share stays in it.
@@ -40,7 +40,7 @@ def upright_factor(
     if not stands.any():
         return None
     sigma = weights.upright_sigma * np.sqrt(fps / 30.0)
-    return graph.UpDirection(
+    return graph.UprightPrior(
         up=jnp.asarray(up),
         sigma=jnp.asarray(np.where(stands, sigma, np.inf)),
         loss=graph.Cauchy(jnp.asarray(_LOSS)),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyslam_jax.io.frame_index import Unfit, Warn
+from bodyslam_jax.io.frame_index import InvalidContent, Warn
 
 Size = tuple[float, float]
 """Width and height, px."""
@@ -84,7 +84,7 @@ def factor_to(
     Args:
         points: some of them, (n, 2), to see whether they can be in such images.
 
-    **Raises:** `Unfit` if the images are of another aspect, or turned.
+    **Raises:** `InvalidContent` if the images are of another aspect, or turned.
     """
     (w, h), (width, height) = declared, size
     if (w, h) == (width, height):
@@ -94,7 +94,7 @@ def factor_to(
     if abs(np.log(aspect)) > _SAME_ASPECT:
         turned = abs(np.log((h / w) / (width / height))) < _SAME_ASPECT
         why = "of the video before it was turned upright" if turned else "cropped"
-        raise Unfit(f"{what} of {names}: {why}, or of another video?")
+        raise InvalidContent(f"{what} of {names}: {why}, or of another video?")
     factor = float(np.sqrt(width / w * height / h))
     outside = (points > np.asarray(declared)).any(axis=-1)
     if factor > 1 and len(points) and outside.mean() > _BEYOND:

@@ -21,7 +21,7 @@ _SPARSEST = 100
 """Times as many frames as are named, above which the numbers are others: times, say."""
 
 
-class Unfit(ValueError):
+class InvalidContent(ValueError):
     """What is wrong with a file's content; the caller adds the file's name."""
 
 
@@ -43,8 +43,8 @@ def frames_of_names(
         images: names of the video's frames, if it is a folder of images.
         complete: whether the file lists images with nobody in them, too.
 
-    **Raises:** `Unfit` if a name has no number, two mean the same frame, or the video
-    is another one.
+    **Raises:** `InvalidContent` if a name has no number, two mean the same frame, or
+    the video is another one.
     """
     names = list(dict.fromkeys(names))
     if not names:
@@ -57,7 +57,7 @@ def frames_of_names(
         numbers = _numbers(stems)
         if numbers is None:
             bare = next(n for n in names if not re.search(r"\d", _stem(n)))
-            raise Unfit(f"no frame number in the name {bare}")
+            raise InvalidContent(f"no frame number in the name {bare}")
         _refuse_two_of_one(names, numbers)
         frames = _by_image(numbers, list(place), what, warn)
         if frames is None:
@@ -113,7 +113,9 @@ def _refuse_two_of_one(names: list[str], numbers: list[int]) -> None:
     first: dict[int, str] = {}
     for name, number in zip(names, numbers, strict=True):
         if number in first:
-            raise Unfit(f"{first[number]} and {name} are both of frame {number}")
+            raise InvalidContent(
+                f"{first[number]} and {name} are both of frame {number}"
+            )
         first[number] = name
 
 
@@ -142,14 +144,16 @@ def _first(
     unbroken = len(set(numbers)) == last - first + 1
     if num_frames is None:
         if last > _SPARSEST * (len(numbers) + 10):
-            raise Unfit(f"{what} of frame {last}, but {len(numbers)} names: no numbers")
+            raise InvalidContent(
+                f"{what} of frame {last}, but {len(numbers)} names: no numbers"
+            )
         num_frames = len(numbers) if complete and unbroken else last + 1
     if unbroken and len(numbers) == num_frames:
         return first  # also a cut-out of a longer video
     if first >= 1 and last == num_frames:
         return 1
     if last >= num_frames:
-        raise Unfit(
+        raise InvalidContent(
             f"{what} of frames {first} to {last}, but the video has {num_frames} frames"
         )
     if first == 0:

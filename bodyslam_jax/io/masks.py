@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.io.camera.calibration import project_points
-from bodyslam_jax.io.frame_index import Unfit, Warn, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.video import list_images
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, MaskUse
 
@@ -129,7 +129,7 @@ def _by_frame(
             complete=False,
             warn=quiet,
         )
-    except Unfit as error:
+    except InvalidContent as error:
         raise ValueError(f"{folder}: {count}, and {error}.") from None
     of_frame = {frame: name for name, frame in frames.items()}
     own = np.array(sorted(of_frame))

@@ -15,7 +15,7 @@ from bodyslam_jax.people.fit import fit_bodies as fit_bodies
 from bodyslam_jax.people.found import Found as Found
 from bodyslam_jax.people.keypoint_errors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people.networks import network_status as network_status
-from bodyslam_jax.people.person_state import Roots as Roots
+from bodyslam_jax.people.person_state import PersonState as PersonState
 from bodyslam_jax.people.person_state import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people.person_state import roots_from_bodies as roots_from_bodies
 from bodyslam_jax.people.sides import unexchanged as unexchanged

@@ -24,7 +24,11 @@ from bodyslam_jax.people.keypoint_errors import (
     keypoint_sigma,
     pixels_per_metre,
 )
-from bodyslam_jax.people.person_state import Roots, bodies_from_roots, roots_from_bodies
+from bodyslam_jax.people.person_state import (
+    PersonState,
+    bodies_from_roots,
+    roots_from_bodies,
+)
 from bodyslam_jax.people.rotations import matrices, slerp, vectors
 from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
@@ -75,7 +79,7 @@ def prepare_bodies(
     """
     roots = roots_from_bodies(bodies, body)
     skeleton = make_skeleton(body, settings.detector_bias)
-    prepared = Roots(
+    prepared = PersonState(
         present=roots.present.copy(),
         T_CH=roots.T_CH.copy(),
         body_pose=roots.body_pose.copy(),
@@ -144,7 +148,7 @@ def _spread(values: np.ndarray) -> float:
 def _place_person(
     skeleton: Skeleton,
     intrinsics: Intrinsics,
-    roots: Roots,
+    roots: PersonState,
     person: int,
     where: np.ndarray,
     uv: np.ndarray,
@@ -276,7 +280,7 @@ def _smooth_curve(
     return smooth[index]
 
 
-def _fill_gaps(roots: Roots, person: int, longest: float) -> None:
+def _fill_gaps(roots: PersonState, person: int, longest: float) -> None:
     """Interpolates gaps of up to `longest` frames, in place."""
     where = np.flatnonzero(roots.present[person])
     T_CH, pose = roots.T_CH[person], roots.body_pose[person]

@@ -19,7 +19,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
 from bodyslam_jax.people.keypoint_errors import in_pixels, keypoint_sigma
-from bodyslam_jax.people.person_state import Roots
+from bodyslam_jax.people.person_state import PersonState
 from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
     Skeleton,
@@ -34,7 +34,7 @@ _ROUNDS = 6
 
 def as_body_keypoints(
     keypoints: Keypoints,
-    roots: Roots,
+    roots: PersonState,
     chosen: Bool[np.ndarray, " h"],
     intrinsics: Intrinsics,
     body: BodyModel,

@@ -27,7 +27,7 @@ from bodyslam_jax.people.keypoint_errors import (
 )
 from bodyslam_jax.people.lift import lift, load_lifter
 from bodyslam_jax.people.multistart import fit_frames
-from bodyslam_jax.people.person_state import Roots, bodies_from_roots
+from bodyslam_jax.people.person_state import PersonState, bodies_from_roots
 from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people.rotations import slerp
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
@@ -59,7 +59,7 @@ def fit_bodies(
     keypoints enough or a short gap between such frames.
     """
     people, frames = keypoints.confidence.shape[:2]
-    roots = Roots(
+    roots = PersonState(
         np.zeros((people, frames), bool),
         np.tile(np.eye(4), (people, frames, 1, 1)),
         np.zeros((people, frames, 23, 3)),

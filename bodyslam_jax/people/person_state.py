@@ -12,7 +12,7 @@ from bodyslam_jax.types import Bodies
 
 
 @dataclasses.dataclass(frozen=True)
-class Roots:
+class PersonState:
     """`h` people in `t` frames: pelvis pose in the camera, posture, one shape each."""
 
     present: Bool[np.ndarray, "h t"]
@@ -24,7 +24,7 @@ class Roots:
     """β, the median over the frames where present."""
 
 
-def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
+def roots_from_bodies(bodies: Bodies, body: BodyModel) -> PersonState:
     """To the graph's convention: `r_CH = J_0(β) + trans`, one β per person.
 
     The pelvis stays where the frame's own β put it: trans belongs to that β.
@@ -41,10 +41,10 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> Roots:
     for h, there in enumerate(present):
         if there.any():
             shape[h] = np.median(bodies.shapes[h, there].astype(float), axis=0)
-    return Roots(present, T_CH, body_pose, shape)
+    return PersonState(present, T_CH, body_pose, shape)
 
 
-def bodies_from_roots(roots: Roots, body: BodyModel) -> Bodies:
+def bodies_from_roots(roots: PersonState, body: BodyModel) -> Bodies:
     """Inverse of `roots_from_bodies`, for bodies whose β does not change.
 
     That β is an estimate, no longer what a regressor said.

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Measured
-from bodyslam_jax.people.person_state import Roots
+from bodyslam_jax.people.person_state import PersonState
 
 _UP = 1
 
@@ -48,11 +48,11 @@ def of_each(
 
 
 def with_statures(
-    roots: Roots,
+    roots: PersonState,
     statures: Mapping[int, Measured],
     body: BodyModel,
     shape_sigma: Float[np.ndarray, " h"],
-) -> Roots:
+) -> PersonState:
     """The most probable shapes given the statures, people as large in the image.
 
     β has the standard deviation `shape_sigma` about its estimate in every component, so

@@ -30,7 +30,14 @@ from bodyslam_jax.pipeline import joint_stage, sfm_stage
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import assemble
 from bodyslam_jax.rehearsal import Rehearsal, rehearse
-from bodyslam_jax.types import Bodies, Cameras, Joint, Result, Sequence, Tracks
+from bodyslam_jax.types import (
+    Bodies,
+    JointEstimate,
+    Result,
+    Sequence,
+    SfmResult,
+    Tracks,
+)
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +113,7 @@ def _run(
     config: Config,
     cache: Cache,
     rehearsal: Rehearsal = Rehearsal(),
-) -> tuple[Result, Cameras]:
+) -> tuple[Result, SfmResult]:
     """`run`, and the cameras before the joint estimate."""
     _check_length(sequence)
     watch = Stopwatch()
@@ -124,7 +131,7 @@ def _run(
         joint = cache.stage(
             "joint",
             key,
-            Joint,
+            JointEstimate,
             lambda: joint_stage.estimate(seen, cameras, bodies, body, config),
         )
     rehearsal.wait("outcome")
@@ -138,7 +145,7 @@ def before_joint(
     cache: Cache = Cache(None),
     watch: Stopwatch | None = None,
     rehearsal: Rehearsal = Rehearsal(),
-) -> tuple[Cameras, Bodies]:
+) -> tuple[SfmResult, Bodies]:
     """Cameras and map up to scale, bodies in the camera: what the graph starts from.
 
     **Raises:** as `run`.
@@ -154,7 +161,7 @@ def before_joint(
         cameras = cache.stage(
             "cameras",
             key,
-            Cameras,
+            SfmResult,
             lambda: sfm_stage.estimate(sequence, tracks, config),
         )
     sequence = people.select_people(sequence, config.person)
@@ -362,7 +369,7 @@ def _to_folder(
     return result
 
 
-def _images(sequence: Sequence, cameras: Cameras) -> Iterator[np.ndarray]:
+def _images(sequence: Sequence, cameras: SfmResult) -> Iterator[np.ndarray]:
     """The images, with the zoom undone where there is one."""
     images = io.frames(sequence)
     if cameras.zoom is None:
@@ -370,7 +377,7 @@ def _images(sequence: Sequence, cameras: Cameras) -> Iterator[np.ndarray]:
     return sfm.without_zoom(images, cameras.zoom, cameras.intrinsics[2:4])
 
 
-def _seen(cameras: Cameras) -> Tracks:
+def _seen(cameras: SfmResult) -> Tracks:
     """The points of the map as they were seen."""
     tracks, keep = cameras.tracks, cameras.keep
     return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])

@@ -14,16 +14,16 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, Config
-from bodyslam_jax.people import Roots
-from bodyslam_jax.types import Bodies, Cameras, Joint, ScaleStart, Sequence
+from bodyslam_jax.people import PersonState
+from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
 
-ENOUGH = 0.005
+COST_ATOL = 0.005
 """Decrease of the cost that is not worth a step: the cost is a negative log-likelihood,
 in which a standard deviation is a half. Without it, a few landmarks that are seen from
 one place creep for dozens of steps, to no effect on anything else."""
-COUPLED = {
+COUPLED_OUTPUTS = {
     "frozen": (),
     "refreshed": (),
     "displacement": ("translation",),
@@ -39,7 +39,7 @@ class Prepared:
     problem: graph.Problem
     state: graph.State
     scale: ScaleStart
-    roots: Roots
+    roots: PersonState
     moving: bool
     """Whether the camera's path has a scale to be found."""
     stages: tuple[dict, ...]
@@ -50,7 +50,7 @@ class Prepared:
 
 def prepare(
     sequence: Sequence,
-    cameras: Cameras,
+    cameras: SfmResult,
     bodies: Bodies,
     body: body_.BodyModel,
     config: Config,
@@ -93,7 +93,9 @@ def prepare(
             initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
         )
         factors.append(
-            initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
+            initialisation.revisit_factor(
+                cameras.prior_mean, cameras.prior_information, sigma
+            )
         )
         factors += initialisation.path_factors(
             cameras.path, cameras.path_known, cameras.path_scale
@@ -197,7 +199,7 @@ def prepare(
 
 
 def motion_predictor(
-    sequence: Sequence, roots: Roots, body: body_.BodyModel, config: Config
+    sequence: Sequence, roots: PersonState, body: body_.BodyModel, config: Config
 ) -> graph.MotionPredictor:
     """The motion model, at the times of these frames."""
     model = motion.load_motion_model(config.motion_model)
@@ -208,7 +210,7 @@ def motion_predictor(
         (model, clock),
         body,
         present,
-        COUPLED[config.motion_coupling],
+        COUPLED_OUTPUTS[config.motion_coupling],
     )
 
 
@@ -227,28 +229,28 @@ def _settle_people(
     problem: graph.Problem, state: graph.State, config: Config
 ) -> tuple[graph.State, dict]:
     """People alone in the camera's frame: the same program with all else held."""
-    alone = graph.mute(
+    alone = graph.disable(
         problem,
         graph.Reprojection,
         graph.HumanMotion,
-        graph.OrientationChange,
+        graph.RelativeOrientation,
         graph.RootSmoothness,
         graph.StanceFoot,
         graph.GroundContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")
-    alone = dataclasses.replace(alone, free=graph.hold(alone.free, *rest))
+    alone = dataclasses.replace(alone, free=graph.set_constant(alone.free, *rest))
     solution, stage = solve_stage(alone, state, config, "people alone")
     return solution.state, stage
 
 
 def estimate(
     sequence: Sequence,
-    cameras: Cameras,
+    cameras: SfmResult,
     bodies: Bodies,
     body: body_.BodyModel,
     config: Config,
-) -> Joint:
+) -> JointEstimate:
     """The paper's graph: two steps, then the optimum of everything.
 
     **Raises:** as `prepare`, unless a detector looked at all images and found nobody.
@@ -269,7 +271,7 @@ def estimate(
         if len(there) and (fitted & there).any():
             sigma = np.where(fitted, config.weights.shape_sigma, 1.0)
             spread = of_fitted_sizes(spread, best, body, sigma, there)
-    return Joint(
+    return JointEstimate(
         scale=float(best.scale),
         start=prepared.scale,
         scale_sigma=_scale_sigma(
@@ -299,11 +301,11 @@ def estimate(
     )
 
 
-def without_anything(cameras: Cameras) -> Joint:
+def without_anything(cameras: SfmResult) -> JointEstimate:
     """The estimate where the camera did not move and nobody was found: cameras stay
     where they are, and nothing has a size."""
     frames = len(cameras.registered)
-    return Joint(
+    return JointEstimate(
         scale=1.0,
         start=ScaleStart(),
         scale_sigma=float("nan"),
@@ -368,7 +370,7 @@ def solve_stage(
     start = time.perf_counter()
     schedule = solver.paper_schedule(config.solver)
     schedule = schedule if name == "joint" else schedule[-1:]
-    schedule = tuple(dataclasses.replace(stage, atol=ENOUGH) for stage in schedule)
+    schedule = tuple(dataclasses.replace(stage, atol=COST_ATOL) for stage in schedule)
     solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
     before, after = float(solution.first_cost), float(solution.cost)
     steps = sum(int(n) for n in solution.num_steps)

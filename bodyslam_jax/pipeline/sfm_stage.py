@@ -15,7 +15,7 @@ from jaxtyping import Float
 from bodyslam_jax import graph, initialisation, sfm, solver
 from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config, Structure
-from bodyslam_jax.types import Cameras, Intrinsics, Sequence, Tracks
+from bodyslam_jax.types import Intrinsics, Sequence, SfmResult, Tracks
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ _SQUARE = 1e-4
 """How alike the pixels' sides are, of the focal length."""
 
 
-def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
+def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
     """Cameras, map and intrinsics of a sequence, up to scale.
 
     A camera that does not move, or only turns, is said to be that, and keeps the guess.
@@ -59,7 +59,7 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     return cameras
 
 
-def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
+def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
     num_frames = sequence.num_frames
     warnings = tracks.warnings
     tracks, share = sfm.without_burnt_in(tracks, sequence.intrinsics, num_frames)
@@ -81,7 +81,7 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> Cameras:
     return dataclasses.replace(cameras, warnings=warnings, zoom=model.zoom)
 
 
-def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> Cameras:
+def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> SfmResult:
     """Cameras of a sequence whose intrinsics are the model's, adjusted."""
     guess, found = sequence.intrinsics, model.found
     cameras = _unadjusted(sequence, found, guess, config)
@@ -98,8 +98,8 @@ def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> Cam
 
 
 def _with_focal(
-    sequence: Sequence, tracks: Tracks, cameras: Cameras, error: float, config: Config
-) -> Cameras:
+    sequence: Sequence, tracks: Tracks, cameras: SfmResult, error: float, config: Config
+) -> SfmResult:
     """The focal length as the camera's path tells it, where it does."""
     guess = sequence.intrinsics
     sigma = _clipped(error / _PER_SIGMA)
@@ -123,23 +123,23 @@ def _with_focal(
     return adjusted
 
 
-def _cut(cameras: Cameras, span: int) -> Cameras:
+def _cut(cameras: SfmResult, span: int) -> SfmResult:
     """Long tracks in pieces, which know of each other by what is known of the map."""
     tracks = cameras.tracks
-    of, piece = sfm.cut_tracks(tracks.frame, tracks.landmark, span)
+    of, piece = sfm.split_tracks(tracks.frame, tracks.landmark, span)
     kept = cameras.keep
     told = sfm.told_by_other_pieces(
         cameras.T_WC, cameras.landmarks, tracks.frame[kept], piece[kept], of
     )
     count = np.bincount(of)[of]
-    known = cameras.elsewhere[of] / count[:, None, None]
-    places = cameras.landmarks[of]
+    known = cameras.prior_information[of] / count[:, None, None]
+    prior_mean = cameras.landmarks[of]
     return dataclasses.replace(
         cameras,
-        landmarks=places,
+        landmarks=prior_mean,
         tracks=Tracks(tracks.frame, piece, tracks.uv),
-        places=places,
-        elsewhere=known + cameras.focal**2 * told,
+        prior_mean=prior_mean,
+        prior_information=known + cameras.focal**2 * told,
     )
 
 
@@ -209,17 +209,17 @@ def _unadjusted(
     found: sfm.Reconstruction,
     intrinsics: Intrinsics,
     config: Config,
-) -> Cameras:
+) -> SfmResult:
     path = sequence.camera_path if found.kind == "moving" else None
-    return Cameras(
+    return SfmResult(
         kind=found.kind,
         T_WC=found.T_WC,
         registered=found.registered,
         landmarks=found.landmarks,
         tracks=found.tracks,
         keep=np.ones(len(found.tracks.frame), bool),
-        elsewhere=found.elsewhere,
-        places=found.landmarks,
+        prior_information=found.prior_information,
+        prior_mean=found.landmarks,
         pixel_sigma=config.weights.pixel_sigma or 1.0,
         intrinsics=np.asarray(intrinsics.params, float),
         focal_sigma=float("nan"),
@@ -232,8 +232,8 @@ def _unadjusted(
 
 
 def _with_guess(
-    sequence: Sequence, tracks: Tracks, adjusted: Cameras, config: Config
-) -> Cameras:
+    sequence: Sequence, tracks: Tracks, adjusted: SfmResult, config: Config
+) -> SfmResult:
     """The guess as it was, for a camera whose path does not tell the focal length."""
     guess = sequence.intrinsics
     found = _reconstruct(sequence, tracks, guess, config)
@@ -255,8 +255,8 @@ def _with_guess(
 
 
 def _adjusted(
-    cameras: Cameras, sigma: float, config: Config, guess: Intrinsics | None
-) -> Cameras:
+    cameras: SfmResult, sigma: float, config: Config, guess: Intrinsics | None
+) -> SfmResult:
     """Bundle adjustment; with a `guess` the focal length is free."""
     nobody = initialisation.no_people(len(cameras.T_WC))
     state = initialisation.first_state(
@@ -265,7 +265,9 @@ def _adjusted(
     # What the joint graph is to take for the noise does not change what it is.
     weights = dataclasses.replace(config.weights, pixel_sigma=None)
     factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
-    again = initialisation.revisit_factor(cameras.places, cameras.elsewhere, sigma)
+    again = initialisation.revisit_factor(
+        cameras.prior_mean, cameras.prior_information, sigma
+    )
     if guess is not None and config.structure.focal_sigma > _HELD:
         # Places are those of the focal length that was thought so far.
         again = dataclasses.replace(again, whitening=0 * again.whitening)
@@ -276,9 +278,9 @@ def _adjusted(
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
     state = solution.state
     focal_sigma = float("nan")
-    elsewhere = cameras.elsewhere
+    prior_information = cameras.prior_information
     if abs(float(state.intrinsics[0]) / cameras.focal - 1) > _SAME:
-        elsewhere = np.zeros_like(elsewhere)
+        prior_information = np.zeros_like(prior_information)
     if guess is not None:
         spread = solver.marginals(problem, state).intrinsics
         focal_sigma = float(np.sqrt(config.structure.focal_runs * spread[0, 0]))
@@ -292,7 +294,7 @@ def _adjusted(
         intrinsics=np.asarray(state.intrinsics),
         focal_sigma=focal_sigma,
         keep=keep & (error < 10 * found),
-        elsewhere=elsewhere,
+        prior_information=prior_information,
         pixel_sigma=found,
         costs=(before, float(solution.cost)),
     )
@@ -302,7 +304,7 @@ _residual = jit_once(lambda factor, state: factor.residual(state))
 
 
 def _problem(
-    factors: list[graph.AbstractFactor],
+    factors: list[graph.Factor],
     state: graph.State,
     structure: Structure,
     guess: Intrinsics | None,
@@ -321,7 +323,7 @@ def _problem(
     factors = [
         *factors,
         graph.IntrinsicsPrior(jnp.asarray(known)[None], jnp.asarray(sigma)[None]),
-        graph.SquarePixels(
+        graph.AspectRatioPrior(
             jnp.asarray([_SQUARE * focal]), ratio=float(focal / known[1])
         ),
     ]

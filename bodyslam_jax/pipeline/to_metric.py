@@ -14,7 +14,7 @@ from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
 from bodyslam_jax.geometry.so3 import log
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
-from bodyslam_jax.types import Cameras, Joint, Result, Sequence
+from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 FEET = [10, 11]
 """SMPL's toe joints."""
@@ -24,8 +24,8 @@ def assemble(
     sequence: Sequence,
     config: Config,
     body: body_.BodyModel,
-    cameras: Cameras,
-    joint: Joint,
+    cameras: SfmResult,
+    joint: JointEstimate,
     seconds: dict[str, float],
 ) -> Result:
     """The optimum in a metric world whose y axis is up; standing feet are at y = 0."""
@@ -73,7 +73,7 @@ def _placed(
     sequence: Sequence,
     config: Config,
     body: body_.BodyModel,
-    joint: Joint,
+    joint: JointEstimate,
     T_WC: Float[np.ndarray, "t 4 4"],
 ) -> tuple[
     Float[np.ndarray, "h t 72"],

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyslam_jax.sfm.bundle import Scene
 from bodyslam_jax.sfm.multiview import relative_pose, resect
-from bodyslam_jax.sfm.partial_map import Growing, Mapper
+from bodyslam_jax.sfm.partial_map import Mapper, PartialMap
 from bodyslam_jax.types import CameraPath
 
 _log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ it that show which of two maps is right there."""
 
 def build_map(
     make: Callable[[], "Builder"], keyframes: np.ndarray, pairs: np.ndarray
-) -> tuple["Builder", Growing] | None:
+) -> tuple["Builder", PartialMap] | None:
     """The map that grows best over the keyframes of one shot.
 
     A camera that moves along a plane that few points show may be taken for one that
@@ -94,7 +94,7 @@ class Builder(Mapper):
     thin: dict[int, int]
     """Keyframes that were located by few points, and by how many."""
 
-    def begin(self, path: CameraPath) -> Growing:
+    def begin(self, path: CameraPath) -> PartialMap:
         """The map that cameras at known places see; they stay where they are."""
         R_WC, centre = path.T_WC[:, :3, :3], path.T_WC[:, :3, 3]
         scene = Scene(
@@ -102,7 +102,7 @@ class Builder(Mapper):
             centre.copy(),
             np.zeros((self.num_landmarks, 3)),
         )
-        grown = Growing(
+        grown = PartialMap(
             scene,
             path.known.copy(),
             np.zeros(self.num_landmarks, dtype=bool),
@@ -114,7 +114,7 @@ class Builder(Mapper):
         self._mark(grown)
         return grown
 
-    def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> Growing | None:
+    def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> PartialMap | None:
         """The best of the reconstructions that grow from `pairs` of keyframes.
 
         Where even the best leaves much unexplained, the points are noisier than
@@ -148,7 +148,7 @@ class Builder(Mapper):
             self._grow(best, keyframes)
         return best
 
-    def finish(self, grown: Growing, keyframes: np.ndarray) -> None:
+    def finish(self, grown: PartialMap, keyframes: np.ndarray) -> None:
         """Looks at all joins and outliers again, now that the keyframes are there."""
         self._settle(grown, keyframes[grown.registered[keyframes]])
         for _ in range(3):  # outliers sorted anew in between
@@ -157,7 +157,7 @@ class Builder(Mapper):
 
     def _best_start(
         self, keyframes: np.ndarray, pairs: np.ndarray
-    ) -> tuple[Growing | None, float]:
+    ) -> tuple[PartialMap | None, float]:
         best, scores = None, [-1.0]
         for a, b in pairs:
             started = self._start(int(a), int(b))
@@ -177,7 +177,7 @@ class Builder(Mapper):
                 break
         return best, max(scores)
 
-    def complete(self, grown: Growing, frames: np.ndarray) -> None:
+    def complete(self, grown: PartialMap, frames: np.ndarray) -> None:
         """Adds the frames between keyframes, then looks at everything once more."""
         for k in frames:
             if not grown.registered[k]:
@@ -186,7 +186,7 @@ class Builder(Mapper):
         self._mark(grown)
         grown.shown[self.revisits.track] = self.views.landmark
 
-    def _start(self, a: int, b: int) -> Growing | None:
+    def _start(self, a: int, b: int) -> PartialMap | None:
         _, i, j = np.intersect1d(
             self.views.landmark[self.of_frame[a]],
             self.views.landmark[self.of_frame[b]],
@@ -205,7 +205,7 @@ class Builder(Mapper):
             np.zeros((self.num_landmarks, 3)),
         )
         scene.R_CW[b], scene.centre[b] = R, -R.T @ t
-        grown = Growing(
+        grown = PartialMap(
             scene,
             np.isin(np.arange(self.num_frames), [a, b]),
             np.zeros(self.num_landmarks, dtype=bool),
@@ -218,7 +218,7 @@ class Builder(Mapper):
         self._refine(grown, grown.registered & (np.arange(self.num_frames) != a))
         return grown
 
-    def _grow(self, grown: Growing, frames: np.ndarray) -> None:
+    def _grow(self, grown: PartialMap, frames: np.ndarray) -> None:
         """Registers `frames`, the one that sees most points first."""
         waiting = {int(k) for k in frames if not grown.registered[k]}
         failed: set[int] = set()
@@ -248,7 +248,7 @@ class Builder(Mapper):
         self._triangulate(grown, self._views_of(grown))
         self._refine(grown, self._free(grown))
 
-    def _register(self, grown: Growing, k: int) -> bool:
+    def _register(self, grown: PartialMap, k: int) -> bool:
         at = self.of_frame[k]
         at = at[grown.has_point[self.views.landmark[at]]]
         known = np.flatnonzero(grown.registered)
@@ -269,11 +269,13 @@ class Builder(Mapper):
         grown.inlier[at] = found[2]
         return True
 
-    def score(self, grown: Growing, frames: np.ndarray) -> float:
+    def score(self, grown: PartialMap, frames: np.ndarray) -> float:
         """Part of the observations in `frames` that the reconstruction explains."""
         return self.share_explained(grown, frames)[0]
 
-    def share_explained(self, grown: Growing, frames: np.ndarray) -> tuple[float, int]:
+    def share_explained(
+        self, grown: PartialMap, frames: np.ndarray
+    ) -> tuple[float, int]:
         """The same, and how many observations could be explained."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.

@@ -187,7 +187,7 @@ class Revisits:
         return loose
 
 
-def cut_tracks(
+def split_tracks(
     frame: Int[np.ndarray, " m"], track: Int[np.ndarray, " m"], longest: int
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " m"]]:
     """Cuts tracks that span more than `longest` frames into equal pieces.

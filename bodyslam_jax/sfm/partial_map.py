@@ -28,7 +28,7 @@ Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
 
 
 @dataclasses.dataclass
-class Growing:
+class PartialMap:
     """A reconstruction on its way."""
 
     scene: Scene
@@ -70,7 +70,7 @@ class Mapper:
     def _adjust(self, scene: Scene, views: Views, free: np.ndarray) -> None:
         adjust(scene, views, free, loss=self.pixel, iterations=10, tolerance=1e-3)
 
-    def _join(self, grown: Growing, k: int) -> None:
+    def _join(self, grown: PartialMap, k: int) -> None:
         """Finds points of the map again among those that frame `k` sees."""
         if not self.joining:
             return
@@ -85,7 +85,7 @@ class Mapper:
         if pairs and away > _DRIFTED * self.threshold:
             self._close(grown)
 
-    def _settle(self, grown: Growing, frames: np.ndarray) -> None:
+    def _settle(self, grown: PartialMap, frames: np.ndarray) -> None:
         """Joins and parts tracks until that changes little: what was joined wrongly
         while the map was bent is seen to be once it is less so."""
         for turn in range(_ROUNDS):
@@ -101,7 +101,7 @@ class Mapper:
             if np.mean(self.views.landmark != before) < _SETTLED:
                 return
 
-    def _close(self, grown: Growing) -> None:
+    def _close(self, grown: PartialMap) -> None:
         """Spreads what the map has drifted over all that was seen since."""
         use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
         for loss in _CLOSING:
@@ -114,10 +114,10 @@ class Mapper:
             )
         self._mark(grown)
 
-    def _views_of(self, grown: Growing) -> np.ndarray:
+    def _views_of(self, grown: PartialMap) -> np.ndarray:
         return np.flatnonzero(grown.registered[self.views.frame])
 
-    def _views_seen_in(self, grown: Growing, k: int) -> np.ndarray:
+    def _views_seen_in(self, grown: PartialMap, k: int) -> np.ndarray:
         """All views of the points that frame `k` sees and that are not known yet."""
         wanted = np.zeros(self.num_landmarks, dtype=bool)
         wanted[self.views.landmark[self.of_frame[k]]] = True
@@ -125,7 +125,7 @@ class Mapper:
         use = wanted[self.views.landmark] & grown.registered[self.views.frame]
         return np.flatnonzero(use)
 
-    def _triangulate(self, grown: Growing, use: np.ndarray) -> None:
+    def _triangulate(self, grown: PartialMap, use: np.ndarray) -> None:
         """Makes points of landmarks that have none, where the views `use` allow it."""
         use = use[~grown.has_point[self.views.landmark[use]]]
         if not len(use):
@@ -147,7 +147,7 @@ class Mapper:
         kept = new[views.landmark]
         grown.inlier[use[kept]] = good[kept]
 
-    def _parallax(self, trial: Scene, views: Views, grown: Growing) -> np.ndarray:
+    def _parallax(self, trial: Scene, views: Views, grown: PartialMap) -> np.ndarray:
         """Largest angle (rad) between the rays to each landmark, were it as far away as
         points usually are that the same cameras see.
 
@@ -168,7 +168,7 @@ class Mapper:
         there = centre + usual * ray / np.maximum(distance, 1e-12)
         return widest_angle(trial, views, there, self.num_landmarks)
 
-    def _mark(self, grown: Growing) -> None:
+    def _mark(self, grown: PartialMap) -> None:
         """Sorts observations into inliers and outliers, and drops poor points."""
         use = self._views_of(grown)
         use = use[grown.has_point[self.views.landmark[use]]]
@@ -196,18 +196,18 @@ class Mapper:
         grown.has_point &= ~bad
         grown.inlier &= grown.has_point[self.views.landmark]
 
-    def _free(self, grown: Growing) -> np.ndarray:
+    def _free(self, grown: PartialMap) -> np.ndarray:
         """All registered cameras but the first, which holds the frame in place."""
         free = grown.registered.copy()
         free[np.argmax(free)] = False
         return free
 
-    def _nearest(self, grown: Growing, k: int, count: int) -> np.ndarray:
+    def _nearest(self, grown: PartialMap, k: int, count: int) -> np.ndarray:
         known = np.flatnonzero(grown.registered)
         near = known[np.argsort(np.abs(known - k), kind="stable")][:count]
         return np.isin(np.arange(self.num_frames), near) & self._free(grown)
 
-    def _refine(self, grown: Growing, free: np.ndarray) -> None:
+    def _refine(self, grown: PartialMap, free: np.ndarray) -> None:
         use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
         if not free.all():
             # Points that no free camera sees would only cost time.

@@ -20,7 +20,7 @@ from bodyslam_jax.sfm.camera_motion import (
 )
 from bodyslam_jax.sfm.incremental import Builder, build_map
 from bodyslam_jax.sfm.loop_closure import told_by_others
-from bodyslam_jax.sfm.partial_map import Growing, Refine
+from bodyslam_jax.sfm.partial_map import PartialMap, Refine
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
@@ -50,7 +50,7 @@ class Reconstruction:
     """Which of the `m` observations given they are."""
     landmark_ids: Int[np.ndarray, " l"]
     """Which of the landmarks given these are; a long track is several landmarks."""
-    elsewhere: Float[np.ndarray, "l 3 3"]
+    prior_information: Float[np.ndarray, "l 3 3"]
     """Information that other tracks of the same point hold on each landmark's place,
     px² per squared unit of the map: to be divided by the variance of a pixel."""
     error: float
@@ -251,7 +251,7 @@ def _turning_error(pairs: np.ndarray) -> float:
 
 def _moving(
     problem: _Problem,
-    grown: Growing,
+    grown: PartialMap,
     inlier: np.ndarray,
     shot: tuple[int, int],
     warnings: tuple[str, ...],
@@ -274,8 +274,8 @@ def _moving(
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
     T_WC = interpolate_poses(T_WC, registered)
     views = Views(views.frame, of, views.xy)
-    elsewhere = told_by_others(grown.scene, views, grown.shown[ids])
-    elsewhere = (problem.focal * unit) ** 2 * (R0 @ elsewhere @ R0.T)
+    prior_information = told_by_others(grown.scene, views, grown.shown[ids])
+    prior_information = (problem.focal * unit) ** 2 * (R0 @ prior_information @ R0.T)
     return _pack(
         problem,
         "moving",
@@ -285,7 +285,7 @@ def _moving(
         (ids, of),
         inlier,
         warnings,
-        elsewhere=elsewhere,
+        prior_information=prior_information,
         unit=unit,
     )
 
@@ -337,7 +337,7 @@ def _pack(
     inlier: np.ndarray,
     warnings: tuple[str, ...],
     *,
-    elsewhere: np.ndarray | None = None,
+    prior_information: np.ndarray | None = None,
     unit: float = 1.0,
 ) -> Reconstruction:
     """`which`: the track that each landmark is of; the landmark of each inlier."""
@@ -357,7 +357,9 @@ def _pack(
         tracks=tracks,
         inlier=inlier,
         landmark_ids=ids,
-        elsewhere=np.zeros((len(ids), 3, 3)) if elsewhere is None else elsewhere,
+        prior_information=np.zeros((len(ids), 3, 3))
+        if prior_information is None
+        else prior_information,
         error=error,
         unit=unit,
         warnings=warnings,

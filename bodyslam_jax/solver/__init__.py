@@ -1,6 +1,6 @@
 """How a problem is solved: structure, linear algebra, steps, baselines, uncertainty."""
 
-from bodyslam_jax.solver.batching import over_devices as over_devices
+from bodyslam_jax.solver.batching import vmap_over_devices as vmap_over_devices
 from bodyslam_jax.solver.convergence_trace import clock as clock
 from bodyslam_jax.solver.convergence_trace import trace as trace
 from bodyslam_jax.solver.covariance import Marginals as Marginals

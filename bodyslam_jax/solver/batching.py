@@ -19,7 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bodyslam_jax.compilation import is_alone, is_traced, quick_options
 
 
-def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
+def sequential_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same function of pytrees; on a CPU it is mapped one after another, in one
     program."""
 
@@ -45,7 +45,7 @@ def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
 AXIS = "device"
 
 
-def over_devices(
+def vmap_over_devices(
     function: Callable[..., Any], in_axes: int | tuple[int | None, ...] = 0
 ) -> Callable[..., Any]:
     """`jax.vmap(function, in_axes)`, compiled, a share of the batch on each device.

@@ -12,7 +12,7 @@ import optimistix as optx
 
 from bodyslam_jax.compilation import in_full_precision, is_traced, quick_options
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Stage, check_schedule
@@ -46,7 +46,7 @@ def trace(
     _check(problem, state, schedule, damping)
     settings = observe, schedule, damping, mixed_precision
     watched = lambda problem, state: _trace(problem, state, *settings)
-    return (in_turn(watched) if is_traced(state) else watched)(problem, state)
+    return (sequential_vmap(watched) if is_traced(state) else watched)(problem, state)
 
 
 def _check(problem, state, schedule, damping):

@@ -18,7 +18,7 @@ from bodyslam_jax.solver.linear_system import UNSEEN, damped, diagonals, elimina
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.lm_state import Final
-from bodyslam_jax.solver.second_order import bend, curvature_of
+from bodyslam_jax.solver.second_order import add_second_order, curvature_of
 from bodyslam_jax.solver.step import little
 
 
@@ -42,7 +42,7 @@ def _bent(
     problem: Problem, lin: Linearisation, state: State, sizes: Sizes
 ) -> Linearisation:
     """With the curvature of keypoints where there is an inverse, as in the loop."""
-    bent = bend(lin, curvature_of(problem, lin, state, sizes))
+    bent = add_second_order(lin, curvature_of(problem, lin, state, sizes))
     tried = jax.lax.stop_gradient(bent)
     factor = eliminate(problem, tried, sizes, _damping(tried, sizes)).factor
     sound = jnp.all(jnp.isfinite(factor.half))

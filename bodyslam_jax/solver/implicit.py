@@ -27,7 +27,7 @@ from bodyslam_jax.compilation import (
 from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver.apart import join_poses
-from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
 from bodyslam_jax.solver.coupling import with_gradient
 from bodyslam_jax.solver.gmres import gmres
@@ -45,7 +45,7 @@ def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Pr
     """What a cotangent on the solution is on everything in the (padded) problem."""
     given = problem, state, cotangent
     if is_traced(given):
-        return in_turn(_program(False))(*given)
+        return sequential_vmap(_program(False))(*given)
     return _program(is_alone())(*given)
 
 

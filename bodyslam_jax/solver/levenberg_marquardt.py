@@ -20,7 +20,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from bodyslam_jax.graph import VARIABLES, Problem, State, Step, lift, residual_of
+from bodyslam_jax.graph import VARIABLES, Problem, State, Step, residual_of, robustify
 from bodyslam_jax.solver.blocks import Linearisation, sizes_of
 from bodyslam_jax.solver.coupling import with_coupling
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
@@ -28,7 +28,7 @@ from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.lm_state import Final, History, Loop
 from bodyslam_jax.solver.retriangulation import triangulate_anew
-from bodyslam_jax.solver.second_order import bend, curvature_if, next_share
+from bodyslam_jax.solver.second_order import add_second_order, curvature_if, next_share
 from bodyslam_jax.solver.step import Trial, attempt
 
 MAX_DAMPING = 1e12
@@ -81,9 +81,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             final=empty[0],
             stale=jnp.array(True),
             damping=jnp.asarray(self.damping, dtype),
-            caution=jnp.zeros(len(y.landmarks), dtype),
+            landmark_damping=jnp.zeros(len(y.landmarks), dtype),
             searched=jnp.array(0),
-            growth=jnp.asarray(2.0, dtype),
+            nu=jnp.asarray(2.0, dtype),
             cost=jnp.asarray(jnp.inf, dtype),
             first_cost=jnp.asarray(jnp.inf, dtype),
             steps=jnp.zeros(s, int),
@@ -122,9 +122,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         problem: Problem = args.with_prediction(prediction)
         share = jnp.where(last, state.bent.astype(dtype), state.share)
         curvature = curvature_if(share > 0, problem, lin, y, sizes)
-        bent = bend(lin, curvature, share)
+        bent = add_second_order(lin, curvature, share)
         known = jnp.sum(lin.costs)
-        trial = attempt(problem, y, bent, sizes, state.damping, state.caution, last)
+        trial = attempt(
+            problem, y, bent, sizes, state.damping, state.landmark_damping, last
+        )
         accept, before = trial.accepted, jnp.sum(trial.terms)
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
         done = _is_done(trial, known, enough)
@@ -141,7 +143,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         cost = jnp.sum(terms)
         found = before - cost > enough
         done = done & ~found
-        damping = trial.next_damping(state.growth)
+        damping = trial.next_damping(state.nu)
         stuck = ~accept & ~done & ~found & (damping > MAX_DAMPING)
         broken = ~jnp.isfinite(known)
         row = jnp.where(last, len(self.limit), at)
@@ -174,9 +176,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             final=final_of(lin, trial.eliminated),
             stale=accept | found | over | last,
             damping=jnp.where(over, self.damping, damping).astype(dtype),
-            caution=trial.caution,
+            landmark_damping=trial.landmark_damping,
             searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
-            growth=jnp.where(accept | over, 2.0, 2 * state.growth).astype(dtype),
+            nu=jnp.where(accept | over, 2.0, 2 * state.nu).astype(dtype),
             cost=cost,
             first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
             steps=steps,
@@ -239,4 +241,4 @@ def _linearise_anew(problem, observations, state, dtype):
 
 def lifted(state: State, problem: Problem) -> list[Array]:
     """Lifted residuals of all factors, as a stock solver sees them."""
-    return [lift(f.loss, residual_of(f, state)) for f in problem.factors]
+    return [robustify(f.loss, residual_of(f, state)) for f in problem.factors]

@@ -24,7 +24,7 @@ def search(problem, state, move, slope, predicted, terms):
     known = jnp.sum(terms)
 
     def one(carry, _):
-        share, place, thrown, best, best_terms, full = carry
+        share, place, rejected, best, best_terms, full = carry
         moved = state.retract(jax.tree.map(lambda x: share * x, move))
         moved, off, new = _settle(problem, state, moved)
         cost = jnp.sum(new)
@@ -33,22 +33,22 @@ def search(problem, state, move, slope, predicted, terms):
         best = jnp.where(better, share, best)
         best_terms = jnp.where(better, new, best_terms)
         place = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, place)
-        thrown = jnp.where(better, off, thrown)
+        rejected = jnp.where(better, off, rejected)
         full = jnp.where(jnp.isnan(full), cost, full)
         # cost(a) = known - slope a + bend a^2, through the full step
-        bend = full - known + slope
-        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
-        vertex = jnp.where(bend > 0, vertex, 2.0)
+        add_second_order = full - known + slope
+        vertex = slope / jnp.where(add_second_order > 0, 2 * add_second_order, 1.0)
+        vertex = jnp.where(add_second_order > 0, vertex, 2.0)
         share = jnp.clip(vertex, 0.1, 2.0)
-        return (share, place, thrown, best, best_terms, full), None
+        return (share, place, rejected, best, best_terms, full), None
 
     one_ = jnp.ones_like(known)
     none = jnp.zeros(len(state.landmarks), bool)
     start = (one_, state, none, one_, terms, jnp.nan * one_)
     found, _ = jax.lax.scan(one, start, length=2)
-    _, place, thrown, best, best_terms, full = found
+    _, place, rejected, best, best_terms, full = found
     gain = (known - full) / jnp.where(predicted > 0, predicted, 1.0)
-    return place, thrown, best, best_terms, jnp.clip(gain, -1.0, 2.0)
+    return place, rejected, best, best_terms, jnp.clip(gain, -1.0, 2.0)
 
 
 def _settle(

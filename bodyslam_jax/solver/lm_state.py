@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.solver.block_cholesky import Factor
 from bodyslam_jax.solver.blocks import Linearisation, Observations
-from bodyslam_jax.solver.elimination.person import Roots
+from bodyslam_jax.solver.elimination.person import RootFactor
 
 
 class History(eqx.Module):
@@ -33,7 +33,7 @@ class Final(eqx.Module):
     lin: Linearisation
     """Without what keypoints bend (`_curvature`), which the factor may have."""
     factor: Factor
-    roots: Roots | None
+    roots: RootFactor | None
     """Of the people's roots that were eliminated within chunks."""
 
 
@@ -48,11 +48,11 @@ class Loop(eqx.Module):
     stale: Bool[Array, ""]
     """Whether `final.lin` is of an earlier state or stage."""
     damping: Float[Array, ""]
-    caution: Float[Array, " l"]
+    landmark_damping: Float[Array, " l"]
     """Damping that landmarks have at least, each by itself."""
     searched: Int[Array, ""]
     """How often landmarks were triangulated anew in this stage."""
-    growth: Float[Array, ""]
+    nu: Float[Array, ""]
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]
     steps: Int[Array, " s"]

@@ -7,13 +7,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from bodyslam_jax.graph import (
+    AspectRatioPrior,
     CameraPrior,
     CameraSmoothness,
     IntrinsicsPrior,
     LandmarkPrior,
     Problem,
     Reprojection,
-    SquarePixels,
     State,
     world_from_root,
 )
@@ -162,7 +162,7 @@ def _focal_length(scene: _Scene, spread: Marginals) -> Iterator[str]:
         ),
         default=np.inf,
     )
-    if any(isinstance(x, SquarePixels) for x in scene.problem.factors):
+    if any(isinstance(x, AspectRatioPrior) for x in scene.problem.factors):
         before /= np.sqrt(2)  # known twice
     if not deviation < min(UNKNOWN * size, NO_BETTER * before):
         share = deviation / size

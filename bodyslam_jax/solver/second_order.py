@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.graph import JointReprojection, Problem, State
+from bodyslam_jax.graph import KeypointReprojection, Problem, State
 from bodyslam_jax.solver.apart import pick
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, cast, mask_of
 from bodyslam_jax.solver.elimination.limbs import diagonal
@@ -79,7 +79,7 @@ def curvature_of(
     each = [
         _blocks_of(factor, problem, state, sizes)
         for factor in problem.factors
-        if isinstance(factor, JointReprojection)
+        if isinstance(factor, KeypointReprojection)
     ]
     if not each:
         return Curvature({}, [])
@@ -88,7 +88,7 @@ def curvature_of(
     return Curvature(blocks, found.limbs if 0 in lin.limbs else [])
 
 
-def bend(
+def add_second_order(
     lin: Linearisation, curvature: Curvature, share: float | Float[Array, ""] = 1.0
 ) -> Linearisation:
     """The same equations with a share of the curvature."""

@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.solver.block_cholesky import Factor
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes, own_to_global
-from bodyslam_jax.solver.elimination.person import Roots
+from bodyslam_jax.solver.elimination.person import RootFactor
 from bodyslam_jax.solver.front import Window
 
 
 def selected_inverse(
     factor: Factor,
-    roots: Roots | None,
+    roots: RootFactor | None,
     window: Window,
     sizes: Sizes,
     order: Int[Array, " n"] | None,
@@ -86,7 +86,7 @@ def selected_inverse(
 
 
 def _with_inner(
-    pair: Float[Array, "p p"], roots: Roots | None, window: Window, sizes: Sizes
+    pair: Float[Array, "p p"], roots: RootFactor | None, window: Window, sizes: Sizes
 ) -> Float[Array, "f f"]:
     """Covariance of all roots of a chunk, its cameras and the globals, from that of
     what two chunks kept: eliminated roots follow from it, with a spread of their own.

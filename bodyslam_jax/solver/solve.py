@@ -20,7 +20,7 @@ from bodyslam_jax.compilation import (
 from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
 from bodyslam_jax.kept import kept
 from bodyslam_jax.solver import baselines
-from bodyslam_jax.solver.batching import in_turn
+from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.implicit import cotangent_of_problem
 from bodyslam_jax.solver.levenberg_marquardt import (
     StructuredLevenbergMarquardt,
@@ -60,8 +60,8 @@ def solve(
       it ends, keep that of `state`. Flat directions are damped a little more.
 
     Pure: jits, differentiates, and maps over problems or states of one shape: one after
-    another on a CPU, which is no slower there, at once elsewhere; `over_devices` gives
-    each device a share. Threads may solve at the same time.
+    another on a CPU, which is no slower there, at once elsewhere; `vmap_over_devices`
+    gives each device a share. Threads may solve at the same time.
 
     Derivatives, of `structured`, are those of `state` and `cost` with respect to all of
     `problem`, by the implicit function theorem; a solution does not depend on where it
@@ -150,7 +150,7 @@ def run(
     """
     given = problem, state, method
     if is_traced(given):
-        return in_turn(_program(False))(*given)
+        return sequential_vmap(_program(False))(*given)
     return _program(alone)(*given)
 
 

@@ -50,18 +50,16 @@ class Trial(NamedTuple):
     """Cost by factor there."""
     gain: Float[Array, ""]
     """Actual over predicted decrease of the full step."""
-    caution: Float[Array, " l"]
+    landmark_damping: Float[Array, " l"]
     """Of landmarks, for the next step."""
 
-    def next_damping(self, growth: Float[Array, ""]) -> Float[Array, ""]:
-        """Less after a good step, more by `growth` after one that was not accepted."""
+    def next_damping(self, nu: Float[Array, ""]) -> Float[Array, ""]:
+        """Less after a good step, more by `nu` after one that was not accepted."""
         least = least_damping(self.eliminated.factor.half.dtype)
         shrink = jnp.maximum(1 - (2 * self.gain - 1) ** 3, SHRINK)
         shrink = jnp.where(self.gain < 0.25, 2.0, shrink)
         lower = jnp.maximum(self.damping * shrink, least)
-        return jnp.where(
-            self.accepted, lower, jnp.maximum(self.damping, least) * growth
-        )
+        return jnp.where(self.accepted, lower, jnp.maximum(self.damping, least) * nu)
 
 
 def attempt(
@@ -70,7 +68,7 @@ def attempt(
     lin: Linearisation,
     sizes: Sizes,
     damping: Float[Array, ""],
-    caution: Float[Array, " l"],
+    landmark_damping: Float[Array, " l"],
     last: Bool[Array, ""],
 ) -> Trial:
     """Solves for a step and tries it; with `last` only factorises, hardly damped."""
@@ -79,7 +77,7 @@ def attempt(
     extra = damped(
         diagonal, damping, jnp.where(last, UNSEEN, 1.0).astype(damping.dtype)
     )
-    least = jnp.where(last, 0.0, caution)
+    least = jnp.where(last, 0.0, landmark_damping)
     extra["landmarks"] = tuple(
         jnp.maximum(more, least[bucket.landmark][:, None] * own)
         for more, own, bucket in zip(
@@ -97,13 +95,13 @@ def attempt(
     finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
     move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
     slope = jnp.where(finite, slope, 0.0)
-    there, thrown, share, terms, gain = search(
+    there, rejected, share, terms, gain = search(
         problem, state, move, slope, predicted, lin.costs
     )
     decrease = jnp.sum(lin.costs) - jnp.sum(terms)
     accepted = finite & (predicted > 0) & (decrease > GAIN * share * predicted)
-    more = jnp.clip(10 * caution, *CAUTION)
-    after = jnp.where(thrown, more, 0.1 * caution)
+    more = jnp.clip(10 * landmark_damping, *CAUTION)
+    after = jnp.where(rejected, more, 0.1 * landmark_damping)
     return Trial(
         eliminated=eliminated,
         damping=damping,
@@ -114,7 +112,7 @@ def attempt(
         state=jax.tree.map(lambda a, b: jnp.where(accepted, a, b), there, state),
         terms=jnp.where(accepted, terms, lin.costs),
         gain=gain,
-        caution=jnp.where(accepted, after, caution),
+        landmark_damping=jnp.where(accepted, after, landmark_damping),
     )
 
 

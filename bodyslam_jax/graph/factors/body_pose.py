@@ -9,14 +9,14 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry.so3 import compose, log_of
-from bodyslam_jax.graph.factor import AbstractFrameFactor, Touch
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import before
 from bodyslam_jax.graph.state import State, inverse_right_jacobian
 from bodyslam_jax.graph.whitening import innovation
 
 
-class Posture(AbstractFrameFactor):
+class BodyPosePrior(FrameFactor):
     """Each joint's rotation against a measured or predicted one.
 
     `e_k = Log(C̃_k^T C(θ_k))`, the geodesic form of the paper's `θ_k - θ̃_k`. Errors of a
@@ -30,17 +30,17 @@ class Posture(AbstractFrameFactor):
     """Stationary standard deviation per axis, rad; `inf` where not measured."""
     correlation: Float[Array, "h t"]
     """ρ between the errors of k-1 and k; 0 at the start of a run."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     correlated: bool = eqx.field(static=True, default=True)
     predicted: bool = eqx.field(static=True, default=False)
     """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
     of_people = True
-    frame_fields = ("rotation", "sigma", "correlation")
+    time_fields = ("rotation", "sigma", "correlation")
     padding = {"sigma": jnp.inf, "correlation": 0.0}
     per_joint = True
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("pose", 0), ("pose", 1)) if self.correlated else (("pose", 0),)
 
     def data(self):
@@ -54,7 +54,7 @@ class Posture(AbstractFrameFactor):
         known = jnp.isfinite(before(self.sigma))
         return jnp.where(known, self.correlation[..., None], 0.0)
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         rotation, previous, sigma, correlation = data
         error = rotation_between(rotation, window[0].pose)
         if self.correlated:
@@ -69,7 +69,7 @@ class Posture(AbstractFrameFactor):
         error = rotation_between(self.rotation, state.poses)
         residual, now, earlier = self._innovation(error)
         by_error = inverse_right_jacobian(error)
-        parts: dict[Touch, Array] = {("pose", 0): now[..., None] * by_error}
+        parts: dict[Key, Array] = {("pose", 0): now[..., None] * by_error}
         if self.correlated:
             parts["pose", 1] = earlier[..., None] * before(by_error)
         return residual, parts
@@ -85,7 +85,7 @@ class Posture(AbstractFrameFactor):
         return now * error + earlier * before(error), now, earlier
 
 
-class Shape(AbstractFrameFactor):
+class ShapePrior(FrameFactor):
     """Regressed shape: `β - β̃_k`. Regressors err alike in all frames of a video: one
     measurement, in one frame, says as much as it knows."""
 
@@ -93,24 +93,24 @@ class Shape(AbstractFrameFactor):
     """β̃"""
     sigma: Float[Array, "h t 10"]
     """`inf` where not measured."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = True
-    frame_fields = ("shape", "sigma")
+    time_fields = ("shape", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("shape", 0),)
 
     def data(self):
         return self.shape, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         shape, sigma = data
         return (shared.shape - shape) / sigma
 
 
-class Stature(AbstractFrameFactor):
+class Stature(FrameFactor):
     """A known height of the person, `(h_0 + g · β - h̃) / σ`.
 
     The height of the mesh at rest, between the vertices that are highest and lowest in
@@ -125,19 +125,19 @@ class Stature(AbstractFrameFactor):
     """h̃, m"""
     sigma: Float[Array, "h t"]
     """m; finite in one frame of each person who was measured, `inf` elsewhere."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = True
-    frame_fields = ("height", "sigma")
+    time_fields = ("height", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("shape", 0),)
 
     def data(self):
         return self.height, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         height, sigma = data
         return (self.template + jnp.dot(self.slope, shared.shape) - height)[
             None

@@ -5,69 +5,69 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry.so3 import log
-from bodyslam_jax.graph.factor import AbstractFrameFactor, Touch
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.losses import Loss, Squared
 
 
-class CameraPrior(AbstractFrameFactor):
+class CameraPrior(FrameFactor):
     """A camera known beforehand: `[Log(C̃^T C), r' - r̃'] / σ`."""
 
     cameras: Float[Array, "t 4 4"]
     """T̃'_WC"""
     sigma: Float[Array, "t 6"]
     """rad, then units of the map; `inf` where not known."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = False
-    frame_fields = ("cameras", "sigma")
+    time_fields = ("cameras", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("camera", 0),)
 
     def data(self):
         return self.cameras, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         known, sigma = data
         camera = window[0].camera
         turn = log(known[:3, :3].T @ camera[:3, :3])
         return jnp.concatenate([turn, camera[:3, 3] - known[:3, 3]]) / sigma
 
 
-class ScalePrior(AbstractFrameFactor):
+class ScalePrior(FrameFactor):
     """A known size of the map, `(s - s̃) / σ`: of a camera path that is in metres."""
 
     scale: Float[Array, " t"]
     """s̃, m per unit of the map."""
     sigma: Float[Array, " t"]
     """m per unit of the map; finite in one frame, `inf` in all others."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = False
-    frame_fields = ("scale", "sigma")
+    time_fields = ("scale", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("scale", 0),)
 
     def data(self):
         return self.scale, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         known, sigma = data
         return (shared.scale - known)[None] / sigma
 
 
-class AbstractIntrinsicsFactor(AbstractFrameFactor):
+class AbstractIntrinsicsFactor(FrameFactor):
     """A factor of the intrinsics alone: one for the whole video."""
 
     of_people = False
-    frame_fields = ()
+    time_fields = ()
     padding = {}  # its one row is no frame
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return (("intrinsics", 0),)
 
     def map_frames(self, function, state, extra=None):
@@ -81,33 +81,33 @@ class IntrinsicsPrior(AbstractIntrinsicsFactor):
     intrinsics: Float[Array, "1 i"]
     sigma: Float[Array, "1 i"]
     """px, distortion: 1; `inf` where not known."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
 
     def data(self):
         return self.intrinsics, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         known, sigma = data
         return (shared.intrinsics - known) / sigma
 
 
-class SquarePixels(AbstractIntrinsicsFactor):
+class AspectRatioPrior(AbstractIntrinsicsFactor):
     """One focal length for rows and columns, `(fx - a fy) / σ`."""
 
     sigma: Float[Array, " 1"]
     """px"""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     ratio: float = eqx.field(static=True, default=1.0)
     """a, the height of a pixel over its width: 1 for square pixels."""
 
     def data(self):
         return self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data
 
 
-class CameraSmoothness(AbstractFrameFactor):
+class CameraSmoothness(FrameFactor):
     """The camera keeps its velocity: turn and shift, against those before.
 
     `(Log(C_{k-1}^T C_k) - Log(C_{k-2}^T C_{k-1})) / σ_1` of C = C_WC, in rad per frame
@@ -117,19 +117,19 @@ class CameraSmoothness(AbstractFrameFactor):
 
     sigma: Float[Array, "t 2"]
     """Per frame squared: rad, units of the map; `inf` for the first two frames."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = False
-    frame_fields = ("sigma",)
+    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return ("camera", 0), ("camera", 1), ("camera", 2)
 
     def data(self):
         return self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         now, before, first = (f.camera for f in window)
         turn = log(before[:3, :3].T @ now[:3, :3])
         turn = turn - log(first[:3, :3].T @ before[:3, :3])

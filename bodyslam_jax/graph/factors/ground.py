@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph.factor import AbstractFrameFactor, Limbs, Touch
+from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
 from bodyslam_jax.graph.factors.stance import BODY25_FEET
 from bodyslam_jax.graph.keypoint_jacobian import (
     keypoint_jacobian,
     turning_joints,
 )
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
 SOLE = 0.018
@@ -21,7 +21,7 @@ _SOFTNESS = 0.01
 """Points this much higher than the lowest count e times less, m."""
 
 
-class GroundContact(AbstractFrameFactor):
+class GroundContact(FrameFactor):
     """The lowest point of the feet is on a plane that is fixed in the map.
 
     `(n^T (s r'_WC + C_WC p_C) + s d - SOLE) / σ`, where `n^T x' + d = 0` is the ground
@@ -35,13 +35,13 @@ class GroundContact(AbstractFrameFactor):
     sigma: Float[Array, "h t"]
     """m; `inf` where feet are not seen. Where the plane lies is one error for all
     frames: its standard deviation times the root of their number."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = True
-    frame_fields = ("sigma",)
+    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         frames = (("camera", 0), ("root", 0), ("pose", 0))
         return (*frames, ("scale", 0), ("shape", 0))
 
@@ -52,7 +52,7 @@ class GroundContact(AbstractFrameFactor):
     def data(self):
         return self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         (frame,) = window
         return (self._lowest(frame, shared) - SOLE)[None] / data
 
@@ -69,7 +69,7 @@ class GroundContact(AbstractFrameFactor):
         normal, offset = self.plane[:3], self.plane[3]
         r_WC = frame.camera[:3, 3]
         # n^T C Exp(ω) p = up^T (p + ω x p), so the derivative is p x up.
-        parts: dict[Touch, Array] = {
+        parts: dict[Key, Array] = {
             ("camera", 0): jnp.concatenate(
                 [jnp.cross(at_C, up_C), shared.scale * normal]
             ),

@@ -11,14 +11,14 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry.so3 import log
-from bodyslam_jax.graph.factor import AbstractFrameFactor, Shared, Touch
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.factor import FrameFactor, Key, Shared
+from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import before, displacement, displacements
 from bodyslam_jax.graph.whitening import innovation
 from bodyslam_jax.motion import leg_length
 
 
-class HumanMotion(AbstractFrameFactor):
+class HumanMotion(FrameFactor):
     """The pelvis moves as the motion model predicts.
 
     `e_k = C_WH_{k-1}^T (r_WH_k - r_WH_{k-1}) - r̃_k` with `r_WH = s r'_WC + C_WC r_CH`,
@@ -37,16 +37,16 @@ class HumanMotion(AbstractFrameFactor):
     """`W` with `W^T W` the inverse of the covariance (m^-1); 0 where not predicted."""
     correlation: Float[Array, "h t"]
     """ρ between the errors of k-1 and k; 0 where k-1 has no prediction."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     correlated: bool = eqx.field(static=True, default=True)
     """Whether any correlation is used; if not, a term spans two frames, not three."""
     body: BodyModel | None = None
     of_people = True
-    frame_fields = ("translation", "whitening", "correlation")
+    time_fields = ("translation", "whitening", "correlation")
     padding = {"whitening": 0.0, "correlation": 0.0}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         lags = range(3 if self.correlated else 2)
         return (
             *(("camera", lag) for lag in lags),
@@ -61,7 +61,7 @@ class HumanMotion(AbstractFrameFactor):
         )
         return self.translation, previous, self.whitening, self.correlation
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         translation, previous, whitening, correlation = data
         leg = unit_length(self.body, shared)
         error = displacement(window[1], window[0], shared.scale) / leg - translation
@@ -89,18 +89,18 @@ class HumanMotion(AbstractFrameFactor):
             last = -rho[..., None] * before(jac)
         now, last = whitening @ jac, whitening @ last
         six = lambda x, i: x[..., 6 * i : 6 * i + 6]
-        touches: dict[Touch, Array] = {("scale", 0): (now + last)[..., 24:25]}
+        keys: dict[Key, Array] = {("scale", 0): (now + last)[..., 24:25]}
         for i, name in enumerate(("camera", "root")):
-            touches[name, 0] = six(now, 2 * i)
-            touches[name, 1] = six(now, 2 * i + 1) + six(last, 2 * i)
+            keys[name, 0] = six(now, 2 * i)
+            keys[name, 1] = six(now, 2 * i + 1) + six(last, 2 * i)
             if self.correlated:
-                touches[name, 2] = six(last, 2 * i + 1)
+                keys[name, 2] = six(last, 2 * i + 1)
         if self.body is not None:
-            touches["shape", 0] = (now + last)[..., 25:]
-        return (whitening @ error[..., None])[..., 0], touches
+            keys["shape", 0] = (now + last)[..., 25:]
+        return (whitening @ error[..., None])[..., 0], keys
 
 
-class OrientationChange(AbstractFrameFactor):
+class RelativeOrientation(FrameFactor):
     """The person turns as the motion model predicts: `Log(C̃^T C_WH_{k-1}^T C_WH_k)`.
 
     The paper's model predicts it; its cost leaves it out.
@@ -110,19 +110,19 @@ class OrientationChange(AbstractFrameFactor):
     """Rotation vector from H_{k-1} to H_k, rad."""
     sigma: Float[Array, "h t"]
     """Per axis, rad; `inf` where not predicted."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     of_people = True
-    frame_fields = ("rotation", "sigma")
+    time_fields = ("rotation", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return ("camera", 0), ("camera", 1), ("root", 0), ("root", 1)
 
     def data(self):
         return self.rotation, self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         rotation, sigma = data
         now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
         predicted = jaxlie.SO3.exp(rotation).as_matrix()

@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import AbstractFactor
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.factor import Factor
+from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
 
-class LandmarkPrior(AbstractFactor):
+class LandmarkPrior(Factor):
     """A landmark is where its other sightings put it: `W (l - l̃)`.
 
     A point that is lost and found again is several landmarks, each seen in a few frames
@@ -21,7 +21,7 @@ class LandmarkPrior(AbstractFactor):
     """l̃, in units of the map."""
     whitening: Float[Array, "l 3 3"]
     """`W` with `W^T W` the inverse of the covariance; 0 where nothing is known."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
 
     def residual(self, state: State) -> Float[Array, "l 3"]:
         away = state.landmarks - self.place

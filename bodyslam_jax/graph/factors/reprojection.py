@@ -11,18 +11,18 @@ from jaxtyping import Array, Float, Int
 from bodyslam_jax.body import KEYPOINT_NAMES, BodyModel, local_keypoints
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.graph.factor import (
-    AbstractFactor,
-    AbstractFrameFactor,
+    Factor,
+    FrameFactor,
+    Key,
     Limbs,
-    Touch,
 )
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
-from bodyslam_jax.graph.losses import AbstractLoss, squared_norm
+from bodyslam_jax.graph.losses import Loss, squared_norm
 from bodyslam_jax.graph.state import State
 
 
-class Reprojection(AbstractFactor):
+class Reprojection(Factor):
     """Static landmarks seen by the moving camera: `u(T_WC^-1 l) - z`.
 
     Both are in the unscaled map, so the scale s does not enter.
@@ -33,7 +33,7 @@ class Reprojection(AbstractFactor):
     pixel: Float[Array, "m 2"]
     sigma: Float[Array, " m"]
     """Standard deviation of each pixel coordinate, px."""
-    loss: AbstractLoss
+    loss: Loss
 
     def residual(self, state: State) -> Float[Array, "m 2"]:
         camera = state.cameras[self.frame]
@@ -43,23 +43,23 @@ class Reprojection(AbstractFactor):
         return (project(state.intrinsics, p_C) - self.pixel) / self.sigma[:, None]
 
 
-class JointReprojection(AbstractFrameFactor):
+class KeypointReprojection(FrameFactor):
     """Keypoints of the person: `u(T_CH p_H(θ, β)) - z`."""
 
     body: BodyModel
     pixel: Float[Array, "h t j 2"]
     sigma: Float[Array, "h t j"]
     """px; `inf` where there is no keypoint."""
-    loss: AbstractLoss
+    loss: Loss
     bias: float | Float[Array, ""] = 0.0
     """Share of the detector's own idea of hips, neck and shoulders, 1."""
     layout: str = eqx.field(static=True, default="body25")
     of_people = True
-    frame_fields = ("pixel", "sigma")
+    time_fields = ("pixel", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         return ("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0)
 
     @property
@@ -79,7 +79,7 @@ class JointReprojection(AbstractFrameFactor):
         p_C = p_H @ root[..., :3, :3].swapaxes(-1, -2) + root[..., None, :3, 3]
         return (project(state.intrinsics, p_C) - self.pixel) / self.sigma[..., None]
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         return self.jacobian(data, window, shared)[0]
 
     def jacobian(self, data, window, shared):

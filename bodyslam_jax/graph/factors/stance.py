@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph.factor import AbstractFrameFactor, Limbs, Touch
+from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
 from bodyslam_jax.graph.factors.human_motion import unit_length
 from bodyslam_jax.graph.keypoint_jacobian import turning_joints
-from bodyslam_jax.graph.losses import AbstractLoss, Squared
+from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
 BODY25_FEET = (19, 21, 22, 24)
 """Big toe and heel, left and right."""
 
 
-class StanceFoot(AbstractFrameFactor):
+class StanceFoot(FrameFactor):
     """The foot that carries the weight does not move in the world, between k-1 and k.
 
     `(p_W(k) - p_W(k-1)) / (L(β) σ)` for each point of the feet, with
@@ -30,15 +30,15 @@ class StanceFoot(AbstractFrameFactor):
     body: BodyModel
     sigma: Float[Array, "h t f"]
     """Legs per frame, for the points of the feet; `inf` where one does not carry."""
-    loss: AbstractLoss = Squared()
+    loss: Loss = Squared()
     points: tuple[int, ...] = eqx.field(static=True, default=BODY25_FEET)
     """Which keypoints of BODY_25 they are."""
     of_people = True
-    frame_fields = ("sigma",)
+    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property
-    def touches(self) -> tuple[Touch, ...]:
+    def keys(self) -> tuple[Key, ...]:
         frames = ("camera", "root", "pose")
         both = tuple((name, lag) for name in frames for lag in range(2))
         return (*both, ("scale", 0), ("shape", 0))
@@ -50,7 +50,7 @@ class StanceFoot(AbstractFrameFactor):
     def data(self):
         return self.sigma
 
-    def local(self, data, window, shared):
+    def frame_residual(self, data, window, shared):
         now, before = (self._feet(f, shared) for f in window)
         leg = unit_length(self.body, shared)
         return (now - before) / leg / data[:, None]
@@ -61,7 +61,7 @@ class StanceFoot(AbstractFrameFactor):
         return p_C @ frame.camera[:3, :3].T + shared.scale * frame.camera[:3, 3]
 
 
-def carrying(
+def stance_mask(
     body: BodyModel, state: State, present: Bool[Array, "h t"]
 ) -> Bool[Array, "h t 4"]:
     """Which of toes and heels is lowest, along the body's up axis, in k-1 and in k."""

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
-from bodyslam_jax.io.frame_index import Unfit
+from bodyslam_jax.io.frame_index import InvalidContent
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 """What AMASS calls its rate: with SMPL-H, and since it has SMPL-X."""
@@ -46,7 +46,9 @@ def from_amass(data: dict, video: Video) -> Rows:
         poses = np.concatenate([p.reshape(len(p), -1) for p in parts], axis=-1)
     n = len(poses)
     if poses.ndim != 2 or poses.shape[1] < 66 or not n:
-        raise Unfit(f"`poses` is {poses.shape}, not (t, 72), (t, 156) or (t, 165)")
+        raise InvalidContent(
+            f"`poses` is {poses.shape}, not (t, 72), (t, 156) or (t, 165)"
+        )
     smplx = is_smplx(data, poses.shape[1])
     poses, trans = body_pose(poses), numbers_of(data, "trans", (n, 3))
     if smplx:
@@ -54,7 +56,7 @@ def from_amass(data: dict, video: Video) -> Rows:
     key = next(key for key in _RATES if key in data)
     rate = np.ravel(numbers_of(data, key, None))
     if len(rate) != 1 or not 0 < rate[0] < np.inf:
-        raise Unfit(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
+        raise InvalidContent(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
     at, slack = _places(n, float(rate[0]), video)
     video.warn("AMASS-style bodies taken as in the camera's frame, not in a world.")
     frame = np.flatnonzero(at <= n - 1 + slack)
@@ -88,7 +90,7 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
     if n == t and fps is None:
         return np.arange(float(n)), 0.5
     if fps is None:
-        raise Unfit(f"{n} frames at {rate:g}/s, but the video has {t} frames")
+        raise InvalidContent(f"{n} frames at {rate:g}/s, but the video has {t} frames")
     # Its rate may vary, and that of the frames that are used is another one.
     times = np.arange(t) / fps if video.times is None else video.times - video.times[0]
     filmed = float(times[-1]) * t / (t - 1) if t > 1 else 1 / fps
@@ -96,7 +98,7 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
     if n == t and abs(moved / filmed - 1) < _SAME_RATE:
         return np.arange(float(n)), 0.5
     if not 1 / _MAX_RATIO < moved / filmed < _MAX_RATIO:
-        raise Unfit(
+        raise InvalidContent(
             f"{n} frames at {rate:g}/s are {moved:.3g} s, but the video has "
             f"{filmed:.3g} s"
         )

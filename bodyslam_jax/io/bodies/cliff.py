@@ -14,7 +14,7 @@ from bodyslam_jax.io.bodies.parts import (
     tell_apart,
 )
 from bodyslam_jax.io.bodies.tool_focal import default_focal
-from bodyslam_jax.io.frame_index import Unfit
+from bodyslam_jax.io.frame_index import InvalidContent
 
 
 def from_cliff(data: dict, video: Video) -> Rows:
@@ -61,5 +61,5 @@ def _image_of_each(data: dict, n: int, images: int) -> np.ndarray | None:
         if len(image) == n and within.all():
             return image.astype(np.int64)
     if images != n:
-        raise Unfit(f"{images} image names for {n} bodies")
+        raise InvalidContent(f"{images} image names for {n} bodies")
     return None

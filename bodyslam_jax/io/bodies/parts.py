@@ -1,6 +1,7 @@
 """Parts that the readers of regressed bodies share: checks, frames, rotations, cameras.
 
-An `Unfit` says what is wrong with the content; the caller adds the file's name.
+An `InvalidContent` says what is wrong with the content; the caller adds the file's
+name.
 """
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
-from bodyslam_jax.io.frame_index import Unfit, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
 from bodyslam_jax.io.keypoints.associate import identify
 from bodyslam_jax.types import Intrinsics
 
@@ -28,11 +29,11 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
     end.
     """
     if not isinstance(data, dict) or key not in data:
-        raise Unfit(f"no `{key}`")
+        raise InvalidContent(f"no `{key}`")
     try:
         array = np.asarray(data[key], dtype=np.float64)
     except (TypeError, ValueError):
-        raise Unfit(f"`{key}` does not hold numbers") from None
+        raise InvalidContent(f"`{key}` does not hold numbers") from None
     array = np.where(np.isfinite(array), array, np.nan)
     if shape is not None:
         fits = array.ndim == len(shape) and all(
@@ -40,7 +41,7 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
         )
         if not fits:
             expected = tuple("any" if n < 0 else n for n in shape)
-            raise Unfit(f"`{key}` is {array.shape}, not {expected}")
+            raise InvalidContent(f"`{key}` is {array.shape}, not {expected}")
     return array
 
 
@@ -48,18 +49,20 @@ def betas_of(data: dict, key: str, n: int) -> np.ndarray:
     betas = numbers_of(data, key, None)
     betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
     if betas.shape[1] < 10:
-        raise Unfit(f"`{key}` has {betas.shape[1]} numbers a body, not 10 or more")
+        raise InvalidContent(
+            f"`{key}` has {betas.shape[1]} numbers a body, not 10 or more"
+        )
     return betas[:, :10].copy()
 
 
 def whole_of(array: np.ndarray, name: str) -> np.ndarray:
     """Numbers of frames or people as integers.
 
-    **Raises:** `Unfit` if one is none.
+    **Raises:** `InvalidContent` if one is none.
     """
     off = array[~np.isfinite(array) | (array != np.round(array))]
     if len(off):
-        raise Unfit(f"`{name}` has {off[0]:g} in it, expected whole numbers")
+        raise InvalidContent(f"`{name}` has {off[0]:g} in it, expected whole numbers")
     return array.astype(np.int64)
 
 
@@ -73,10 +76,10 @@ def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarra
     if key in data:
         found = whole_of(np.ravel(numbers_of(data, key, None)), key)
         if len(found) != n:
-            raise Unfit(f"`{key}` has {len(found)} entries for {n} bodies")
+            raise InvalidContent(f"`{key}` has {len(found)} entries for {n} bodies")
         return found
     if num_frames is not None and n != num_frames:
-        raise Unfit(
+        raise InvalidContent(
             f"{n} bodies without `{key}`, but the video has {num_frames} frames"
         )
     return np.arange(n)
@@ -120,7 +123,7 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
     array = np.asarray(array, dtype=np.float64)
     if array.shape[-2:] == (3, 3):
         if joints is not None and array.size % (9 * joints):
-            raise Unfit(f"rotations {array.shape}, not of {joints} joints")
+            raise InvalidContent(f"rotations {array.shape}, not of {joints} joints")
         rotvec = rotvec_of(array.reshape(-1, 3, 3))
         count = joints or array.shape[1]
         return rotvec.reshape(-1, 3 * count)
@@ -142,7 +145,9 @@ def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
 def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
     array = numbers_of(data, key, None)
     if array.shape[1:] not in ((3 * joints,), (joints, 3), (joints, 3, 3)):
-        raise Unfit(f"`{key}` is {array.shape}, not rotations of {joints} joints")
+        raise InvalidContent(
+            f"`{key}` is {array.shape}, not rotations of {joints} joints"
+        )
     return as_rotvec(array, joints)
 
 
@@ -163,7 +168,7 @@ def refocused(
         center: its principal point, px: one for all, or one a body.
     """
     if (trans[:, 2] == 0).any():
-        raise Unfit("a body at a distance of 0 from the camera (z = 0)")
+        raise InvalidContent("a body at a distance of 0 from the camera (z = 0)")
     fx, fy, cx, cy = camera.params[:4]
     focal = np.broadcast_to(focal.reshape(len(trans), -1), (len(trans), 2))
     center = np.broadcast_to(center, (len(trans), 2))
@@ -205,7 +210,9 @@ def from_crops(
     camera: Intrinsics,
 ) -> Rows:
     if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
-        raise Unfit("a weak-perspective camera or box with a size of 0 or less")
+        raise InvalidContent(
+            "a weak-perspective camera or box with a size of 0 or less"
+        )
     trans = full_translation(crop, box, camera)
     root = turn_to_camera(poses[:, :3], box, camera)
     return Rows(
@@ -215,7 +222,7 @@ def from_crops(
 
 def join(rows: list[Rows]) -> Rows:
     if not rows:
-        raise Unfit("no person in it")
+        raise InvalidContent("no person in it")
     names = ("frame", "person", "poses", "betas", "trans")
     return Rows(
         *(np.concatenate([getattr(r, name) for r in rows]) for name in names),

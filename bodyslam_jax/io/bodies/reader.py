@@ -18,7 +18,7 @@ from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, join, whole_of
 from bodyslam_jax.io.bodies.slahmr import with_track_info
 from bodyslam_jax.io.bodies.tools import READERS, from_spin
-from bodyslam_jax.io.frame_index import Unfit, Warn
+from bodyslam_jax.io.frame_index import InvalidContent, Warn
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.types import Bodies, Intrinsics
 
@@ -79,7 +79,7 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
         for _, recognise, read in READERS:
             if recognise(data):
                 return read(data, video)
-    except Unfit as error:
+    except InvalidContent as error:
         raise ValueError(f"{path}: {error}.") from None
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
@@ -93,7 +93,7 @@ def _from_contract(data: dict, video: Video) -> Rows:
     regressed = _flag(data, "shapes_regressed", default=True)
     if "trans" not in data:
         if "camera" not in data:
-            raise Unfit("neither `trans` nor `camera` and `bbox`")
+            raise InvalidContent("neither `trans` nor `camera` and `bbox`")
         rows = from_spin({**data, "pose": data["poses"]}, video)
         return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
@@ -109,9 +109,9 @@ def _from_contract(data: dict, video: Video) -> Rows:
     ):
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":
-            raise Unfit(f"`{name}` holds {array.dtype}, not numbers")
+            raise InvalidContent(f"`{name}` holds {array.dtype}, not numbers")
         if array.shape != shape:
-            raise Unfit(f"`{name}` is {array.shape}, not {shape}")
+            raise InvalidContent(f"`{name}` is {array.shape}, not {shape}")
         whole = name in ("frame", "person")
         arrays[name] = whole_of(array, name) if whole else array.astype(np.float64)
     return Rows(**arrays, shapes_regressed=regressed)
@@ -140,7 +140,7 @@ def _as_smpl(data: dict) -> dict:
 def _flag(data: dict, key: str, default: bool) -> bool:
     value = np.asarray(data.get(key, default))
     if value.size != 1 or value.item() not in (0, 1):
-        raise Unfit(f"`{key}` is {str(value)[:40]}, not true or false")
+        raise InvalidContent(f"`{key}` is {str(value)[:40]}, not true or false")
     return bool(value.item())
 
 

@@ -19,7 +19,7 @@ from bodyslam_jax.io.bodies.parts import (
     numbers_of,
     refocused,
 )
-from bodyslam_jax.io.frame_index import Unfit
+from bodyslam_jax.io.frame_index import InvalidContent
 
 _INFO = "track_info"
 
@@ -74,14 +74,14 @@ class _Info:
 def from_slahmr(data: dict, video: Video) -> Rows:
     """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
     if "cam_R" not in data or "cam_t" not in data:
-        raise Unfit(
+        raise InvalidContent(
             "what SLAHMR starts from, without cameras; give *_world_results.npz"
         )
     trans = numbers_of(data, "trans", (-1, -1, 3))
     p, t = trans.shape[:2]
     info = _Info.of(data.get(_INFO))
     if info is None and video.num_frames not in (None, t):
-        raise Unfit(
+        raise InvalidContent(
             f"{t} frames, but the video has {video.num_frames}; SLAHMR's "
             "track_info.json beside the file says which"
         )

@@ -19,7 +19,7 @@ from bodyslam_jax.io.bodies.cliff import from_cliff
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
     PELVIS_SMPLX,
-    Unfit,
+    InvalidContent,
     as_rotvec,
     at_size,
     betas_of,
@@ -44,7 +44,7 @@ def from_spin(data: dict, video: Video) -> Rows:
     poses = numbers_of(data, "pose", (-1, 72))
     frame = frames_of(data, "frame", len(poses), video.num_frames)
     if "bbox" not in data:
-        raise Unfit("`camera` needs `bbox` (m, 3: cx, cy, side px)")
+        raise InvalidContent("`camera` needs `bbox` (m, 3: cx, cy, side px)")
     box, crop = (
         numbers_of(data, "bbox", (len(poses), 3)),
         numbers_of(data, "camera", (len(poses), 3)),
@@ -140,7 +140,7 @@ def from_phalp(data: dict, video: Video) -> Rows:
             trans.append(np.ravel(found["camera"][i])[:3])
             box.append((x + w / 2, y + h / 2, max(w, h)))
     if not frame:
-        raise Unfit("no body in any frame")
+        raise InvalidContent("no body in any frame")
     stacked = [np.asarray(a, dtype=np.float64) for a in (poses, betas, trans, box)]
     poses, betas, trans, box = stacked
     trans = _of_default(trans, DEFAULT_FOCAL["4D-Humans"](video.camera), video)
@@ -159,7 +159,7 @@ def _phalp_factor(data: dict, video: Video) -> float:
     if not sizes:
         return 1.0
     if len(sizes) > 1:
-        raise Unfit(f"images of several sizes: {sorted(sizes)[:3]}")
+        raise InvalidContent(f"images of several sizes: {sorted(sizes)[:3]}")
     height, width = sizes.pop()
     size = (video.camera.width, video.camera.height)
     seen = (float(width), float(height))
@@ -222,7 +222,7 @@ def from_prompthmr(data: dict, video: Video) -> Rows:
         n = len(pose)
         pose = pose.reshape(n, -1)[:, :66]
         if pose.shape[1] != 66:
-            raise Unfit(f"`pose` of {pose.shape[1]} numbers, not 66 or more")
+            raise InvalidContent(f"`pose` of {pose.shape[1]} numbers, not 66 or more")
         trans = numbers_of(body, "trans", (n, 3)) + PELVIS_SMPLX - PELVIS_SMPL
         if "img_focal" in world:
             focal = np.full(n, float(np.ravel(world["img_focal"])[0]))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bodyslam_jax.io.camera.colmap import read_poses
 from bodyslam_jax.io.camera.tum import read_tum
-from bodyslam_jax.io.frame_index import Unfit, Warn, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.types import CameraPath
 
 _FEWEST = 2
@@ -53,7 +53,7 @@ def read_camera_path(
                 complete=False,
                 warn=warn,
             )
-        except Unfit as error:
+        except InvalidContent as error:
             raise ValueError(f"{path}: {error}.") from None
         T_WC, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
         at = [frames[name] for name in names]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
-from bodyslam_jax.io.frame_index import Unfit, Warn, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
 from bodyslam_jax.io.keypoints.files import read_json, read_npz, read_openpose
 from bodyslam_jax.io.keypoints.turned import turned_back
@@ -75,7 +75,7 @@ def read_detections(
             complete=listed.complete,
             warn=warn,
         )
-    except Unfit as error:
+    except InvalidContent as error:
         raise ValueError(f"{path}: {error}.") from None
     if num_frames is None:
         num_frames = max(frames.values(), default=-1) + 1
@@ -129,7 +129,7 @@ def _to_pixels(
     elif declared is not None:
         try:
             factor = factor_to(declared, size, points[sure][:, :2], "keypoints", warn)
-        except Unfit as error:
+        except InvalidContent as error:
             raise ValueError(f"{path}: {error}") from None
         points[..., :2] = scaled(points[..., :2], factor)
     at = points[points[..., 2] > _SURE][:, :2]

@@ -35,7 +35,7 @@ GROUP = 16
 """Chunks eliminated together, at most."""
 
 
-class Roots(eqx.Module):
+class RootFactor(eqx.Module):
     """The factor of inner roots: `L^-1` of their pivot, and of their coupling with the
     kept groups, transposed; its last row is the right-hand side's."""
 
@@ -48,7 +48,7 @@ class People(eqx.Module):
 
     postures: Postures | None
     """Leading axes `h n`."""
-    roots: Roots
+    roots: RootFactor
     kept: Float[Array, "*n k k"]
     """Between the groups `KEPT` of each chunk's window."""
 
@@ -74,7 +74,7 @@ def eliminate_people(
         half = half_of(matrix_of(window, pairs, ("inner",), ("inner",)))
         side = matrix_of(window, pairs, KEPT, ("inner",)) @ half.swapaxes(-1, -2)
         kept = matrix_of(window, pairs, KEPT, KEPT) - side @ side.swapaxes(-1, -2)
-        return People(postures, Roots(half, side), kept)
+        return People(postures, RootFactor(half, side), kept)
 
     found = jax.lax.map(group, given)
     return jax.tree.map(lambda x: x.reshape(h, n, *x.shape[2:]), found)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax.graph import (
-    AbstractFrameFactor,
+    FrameFactor,
     LandmarkPrior,
     Problem,
     Reprojection,
@@ -40,7 +40,7 @@ def linearise(
         elif isinstance(factor, LandmarkPrior):
             priors.append(factor)
             sums.costs.append(factor.cost(state))
-        elif isinstance(factor, AbstractFrameFactor):
+        elif isinstance(factor, FrameFactor):
             linearise_frames(problem, factor, state, sums)
     for prior in priors:
         landmarks = add_prior(problem, prior, state, landmarks)

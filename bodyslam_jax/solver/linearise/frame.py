@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import (
-    AbstractFrameFactor,
     Frame,
+    FrameFactor,
     Problem,
     State,
     inverse_right_jacobian,
@@ -35,15 +35,15 @@ _COMMON = ("scale", "intrinsics", "shape")
 
 
 def linearise_frames(
-    problem: Problem, factor: AbstractFrameFactor, state: State, sums: Sums
+    problem: Problem, factor: FrameFactor, state: State, sums: Sums
 ) -> None:
     """Adds all blocks of one factor to `sums`; held coordinates have zeros."""
-    touches = [t for t in factor.touches if _GROUP[t[0]] in problem.variables]
-    if not touches:
+    keys = [t for t in factor.keys if _GROUP[t[0]] in problem.variables]
+    if not keys:
         sums.costs.append(factor.cost(state))
         return
     joint = factor.per_joint
-    residual, parts = _derivatives(factor, touches, state, sums)
+    residual, parts = _derivatives(factor, keys, state, sums)
     s = squared_norm(residual)
     sums.costs.append(0.5 * jnp.sum(factor.loss.rho(s)))
     root_weight = jnp.sqrt(factor.loss.weight(s))[..., None]
@@ -55,7 +55,7 @@ def linearise_frames(
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
     # Postures first: their limbs do not touch each other (`_add_products`).
-    local = sorted((t for t in touches if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
+    local = sorted((t for t in keys if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
     columns = []
     for touch in local:
         free = _free_of(problem, *touch, joint)
@@ -63,7 +63,7 @@ def linearise_frames(
         if touch[0] == "pose" and not joint:
             part, free = (pick(x, sums.sizes.joints, width=3) for x in (part, free))
         columns.append(rows(part, part.shape[-1]) * free[..., None, :])
-    common = [name for name in _COMMON if (name, 0) in touches]
+    common = [name for name in _COMMON if (name, 0) in keys]
     if common:
         widths = dict(scale=1, intrinsics=sums.sizes.intrinsics, shape=10)
         for name in _COMMON:
@@ -76,13 +76,13 @@ def linearise_frames(
     _add_products(sums, local, bool(common), columns, weight, factor)
 
 
-def _derivatives(factor, touches, state, sums):
+def _derivatives(factor, keys, state, sums):
     """The residual of all frames, and its derivative by each of the touches."""
     known = factor.jacobians(state)
     if known is not None:
         return known
-    local = [t for t in touches if t[0] in _LOCAL]
-    common = [t for t in touches if t[0] not in _LOCAL]
+    local = [t for t in keys if t[0] in _LOCAL]
+    common = [t for t in keys if t[0] not in _LOCAL]
     width = {"pose": 3 if factor.per_joint else 69, "root": 6, "camera": 6}
     width |= {"scale": 1, "intrinsics": sums.sizes.intrinsics, "shape": 10}
     ordered = [*local, *common]
@@ -106,7 +106,7 @@ def _derivatives(factor, touches, state, sums):
                 frames[lag] = _move(frames[lag], name, change, turns[lag])
             for name, _ in common:
                 rest = _move_shared(rest, name, step[..., parts[name, 0]])
-            residual = factor.local(data, tuple(frames), rest)
+            residual = factor.frame_residual(data, tuple(frames), rest)
             return residual, residual
 
         zero = jnp.zeros(ends[-1], state.scale.dtype)
