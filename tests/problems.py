@@ -11,10 +11,9 @@ from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
-from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.kept import kept
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.compilation import compiled, quick_options
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver.linearise import linearise
@@ -89,7 +88,7 @@ def _dense_of(problem, state):
     return jax.jacfwd(residual, has_aux=True)(zero)
 
 
-_dense = kept(_dense_of, quick_options)
+_dense = compiled(_dense_of)
 
 
 def _bent_along(problem, state, way):
@@ -119,7 +118,7 @@ def _bent_along(problem, state, way):
     return jax.jvp(slope, (state.zero_step(),), (way,))[1]
 
 
-_bent = kept(_bent_along, quick_options)
+_bent = compiled(_bent_along)
 
 
 def bent(problem, state):
@@ -161,4 +160,4 @@ def _structured_step(problem, state, damping):
     return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
 
 
-structured_step = kept(_structured_step, quick_options)
+structured_step = compiled(_structured_step)

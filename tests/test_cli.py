@@ -9,8 +9,8 @@ import pytest
 from body_cases import make_raw, write
 
 from bodyslam_jax import cli
-from bodyslam_jax.cli import doctor
-from bodyslam_jax.cli import run as commands
+from bodyslam_jax.cli import environment
+from bodyslam_jax.cli import estimate as commands
 from bodyslam_jax.config import Config
 
 
@@ -96,7 +96,7 @@ def test_doctor_reports(monkeypatch, capsys):
 
 
 def _body_in_use():
-    return dict(doctor.report())["body in use"]
+    return dict(environment.report())["body in use"]
 
 
 def test_doctor_tells_of_a_body_that_is_not_there_or_does_not_fit(
@@ -197,18 +197,18 @@ def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
 def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
     import jax
 
-    from bodyslam_jax.cli import run as commands
+    from bodyslam_jax.cli import estimate as commands
 
     kept = jax.config.jax_compilation_cache_dir
     caplog.set_level("INFO")
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
-        assert commands._is_first()
+        commands._announce_compilation()
         assert "first run: programs are compiled" in caplog.text
         caplog.clear()
         (tmp_path / "compiled").mkdir()
         (tmp_path / "compiled" / "program").write_text("compiled")
-        assert not commands._is_first()
+        commands._announce_compilation()
         assert caplog.text == ""
     finally:
         jax.config.update("jax_compilation_cache_dir", kept)

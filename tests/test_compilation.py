@@ -1,11 +1,11 @@
-"""Programs that run once are compiled with less effort, and say the same."""
+"""Compiler options belong to whole programs only."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax import compilation
-from bodyslam_jax.compilation import is_alone, jit_once
+from bodyslam_jax.graph.tracing import is_alone
+from bodyslam_jax.solver import compilation
 
 
 def test_only_a_whole_program_is_compiled_with_options_of_its_own():
@@ -16,18 +16,15 @@ def test_only_a_whole_program_is_compiled_with_options_of_its_own():
     assert seen == [True, False]
 
 
-def test_code_as_it_comes_says_the_same_alone_mapped_derived_and_within_a_program():
+def test_a_program_compiled_with_options_gives_the_same():
     square = lambda x, power=2: jnp.sum(jnp.sin(x) ** power)
-    once = jit_once(square)
     x = jnp.linspace(0.0, 1.0, 7)
-    assert np.allclose(once(x), square(x), rtol=1e-14)
-    assert np.allclose(once(x, power=3), square(x, 3), rtol=1e-14)
-    assert np.allclose(jax.jit(once)(x), square(x), rtol=1e-14)
-    assert np.allclose(jax.vmap(once)(x[:, None]), jnp.sin(x) ** 2, rtol=1e-14)
-    assert np.allclose(jax.grad(once)(x), jax.grad(square)(x), rtol=1e-14)
-    assert np.allclose(jax.jit(jax.grad(once))(x), jax.grad(square)(x), rtol=1e-14)
+    assert np.allclose(compilation.compiled(square)(x, power=3), square(x, 3))
 
 
-def test_options_that_xla_does_not_know_are_left_out():
-    assert compilation._if_known({"no_such_option": True}) is None
-    assert compilation._if_known({"xla_backend_optimization_level": 0}) is not None
+def test_options_that_xla_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(compilation, "_OPTIONS", {"no_such_option": True})
+    compilation.quick_options.cache_clear()
+    assert compilation.quick_options() is None
+    monkeypatch.undo()
+    compilation.quick_options.cache_clear()

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import scenes
 import bodyslam_jax.graph as g
-from bodyslam_jax.kept import kept
+from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.solver import Stage, over_devices, solve
 """
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from problems import dense, make
 
-from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.solver import Stage, clock, solve, trace
+from bodyslam_jax.solver.compilation import quick_options
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad

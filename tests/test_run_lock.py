@@ -235,7 +235,7 @@ def report():
     jax.jit(lambda: add(jnp.ones((80, 80))).sum()).lower().compile()
     return [("compiled", "slowly")]
 sys.argv = ["bodyslam", "doctor"]
-with mock.patch("bodyslam_jax.cli.doctor.report", report):
+with mock.patch("bodyslam_jax.cli.environment.report", report):
     cli.main()
 """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TF_CPP")}

@@ -15,7 +15,6 @@ from jax.flatten_util import ravel_pytree
 from problems import bent, dense, make, structured_step
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.compilation import quick_options
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver import (
@@ -28,6 +27,7 @@ from bodyslam_jax.solver import (
 )
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import sizes_of
+from bodyslam_jax.solver.compilation import quick_options
 from bodyslam_jax.solver.gmres import RESTART, gmres
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather

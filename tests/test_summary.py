@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import estimates
 import numpy as np
 import pytest
 
-from bodyslam_jax import export, rehearsal, simulation
+from bodyslam_jax import export, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.pipeline.to_metric import assemble
@@ -15,12 +16,12 @@ from bodyslam_jax.types import ScaleStart
 def test_metres_are_no_surer_than_the_two_cues_leave_them():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
-    cameras = rehearsal._cameras(sequence)
+    cameras = estimates.still_camera(sequence)
 
     def found(motion: float, sigma: float) -> tuple[dict, str]:
         start = ScaleStart(motion, 0.1, ground=3.0, ground_error=0.1)
         joint = dataclasses.replace(
-            rehearsal._joint(sequence), start=start, scale_sigma=sigma
+            estimates.standing_people(sequence), start=start, scale_sigma=sigma
         )
         moving = dataclasses.replace(cameras, kind="moving")
         told = assemble(sequence, config, body, moving, joint, {}).summary
@@ -48,9 +49,9 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
 def test_noise_of_pixels_that_nobody_measured_is_not_told():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
-    joint = rehearsal._joint(sequence)
+    joint = estimates.standing_people(sequence)
     for kind, expected in (("static", None), ("rotation", None), ("moving", 0.7)):
-        cameras = rehearsal._cameras(sequence)
+        cameras = estimates.still_camera(sequence)
         cameras = dataclasses.replace(cameras, kind=kind, pixel_sigma=0.7)
         found = assemble(sequence, config, body, cameras, joint, {}).summary
         assert found["pixel_sigma"] == expected
@@ -59,14 +60,14 @@ def test_noise_of_pixels_that_nobody_measured_is_not_told():
 def test_the_summary_says_who_and_what_is_left_out():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
-    joint = rehearsal._joint(sequence)
+    joint = estimates.standing_people(sequence)
     moved = joint.cameras.copy()
     moved[:, 0, 3] = np.linspace(0, 3, 15)
     nobody = np.zeros_like(joint.present)
     joint = dataclasses.replace(joint, cameras=moved, status="ran out of steps")
 
     def found(joint, first, last, kind="moving"):
-        cameras = rehearsal._cameras(sequence)
+        cameras = estimates.still_camera(sequence)
         located = (np.arange(15) >= first) & (np.arange(15) <= last)
         cameras = dataclasses.replace(cameras, kind=kind, registered=located)
         return assemble(sequence, config, body, cameras, joint, {}).summary
@@ -105,8 +106,8 @@ def test_the_summary_says_who_and_what_is_left_out():
 def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
-    joint = rehearsal._joint(sequence)
-    cameras = dataclasses.replace(rehearsal._cameras(sequence), kind="moving")
+    joint = estimates.standing_people(sequence)
+    cameras = dataclasses.replace(estimates.still_camera(sequence), kind="moving")
 
     def told(**changes):
         one = dataclasses.replace(joint, **changes)
@@ -124,8 +125,8 @@ def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
 def test_steps_that_are_too_slow_for_people_are_told(monkeypatch):
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
-    joint = dataclasses.replace(rehearsal._joint(sequence), scale_sigma=np.nan)
-    cameras = rehearsal._cameras(sequence)
+    joint = dataclasses.replace(estimates.standing_people(sequence), scale_sigma=np.nan)
+    cameras = estimates.still_camera(sequence)
     found = lambda: assemble(sequence, config, body, cameras, joint, {}).summary
     assert found()["people"][0]["steps_per_s"] is None  # half a second
     monkeypatch.setattr(export, "gait", lambda *_: export.Gait(0.7, 0.9, 0.8))

@@ -22,9 +22,9 @@ import tyro
 
 from bodyslam_jax.cli.body import ACTIONS
 from bodyslam_jax.cli.datasets import DATASETS
+from bodyslam_jax.cli.estimate import demo, evaluate, run
 from bodyslam_jax.cli.make import experiment, simulate, train_motion
 from bodyslam_jax.cli.memory import return_memory
-from bodyslam_jax.cli.run import demo, evaluate, run
 from bodyslam_jax.cli.settings import base_config, option, starting_from
 from bodyslam_jax.cli.settings import read_settings as read_settings
 from bodyslam_jax.config import MotionTraining
@@ -32,9 +32,9 @@ from bodyslam_jax.config import MotionTraining
 
 def doctor() -> None:
     """Versions, devices, BRISK, codecs, networks, and body models that were found."""
-    from bodyslam_jax.cli import doctor
+    from bodyslam_jax.cli import environment
 
-    rows = doctor.report()
+    rows = environment.report()
     width = max(len(name) for name, _ in rows)
     for name, finding in rows:
         print(f"{name:<{width}}  {finding}")

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.body import BodyModel, joints, keypoints
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation.alignment import align
 from bodyslam_jax.evaluation.errors import (
     FEET,
@@ -55,7 +54,7 @@ def evaluate(
     return dataclasses.replace(_evaluate(*pair), feet=feet, scope=scope)
 
 
-_evaluate = jit_once(evaluate_trajectories)
+_evaluate = eqx.filter_jit(evaluate_trajectories)
 
 
 def associate(
@@ -364,7 +363,7 @@ def _feet_of(result: Result, body: BodyModel) -> np.ndarray | None:
     return np.asarray(points) if np.all(apart[result.present] < 0.01) else None
 
 
-@jit_once
+@eqx.filter_jit
 def _joints_and_feet(body, pose, shape, trans):
     points = keypoints(body, pose, shape, trans, layout="body25")
     return joints(body, pose, shape, trans), points[..., np.array(_TOES_AND_HEELS), :]

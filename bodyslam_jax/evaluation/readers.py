@@ -7,12 +7,12 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, joints
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.evaluation.association import brackets, interpolate_poses
 from bodyslam_jax.io import read_tum as read_tum
 from bodyslam_jax.types import Result
@@ -252,7 +252,7 @@ def posed_joints(
 
 
 _CHUNK = 256
-_joints = jit_once(joints)
+_joints = eqx.filter_jit(joints)
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 

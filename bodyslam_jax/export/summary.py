@@ -4,13 +4,13 @@ import dataclasses
 import importlib.metadata
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import export
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import figures, plausibility
 from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS, Reason
@@ -466,4 +466,4 @@ def _means(frame: np.ndarray, value: np.ndarray, num_frames: int) -> list[float 
     return [float(x / n) if n else None for x, n in zip(total, count, strict=True)]
 
 
-_keypoints = jit_once(body_.local_keypoints)
+_keypoints = eqx.filter_jit(body_.local_keypoints)

@@ -21,8 +21,8 @@ from bodyslam_jax.body import (
     rest_joints,
 )
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
-from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph.factor import JOINTS
+from bodyslam_jax.graph.tracing import is_traced
 
 
 def ancestors() -> np.ndarray:

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray, Array, Bool
 
-from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State
+from bodyslam_jax.graph.tracing import is_traced
 
 _MOVED = 0.01
 """rad, m and so on: how far from the first state costs are compared, where a residual

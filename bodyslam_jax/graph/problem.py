@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
 from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
@@ -22,6 +21,7 @@ from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.padding import Masked, check_padding
 from bodyslam_jax.graph.state import State, Step, gauge
+from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
     check_factor,
     check_prior,

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import AbstractArray, Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
-from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.camera import CameraPrior
 from bodyslam_jax.graph.factors.ground import GroundContact
@@ -27,6 +26,7 @@ from bodyslam_jax.graph.factors.root import (
 )
 from bodyslam_jax.graph.factors.stance import StanceFoot
 from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation_weights import check_early, check_loss, check_runs
 
 Sizes = dict[str, int]

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax.compilation import is_traced
 from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
 from bodyslam_jax.graph.factors.camera import CameraSmoothness
@@ -21,6 +20,7 @@ from bodyslam_jax.graph.factors.root import (
 from bodyslam_jax.graph.factors.stance import StanceFoot
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.tracing import is_traced
 
 _EARLY = (
     (HumanMotion, "whitening", 1, 0.0),

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Collection, Mapping
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -10,7 +11,6 @@ from scipy.ndimage import maximum_filter1d
 
 from bodyslam_jax import graph, motion, people
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights, Measured
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Sequence, Tracks
@@ -309,7 +309,7 @@ def motion_factor(
     )
 
 
-@jit_once
+@eqx.filter_jit
 def _steps(seen, shapes, body, weights, shared_error):
     """Displacements in lengths of the leg, or in metres, and what whitens their
     errors."""

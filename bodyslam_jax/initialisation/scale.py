@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Collection
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,6 @@ from jaxtyping import Bool
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.initialisation.upright import mean_up
@@ -89,7 +89,7 @@ def ground_contact(
     return contact if low > 0 and high - low < _STEADY * middle else None
 
 
-_scales = jit_once(lambda contact, state: contact.scales(state))
+_scales = eqx.filter_jit(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(

@@ -7,6 +7,7 @@ smoothing a walk shrinks its steps, and the step is the scale.
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,6 @@ from jaxtyping import Array, Float
 from scipy.linalg import solveh_banded
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
@@ -180,7 +180,7 @@ def _place_person(
     return both[each, state], _smooth(position[each, state], where, fps, settings)
 
 
-@jit_once
+@eqx.filter_jit
 def _place_bodies(
     skeleton: Skeleton,
     intrinsics: Float[Array, " i"],

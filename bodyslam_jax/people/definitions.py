@@ -8,13 +8,13 @@ that seems 5 % too short bends the knee by 36 degrees.
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
@@ -73,7 +73,7 @@ def as_body_keypoints(
     return dataclasses.replace(keypoints, uv=uv)
 
 
-@jit_once
+@eqx.filter_jit
 def _shift(
     skeleton: Skeleton,
     intrinsics: Float[Array, " i"],

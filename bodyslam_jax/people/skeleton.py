@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import PARENTS, BodyModel, local_keypoints, rest_joints
-from bodyslam_jax.compilation import jit_once
 
 # Bone that carries each BODY_25 keypoint: SMPL's joint of that name, the head for the
 # face, the toe joint for toes, the ankle for heels.
@@ -82,7 +81,7 @@ class Points(eqx.Module):
     by_shape: Float[Array, "25 3 s"]
 
 
-@jit_once
+@eqx.filter_jit
 def _at_rest(body: BodyModel, bias: Array) -> Float[Array, "11 49 3"]:
     dtype = body.joint_template.dtype
     shapes = jnp.concatenate([jnp.zeros((1, 10), dtype), jnp.eye(10, dtype=dtype)])

@@ -29,7 +29,6 @@ from bodyslam_jax.export.summary import describe
 from bodyslam_jax.pipeline import joint_stage, sfm_stage
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import assemble
-from bodyslam_jax.rehearsal import Rehearsal, rehearse
 from bodyslam_jax.types import (
     Bodies,
     JointEstimate,
@@ -112,7 +111,6 @@ def _run(
     sequence: Sequence,
     config: Config,
     cache: Cache,
-    rehearsal: Rehearsal = Rehearsal(),
 ) -> tuple[Result, SfmResult]:
     """`run`, and the cameras before the joint estimate."""
     _check_length(sequence)
@@ -122,19 +120,17 @@ def _run(
     if config.people:  # now, before minutes are spent
         motion.check_compatible(model, body, model.fps)
     sequence = diagnostics.reconcile(_detected(sequence, config, cache, watch), body)
-    cameras, bodies = before_joint(sequence, body, config, cache, watch, rehearsal)
+    cameras, bodies = before_joint(sequence, body, config, cache, watch)
     key = fingerprint(sequence, config)
     sequence = people.select_people(sequence, config.person)
     seen = sfm_stage.with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     with watch("joint"):
-        rehearsal.wait("prediction")
         joint = cache.stage(
             "joint",
             key,
             JointEstimate,
             lambda: joint_stage.estimate(seen, cameras, bodies, body, config),
         )
-    rehearsal.wait("outcome")
     return assemble(sequence, config, body, cameras, joint, watch.seconds), cameras
 
 
@@ -144,7 +140,6 @@ def before_joint(
     config: Config,
     cache: Cache = Cache(None),
     watch: Stopwatch | None = None,
-    rehearsal: Rehearsal = Rehearsal(),
 ) -> tuple[SfmResult, Bodies]:
     """Cameras and map up to scale, bodies in the camera: what the graph starts from.
 
@@ -169,7 +164,6 @@ def before_joint(
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)
     with watch("people"):
-        rehearsal.wait("people")
         bodies = cache.stage(
             "people", key, Bodies, lambda: _people(sequence, body, config)
         )
@@ -302,16 +296,10 @@ def _people(sequence: Sequence, body: body_.BodyModel, config: Config) -> Bodies
     return people.estimate_bodies(sequence, body, config.people_fit)
 
 
-def run_to_folder(
-    sequence: Sequence, out: Path, config: Config = Config(), *, first: bool = False
-) -> Result:
+def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:
     """`run`, with finished stages kept in `out` and everything of the contract written.
 
     Where the sequence has a ground truth, the report says how far off the result is.
-
-    Args:
-        first: whether programs are yet to be compiled: that then begins at once, beside
-            everything else.
 
     **Raises:** `ValueError` if `out` cannot be written or holds something else.
     """
@@ -321,37 +309,18 @@ def run_to_folder(
     _check_people(sequence, config)
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):
-        return _to_locked_folder(sequence, out, config, cache, first)
+        return _to_folder(sequence, out, config, cache)
 
 
-def _to_locked_folder(
-    sequence: Sequence, out: Path, config: Config, cache: Cache, first: bool
-) -> Result:
-    rehearsal = Rehearsal()
-    if first:
-        body, truth = body_.load_body_model(config.body_model), None
-        if sequence.groundtruth is not None:
-            truth = evaluation.read_groundtruth(sequence.groundtruth, body)
-        rehearsal = rehearse(sequence, body, config, truth)
-    try:
-        return _to_folder(sequence, out, config, cache, rehearsal)
-    finally:
-        rehearsal.stop()
-
-
-def _to_folder(
-    sequence: Sequence, out: Path, config: Config, cache: Cache, rehearsal: Rehearsal
-) -> Result:
+def _to_folder(sequence: Sequence, out: Path, config: Config, cache: Cache) -> Result:
     body = body_.load_body_model(config.body_model)
-    result, cameras = _run(sequence, config, cache, rehearsal)
+    result, cameras = _run(sequence, config, cache)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
-        rehearsal.wait("errors")
         result.summary["errors"] = found = before_after.errors(
             result, cameras, truth, body
         )
         result.summary["headline"] += before_after.headline(found)
-    rehearsal.wait("files")
     watch = Stopwatch()
     with export.run_folder(out) as partial:
         if config.overlay and sequence.frames is not None:
@@ -387,7 +356,6 @@ def demo(
     out: Path,
     config: Config = Config(),
     *,
-    first: bool = False,
     from_pixels: bool = False,
 ) -> Result:
     """Renders a walker whom a moving camera films, and runs everything on the images.
@@ -395,7 +363,6 @@ def demo(
     The scene is written to `out/scene`, a sequence folder with its ground truth.
 
     Args:
-        first: as for `run_to_folder`.
         from_pixels: whether people are found in the images, in place of the keypoints
             and bodies that are simulated.
 
@@ -405,31 +372,19 @@ def demo(
     cache = Cache(out / ".cache", {"name": _SCENE})
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):
-        return _demo(out, config, warnings, first, from_pixels)
+        return _demo(out, config, warnings, from_pixels)
 
 
 def _demo(
     out: Path,
     config: Config,
     warnings: tuple[str, ...],
-    first: bool,
     from_pixels: bool,
 ) -> Result:
-    folder, rehearsal, watch = out / _SCENE, Rehearsal(), Stopwatch()
-    scene = None
-    if first:
-        body = body_.load_body_model(config.body_model)
-        scene = simulation.simulate(simulation.demo_settings())
-        measured, truth = simulation.as_sequence(scene), simulation.as_truth(scene)
-        if from_pixels:
-            measured = dataclasses.replace(measured, keypoints=None, bodies=None)
-        rehearsal = rehearse(measured, body, config, truth)
-    try:
-        with watch("rendering"):
-            simulation.demo_scene(folder, simulated=scene, people=not from_pixels)
-            sequence = _warned(io.read_sequence(folder), warnings)
-        cache = Cache(out / ".cache", describe(sequence))
-        export.check_folder(out, cache.source, cache.owner())
-        return _to_folder(sequence, out, config, cache, rehearsal)
-    finally:
-        rehearsal.stop()
+    folder, watch = out / _SCENE, Stopwatch()
+    with watch("rendering"):
+        simulation.demo_scene(folder, people=not from_pixels)
+        sequence = _warned(io.read_sequence(folder), warnings)
+    cache = Cache(out / ".cache", describe(sequence))
+    export.check_folder(out, cache.source, cache.owner())
+    return _to_folder(sequence, out, config, cache)

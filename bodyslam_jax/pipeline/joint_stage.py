@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, solver
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import PATH_SIGMA, Config
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
@@ -222,7 +221,7 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Pred
     return _predict(predictor, eqx.tree_at(lambda s: s.landmarks, state, none))
 
 
-_predict = jit_once(lambda predictor, state: predictor(state))
+_predict = eqx.filter_jit(lambda predictor, state: predictor(state))
 
 
 def _settle_people(

@@ -8,12 +8,12 @@ and turns that do not fit together give it away. Distortion is not sought.
 import dataclasses
 import logging
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax import graph, initialisation, sfm, solver
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config, Structure
 from bodyslam_jax.types import Intrinsics, Sequence, SfmResult, Tracks
 
@@ -300,7 +300,7 @@ def _adjusted(
     )
 
 
-_residual = jit_once(lambda factor, state: factor.residual(state))
+_residual = eqx.filter_jit(lambda factor, state: factor.residual(state))
 
 
 def _problem(

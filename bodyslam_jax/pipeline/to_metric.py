@@ -2,13 +2,13 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import people
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
@@ -66,7 +66,7 @@ def assemble(
     return dataclasses.replace(result, summary=summary)
 
 
-_joints = jit_once(body_.joints)
+_joints = eqx.filter_jit(body_.joints)
 
 
 def _placed(

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from bodyslam_jax.compilation import is_alone, is_traced, quick_options
+from bodyslam_jax.graph.tracing import is_alone, is_traced
+from bodyslam_jax.solver.compilation import quick_options
 
 
 def sequential_vmap(function: Callable[..., Any]) -> Callable[..., Any]:

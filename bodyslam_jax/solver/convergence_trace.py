@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.compilation import in_full_precision, is_traced, quick_options
 from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
+from bodyslam_jax.solver.compilation import in_full_precision, quick_options
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Stage, check_schedule

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.compilation import in_full_precision, is_alone, jit_once
 from bodyslam_jax.graph import Problem, State
+from bodyslam_jax.graph.tracing import is_alone
 from bodyslam_jax.solver.blocks import (
     CAMERAS,
     Linearisation,
@@ -18,6 +18,7 @@ from bodyslam_jax.solver.blocks import (
     own_to_global,
     sizes_of,
 )
+from bodyslam_jax.solver.compilation import in_full_precision
 from bodyslam_jax.solver.covariance_vjp import equations
 from bodyslam_jax.solver.elimination.schur import half_inverse
 from bodyslam_jax.solver.front import window_of
@@ -101,7 +102,7 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
     return pull(full)[0]
 
 
-@jit_once
+@eqx.filter_jit
 @in_full_precision
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)

@@ -9,9 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from bodyslam_jax.compilation import in_full_precision
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, sizes_of
+from bodyslam_jax.solver.compilation import in_full_precision
 from bodyslam_jax.solver.coupling import with_coupling
 from bodyslam_jax.solver.levenberg_marquardt import final_of
 from bodyslam_jax.solver.linear_system import UNSEEN, damped, diagonals, eliminate

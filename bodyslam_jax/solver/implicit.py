@@ -18,17 +18,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from bodyslam_jax.compilation import (
-    in_full_precision,
-    is_alone,
-    is_traced,
-    quick_options,
-)
 from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
-from bodyslam_jax.kept import kept
+from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.apart import join_poses
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.coupling import with_gradient
 from bodyslam_jax.solver.gmres import gmres
 from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
@@ -52,7 +47,7 @@ def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Pr
 @functools.cache
 def _program(alone: bool) -> Callable[..., Problem]:
     if alone:
-        return kept(_cotangent_of_problem, quick_options)
+        return compiled(_cotangent_of_problem)
     return eqx.filter_jit(_cotangent_of_problem)
 
 

@@ -11,16 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.compilation import (
-    in_full_precision,
-    is_alone,
-    is_traced,
-    quick_options,
-)
 from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
-from bodyslam_jax.kept import kept
+from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
+from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.implicit import cotangent_of_problem
 from bodyslam_jax.solver.levenberg_marquardt import (
     StructuredLevenbergMarquardt,
@@ -156,7 +151,7 @@ def run(
 
 @functools.cache
 def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
-    return kept(_run, quick_options) if alone else eqx.filter_jit(_run)
+    return compiled(_run) if alone else eqx.filter_jit(_run)
 
 
 @in_full_precision
@@ -241,7 +236,7 @@ def _solve_baseline(problem, state, solver, schedule):
 @functools.cache
 def _baseline(alone: bool) -> Callable[..., Any]:
     run = baselines.run
-    return kept(run, quick_options) if alone else eqx.filter_jit(run)
+    return compiled(run) if alone else eqx.filter_jit(run)
 
 
 @eqx.filter_jit

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.body import BodyModel, vertices
-from bodyslam_jax.compilation import jit_once
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.style import PEOPLE, Image
@@ -84,7 +83,7 @@ class _Mesh(eqx.Module):
     """px"""
 
 
-@jit_once
+@eqx.filter_jit
 def _pose(
     body: BodyModel,
     poses: Float[Array, "t 72"],

@@ -43,6 +43,7 @@ def run(
     """
     from bodyslam_jax import io, pipeline
 
+    _announce_compilation()
     sequence = io.read_sequence(
         input,
         keypoints=keypoints,
@@ -53,7 +54,7 @@ def run(
         config=config.association,
         known=config,
     )
-    result = pipeline.run_to_folder(sequence, out, config, first=_is_first())
+    result = pipeline.run_to_folder(sequence, out, config)
     return _finish(result, out)
 
 
@@ -78,8 +79,8 @@ def demo(
     """
     from bodyslam_jax import pipeline
 
-    first = _is_first()
-    result = pipeline.demo(out, config, first=first, from_pixels=from_pixels)
+    _announce_compilation()
+    result = pipeline.demo(out, config, from_pixels=from_pixels)
     return _finish(result, out)
 
 
@@ -135,12 +136,10 @@ def evaluate(
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
 
 
-def _is_first() -> bool:
-    """Whether nothing is compiled yet; says so, as it takes a while."""
+def _announce_compilation() -> None:
+    """Says that programs are compiled first, where none is in JAX's cache yet."""
     import jax
 
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if not folder or (Path(folder).is_dir() and any(Path(folder).iterdir())):
-        return False
-    log.info("first run: programs are compiled, which takes minutes, and kept")
-    return True
+    if folder and not (Path(folder).is_dir() and any(Path(folder).iterdir())):
+        log.info("first run: programs are compiled, which takes minutes, and kept")
