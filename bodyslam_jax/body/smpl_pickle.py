@@ -1,127 +1,50 @@
-"""SMPL's original pickles, read without chumpy or SciPy and without trusting them.
+"""The arrays in SMPL's original pickles, without chumpy or SciPy.
 
-A pickle is a program. This one may make NumPy arrays and plain containers; objects of
-chumpy and scipy.sparse become inert stand-ins from which the numbers are taken. Any
-other name is refused when the pickle asks for it, which is before anything is called.
+These files hold chumpy expressions and scipy.sparse matrices beside NumPy arrays.
+`io.safe_pickle` loads them as inert stand-ins, from whose state the numbers are taken.
 """
 
-import collections
 import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.io.safe_pickle import StandIn, restricted_load
 
-class _StandIn:
-    """An object of a library that is not imported: keeps its state, does nothing."""
-
-    state: Any = None
-
-    def __new__(cls, *args, **kwargs):
-        return object.__new__(cls)
-
-    def __init__(self, *args, **kwargs):
-        pass
-
-    def __setstate__(self, state):
-        # Objects with slots have a pair: dictionary, slots.
-        if isinstance(state, tuple) and state and isinstance(state[0], dict):
-            state = state[0]
-        self.state = state
+_LIBRARIES = ("chumpy", "scipy.sparse")
+_MAX_DEPTH = 8
+"""Nested chumpy expressions that are followed."""
 
 
-def _reconstruct(subtype, shape, dtype):
-    if subtype is not np.ndarray:
-        raise pickle.UnpicklingError("an array type that is not NumPy's own")
-    return np.ndarray.__new__(np.ndarray, (0,), np.dtype("int8"))
-
-
-def _scalar(dtype, data=b""):
-    if dtype.hasobject:
-        raise pickle.UnpicklingError("a scalar that holds an object")
-    data = data.encode("latin1") if isinstance(data, str) else data
-    return np.frombuffer(data, dtype, 1)[0]
-
-
-def _encode(text, encoding="latin1"):
-    if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"text in {encoding!r}")
-    return text.encode("latin1")
-
-
-def _reconstructor(cls, base, state):
-    """What Python 2 writes for an instance of a new-style class."""
-    if isinstance(cls, type) and issubclass(cls, _StandIn):
-        return cls()
-    raise pickle.UnpicklingError(f"an instance of {cls}")
-
-
-_ALLOWED: dict[tuple[str, str], Any] = {
-    ("_codecs", "encode"): _encode,
-    ("collections", "OrderedDict"): collections.OrderedDict,
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-}
-for _module in ("numpy.core.multiarray", "numpy._core.multiarray"):
-    _ALLOWED[_module, "_reconstruct"] = _reconstruct
-    _ALLOWED[_module, "scalar"] = _scalar
-for _module in ("copy_reg", "copyreg"):
-    _ALLOWED[_module, "_reconstructor"] = _reconstructor
-for _module in ("__builtin__", "builtins"):
-    for _type in (object, list, dict, tuple, set, int, float, complex, slice):
-        _ALLOWED[_module, _type.__name__] = _type
-_ALLOWED["__builtin__", "long"] = int
-
-
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _ALLOWED:
-            return _ALLOWED[module, name]
-        if module.split(".")[0] == "chumpy" or module.startswith("scipy.sparse"):
-            return type(name, (_StandIn,), {})
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is refused")
-
-
-def read_pickle(path: Path) -> dict[str, Any]:
+def read_pickle(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a pickled dictionary, by name; what is not an array is left out.
 
-    **Raises:** `ValueError` if the file is not a pickle, is cut short, or asks for
-    anything but arrays.
+    **Raises:** `ValueError`, one line that names the file, if it is not a pickle of a
+    dictionary, is cut short, or asks for anything but plain data.
     """
-    with open(path, "rb") as file:
-        try:
-            content = _Unpickler(file, encoding="latin1").load()
-            if isinstance(content, dict):
-                content = {str(key): _array(value) for key, value in content.items()}
-        except pickle.UnpicklingError as error:
-            raise ValueError(f"{path}: not a usable pickle: {_line(error)}.") from None
-        except Exception as error:
-            # Damaged bytes make pickle raise nearly anything.
-            kind = type(error).__name__
-            raise ValueError(
-                f"{path}: not a pickle, or a damaged one ({kind}: {_line(error)})."
-            ) from None
+    content = restricted_load(path, stand_ins=_LIBRARIES)
     if not isinstance(content, dict):
         found = type(content).__name__
         raise ValueError(f"{path}: holds a {found}, expected a dictionary of arrays.")
-    return {key: value for key, value in content.items() if value is not None}
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120].rstrip(".")
+    try:
+        arrays = {str(key): _array(value) for key, value in content.items()}
+    except Exception as error:  # a damaged state can fail anywhere, with any error
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise ValueError(f"{path}: a damaged pickle ({what}).") from None
+    return {key: value for key, value in arrays.items() if value is not None}
 
 
 def _array(value: Any, depth: int = 0) -> np.ndarray | None:
     """The numbers of an array, a chumpy object or a sparse matrix; else `None`."""
     if isinstance(value, np.ndarray):
         return value
-    if not isinstance(value, _StandIn) or not isinstance(value.state, dict):
+    if not isinstance(value, StandIn) or not isinstance(value.state, dict):
         return None
     state = value.state
     if "indptr" in state:
         return _dense(state, type(value).__name__.startswith("csr"))
-    if depth > 8:
+    if depth > _MAX_DEPTH:
         return None
     if "idxs" in state and "a" in state:  # chumpy.reordering.Select
         source, index = _array(state["a"], depth + 1), np.asarray(state["idxs"])
