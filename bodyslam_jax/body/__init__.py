@@ -14,6 +14,7 @@ from bodyslam_jax.body.model import BodyModel as BodyModel
 from bodyslam_jax.body.show import draw_body as draw_body
 from bodyslam_jax.body.show import posture as posture
 from bodyslam_jax.body.show import save_picture as save_picture
+from bodyslam_jax.body.skeleton import BODY25 as BODY25
 from bodyslam_jax.body.skeleton import DETECTOR_BIAS as DETECTOR_BIAS
 from bodyslam_jax.body.skeleton import JOINT_NAMES as JOINT_NAMES
 from bodyslam_jax.body.skeleton import KEYPOINT_NAMES as KEYPOINT_NAMES

@@ -6,7 +6,6 @@ eyes). At rest those follow the wrist or the head rigidly, so that their weights
 belong to it, and the body is driven by SMPL's 72 numbers.
 """
 
-import contextlib
 import json
 import os
 import re
@@ -17,9 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax.body.model import BodyModel, runs_of_vertices, sparse_rows
-from bodyslam_jax.body.skeleton import JOINT_NAMES, PARENTS, SURFACE_POINTS
-from bodyslam_jax.body.unpickle import read_pickle
+from bodyslam_jax.body.skeleton import (
+    ANKLES,
+    HEAD,
+    JOINT_NAMES,
+    PARENTS,
+    SURFACE_POINTS,
+)
+from bodyslam_jax.body.smpl_pickle import read_pickle
 from bodyslam_jax.body.validate import checked
+from bodyslam_jax.io import atomic
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
 VARIABLE = "BODYSLAM_BODY_MODEL"
@@ -126,29 +132,19 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
     pose_dirs[:, :, : model.pose_dirs.shape[2]] = model.pose_dirs
     parents = np.array([2**32 - 1, *PARENTS[1:]], np.uint32)
     picks = dict(zip(SURFACE_POINTS, np.asarray(model.picks).tolist(), strict=True))
-    part = path.with_name(path.name + ".part")
-    try:
-        with open(part, "wb") as file:
-            np.savez_compressed(
-                file,
-                v_template=np.asarray(model.template),
-                shapedirs=np.asarray(model.shape_dirs),
-                posedirs=pose_dirs,
-                J_regressor=np.asarray(model.joint_regressor),
-                J=np.asarray(model.joint_template),
-                weights=weights,
-                kintree_table=np.stack([parents, np.arange(24, dtype=np.uint32)]),
-                f=np.asarray(model.faces).astype(np.uint32),
-                joint_names=np.array(JOINT_NAMES),
-                header=np.array(json.dumps({"name": model.name, "keypoints": picks})),
-            )
-        part.replace(path)
-    except OSError as error:
-        # Of the file that was asked for, not of the one on the way to it.
-        raise OSError(error.errno, error.strerror, str(path)) from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
+    arrays = {
+        "v_template": np.asarray(model.template),
+        "shapedirs": np.asarray(model.shape_dirs),
+        "posedirs": pose_dirs,
+        "J_regressor": np.asarray(model.joint_regressor),
+        "J": np.asarray(model.joint_template),
+        "weights": weights,
+        "kintree_table": np.stack([parents, np.arange(24, dtype=np.uint32)]),
+        "f": np.asarray(model.faces).astype(np.uint32),
+        "joint_names": np.array(JOINT_NAMES),
+        "header": np.array(json.dumps({"name": model.name, "keypoints": picks})),
+    }
+    atomic.write_npz(path, arrays)
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
@@ -273,9 +269,9 @@ def _picks(template: np.ndarray, regressor: np.ndarray) -> np.ndarray:
     points = np.asarray(known.template)[picks]
     here = regressor @ template
     size = np.ptp(template[:, 1]) / np.ptp(np.asarray(known.template)[:, 1])
-    anchor = [7 if "left" in n else 8 for n in SURFACE_POINTS]
+    anchor = [ANKLES[0] if "left" in n else ANKLES[1] for n in SURFACE_POINTS]
     is_foot = [n.endswith(("toe", "heel")) for n in SURFACE_POINTS]
-    anchor = np.where(is_foot, anchor, 15)
+    anchor = np.where(is_foot, anchor, HEAD)
     target = here[anchor] + size * (points - joints[anchor])
     near = np.linalg.norm(template[None] - target[:, None], axis=-1).argmin(1)
     return np.append(near[:-1], top)

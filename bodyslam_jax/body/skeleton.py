@@ -41,6 +41,15 @@ MIRRORED: tuple[int, ...] = (
 )
 """The joint on the other side of the body."""
 
+PELVIS, NECK, HEAD = (JOINT_NAMES.index(name) for name in ("pelvis", "neck", "head"))
+HIPS, KNEES, ANKLES, FEET, WRISTS, HANDS = (
+    (JOINT_NAMES.index(f"left_{name}"), JOINT_NAMES.index(f"right_{name}"))
+    for name in ("hip", "knee", "ankle", "foot", "wrist", "hand")
+)
+"""Joints by name, left and right; SMPL's foot joint is at the base of the toes."""
+ANKLES_AND_FEET = (ANKLES[0], FEET[0], ANKLES[1], FEET[1])
+"""Joints near the ground: left ankle and foot, right ankle and foot."""
+
 LEVELS: tuple[tuple[int, ...], ...] = (
     (1, 2, 3),
     (4, 5, 6),
@@ -100,6 +109,30 @@ KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
     ),
 }
 """What each keypoint of a detector's layout is, in the layout's own order."""
+
+
+def _other_side(name: str) -> str:
+    """The name with left and right exchanged."""
+    side, _, part = name.partition("_")
+    other = {"left": "right", "right": "left"}.get(side)
+    return name if other is None else f"{other}_{part}"
+
+
+BODY25: dict[str, int] = {name: k for k, name in enumerate(KEYPOINT_NAMES["body25"])}
+"""Index of each keypoint of BODY_25 by its name."""
+BODY25_MIRRORED: tuple[int, ...] = tuple(
+    BODY25[_other_side(name)] for name in KEYPOINT_NAMES["body25"]
+)
+"""The keypoint of BODY_25 on the other side of the body."""
+BODY25_FACE = (BODY25["nose"], BODY25["right_eye"], BODY25["left_eye"])
+BODY25_ANKLES = (BODY25["right_ankle"], BODY25["left_ankle"])
+BODY25_TOES_AND_HEELS = (
+    *(BODY25["left_big_toe"], BODY25["left_heel"]),
+    *(BODY25["right_big_toe"], BODY25["right_heel"]),
+)
+"""Big toe and heel of either foot."""
+BODY25_ANKLES_AND_FEET = (*BODY25_ANKLES, *range(BODY25["left_big_toe"], len(BODY25)))
+"""Ankles, toes and heels."""
 
 _SPREAD = {
     "nose": 0.026,

@@ -7,8 +7,8 @@ one another.
 import numpy as np
 from jaxtyping import Float
 
-HIPS, KNEES, ANKLES, FEET = (1, 2), (4, 5), (7, 8), (10, 11)
-PELVIS, NECK = 0, 12
+from bodyslam_jax.body.skeleton import ANKLES, FEET, HIPS, KNEES, NECK, PELVIS
+
 _PLAN = (0, 2)
 RUNNING = 2.2
 """m/s. Faster than this no foot need be on the ground half of the time."""

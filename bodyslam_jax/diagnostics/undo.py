@@ -8,14 +8,9 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.skeleton import BODY25_MIRRORED
 from bodyslam_jax.diagnostics.explanations import ImageMap
 from bodyslam_jax.types import Bodies, Keypoints, Sequence
-
-_SWAPPED = np.array(
-    [0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11]
-    + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
-)
-"""The keypoint of BODY_25 on the other side of the body."""
 
 
 def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
@@ -24,7 +19,7 @@ def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
     uv, confidence = image.inverse(keypoints.uv), keypoints.confidence
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
     if image.swap:
-        uv, confidence = uv[:, :, _SWAPPED], confidence[:, :, _SWAPPED]
+        uv, confidence = uv[:, :, BODY25_MIRRORED], confidence[:, :, BODY25_MIRRORED]
     return dataclasses.replace(sequence, keypoints=Keypoints(uv, confidence))
 
 

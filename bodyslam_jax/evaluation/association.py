@@ -12,11 +12,10 @@ from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.body import BodyModel, joints, keypoints
+from bodyslam_jax.body.skeleton import ANKLES_AND_FEET, BODY25_TOES_AND_HEELS, PELVIS
 from bodyslam_jax.evaluation.alignment import align
 from bodyslam_jax.evaluation.errors import (
-    FEET,
     NOBODY,
-    PELVIS,
     STRAIGHT,
     Evaluation,
     Pair,
@@ -27,9 +26,6 @@ from bodyslam_jax.evaluation.errors import (
 from bodyslam_jax.evaluation.metrics import Errors, trajectory_error
 from bodyslam_jax.geometry.so3 import log
 from bodyslam_jax.types import Result
-
-_TOES_AND_HEELS = (19, 21, 22, 24)
-"""In BODY_25; on SMPL the vertices 3216, 3387, 6617, 6787 of WHAM's foot sliding."""
 
 
 def evaluate(
@@ -352,7 +348,7 @@ def _feet(
         feet, true_feet = (_feet_of(x, body) for x in (result, truth))
         if feet is not None and true_feet is not None:
             return feet, true_feet, "toes and heels"
-    feet, true_feet = (x.joints[:, :, FEET] for x in (result, truth))
+    feet, true_feet = (x.joints[:, :, ANKLES_AND_FEET] for x in (result, truth))
     return feet, true_feet, "ankle and foot joints"
 
 
@@ -366,7 +362,9 @@ def _feet_of(result: Result, body: BodyModel) -> np.ndarray | None:
 @eqx.filter_jit
 def _joints_and_feet(body, pose, shape, trans):
     points = keypoints(body, pose, shape, trans, layout="body25")
-    return joints(body, pose, shape, trans), points[..., np.array(_TOES_AND_HEELS), :]
+    return joints(body, pose, shape, trans), points[
+        ..., np.array(BODY25_TOES_AND_HEELS), :
+    ]
 
 
 def _pose_shape_trans(result: Result, body: BodyModel) -> tuple[Array, Array, Array]:

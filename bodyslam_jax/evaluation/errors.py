@@ -7,18 +7,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.evaluation import metrics, plausibility
 from bodyslam_jax.evaluation.alignment import Alignment, align, is_point
 
-PELVIS = 0
 NOBODY = -1
 STILL = 0.01
 """m; a camera whose path has a smaller radius (root mean square) stands still."""
 STRAIGHT = 0.1
 """m, root mean square; how far about a path that is straighter a person is turned,
 alignment A1 hardly tells, and J-ATE is of little else."""
-FEET = (7, 10, 8, 11)
-"""Left ankle and foot, right ankle and foot: what slides where no mesh is known."""
 
 
 class Trajectories(eqx.Module):

@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.body.skeleton import (
+    ANKLES,
+    ANKLES_AND_FEET,
+    FEET,
+    HIPS,
+    KNEES,
+    NECK,
+    PELVIS,
+)
 from bodyslam_jax.evaluation.metrics import norm, only
 
-_HIPS, _KNEES, _ANKLES, _FEET = (np.array([i, i + 1]) for i in (1, 4, 7, 10))
-_LOWEST = np.array([7, 8, 10, 11])
-_PELVIS, _NECK = 0, 12
+_HIPS, _KNEES, _ANKLES, _FEET = map(np.array, (HIPS, KNEES, ANKLES, FEET))
+_LOWEST = np.array(ANKLES_AND_FEET)
 _UPRIGHT = float(np.cos(np.radians(35.0)))
 """People's trunks are this near an axis of the world, if that is up."""
 Y = np.array([0.0, 1.0, 0.0])
@@ -26,7 +34,9 @@ def up_axis(
     """The axis of the world that is up, the one along which trunks point on average,
     and whether that is known: it is within 35 degrees of that, and somebody is there.
     """
-    trunk = jnp.where(present[..., None], joints[..., _NECK, :] - joints[..., 0, :], 0)
+    trunk = jnp.where(
+        present[..., None], joints[..., NECK, :] - joints[..., PELVIS, :], 0
+    )
     total = jnp.sum(trunk, (0, 1))
     largest = jnp.argmax(jnp.abs(total))
     sign = jnp.where(total[largest] < 0, -1, 1).astype(joints.dtype)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax import evaluation, graph, people
+from bodyslam_jax.body.skeleton import BODY25_ANKLES
 from bodyslam_jax.experiments.ablation import as_published
 from bodyslam_jax.experiments.problems import with_scale, without_map
 from bodyslam_jax.experiments.scenario import Case
@@ -118,11 +119,11 @@ def depth_scale(case: Case) -> float:
     pelvis = people.roots_from_bodies(case.bodies, case.body).T_CH[0, :, 2, 3]
     found = []
     for k in np.flatnonzero(case.bodies.present[0] & cameras.registered):
-        sure = keypoints.confidence[0, k, [11, 14]] > 0.3
+        sure = keypoints.confidence[0, k, list(BODY25_ANKLES)] > 0.3
         rows = np.flatnonzero((tracks.frame == k) & cameras.keep)
         if not sure.any() or len(rows) < _NEAR:
             continue
-        feet = keypoints.uv[0, k, [11, 14]][sure].mean(axis=0)
+        feet = keypoints.uv[0, k, list(BODY25_ANKLES)][sure].mean(axis=0)
         near = rows[np.argsort(np.linalg.norm(tracks.uv[rows] - feet, axis=1))[:_NEAR]]
         offset = cameras.landmarks[tracks.landmark[near]] - T_WC[k, :3, 3]
         depth = float(np.median(offset @ T_WC[k, :3, 2]))

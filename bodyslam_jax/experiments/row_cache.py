@@ -3,13 +3,13 @@
 import json
 import logging
 import math
-import os
 import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.io import atomic
 from bodyslam_jax.pipeline.stage_cache import fingerprint
 
 log = logging.getLogger(__name__)
@@ -59,9 +59,7 @@ class Journal:
         self.computed += 1
         log.info("%s %s: %.0f s", name, label, time.perf_counter() - start)
         self.folder.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(row, indent=1))
-        os.replace(partial, path)
+        atomic.write_text(path, json.dumps(row, indent=1))
         return row
 
 

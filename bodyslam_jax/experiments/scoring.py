@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import evaluation, graph
 from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.pipeline import to_metric
 from bodyslam_jax.types import Result
@@ -26,7 +27,6 @@ PLAUSIBLE = (
     *(f"{name}{whose}" for name in evaluation.FIGURES for whose in ("", "_of_truth")),
 )
 """Whether people slide, float or crouch: rad, m, s; without the result's low pass."""
-_FEET = (7, 10, 8, 11)
 _FRAMES = 100
 """Numbers of frames are rounded up to this, so that lengths share what is compiled."""
 
@@ -41,7 +41,7 @@ def truth_of(result: Result) -> Trajectories:
         camera_valid=jnp.ones(t, bool),
         joints=joints,
         present=jnp.asarray(result.present),
-        feet=joints[..., np.array(_FEET), :],
+        feet=joints[..., np.array(ANKLES_AND_FEET), :],
         fps=jnp.asarray(fps),
     )
 
@@ -64,7 +64,7 @@ def trajectories(
         camera_valid=jnp.asarray(registered),
         joints=joints,
         present=jnp.asarray(present),
-        feet=joints[..., np.array(_FEET), :],
+        feet=joints[..., np.array(ANKLES_AND_FEET), :],
         fps=fps,
     )
 

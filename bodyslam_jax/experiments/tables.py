@@ -3,12 +3,12 @@
 import csv
 import dataclasses
 import io
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.experiments.paper import OTHER_DATA
+from bodyslam_jax.io.atomic import write_text
 
 Row = dict[str, Any]
 MM = 1e3
@@ -74,13 +74,6 @@ def to_csv(
         cells = [column.value(row) for column in columns]
         writer.writerow([*("" if c is None else c for c in cells), *last])
     return out.getvalue()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
 
 
 def intro(title: str, about: str, *lines: str) -> str:

@@ -3,11 +3,9 @@
 from bodyslam_jax.export.folder import check_folder as check_folder
 from bodyslam_jax.export.folder import run_folder as run_folder
 from bodyslam_jax.export.folder import to_yaml as to_yaml
-from bodyslam_jax.export.folder import write_body as write_body
 from bodyslam_jax.export.folder import write_files as write_files
 from bodyslam_jax.export.folder import write_points as write_points
 from bodyslam_jax.export.folder import write_run as write_run
-from bodyslam_jax.export.folder import write_tum as write_tum
 from bodyslam_jax.export.ground import ground_scale as ground_scale
 from bodyslam_jax.export.lock import locked as locked
 from bodyslam_jax.export.meshes import write_bvh as write_bvh
@@ -21,3 +19,5 @@ from bodyslam_jax.export.statistics import stature as stature
 from bodyslam_jax.export.walking import Gait as Gait
 from bodyslam_jax.export.walking import gait as gait
 from bodyslam_jax.export.walking import gait_of_joints as gait_of_joints
+from bodyslam_jax.io import write_body as write_body
+from bodyslam_jax.io import write_tum as write_tum

@@ -10,19 +10,17 @@ import errno
 import json
 import math
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import trimesh
 import yaml
 from jaxtyping import Float
 
+from bodyslam_jax.io import atomic, write_body, write_tum
 from bodyslam_jax.types import Result
 
 _LAST = "summary.json"
@@ -94,19 +92,9 @@ def run_folder(folder: Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def _partial(folder: Path) -> Iterator[Path]:
     """A hidden folder in `folder`, gone afterwards, and `folder` too if it is empty."""
-    existed = folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
-            try:
-                yield partial
-            finally:
-                shutil.rmtree(partial, ignore_errors=True)
-        finally:
-            if not existed:
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
+        with atomic.hidden_folder(folder) as partial:
+            yield partial
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             reason = "the disk is full"
@@ -144,7 +132,7 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
         for field in dataclasses.fields(result)
         if field.name != "summary"
     }
-    _savez(folder / "result.npz", arrays)
+    atomic.write_npz(folder / "result.npz", arrays)
     located = result.located
     write_tum(folder / "camera.tum", result.timestamps[located], result.T_WC[located])
     for h in range(len(result.poses)):
@@ -167,39 +155,6 @@ def frame_rate(result: Result) -> float:
     """Mean frame rate, 1/s; 30 for a single frame."""
     t = result.timestamps
     return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
-
-
-def write_tum(
-    path: Path, timestamps: Float[np.ndarray, " t"], T_WC: Float[np.ndarray, "t 4 4"]
-) -> None:
-    """Writes a TUM trajectory: camera to world, m, quaternion `xyzw`."""
-    rotation = jaxlie.SO3.from_matrix(jnp.asarray(T_WC[:, :3, :3]))
-    xyzw = np.asarray(rotation.as_quaternion_xyzw())
-    np.savetxt(
-        path,
-        np.column_stack([timestamps, T_WC[:, :3, 3], xyzw]),
-        fmt="%.9f",
-        header="timestamp tx ty tz qx qy qz qw (camera to world)",
-    )
-
-
-def write_body(
-    path: Path,
-    poses: Float[np.ndarray, "t 72"],
-    trans: Float[np.ndarray, "t 3"],
-    betas: Float[np.ndarray, " 10"],
-    fps: float,
-    gender: str = "neutral",
-    **more: np.ndarray,
-) -> None:
-    """Writes one person AMASS style, at the given rate; `more` arrays beside."""
-    person = {"poses": poses, "trans": trans, "betas": betas}
-    rate = {"mocap_framerate": np.array(fps), "gender": np.array(gender)}
-    _savez(path, person | rate | more)
-
-
-def _savez(path: Path, arrays: dict[str, Any]) -> None:
-    np.savez_compressed(path, **arrays)
 
 
 def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:

@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.types import Result
 
-_FEET = [10, 11]
+_FEET = list(FEET)
 _SOLE = 0.027
 """How far these joints lie above what the sole stands on, m, in the default body."""
 _UP = np.array([0.0, 1.0, 0.0])

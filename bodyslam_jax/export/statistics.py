@@ -6,13 +6,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.export.folder import frame_rate
 from bodyslam_jax.types import Result
 
 _UP = 1
 """The y axis of a result's world points up."""
 _PLAN = [0, 2]
-_FEET = [10, 11]
+_FEET = list(FEET)
 _SMOOTHING = 0.5
 """Moving average over so many seconds, so that jitter is not counted as distance."""
 

@@ -11,14 +11,13 @@ from jaxtyping import Bool
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Keypoints, ScaleStart
 
-_FEET = (11, 14, 19, 20, 21, 22, 23, 24)
-"""Ankles, toes and heels of BODY_25."""
 _SEEN = 0.2
 """Confidence from which a keypoint of the feet counts as seen."""
 _STEADY = 0.3
@@ -72,7 +71,8 @@ def ground_contact(
     """
     there = roots.present & registered
     if keypoints is not None:
-        there &= (keypoints.confidence[:, :, _FEET] > _SEEN).any(axis=-1)
+        feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
+        there &= (feet > _SEEN).any(axis=-1)
     if weights.ground_sigma is None or there.sum() < 2:
         return None
     plane = find_ground(

@@ -1,26 +1,29 @@
-"""Pickled result files without running what is in them.
+"""Pickled files without running what is in them.
 
 Pickle, joblib, PyTorch's zip files and object arrays of NumPy can hold code that runs
 on loading. This unpickler makes numbers, text, lists, dictionaries and arrays, by
-functions of its own, and refuses every other name before it is called.
+functions of its own, and refuses every other name before it is called. Objects of
+libraries that the caller names become inert stand-ins that keep their state.
 """
 
 import bz2
 import collections
+import dataclasses
 import gzip
 import io
 import lzma
 import pickle
 import zipfile
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 _MAX_BYTES = 8 << 30
-"""More than this is not a result file but a bomb."""
+"""A larger array or archive is refused as a decompression bomb."""
+_TEXT_PICKLES = (b"(d", b"(l", b"}", b"]")
+"""How dictionaries and lists begin in protocols 0 and 1, which have no magic number."""
 
 _STORAGES = {
     "DoubleStorage": "f8",
@@ -36,20 +39,56 @@ _STORAGES = {
 
 
 class Refused(pickle.UnpicklingError):
-    """A name in a pickle that is not on the list."""
+    """The pickle asks for something that is not plain data."""
 
 
-def restricted_load(path: Path, allow: Mapping[str, Any] | None = None) -> Any:
-    """Loads a pickle, joblib, `.pt` or `.npy` file made of plain data.
+class StandIn:
+    """An object of a library that is not imported: keeps its state, does nothing."""
+
+    state: Any = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> "StandIn":
+        return object.__new__(cls)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        # Objects with slots have a pair: dictionary, slots.
+        if isinstance(state, tuple) and state and isinstance(state[0], dict):
+            state = state[0]
+        self.state = state
+
+
+@dataclasses.dataclass(frozen=True)
+class _Names:
+    """What stands for each name that a pickle may ask for."""
+
+    stand_ins: tuple[str, ...] = ()
+    """Packages whose classes become `StandIn`s."""
+
+    def find(self, module: str, name: str) -> Any:
+        key = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
+        if key in _ALLOWED:
+            return _ALLOWED[key]
+        if any(f"{module}.".startswith(f"{package}.") for package in self.stand_ins):
+            return type(name, (StandIn,), {})
+        raise Refused(f"it wants to load {module}.{name}")
+
+
+def restricted_load(path: Path, stand_ins: tuple[str, ...] = ()) -> Any:
+    """Loads a pickle, joblib, `.pt`, `.npz` or `.npy` file made of plain data.
 
     Tensors become NumPy arrays.
 
     Args:
-        allow: more names (`module.name`), and what to call in their place.
+        stand_ins: packages, such as `"scipy.sparse"`, whose objects become `StandIn`s
+            instead of being refused. The packages are not imported.
 
-    **Raises:** `ValueError`, naming the file, if it is damaged or holds anything else.
+    **Raises:** `ValueError`, one line that names the file, if it is damaged or holds
+    anything else.
     """
-    allowed = _ALLOWED | dict(allow or {})
+    allowed = _Names(stand_ins)
     try:
         with path.open("rb") as file:
             head = file.read(8)
@@ -57,10 +96,10 @@ def restricted_load(path: Path, allow: Mapping[str, Any] | None = None) -> Any:
             if head.startswith(b"PK\x03\x04"):
                 return _load_zip(file, allowed)
             if head.startswith(b"\x93NUMPY"):
-                return load_array(file, allowed)
+                return _load_array(file, allowed)
             stream = _decompressed(file, head)
             start = stream.tell()
-            if stream.read(1) != b"\x80":
+            if not stream.read(2).startswith((b"\x80", *_TEXT_PICKLES)):
                 raise ValueError("neither a pickle nor an archive")
             stream.seek(start)
             return _Unpickler(stream, allowed).load()
@@ -72,7 +111,7 @@ def restricted_load(path: Path, allow: Mapping[str, Any] | None = None) -> Any:
         raise ValueError(f"{path}: not a readable result file ({what}).") from None
 
 
-def load_array(file: io.BufferedIOBase, allow: Mapping[str, Any] | None = None) -> Any:
+def _load_array(file: io.BufferedIOBase, allowed: _Names) -> Any:
     """Reads one array in NumPy's format; a lone pickled object is returned as it is."""
     version = np.lib.format.read_magic(file)
     reader = {
@@ -86,7 +125,7 @@ def load_array(file: io.BufferedIOBase, allow: Mapping[str, Any] | None = None) 
     if not dtype.hasobject:
         file.seek(start - 8)
         return np.lib.format.read_array(file, allow_pickle=False)
-    found = _Unpickler(file, _ALLOWED | dict(allow or {})).load()
+    found = _Unpickler(file, allowed).load()
     is_lone = shape == () and isinstance(found, np.ndarray) and found.size == 1
     return found.item() if is_lone else found
 
@@ -98,23 +137,21 @@ _Base: Any = getattr(pickle, "_Unpickler")
 class _Unpickler(_Base):
     dispatch = dict(_Base.dispatch)
 
-    def __init__(self, file: io.BufferedIOBase, allowed: Mapping[str, Any]):
+    def __init__(self, file: io.BufferedIOBase, allowed: _Names):
         # latin1 is what Python 2's arrays need.
         super().__init__(file, encoding="latin1")
         self.raw, self.allowed = file, allowed
 
     def find_class(self, module: str, name: str) -> Any:
-        key = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
-        if key not in self.allowed:
-            raise Refused(f"it wants to load {module}.{name}")
-        return self.allowed[key]
+        return self.allowed.find(module, name)
 
     def persistent_load(self, pid: Any) -> Any:
         raise Refused("it refers to data outside the file")
 
     def load_build(self) -> None:
         # Setting attributes of anything else could change this program's own functions.
-        if not isinstance(self.stack[-2], np.ndarray | np.dtype | _JoblibArray):
+        changeable = np.ndarray | np.dtype | _JoblibArray | StandIn
+        if not isinstance(self.stack[-2], changeable):
             raise Refused(f"it wants to change a {type(self.stack[-2]).__name__}")
         super().load_build()
         if isinstance(self.stack[-1], _JoblibArray):
@@ -153,7 +190,7 @@ class _Storage:
         self.dtype = np.dtype(dtype)
 
 
-def _load_zip(file: io.BufferedIOBase, allowed: Mapping[str, Any]) -> Any:
+def _load_zip(file: io.BufferedIOBase, allowed: _Names) -> Any:
     """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
     with zipfile.ZipFile(file) as archive:
         total = sum(entry.file_size for entry in archive.infolist())
@@ -162,7 +199,9 @@ def _load_zip(file: io.BufferedIOBase, allowed: Mapping[str, Any]) -> Any:
         pickles = [n for n in archive.namelist() if n.endswith("/data.pkl")]
         if not pickles:
             return {
-                n.removesuffix(".npy"): load_array(io.BytesIO(archive.read(n)), allowed)
+                n.removesuffix(".npy"): _load_array(
+                    io.BytesIO(archive.read(n)), allowed
+                )
                 for n in archive.namelist()
                 if n.endswith(".npy")
             }
@@ -239,18 +278,20 @@ def _parameter(data: Any, *_: Any) -> Any:
     return data
 
 
+def _reconstructor(cls: Any, _base: Any, _state: Any) -> StandIn:
+    """An instance of a new-style class, as Python 2 pickles it."""
+    if isinstance(cls, type) and issubclass(cls, StandIn):
+        return cls()
+    raise Refused(f"it wants to make a {cls}")
+
+
 _ALLOWED: dict[str, Any] = {
     "collections.OrderedDict": dict,
     "collections.defaultdict": lambda *_: {},
     "collections.deque": collections.deque,
-    "builtins.set": set,
-    "builtins.frozenset": frozenset,
-    "builtins.list": list,
-    "builtins.dict": dict,
-    "builtins.tuple": tuple,
-    "builtins.slice": slice,
-    "builtins.complex": complex,
-    "__builtin__.set": set,
+    "__builtin__.long": int,
+    "copy_reg._reconstructor": _reconstructor,
+    "copyreg._reconstructor": _reconstructor,
     "_codecs.encode": _encode,
     "pathlib.PosixPath": lambda *parts: "/".join(str(p) for p in parts),
     "numpy.ndarray": np.ndarray,
@@ -262,4 +303,14 @@ _ALLOWED: dict[str, Any] = {
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": _parameter,
     "torch.Size": tuple,
-} | {f"torch.{name}": _Storage(dtype) for name, dtype in _STORAGES.items()}
+}
+_ALLOWED |= {f"torch.{name}": _Storage(dtype) for name, dtype in _STORAGES.items()}
+_ALLOWED |= {
+    f"{module}.{kind.__name__}": kind
+    for module in ("builtins", "__builtin__")
+    for kind in (
+        *(object, list, dict, tuple, set, frozenset, slice),
+        *(int, float, complex),
+    )
+}
+"""What is called for each name; every other one is refused."""

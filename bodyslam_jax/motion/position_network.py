@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from bodyslam_jax.body.skeleton import ANKLES, FEET
 from bodyslam_jax.motion import rotations
 from bodyslam_jax.motion.network import (
     Guess,
@@ -21,7 +22,7 @@ from bodyslam_jax.motion.network import (
 
 SEEN = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
 """Joints whose positions the default network sees: legs, spine, head, hands."""
-CONTACTS = (7, 8, 10, 11)
+CONTACTS = (*ANKLES, *FEET)
 """Joints that may stand on the ground: ankles and feet."""
 
 

@@ -5,7 +5,6 @@ and metrics.
 """
 
 import json
-import os
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bodyslam_jax.io import atomic
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
@@ -61,11 +61,7 @@ def save_motion_model(
         for i, x in enumerate(jax.tree.leaves(network))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with open(partial, "wb") as file:
-        about = np.array(json.dumps(header))
-        np.savez_compressed(file, allow_pickle=False, header=about, **leaves)
-    os.replace(partial, path)
+    atomic.write_npz(path, {"header": np.array(json.dumps(header)), **leaves})
 
 
 def load_motion_model(path: Path | str | None = None) -> MotionModel:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Detect
-from bodyslam_jax.io import BODY25_FROM
+from bodyslam_jax.io import BODY25_FROM, atomic
 from bodyslam_jax.people.networks import check_onnxruntime, make_session
 
 log = logging.getLogger(__name__)
@@ -260,15 +260,13 @@ def _session(own: str | None, model: Model, offline: bool) -> Any:
 
 
 def _fetch(model: Model, path: Path) -> None:
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    try:
-        with urllib.request.urlopen(model.url, timeout=30) as source:
-            with partial.open("wb") as target:
-                while block := source.read(1 << 20):
-                    target.write(block)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with (
+        atomic.replacing(path) as partial,
+        urllib.request.urlopen(model.url, timeout=30) as source,
+        partial.open("wb") as target,
+    ):
+        while block := source.read(1 << 20):
+            target.write(block)
 
 
 def _sha256(path: Path) -> str:

@@ -11,7 +11,6 @@ import functools
 import hashlib
 import json
 import logging
-import os
 import typing
 import zipfile
 import zlib
@@ -22,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyslam_jax.body import search_paths
+from bodyslam_jax.io import atomic
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -157,15 +157,7 @@ def save(path: Path, value: Any) -> None:
     arrays: dict[str, np.ndarray] = {}
     header = _encode(value, "", arrays)
     blob = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    partial = path.with_suffix(".partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez(file, __header__=blob, **arrays)  # pyright: ignore[reportArgumentType]
-        os.replace(partial, path)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-    finally:
-        partial.unlink(missing_ok=True)
+    atomic.write_npz(path, {"__header__": blob, **arrays}, compressed=False)
 
 
 def load(path: Path, kind: type[T]) -> T:

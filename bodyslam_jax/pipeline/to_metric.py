@@ -9,15 +9,13 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import people
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
 from bodyslam_jax.geometry.so3 import log
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
-
-FEET = [10, 11]
-"""SMPL's toe joints."""
 
 
 def assemble(
@@ -36,7 +34,7 @@ def assemble(
     turn, found = level(
         T_WC,
         T_WC @ joint.roots,
-        joints[:, :, FEET],
+        joints[:, :, list(FEET)],
         joint.present,
         landmarks if cameras.kind == "moving" else landmarks[:0],
         sequence.fps,
@@ -103,11 +101,11 @@ def floor_height(
     `joints` are in a world whose y axis is up, m.
     """
     sole = np.median([sole_height(body, shape) for shape in shapes])
-    stances = find_stances(joints[:, :, FEET], present, fps)
+    stances = find_stances(joints[:, :, list(FEET)], present, fps)
     heights = np.concatenate([places[:, 1] for places in stances])
     if len(heights):
         return float(np.median(heights) - sole)
-    lowest = joints[present][:, FEET, 1].min(axis=1)
+    lowest = joints[present][:, list(FEET), 1].min(axis=1)
     return float(np.quantile(lowest, 0.05) - sole)
 
 
@@ -116,7 +114,7 @@ def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float
     template = np.asarray(body.template, np.float64)[:, 1]
     skin = template + np.asarray(body.shape_dirs, np.float64)[:, 1] @ shape
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(shape)))
-    return float(rest[FEET, 1].mean() - skin.min())
+    return float(rest[list(FEET), 1].mean() - skin.min())
 
 
 def _smoothed(sequence, config, present, poses, pelvis):

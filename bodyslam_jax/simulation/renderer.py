@@ -7,7 +7,6 @@ All textures lie, at every resolution, in one image, so that a frame is looked u
 once. The bodies' small triangles go through a z-buffer.
 """
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.atlas import LEVELS, pack, pyramid
 from bodyslam_jax.simulation.outfit import Figure
@@ -344,13 +344,13 @@ def write_video(
 
     **Raises:** `ValueError` if OpenCV cannot write one.
     """
-    partial = path.with_name(f"partial-{path.name}")
-    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-    if not writer.isOpened():
-        raise ValueError(f"{path}: OpenCV cannot write MPEG-4 video there.")
-    try:
-        for frame in frames:
-            writer.write(frame)
-    finally:
-        writer.release()
-    os.replace(partial, path)
+    code = cv2.VideoWriter.fourcc(*"mp4v")
+    with atomic.replacing(path) as partial:
+        writer = cv2.VideoWriter(str(partial), code, fps, size)
+        if not writer.isOpened():
+            raise ValueError(f"{path}: OpenCV cannot write MPEG-4 video there.")
+        try:
+            for frame in frames:
+                writer.write(frame)
+        finally:
+            writer.release()

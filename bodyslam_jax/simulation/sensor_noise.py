@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import KEYPOINT_SPREAD
+from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.simulation.posing import Person
 
@@ -114,7 +115,7 @@ def noise_of_bodies(settings: Simulation) -> Noise:
     )
 
 
-_HANDS_FEET = np.isin(np.arange(24), (7, 8, 10, 11, 20, 21, 22, 23))
+_HANDS_FEET = np.isin(np.arange(24), (*ANKLES, *FEET, *WRISTS, *HANDS))
 
 
 def ar1(

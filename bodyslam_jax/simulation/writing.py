@@ -6,7 +6,6 @@ import functools
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.export import write_tum
+from bodyslam_jax.io import atomic, write_body, write_tum
 from bodyslam_jax.simulation.camera_paths import FPS
 from bodyslam_jax.simulation.outfit import dress
 from bodyslam_jax.simulation.renderer import Renderer, write_video
@@ -215,25 +214,16 @@ def _shapes_regressed(simulated: SimulatedSequence) -> bool:
 @contextlib.contextmanager
 def _partial(folder: Path, settings: Simulation) -> Iterator[Path]:
     """A hidden folder in `folder`, gone afterwards, with every folder made in vain."""
-    home, made = Path(os.path.realpath(folder)), []
     try:
         _check(folder, settings)
-        made = [place for place in (home, *home.parents) if not place.exists()]
-        home.mkdir(parents=True, exist_ok=True)
+        home = Path(os.path.realpath(folder))
         for killed in home.glob(f"{_PARTIAL}????????"):
             shutil.rmtree(killed, ignore_errors=True)
-        partial = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=home))
-        try:
+        with atomic.hidden_folder(home, _PARTIAL) as partial:
             yield partial
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"{folder}: cannot be written ({reason}).") from None
-    finally:
-        for place in made:
-            with contextlib.suppress(OSError):
-                place.rmdir()
 
 
 def _check(folder: Path, settings: Simulation) -> None:
@@ -315,14 +305,13 @@ def _write(
     write_tum(truth / "camera.txt", simulated.timestamps, simulated.T_WC)
     np.save(truth / "landmarks.npy", simulated.landmarks)
     for h, actor in enumerate(simulated.actors):
-        np.savez_compressed(
+        write_body(
             truth / ("body.npz" if not simulated.others else f"body_{h}.npz"),
-            poses=actor.poses,
-            trans=actor.trans,
-            betas=actor.person.shape,
+            actor.poses,
+            actor.trans,
+            actor.person.shape,
+            fps=FPS,
             joints=actor.joints,
-            mocap_framerate=np.array(FPS),
-            gender=np.array("neutral"),
         )
     if simulated.settings.render:
         write_video(folder / _FILM, render(simulated), FPS, simulated.size)

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.export.folder import write_body, write_tum
+from bodyslam_jax.io import atomic, write_body, write_tum
 
 FPS = 30.0
 """Of all three data sets."""
@@ -33,21 +32,14 @@ def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: a file; expected a folder to write.")
     try:
-        home = out.resolve().parent
-        home.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=".conversion-", dir=home))
+        with atomic.hidden_folder(out.resolve().parent, ".conversion-") as partial:
+            yield partial
+            mark = {"dataset": dataset, "source": str(source.resolve())}
+            (partial / _MARK).write_text(json.dumps(mark) + "\n")
+            partial.chmod(0o755)
+            _move(partial, out)
     except OSError as error:
         raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
-    try:
-        yield partial
-        mark = {"dataset": dataset, "source": str(source.resolve())}
-        (partial / _MARK).write_text(json.dumps(mark) + "\n")
-        partial.chmod(0o755)
-        _move(partial, out)
-    except OSError as error:
-        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _move(partial: Path, out: Path) -> None:

@@ -6,13 +6,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
 from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
 from bodyslam_jax.graph.factors.human_motion import unit_length
 from bodyslam_jax.graph.keypoint_jacobian import turning_joints
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
-BODY25_FEET = (19, 21, 22, 24)
+BODY25_FEET = BODY25_TOES_AND_HEELS
 """Big toe and heel, left and right."""
 
 

@@ -1,9 +1,12 @@
-"""AMASS-style motion of one body -> rows for the frames of a video."""
+"""Motion of one body in AMASS's style: written, and read for the frames of a video."""
+
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.io.atomic import write_npz
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
 from bodyslam_jax.io.frame_index import InvalidContent
@@ -72,6 +75,21 @@ def from_amass(data: dict, video: Video) -> Rows:
         trans,
         shapes_regressed=smplx,
     )
+
+
+def write_body(
+    path: Path,
+    poses: Float[np.ndarray, "t 72"],
+    trans: Float[np.ndarray, "t 3"],
+    betas: Float[np.ndarray, " 10"],
+    fps: float,
+    gender: str = "neutral",
+    **more: np.ndarray,
+) -> None:
+    """Writes one person in AMASS's style, at `fps` (1/s), with any `more` arrays."""
+    person = {"poses": poses, "trans": trans, "betas": betas}
+    rate = {"mocap_framerate": np.array(fps), "gender": np.array(gender)}
+    write_npz(path, person | rate | more)
 
 
 def body_pose(poses: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "t 72"]:

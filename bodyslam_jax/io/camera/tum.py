@@ -1,4 +1,7 @@
-"""Trajectories in the format of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
+"""Trajectories in the format of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
+
+A line is `timestamp tx ty tz qx qy qz qw`: s, m, camera to world; `#` starts a comment.
+"""
 
 from pathlib import Path
 
@@ -9,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
     """Timestamps (s) and poses (camera to world, m) of a TUM trajectory, sorted.
-
-    A line is `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
 
     **Raises:** `ValueError` naming the file, what was found and what was expected.
     """
@@ -47,3 +48,16 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     T_WC[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
     T_WC[:, :3, 3] = table[:, 1:4]
     return table[:, 0], T_WC
+
+
+def write_tum(
+    path: Path, timestamps: Float[np.ndarray, " t"], T_WC: Float[np.ndarray, "t 4 4"]
+) -> None:
+    """Writes timestamps (s) and poses (camera to world, m) as a TUM trajectory."""
+    xyzw = Rotation.from_matrix(T_WC[:, :3, :3]).as_quat()
+    np.savetxt(
+        path,
+        np.column_stack([timestamps, T_WC[:, :3, 3], xyzw]),
+        fmt="%.9f",
+        header="timestamp tx ty tz qx qy qz qw (camera to world)",
+    )

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.body.skeleton import BODY25_FACE
 from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.io.keypoints.files import Listed
 from bodyslam_jax.io.keypoints.layout_evidence import choose_layout
@@ -19,7 +20,6 @@ _USABLE = 4
 _ALL_LIE = 0.85
 """Share of the people and frames who lie on their side from which it is no posture."""
 _AGREED = 0.7
-_FACE = {0, 15, 16}
 _FEWEST = 10
 
 
@@ -48,7 +48,8 @@ def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "
             points = points[..., [1, 0, 2]]
         points, order = _in_order(path, points, layout, listed, warn)
         from_rows = order is VITPOSE and not listed.row_first
-        points = _right_way_round(points, _FACE <= set(order), from_rows, warn)
+        has_face = set(BODY25_FACE) <= set(order)
+        points = _right_way_round(points, has_face, from_rows, warn)
         for k, row in zip(rows, points, strict=True):
             found[k] = row
     return found

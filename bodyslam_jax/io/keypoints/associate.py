@@ -9,15 +9,11 @@ import dataclasses
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from bodyslam_jax.body.skeleton import BODY25_MIRRORED
 from bodyslam_jax.config import Association
 from bodyslam_jax.io.keypoints.reader import Detections
 from bodyslam_jax.types import Keypoints
 
-_EXCHANGED = np.array(
-    [0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11]
-    + [16, 15, 18, 17, 22, 23, 24, 19, 20, 21]
-)
-"""BODY_25 with left and right exchanged."""
 _FEWEST, _MANY = 3, 8
 """Keypoints from which sizes are compared, and are comparable."""
 _GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
@@ -176,7 +172,7 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
     size = max(_size(points), _size(expected), 1.0)
     # The median forgives a swapped or lost limb, which a mean would not; whoever is
     # named left for right in all of them is the same person, too.
-    other = points[_EXCHANGED]
+    other = points[list(BODY25_MIRRORED)]
     crossed = (other[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
     away = lambda p, seen: np.median(np.linalg.norm((p - expected)[seen, :2], axis=-1))
     distance = away(points, both)

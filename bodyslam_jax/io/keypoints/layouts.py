@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.body.skeleton import BODY25
+
 _COCO17 = [0, -1, 6, 8, 10, 5, 7, 9, -1, 12, 14, 16, 11, 13, 15, 2, 1, 4, 3]
 _COCO18 = [0, 1, 2, 3, 4, 5, 6, 7, -1, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17]
 _HALPE = [0, 18, *_COCO17[2:8], 19, *_COCO17[9:], 20, 22, 24, 21, 23, 25]
@@ -56,7 +58,11 @@ LAYOUTS: dict[int, dict[str, list[int]]] = {
 """By the number of keypoints: layouts that have as many, the one that is assumed first.
 For each of their points its part, or -1."""
 
-_NECK, _R_SHOULDER, _L_SHOULDER, _MID_HIP, _R_HIP, _L_HIP = 1, 2, 5, 8, 9, 12
+_MIDPOINTS = (
+    (BODY25["neck"], BODY25["right_shoulder"], BODY25["left_shoulder"]),
+    (BODY25["mid_hip"], BODY25["right_hip"], BODY25["left_hip"]),
+)
+"""Keypoints that are the middle of two others."""
 
 
 def to_body25(path: Path, points: np.ndarray) -> np.ndarray:
@@ -83,10 +89,7 @@ def from_layout(points: np.ndarray, layout: list[int]) -> np.ndarray:
 
 def _gathered(points: np.ndarray, index: np.ndarray) -> np.ndarray:
     found = np.where((index >= 0)[:, None], points[..., index, :], 0.0)
-    for missing, a, b in (
-        (_NECK, _R_SHOULDER, _L_SHOULDER),
-        (_MID_HIP, _R_HIP, _L_HIP),
-    ):
+    for missing, a, b in _MIDPOINTS:
         if index[missing] < 0:
             # As OpenPose was trained: the middle of the pair, if both were seen.
             found[..., missing, :2] = (found[..., a, :2] + found[..., b, :2]) / 2

@@ -10,12 +10,15 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.body.skeleton import BODY25, BODY25_FACE, BODY25_TOES_AND_HEELS
+
 _SEEN = 0.05
 _SURE = 0.3
-_NECK, _MID_HIP = 1, 8
-_FACE = (0, 15, 16)
-_RIGHT, _LEFT = (2, 9), (5, 12)
-_FEET = ((19, 21), (22, 24))
+_NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
+_RIGHT, _LEFT = (
+    (BODY25[f"{side}_shoulder"], BODY25[f"{side}_hip"]) for side in ("right", "left")
+)
+_FEET = (BODY25_TOES_AND_HEELS[:2], BODY25_TOES_AND_HEELS[2:])
 """Toe and heel of either foot."""
 _STEEP = 35.0
 """degrees from the image's rows, that the trunk of who lies is at most."""
@@ -77,9 +80,9 @@ def _facing(
     are lower in an upright image than the heels, as the camera is above the ground. Of
     who lies with the head to the left, lower is further to the right.
     """
-    face = sure[:, list(_FACE)].sum(axis=1) >= 2
+    face = sure[:, list(BODY25_FACE)].sum(axis=1) >= 2
     if has_face and face.mean() <= _ALWAYS:
-        none = (points[:, list(_FACE), 2] <= _SEEN).all(axis=1)
+        none = (points[:, list(BODY25_FACE), 2] <= _SEEN).all(axis=1)
         return np.where(face, 1.0, np.where(none, -1.0, 0.0))
     lower = np.zeros((len(_FEET), len(points)))
     for row, (toe, heel) in zip(lower, _FEET, strict=True):

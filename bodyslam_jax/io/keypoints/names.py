@@ -4,51 +4,52 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from bodyslam_jax.body.skeleton import BODY25
 from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, SPINE
 
 _MIDDLE = {
-    "nose": 0,
-    "neck": 1,
-    "thorax": 1,
-    "midshoulder": 1,
-    "hip": 8,
-    "hips": 8,
-    "midhip": 8,
-    "hipcenter": 8,
-    "hipscenter": 8,
-    "centerhip": 8,
-    "pelvis": 8,
-    "root": 8,
-    "head": HEAD_TOP,
-    "headtop": HEAD_TOP,
-    "tophead": HEAD_TOP,
-    "spine": SPINE,
-    "torso": SPINE,
+    "nose": BODY25["nose"],
+    **dict.fromkeys(("neck", "thorax", "midshoulder"), BODY25["neck"]),
+    **dict.fromkeys(
+        ("hip", "hips", "midhip", "hipcenter", "hipscenter", "centerhip"),
+        BODY25["mid_hip"],
+    ),
+    **dict.fromkeys(("pelvis", "root"), BODY25["mid_hip"]),
+    **dict.fromkeys(("head", "headtop", "tophead"), HEAD_TOP),
+    **dict.fromkeys(("spine", "torso"), SPINE),
 }
-_SIDED = {  # right, left
-    "shoulder": (2, 5),
-    "sho": (2, 5),
-    "elbow": (3, 6),
-    "elb": (3, 6),
-    "wrist": (4, 7),
-    "wri": (4, 7),
-    "hip": (9, 12),
-    "knee": (10, 13),
-    "ankle": (11, 14),
-    "ank": (11, 14),
-    "eye": (15, 16),
-    "ear": (17, 18),
-    "bigtoe": (22, 19),
-    "toe": (22, 19),
-    "footindex": (22, 19),
-    "smalltoe": (23, 20),
-    "littletoe": (23, 20),
-    "heel": (24, 21),
-}
-_ELSE = {"hand": (4, 7), "foot": (11, 14)}
+
+
+def _sided(**parts: str) -> dict[str, tuple[int, int]]:
+    """Right and left keypoint of each part of BODY_25, by each word for it."""
+    return {
+        word: (BODY25[f"right_{part}"], BODY25[f"left_{part}"])
+        for part, words in parts.items()
+        for word in words.split()
+    }
+
+
+_SIDED = _sided(
+    shoulder="shoulder sho",
+    elbow="elbow elb",
+    wrist="wrist wri",
+    hip="hip",
+    knee="knee",
+    ankle="ankle ank",
+    eye="eye",
+    ear="ear",
+    big_toe="bigtoe toe footindex",
+    small_toe="smalltoe littletoe",
+    heel="heel",
+)
+_ELSE = _sided(wrist="hand", ankle="foot")
 """What some call wrist and ankle, where nothing else is called so."""
 _RIGHT, _LEFT = {"right", "r"}, {"left", "l"}
-_LIMBS = {2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14}
+_LIMBS = {
+    BODY25[f"{side}_{part}"]
+    for side in ("right", "left")
+    for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+}
 _FEWEST = 8
 """Of the twelve joints of the limbs: as many must be named."""
 

@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import TypeVar
 from zipfile import BadZipFile
@@ -14,6 +13,7 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.io import atomic
 from bodyslam_jax.motion.training.sampling import Corpus
 
 Tree = TypeVar("Tree")
@@ -34,12 +34,7 @@ def save_checkpoint(path: Path, progress: object, mark: str) -> None:
         f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(progress))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial.npz")
-    with open(partial, "wb") as file:
-        np.savez(file, allow_pickle=False, mark=np.array(mark), **leaves)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+    atomic.write_npz(path, {"mark": np.array(mark), **leaves}, compressed=False)
 
 
 def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:

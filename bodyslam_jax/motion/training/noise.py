@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
 from bodyslam_jax.motion.rotations import turned
 
 CORRELATION = 0.96
 """Correlation of the slow error from one frame at 30 fps to the next."""
 
-_EXTREMITIES = (7, 8, 10, 11, 20, 21, 22, 23)
+_EXTREMITIES = (*ANKLES, *FEET, *WRISTS, *HANDS)
 JOINT_FACTOR = np.where(np.isin(np.arange(24), _EXTREMITIES), 1.5, 1.0)
 """Hands and feet err half as much again."""
 
