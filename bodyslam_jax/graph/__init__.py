@@ -15,9 +15,9 @@ from bodyslam_jax.graph.factors.body_pose import Stature as Stature
 from bodyslam_jax.graph.factors.body_pose import rotation_between as rotation_between
 from bodyslam_jax.graph.factors.camera import AspectRatioPrior as AspectRatioPrior
 from bodyslam_jax.graph.factors.camera import CameraPrior as CameraPrior
-from bodyslam_jax.graph.factors.camera import CameraSmoothness as CameraSmoothness
 from bodyslam_jax.graph.factors.camera import IntrinsicsPrior as IntrinsicsPrior
 from bodyslam_jax.graph.factors.camera import ScalePrior as ScalePrior
+from bodyslam_jax.graph.factors.ground import HEELS_AND_TOES as HEELS_AND_TOES
 from bodyslam_jax.graph.factors.ground import GroundContact as GroundContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion
 from bodyslam_jax.graph.factors.human_motion import (
@@ -35,9 +35,7 @@ from bodyslam_jax.graph.factors.root import RootOrientation as RootOrientation
 from bodyslam_jax.graph.factors.root import RootPositionPrior as RootPositionPrior
 from bodyslam_jax.graph.factors.root import RootSmoothness as RootSmoothness
 from bodyslam_jax.graph.factors.root import UprightPrior as UprightPrior
-from bodyslam_jax.graph.factors.stance import BODY25_FEET as BODY25_FEET
-from bodyslam_jax.graph.factors.stance import StanceFoot as StanceFoot
-from bodyslam_jax.graph.factors.stance import stance_mask as stance_mask
+from bodyslam_jax.graph.keypoint_jacobian import turning_joints as turning_joints
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout
 from bodyslam_jax.graph.layout import round_up as round_up

@@ -24,7 +24,6 @@ from bodyslam_jax.graph.factors.root import (
     RootPositionPrior,
     UprightPrior,
 )
-from bodyslam_jax.graph.factors.stance import StanceFoot
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation_weights import check_early, check_loss, check_runs
@@ -87,9 +86,6 @@ def check_factor(factor: Factor, sizes: Sizes) -> None:
                 f"{sorted(KEYPOINT_NAMES)}."
             )
         sizes["j"] = len(KEYPOINT_NAMES[factor.layout])
-    if isinstance(factor, StanceFoot):
-        sizes["f"] = len(factor.points)
-        _check_range(f"{name}.points", np.array(factor.points, int), 25)
     check_shapes(factor, name, sizes)
     if isinstance(factor, FrameFactor):
         _check_frames(factor, name, sizes)

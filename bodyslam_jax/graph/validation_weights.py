@@ -9,7 +9,6 @@ import numpy as np
 
 from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
-from bodyslam_jax.graph.factors.camera import CameraSmoothness
 from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
 from bodyslam_jax.graph.factors.root import (
     AngularAccelerationPrior,
@@ -17,7 +16,6 @@ from bodyslam_jax.graph.factors.root import (
     RootPositionPrior,
     RootSmoothness,
 )
-from bodyslam_jax.graph.factors.stance import StanceFoot
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
@@ -30,8 +28,6 @@ _EARLY = (
     (RootOrientation, "correlation", 1, 0.0),
     (RootPositionPrior, "correlation", 1, 0.0),
     (RelativeOrientation, "sigma", 1, np.inf),
-    (StanceFoot, "sigma", 1, np.inf),
-    (CameraSmoothness, "sigma", 2, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
     (AngularAccelerationPrior, "sigma", 2, np.inf),
 )

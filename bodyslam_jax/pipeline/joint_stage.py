@@ -123,9 +123,7 @@ def prepare(
                 shared_error=shared,
                 without=carried,
             ),
-            *initialisation.optional_factors(
-                state, seen, there, sequence.fps, body, weights
-            ),
+            *initialisation.optional_factors(seen, sequence.fps, weights),
         ]
         if moving:
             contact = initialisation.ground_contact(
@@ -221,7 +219,6 @@ def _settle_people(
         graph.HumanMotion,
         graph.RelativeOrientation,
         graph.RootSmoothness,
-        graph.StanceFoot,
         graph.GroundContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")

@@ -105,33 +105,3 @@ class AspectRatioPrior(AbstractIntrinsicsFactor):
 
     def frame_residual(self, data, window, shared):
         return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data
-
-
-class CameraSmoothness(FrameFactor):
-    """The camera keeps its velocity: turn and shift, against those before.
-
-    `(Log(C_{k-1}^T C_k) - Log(C_{k-2}^T C_{k-1})) / σ_1` of C = C_WC, in rad per frame
-    squared, and `(r'_k - 2 r'_{k-1} + r'_{k-2}) / σ_2` of r' = r'_WC, in units of the
-    map per frame squared: in metres, it would draw s towards 0.
-    """
-
-    sigma: Float[Array, "t 2"]
-    """Per frame squared: rad, units of the map; `inf` for the first two frames."""
-    loss: Loss = Squared()
-    of_people = False
-    time_fields = ("sigma",)
-    padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("camera", 0), ("camera", 1), ("camera", 2)
-
-    def data(self):
-        return self.sigma
-
-    def frame_residual(self, data, window, shared):
-        now, before, first = (f.camera for f in window)
-        turn = log(before[:3, :3].T @ now[:3, :3])
-        turn = turn - log(first[:3, :3].T @ before[:3, :3])
-        shift = now[:3, 3] - 2 * before[:3, 3] + first[:3, 3]
-        return jnp.concatenate([turn / data[0], shift / data[1]])

@@ -7,7 +7,6 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
-from bodyslam_jax.graph.factors.stance import BODY25_FEET
 from bodyslam_jax.graph.keypoint_jacobian import (
     keypoint_jacobian,
     turning_joints,
@@ -15,6 +14,8 @@ from bodyslam_jax.graph.keypoint_jacobian import (
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
+HEELS_AND_TOES = (19, 21, 22, 24)
+"""Big toe and heel among the keypoints of BODY_25, left and right."""
 SOLE = 0.018
 """How far the points of the feet lie above what the sole stands on, m."""
 _SOFTNESS = 0.01
@@ -47,7 +48,7 @@ class GroundContact(FrameFactor):
 
     @property
     def limbs(self) -> Limbs:
-        return (turning_joints(self.body, "body25", BODY25_FEET),)
+        return (turning_joints(self.body, "body25", HEELS_AND_TOES),)
 
     def data(self):
         return self.sigma
@@ -59,7 +60,7 @@ class GroundContact(FrameFactor):
     def jacobian(self, data, window, shared):
         (frame,) = window
         points = keypoint_jacobian(self.body, frame.pose, shared.shape, "body25", 0.0)
-        feet = np.array(BODY25_FEET)
+        feet = np.array(HEELS_AND_TOES)
         p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
         height, up_C = self._heights(p_H, frame, shared)
         share = jax.nn.softmax(-height / _SOFTNESS)
@@ -92,7 +93,7 @@ class GroundContact(FrameFactor):
 
     def _lowest(self, frame, shared):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
-        height, _ = self._heights(p_H[np.array(BODY25_FEET)], frame, shared)
+        height, _ = self._heights(p_H[np.array(HEELS_AND_TOES)], frame, shared)
         return _soft_minimum(height)
 
     def _heights(self, p_H, frame, shared):
