@@ -152,7 +152,7 @@ def landmark_prior(rng, state, seen=None):
         whitening[~np.isin(np.arange(l), np.asarray(seen.landmark))] = 0.0
     away = 0.05 * rng.standard_normal((l, 3))
     return g.LandmarkPrior(
-        place=state.landmarks + away, whitening=jnp.asarray(whitening)
+        position=state.landmarks + away, whitening=jnp.asarray(whitening)
     )
 
 
@@ -206,7 +206,7 @@ def extra_factors(rng, state, seen=None):
             correlation=g.ar1_correlation(there, 0.9),
         ),
         g.RootPositionPrior(
-            place=state.roots[..., :3, 3] + 0.1,
+            position=state.roots[..., :3, 3] + 0.1,
             sigma=jnp.full((h, t, 2), 0.05),
             correlation=g.ar1_correlation(there, 0.9),
         ),

@@ -128,7 +128,7 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("Reprojection", "sigma", lambda x: x.at[0].set(0.0), "above 0"),
         ("Reprojection", "loss", g.Cauchy(0.0), "loss.scale: found 0.0"),
         ("Reprojection", "loss", g.Cauchy(float("nan")), "not finite"),
-        ("LandmarkPrior", "place", lambda x: x[:5], "(5, 3), expected (6, 3)"),
+        ("LandmarkPrior", "position", lambda x: x[:5], "(5, 3), expected (6, 3)"),
         ("LandmarkPrior", "whitening", ones(L, 3, 3), "1 landmarks have a prior"),
         ("KeypointReprojection", "pixel", NAN, "not finite"),
         ("KeypointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
@@ -155,7 +155,7 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("RootOrientation", "orientation", zeros(1, T, 3, 3), "no rigid rotations"),
         (
             "RootPositionPrior",
-            "place",
+            "position",
             zeros(1, T, 3),
             "a depth of 0.0 m, expected above 0",
         ),

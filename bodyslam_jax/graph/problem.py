@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
-from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
-from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
-from bodyslam_jax.graph.factors.landmark import LandmarkPrior
+from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
+from bodyslam_jax.graph.factors.human_motion import HumanMotion
+from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
