@@ -2,9 +2,8 @@
 
     python benchmarks/bench_motion_coupling.py accuracy --sequences M2-room E2-follow
     python benchmarks/bench_motion_coupling.py drift --sequences E2-follow --hold-shape
-    python benchmarks/bench_motion_coupling.py cost --frames 1000
 
-`accuracy`: errors, steps and processor time of the ways, on simulated sequences.
+`accuracy`: errors, steps and processor time of the two, on simulated sequences.
 `drift`: are people bent to postures whose prediction fits a wrong scale? Cameras are
 held, and so is a scale that is wrong by 20 %: how far do predicted steps follow it? And
 with the scale free from there, where does it end? With `--hold-shape` the body cannot
@@ -22,18 +21,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import solver_scene
-from solver_clock import timed
 
 from bodyslam_jax import evaluation, graph, solver
-from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.experiments.scenario import make_case
 from bodyslam_jax.experiments.scoring import trajectories
-from bodyslam_jax.motion import load_motion_model, make_clock, predict_between
-from bodyslam_jax.pipeline.joint_stage import COUPLED_OUTPUTS
 
-WAYS = ("frozen", "refreshed", "displacement", "full")
+WAYS = ("frozen", "refreshed")
 WRONG = (0.8, 1.2)
 
 
@@ -45,12 +39,9 @@ def cases(names, frames, cache, config):
 
 
 def problem_for(prepared, way):
-    """The same factors and start with another way; `frozen` predicts no more."""
+    """The same factors and start; `frozen` keeps the prediction that they hold."""
     problem = prepared.problem
-    if way == "frozen":
-        return dataclasses.replace(problem, motion=None)
-    motion = dataclasses.replace(problem.motion, coupled=COUPLED_OUTPUTS[way])
-    return dataclasses.replace(problem, motion=motion)
+    return dataclasses.replace(problem, motion=None) if way == "frozen" else problem
 
 
 def run(problem, state, repeats=1):
@@ -165,35 +156,12 @@ def drift(args, config):
                 )
 
 
-def cost(args, config):
-    """Processor time of a prediction, and of its share of the gradient, ms."""
-    del config
-    problem, _, start = solver_scene.make(args.frames)
-    model = load_motion_model(None)
-    clock = make_clock(np.arange(args.frames) / model.fps, model.fps)
-    present = jnp.ones((1, args.frames), bool)
-    predictor = graph.MotionPredictor(
-        predict_between, (model, clock), load_body_model(), present, ("translation",)
-    )
-    problem = dataclasses.replace(problem, motion=predictor)
-    follow = eqx.filter_jit(lambda p, s: p.follow(s).factors[2].translation)
-
-    @eqx.filter_jit
-    def share(problem, state):
-        cost = lambda step: problem.follow(state.retract(step)).factors[2].cost(state)
-        return jax.grad(cost)(state.zero_step())
-
-    for name, function in (("prediction", follow), ("with its gradient", share)):
-        _, _, (_, cpu) = timed(lambda f=function: f(problem, start), 5)
-        print(f"{args.frames} frames: {name} {1e3 * cpu:.0f} ms", flush=True)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("accuracy", "drift", "cost"))
+    parser.add_argument("what", choices=("accuracy", "drift"))
     parser.add_argument("--sequences", nargs="+", default=["M2-room", "E2-follow"])
     parser.add_argument("--frames", type=int, default=150)
-    parser.add_argument("--ways", nargs="+", default=WAYS[:3], choices=WAYS)
+    parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS)
     parser.add_argument("--hold-shape", action="store_true", help="in `drift`")
     parser.add_argument("--cache", type=Path, help="keeps stages before the solve")
     parser.add_argument("--weights", choices=("default", "paper"), default="default")
@@ -201,7 +169,7 @@ def main():
     jax.config.update("jax_enable_x64", True)
     paper = GraphWeights.paper() if args.weights == "paper" else GraphWeights()
     config = Config(weights=paper)
-    {"accuracy": accuracy, "drift": drift, "cost": cost}[args.what](args, config)
+    {"accuracy": accuracy, "drift": drift}[args.what](args, config)
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def joint_cg(problem, start, rtol):
 
     def run():
         state, *_ = baselines.optimistix_cg(problem, start, stage)
-        return float(cost_of(problem.follow(state), state))
+        return float(cost_of(problem, state))
 
     cost, _, seconds = timed(run, 1)
     return f"optimistix LM with CG, {CG_STEPS} steps at most", [cost], seconds
@@ -90,7 +90,7 @@ def joint_adam(problem, start, name):
                 held, state, stage, float(rate), decays=decays
             )
             curves.append(np.asarray(costs))
-        cost = float(cost_of(problem.follow(state), state))
+        cost = float(cost_of(problem, state))
         return np.append(np.concatenate(curves), cost)
 
     costs, _, seconds = timed(run, 1)

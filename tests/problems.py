@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import scenes
 from jax.flatten_util import ravel_pytree
+from own_factors import CameraSmoothness
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
@@ -52,7 +53,7 @@ def make(
         factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
     if steady:
         sigma = jnp.full((frames, 2), 0.05).at[:2].set(jnp.inf)
-        factors.append(g.CameraSmoothness(sigma=sigma))
+        factors.append(CameraSmoothness(sigma=sigma))
     if extras:
         factors += scenes.extra_factors(rng, state, factors[0])
     problem = g.make_problem(factors, state, **options)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from own_factors import CameraSmoothness, StillFeet
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
@@ -151,7 +152,7 @@ def landmark_prior(rng, state, seen=None):
         whitening[~np.isin(np.arange(l), np.asarray(seen.landmark))] = 0.0
     away = 0.05 * rng.standard_normal((l, 3))
     return g.LandmarkPrior(
-        place=state.landmarks + away, whitening=jnp.asarray(whitening)
+        position=state.landmarks + away, whitening=jnp.asarray(whitening)
     )
 
 
@@ -195,7 +196,7 @@ def extra_factors(rng, state, seen=None):
             height=jnp.full((h, t), 1.8),
             sigma=jnp.full((h, t), jnp.inf).at[:, 1].set(0.02),
         ),
-        g.CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
+        CameraSmoothness(sigma=jnp.full((t, 2), 0.05).at[:2].set(jnp.inf)),
         g.RootSmoothness(sigma=late(h, t, skip=2)),
         g.RootSmoothness(sigma=late(h, t, skip=2), body=body),
         g.AngularAccelerationPrior(sigma=late(h, t, skip=2)),
@@ -205,11 +206,11 @@ def extra_factors(rng, state, seen=None):
             correlation=g.ar1_correlation(there, 0.9),
         ),
         g.RootPositionPrior(
-            place=state.roots[..., :3, 3] + 0.1,
+            position=state.roots[..., :3, 3] + 0.1,
             sigma=jnp.full((h, t, 2), 0.05),
             correlation=g.ar1_correlation(there, 0.9),
         ),
-        g.StanceFoot(body=body, sigma=late(h, t, 4, skip=1)),
+        StillFeet(body=body, sigma=late(h, t, 4, skip=1)),
         g.UprightPrior(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
             body=body,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
+from own_factors import StillFeet
 from problems import make, structured_step
 
 import bodyslam_jax.graph as g
@@ -106,8 +107,8 @@ def test_limbs_are_what_factors_see_together():
     assert tuple(found) == legs
     assert trunk == (2, 5, 8, *range(11, 19))
     extras = scenes.extra_factors(rng, state)
-    stance = [f for f in extras if isinstance(f, g.StanceFoot)]
-    assert g.limbs_of(stance) == legs
+    still = [f for f in extras if isinstance(f, StillFeet)]
+    assert g.limbs_of(still) == legs
     # The lower foot stands on the ground: a measurement of both.
     ground = [f for f in extras if isinstance(f, g.GroundContact)]
     assert g.limbs_of([*factors, *ground]) == (tuple(sorted(sum(legs, ()))), trunk)

@@ -98,9 +98,8 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     # Nothing of the kind is there to be left out.
     for name in ("no places seen again", "no ground", "no smooth path"):
         assert experiments.VARIANTS[name](problem, start)[0] is problem
-    for name in ("with stance foot", "with steady camera", "with up direction"):
-        found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
-        assert len(found) == len(full) + 1
+    found, _ = experiments.VARIANTS["with up direction"](problem, start)
+    assert len(found.cost_by_term(start)) == len(full) + 1
     still, _ = experiments.VARIANTS["nothing that sees scale"](problem, start)
     assert not still.free.scale.any() and still.free.poses.all()
     held, state = experiments.VARIANTS["β held at the regressor's"](problem, start)
@@ -109,9 +108,6 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     regressed = said.shape[0][np.isfinite(np.asarray(said.sigma)[0]).all(axis=-1)]
     assert not np.allclose(start.shapes[0], regressed.mean(axis=0))
     np.testing.assert_allclose(state.shapes[0], regressed.mean(axis=0))
-    low = g.stance_mask(scenes.body_model(), start, jnp.ones((1, 12), bool))
-    assert low.shape == (1, 12, 4) and not low[:, 0].any()
-    assert (low.sum(axis=-1) <= 1).all()
 
 
 def test_shaking_keeps_what_holds_the_map(scene):

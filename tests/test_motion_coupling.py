@@ -1,8 +1,7 @@
-"""The motion model's prediction in the graph: held, made anew, or differentiated."""
+"""The motion model's prediction in the graph: held within a step, then made anew."""
 
 import dataclasses
 import importlib
-import typing
 from pathlib import Path
 
 import equinox as eqx
@@ -17,21 +16,14 @@ from jax.flatten_util import ravel_pytree
 
 import bodyslam_jax.graph as g
 from bodyslam_jax import motion, simulation
-from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.pipeline.joint_stage import COUPLED_OUTPUTS
+from bodyslam_jax.config import Simulation
 from bodyslam_jax.solver import Stage, solve
-from bodyslam_jax.solver.apart import split_poses
-from bodyslam_jax.solver.blocks import mask_of, sizes_of
-from bodyslam_jax.solver.coupling import with_coupling
-from bodyslam_jax.solver.linearise import linearise
-from bodyslam_jax.solver.linearise.landmark import gather
-from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.blocks import mask_of
 
 FRAMES = 7
-TIGHT = (Stage(rtol=1e-12, max_steps=120),)
 
 
-class Seen(eqx.Module):
+class Prediction(eqx.Module):
     translation: jax.Array
     rotation: jax.Array
     body_pose: jax.Array
@@ -43,20 +35,15 @@ def stride(model, body, orientation, body_pose, shape, present):
     swing = swing + 0.5 * jnp.roll(swing, 2)
     step = model * jnp.stack([0 * swing, 0.01 * swing, 0.05 + 0.02 * swing], -1)
     step = step * (1 + 0.05 * shape[0])
-    return Seen(step, jnp.zeros_like(step), 0.9 * body_pose)
+    return Prediction(step, jnp.zeros_like(step), 0.9 * body_pose)
 
 
-def make(coupled, factors=lambda found: found):
+def make(factors=lambda found: found):
     rng = np.random.default_rng(2)
     state = scenes.truth(rng, FRAMES, 1, 25)
     found = [scenes.reprojection(rng, state), *scenes.person_factors(rng, state)]
-    predictor = g.MotionPredictor(
-        stride,
-        jnp.asarray(1.0),
-        scenes.body_model(),
-        jnp.ones((1, FRAMES), bool),
-        coupled,
-    )
+    body, present = scenes.body_model(), jnp.ones((1, FRAMES), bool)
+    predictor = g.MotionPredictor(stride, jnp.asarray(1.0), body, present)
     problem = g.make_problem(factors(found), state, motion=predictor)
     return problem, scenes.perturb(rng, problem, state)
 
@@ -69,58 +56,8 @@ def held_to_prediction(factors):
     return [change(f) for f in factors]
 
 
-@pytest.mark.slow
-def test_gradient_holds_the_derivative_of_what_is_coupled():
-    problem, state = pad(*make(("translation", "body_pose"), held_to_prediction))
-    problem = problem.refresh(state)
-
-    @eqx.filter_jit
-    def both(problem, state):
-        lin = linearise(problem, gather(problem), state)
-        lin = with_coupling(problem, lin, state)
-
-        def cost(step):
-            place = state.retract(step)
-            return problem.follow(place).cost(place)
-
-        exact = jax.grad(cost)(state.zero_step())
-        return lin, jax.tree.map(lambda m, x: m * x, mask_of(problem), exact)
-
-    lin, exact = both(problem, state)
-    assert sizes_of(problem, state).intrinsics == 0
-    poses = split_poses(exact.poses, problem.layout.joints)
-    assert set(poses) == {"pose", "apart"}
-    close = lambda a, b: abs(a - b).max() < 1e-9 * abs(b).max()
-    assert all(close(lin.gradient[name], poses[name]) for name in poses)
-    assert close(lin.gradient["root"], exact.roots)
-    assert close(lin.globals_gradient[1:], exact.shapes.reshape(-1))
-    held = linearise(problem, gather(problem), state)
-    assert not any(close(held.gradient[name], poses[name]) for name in poses)
-
-
-@pytest.mark.slow
-def test_the_coupled_optimum_is_that_of_a_dense_solver():
-    """Which has the whole Jacobian, the network's included."""
-    problem, start = make(("translation",))
-    found = solve(problem, start, schedule=TIGHT)
-    assert found.status == "converged"
-    dense = solve(problem, found.state, solver="optimistix", schedule=TIGHT)
-    assert float(found.cost) == pytest.approx(float(dense.cost), rel=1e-6)
-    apart = solve(make(())[0], start, schedule=TIGHT).state
-    cost = lambda state: float(problem.follow(state).cost(state))
-    assert cost(apart) > float(found.cost) * (1 + 1e-4)
-
-
-def test_every_way_to_follow_the_estimate_is_known():
-    hints = typing.get_type_hints(Config)
-    assert set(COUPLED_OUTPUTS) == set(typing.get_args(hints["motion_coupling"]))
-    names = {field.name for field in dataclasses.fields(Seen)}
-    assert names == set(COUPLED_OUTPUTS["full"])
-
-
-def test_what_is_not_coupled_has_no_derivative():
-    problem, state = make(())
-    assert problem.follow(state) is problem
+def test_no_derivative_flows_through_a_prediction():
+    problem, state = make()
 
     def predicted(step):
         factor = problem.refresh(state.retract(step)).factors[2]
@@ -133,7 +70,7 @@ def test_what_is_not_coupled_has_no_derivative():
 
 def test_first_order_steps_follow_what_is_predicted_anew():
     """Each by the gradient of the cost with the prediction at its place, held."""
-    problem, start = make((), held_to_prediction)
+    problem, start = make(held_to_prediction)
     count, rate = 6, 1e-2
     schedule = (Stage(max_steps=count),)
     found = solve(problem, start, solver="adam", schedule=schedule)
@@ -164,8 +101,8 @@ def test_first_order_steps_follow_what_is_predicted_anew():
 
 
 @pytest.mark.slow
-def test_gradient_of_a_coupled_solution_is_that_of_solving_again():
-    problem, start = make(("translation",))
+def test_gradient_by_the_motion_model_is_that_of_solving_again():
+    problem, start = make()
     exact = (Stage(rtol=1e-15, max_steps=200),)
     start = solve(problem, start, schedule=exact).state
 
@@ -227,38 +164,14 @@ def bent(problem, right, wrong, monkeypatch):
     return [float(x) for x in found]
 
 
-def follows(coupled, change, monkeypatch):
-    """`bent` by a scale that is 20 % too large."""
+@pytest.mark.slow
+def test_postures_do_not_follow_a_wrong_scale(monkeypatch):
+    """A scale that is 20 % too large asks for steps that are as much longer; postures
+    must not be bent to predict them: by far less, and by less than their own error."""
     schedule = (Stage(rtol=1e-8, max_steps=300),)
     ends = []
     for scale in (1.0, 1.2):
         problem, start = walk(scale)
-        motion = dataclasses.replace(problem.motion, coupled=coupled)
-        problem = change(dataclasses.replace(problem, motion=motion))
         ends.append(solve(problem, start, schedule=schedule).state)
-    return bent(problem, *ends, monkeypatch)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("coupled", [(), ("translation",)])
-def test_postures_do_not_follow_a_wrong_scale(coupled, monkeypatch):
-    """The cameras want longer steps of the network; postures must not give them: by far
-    less than that, and less than their own error."""
-    longer, error = follows(coupled, lambda problem: problem, monkeypatch)
+    longer, error = bent(problem, *ends, monkeypatch)
     assert abs(longer) < min(error, 0.01)
-
-
-@pytest.mark.slow
-def test_postures_that_nothing_holds_do_follow_a_wrong_scale(monkeypatch):
-    """So that the test above could see it."""
-
-    def loosen(problem):
-        problem = g.disable(problem, g.KeypointReprojection)
-        held = g.set_constant(problem.free, "roots")
-        problem = dataclasses.replace(problem, free=held)
-        where = lambda p: p.factors[2].sigma
-        assert isinstance(problem.factors[2], g.BodyPosePrior)
-        return eqx.tree_at(where, problem, 10 * where(problem))
-
-    longer, _ = follows(("translation",), loosen, monkeypatch)
-    assert longer > 0.03

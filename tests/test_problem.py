@@ -63,7 +63,6 @@ def fitting() -> tuple[g.State, dict[str, g.Factor]]:
         g.AspectRatioPrior(ones(1)),
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
         g.RootPositionPrior(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
-        g.StanceFoot(body, ones(1, T, 4).at[:, 0].set(jnp.inf)),
         g.UprightPrior(jnp.array([0.0, -1, 0]), ones(1, T)),
         g.GroundContact(body, jnp.array([0.0, -1, 0, 1.5]), ones(1, T)),
     ]
@@ -129,7 +128,7 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("Reprojection", "sigma", lambda x: x.at[0].set(0.0), "above 0"),
         ("Reprojection", "loss", g.Cauchy(0.0), "loss.scale: found 0.0"),
         ("Reprojection", "loss", g.Cauchy(float("nan")), "not finite"),
-        ("LandmarkPrior", "place", lambda x: x[:5], "(5, 3), expected (6, 3)"),
+        ("LandmarkPrior", "position", lambda x: x[:5], "(5, 3), expected (6, 3)"),
         ("LandmarkPrior", "whitening", ones(L, 3, 3), "1 landmarks have a prior"),
         ("KeypointReprojection", "pixel", NAN, "not finite"),
         ("KeypointReprojection", "pixel", zeros(1, T, 24, 2), "expected (1, 3, 25, 2)"),
@@ -156,12 +155,10 @@ def test_a_state_that_is_none_is_refused(where, value, message):
         ("RootOrientation", "orientation", zeros(1, T, 3, 3), "no rigid rotations"),
         (
             "RootPositionPrior",
-            "place",
+            "position",
             zeros(1, T, 3),
             "a depth of 0.0 m, expected above 0",
         ),
-        ("StanceFoot", "sigma", ones(1, T, 3), "(1, 3, 3), expected (1, 3, 4)"),
-        ("StanceFoot", "points", (19, 21, 22, 25), "19 to 25, expected 0 to 24"),
         ("UprightPrior", "up", ones(4), "(4,), expected (3,)"),
         ("UprightPrior", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
         ("GroundContact", "plane", lambda x: x / 1.5, "length 0.6667, expected 1"),
@@ -169,8 +166,7 @@ def test_a_state_that_is_none_is_refused(where, value, message):
 )
 def test_measurements_that_do_not_fit_are_refused(name, where, value, message):
     factor = fitting()[1][name]
-    static = where in ("layout", "points")
-    if static:
+    if where == "layout":
         factor = dataclasses.replace(factor, **{where: value})
     else:
         factor = changed(factor, where, value)
@@ -373,7 +369,6 @@ def test_a_mask_takes_the_precision_of_the_state():
 EARLY = {
     "RootSmoothness": lambda: g.RootSmoothness(ones(1, T)),
     "AngularAccelerationPrior": lambda: g.AngularAccelerationPrior(ones(1, T)),
-    "CameraSmoothness": lambda: g.CameraSmoothness(ones(T, 2)),
     "RelativeOrientation": lambda: g.RelativeOrientation(zeros(1, T, 3), ones(1, T)),
 }
 
@@ -389,8 +384,6 @@ EARLY_FRAMES = [
     ("RootSmoothness", "sigma", 0),
     ("RootSmoothness", "sigma", 1),
     ("AngularAccelerationPrior", "sigma", 1),
-    ("StanceFoot", "sigma", 0),
-    ("CameraSmoothness", "sigma", 1),
 ]
 """Factors, their fields, and frames that have no earlier one to look back to."""
 
@@ -401,9 +394,8 @@ def test_weights_of_frames_without_an_earlier_one_are_refused(name, field, at):
     factor = EARLY[name]() if name in EARLY else fitting()[1][name]
     first = max(a for n, f, a in EARLY_FRAMES if (n, f) == (name, field))
     empty = jnp.inf if field == "sigma" else 0.0
-    frames = lambda x, k: x.at[k] if name == "CameraSmoothness" else x.at[:, k]
     none = lambda x: jnp.full_like(x, empty)
-    one = lambda k: changed(factor, field, lambda x: frames(none(x), k).set(0.5))
+    one = lambda k: changed(factor, field, lambda x: none(x).at[:, k].set(0.5))
     with pytest.raises(ValueError, match=f"{name}.{field}: found 0.5 within frame"):
         make(**{name: one(at)})
     make(**{name: one(first + 1)})

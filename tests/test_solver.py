@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
+from own_factors import CameraSmoothness
 from problems import bent, dense, make, structured_step
 
 import bodyslam_jax.graph as g
@@ -600,7 +601,7 @@ def test_marginal_covariances_are_mapped_over():
 
 
 def test_factors_that_reach_too_far_are_refused():
-    class Far(g.CameraSmoothness):
+    class Far(CameraSmoothness):
         @property
         def keys(self):
             return ("camera", 0), ("camera", CHUNK)

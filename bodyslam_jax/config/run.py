@@ -40,11 +40,9 @@ class Config(Known):
     weights: GraphWeights = GraphWeights()
     solver: Literal["structured", "adam"] = "structured"
     """Second order, or the paper's 200 + 100 first-order steps."""
-    motion_coupling: Literal["frozen", "refreshed", "displacement", "full"] = (
-        "refreshed"
-    )
-    """How predicted motion follows the estimate: made once; anew after each step; or
-    with its derivative too, of displacements or of all that is predicted."""
+    motion_coupling: Literal["frozen", "refreshed"] = "refreshed"
+    """When motion is predicted: once, before the joint solve, or again after each
+    accepted step. No derivative of the prediction enters the solve."""
     smoothing_hz: float | None = 6.0
     """People's motion faster than this is taken for noise in the result, Hz; nothing
     is smoothed without it."""

@@ -84,12 +84,6 @@ class GraphWeights:
     """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
     are of 0.006 m; held to that, a camera that goes with the person would be thought to
     move less, and the world to be smaller."""
-    stance_sigma: float | None = None
-    """How still the lowest point of the feet stands, lengths of the leg in a frame of
-    1/30 s; free without it. 0.01 suits people who walk."""
-    camera_smoothness: float | None = None
-    """Change of the camera's turn, rad, and of its step, m, in a frame of 1/30 s; free
-    without it. 0.02 suits a hand. Used where people tell how long a metre is."""
     ground_sigma: float | None = 0.04
     """How far the map's ground may be from what people stand on, m: one error for the
     whole sequence. Without it, people need not stand on anything."""

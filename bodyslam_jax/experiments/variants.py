@@ -12,16 +12,11 @@ from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.experiments.problems import rebuild
-from bodyslam_jax.initialisation import (
-    stance_factor,
-    steady_camera_factor,
-    upright_factor,
-)
+from bodyslam_jax.initialisation import upright_factor
 
 _SEE_SCALE = (
     graph.HumanMotion,
     graph.RootSmoothness,
-    graph.StanceFoot,
     graph.GroundContact,
 )
 """What ties the map's unit to metres."""
@@ -29,10 +24,8 @@ _SEE_SCALE = (
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
 
-ASKED_FOR = GraphWeights(upright_sigma=0.1, stance_sigma=0.01, camera_smoothness=0.02)
-"""Of what is off by default: how upright people walk, rad; how still a foot that
-carries stands, legs a frame; how steadily a hand moves a camera, rad and m per frame
-squared."""
+ASKED_FOR = GraphWeights(upright_sigma=0.1)
+"""Of what is off by default: how upright people walk, rad."""
 _FPS = 30.0
 """Of the simulated sequences."""
 
@@ -129,12 +122,6 @@ VARIANTS: dict[str, Variant] = {
     "no regressed shape": without(graph.ShapePrior),
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
-    "with stance foot": beside(
-        lambda body, state, there: stance_factor(state, there, _FPS, body, ASKED_FOR)
-    ),
-    "with steady camera": beside(
-        lambda body, state, there: steady_camera_factor(state, _FPS, ASKED_FOR)
-    ),
     "with up direction": beside(
         lambda body, state, there: upright_factor(state, there, _FPS, ASKED_FOR)
     ),

@@ -9,35 +9,43 @@ from bodyslam_jax.graph.factor import FrameFactor as FrameFactor
 from bodyslam_jax.graph.factor import Limbs as Limbs
 from bodyslam_jax.graph.factor import Shared as Shared
 from bodyslam_jax.graph.factor import residual_of as residual_of
-from bodyslam_jax.graph.factors.body_pose import BodyPosePrior as BodyPosePrior
-from bodyslam_jax.graph.factors.body_pose import ShapePrior as ShapePrior
-from bodyslam_jax.graph.factors.body_pose import Stature as Stature
-from bodyslam_jax.graph.factors.body_pose import rotation_between as rotation_between
-from bodyslam_jax.graph.factors.camera import AspectRatioPrior as AspectRatioPrior
-from bodyslam_jax.graph.factors.camera import CameraPrior as CameraPrior
-from bodyslam_jax.graph.factors.camera import CameraSmoothness as CameraSmoothness
-from bodyslam_jax.graph.factors.camera import IntrinsicsPrior as IntrinsicsPrior
-from bodyslam_jax.graph.factors.camera import ScalePrior as ScalePrior
-from bodyslam_jax.graph.factors.ground import GroundContact as GroundContact
-from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion
-from bodyslam_jax.graph.factors.human_motion import (
-    RelativeOrientation as RelativeOrientation,
-)
-from bodyslam_jax.graph.factors.landmark import LandmarkPrior as LandmarkPrior
-from bodyslam_jax.graph.factors.reprojection import (
-    KeypointReprojection as KeypointReprojection,
-)
-from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
-from bodyslam_jax.graph.factors.root import (
+from bodyslam_jax.graph.factors.angular_acceleration_prior import (
     AngularAccelerationPrior as AngularAccelerationPrior,
 )
-from bodyslam_jax.graph.factors.root import RootOrientation as RootOrientation
-from bodyslam_jax.graph.factors.root import RootPositionPrior as RootPositionPrior
-from bodyslam_jax.graph.factors.root import RootSmoothness as RootSmoothness
-from bodyslam_jax.graph.factors.root import UprightPrior as UprightPrior
-from bodyslam_jax.graph.factors.stance import BODY25_FEET as BODY25_FEET
-from bodyslam_jax.graph.factors.stance import StanceFoot as StanceFoot
-from bodyslam_jax.graph.factors.stance import stance_mask as stance_mask
+from bodyslam_jax.graph.factors.aspect_ratio_prior import (
+    AspectRatioPrior as AspectRatioPrior,
+)
+from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior as BodyPosePrior
+from bodyslam_jax.graph.factors.body_pose_prior import (
+    rotation_between as rotation_between,
+)
+from bodyslam_jax.graph.factors.camera_prior import CameraPrior as CameraPrior
+from bodyslam_jax.graph.factors.ground_contact import HEELS_AND_TOES as HEELS_AND_TOES
+from bodyslam_jax.graph.factors.ground_contact import GroundContact as GroundContact
+from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion
+from bodyslam_jax.graph.factors.intrinsics_prior import (
+    IntrinsicsPrior as IntrinsicsPrior,
+)
+from bodyslam_jax.graph.factors.keypoint_reprojection import (
+    KeypointReprojection as KeypointReprojection,
+)
+from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior as LandmarkPrior
+from bodyslam_jax.graph.factors.relative_orientation import (
+    RelativeOrientation as RelativeOrientation,
+)
+from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
+from bodyslam_jax.graph.factors.root_orientation import (
+    RootOrientation as RootOrientation,
+)
+from bodyslam_jax.graph.factors.root_position_prior import (
+    RootPositionPrior as RootPositionPrior,
+)
+from bodyslam_jax.graph.factors.root_smoothness import RootSmoothness as RootSmoothness
+from bodyslam_jax.graph.factors.scale_prior import ScalePrior as ScalePrior
+from bodyslam_jax.graph.factors.shape_prior import ShapePrior as ShapePrior
+from bodyslam_jax.graph.factors.stature import Stature as Stature
+from bodyslam_jax.graph.factors.upright_prior import UprightPrior as UprightPrior
+from bodyslam_jax.graph.keypoint_jacobian import turning_joints as turning_joints
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout
 from bodyslam_jax.graph.layout import round_up as round_up

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from bodyslam_jax.graph.factor import Factor, FrameFactor
-from bodyslam_jax.graph.factors.camera import AbstractIntrinsicsFactor
-from bodyslam_jax.graph.factors.landmark import LandmarkPrior
+from bodyslam_jax.graph.factors.intrinsics_prior import AbstractIntrinsicsFactor
+from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
-from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
-from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
-from bodyslam_jax.graph.factors.landmark import LandmarkPrior
+from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
+from bodyslam_jax.graph.factors.human_motion import HumanMotion
+from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
@@ -43,9 +44,6 @@ class MotionPredictor(eqx.Module):
     model: Any
     body: Any
     present: Bool[Array, "h t"]
-    coupled: tuple[str, ...] = eqx.field(static=True, default=())
-    """Among `translation`, `rotation`, `body_pose`: predictions by whose derivatives
-    the solver may move people to where the prediction fits."""
 
     def __call__(self, state: State) -> Any:
         """Predictions of all people; leading axes `h t`."""
@@ -111,22 +109,6 @@ class Problem(eqx.Module):
     def refresh(self, state: State) -> "Problem":
         """The same problem with the motion predicted anew."""
         return self.with_prediction(self.predict(state))
-
-    @property
-    def coupled(self) -> bool:
-        """Whether any prediction's derivative counts."""
-        return self.motion is not None and len(self.motion.coupled) > 0
-
-    def follow(self, state: State) -> "Problem":
-        """The same problem with those predictions made anew whose derivatives count.
-
-        The others stay, and so does the problem where none counts (the default).
-        """
-        if self.motion is None or not self.coupled:
-            return self
-        seen = self.predict(state, frozen=False)
-        names = (*self.motion.coupled, "leg")
-        return self.with_prediction({name: seen[name] for name in names})
 
 
 def _with_prediction(factor, seen):

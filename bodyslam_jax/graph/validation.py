@@ -15,16 +15,14 @@ from jaxtyping import AbstractArray, Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.graph.factor import Factor, FrameFactor
-from bodyslam_jax.graph.factors.camera import CameraPrior
-from bodyslam_jax.graph.factors.ground import GroundContact
-from bodyslam_jax.graph.factors.landmark import LandmarkPrior
-from bodyslam_jax.graph.factors.reprojection import KeypointReprojection, Reprojection
-from bodyslam_jax.graph.factors.root import (
-    RootOrientation,
-    RootPositionPrior,
-    UprightPrior,
-)
-from bodyslam_jax.graph.factors.stance import StanceFoot
+from bodyslam_jax.graph.factors.camera_prior import CameraPrior
+from bodyslam_jax.graph.factors.ground_contact import GroundContact
+from bodyslam_jax.graph.factors.keypoint_reprojection import KeypointReprojection
+from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.reprojection import Reprojection
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation
+from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
+from bodyslam_jax.graph.factors.upright_prior import UprightPrior
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation_weights import check_early, check_loss, check_runs
@@ -87,9 +85,6 @@ def check_factor(factor: Factor, sizes: Sizes) -> None:
                 f"{sorted(KEYPOINT_NAMES)}."
             )
         sizes["j"] = len(KEYPOINT_NAMES[factor.layout])
-    if isinstance(factor, StanceFoot):
-        sizes["f"] = len(factor.points)
-        _check_range(f"{name}.points", np.array(factor.points, int), 25)
     check_shapes(factor, name, sizes)
     if isinstance(factor, FrameFactor):
         _check_frames(factor, name, sizes)
@@ -108,11 +103,11 @@ def check_factor(factor: Factor, sizes: Sizes) -> None:
         _check_unit(factor.plane[:3], f"{name}.plane")
     if isinstance(factor, UprightPrior):
         _check_unit(factor.up, f"{name}.up")
-    if isinstance(factor, RootPositionPrior) and not is_traced(factor.place):
-        depth = np.asarray(factor.place)[..., 2][_known(factor.sigma)]
+    if isinstance(factor, RootPositionPrior) and not is_traced(factor.position):
+        depth = np.asarray(factor.position)[..., 2][_known(factor.sigma)]
         if not (depth > 0).all():
             raise ValueError(
-                f"{name}.place: found a depth of {depth.min()} m, expected above 0."
+                f"{name}.position: found a depth of {depth.min()} m, expected above 0."
             )
 
 

@@ -8,16 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from bodyslam_jax.graph.factor import Factor
-from bodyslam_jax.graph.factors.body_pose import BodyPosePrior
-from bodyslam_jax.graph.factors.camera import CameraSmoothness
-from bodyslam_jax.graph.factors.human_motion import HumanMotion, RelativeOrientation
-from bodyslam_jax.graph.factors.root import (
+from bodyslam_jax.graph.factors.angular_acceleration_prior import (
     AngularAccelerationPrior,
-    RootOrientation,
-    RootPositionPrior,
-    RootSmoothness,
 )
-from bodyslam_jax.graph.factors.stance import StanceFoot
+from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
+from bodyslam_jax.graph.factors.human_motion import HumanMotion
+from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation
+from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
+from bodyslam_jax.graph.factors.root_smoothness import RootSmoothness
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
@@ -30,8 +29,6 @@ _EARLY = (
     (RootOrientation, "correlation", 1, 0.0),
     (RootPositionPrior, "correlation", 1, 0.0),
     (RelativeOrientation, "sigma", 1, np.inf),
-    (StanceFoot, "sigma", 1, np.inf),
-    (CameraSmoothness, "sigma", 2, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
     (AngularAccelerationPrior, "sigma", 2, np.inf),
 )

@@ -13,10 +13,6 @@ from bodyslam_jax.initialisation.carried_people import (
 from bodyslam_jax.initialisation.extra_factors import (
     optional_factors as optional_factors,
 )
-from bodyslam_jax.initialisation.extra_factors import stance_factor as stance_factor
-from bodyslam_jax.initialisation.extra_factors import (
-    steady_camera_factor as steady_camera_factor,
-)
 from bodyslam_jax.initialisation.factors import PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE
 from bodyslam_jax.initialisation.factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation.factors import landmark_sigma as landmark_sigma

@@ -54,7 +54,8 @@ def revisit_factor(
     size, axes = np.linalg.eigh(prior_information)
     whitening = np.sqrt(np.maximum(size, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
     return graph.LandmarkPrior(
-        place=jnp.asarray(prior_mean, float), whitening=jnp.asarray(whitening / sigma)
+        position=jnp.asarray(prior_mean, float),
+        whitening=jnp.asarray(whitening / sigma),
     )
 
 
@@ -248,7 +249,7 @@ def _place_factor(
     there = placed[..., None]
     sigma = np.array([weights.root_direction, weights.root_depth])
     return graph.RootPositionPrior(
-        place=jnp.asarray(np.where(there, roots.T_CH[..., :3, 3], [0.0, 0.0, 1.0])),
+        position=jnp.asarray(np.where(there, roots.T_CH[..., :3, 3], [0.0, 0.0, 1.0])),
         sigma=jnp.asarray(np.where(there, sigma, np.inf)),
         correlation=correlation,
     )

@@ -22,13 +22,6 @@ COST_ATOL = 0.005
 """Decrease of the cost that is not worth a step: the cost is a negative log-likelihood,
 in which a standard deviation is a half. Without it, a few landmarks that are seen from
 one place creep for dozens of steps, to no effect on anything else."""
-COUPLED_OUTPUTS = {
-    "frozen": (),
-    "refreshed": (),
-    "displacement": ("translation",),
-    "full": ("translation", "rotation", "body_pose"),
-}
-"""Predictions of the motion model whose derivatives count, by `motion_coupling`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,9 +123,7 @@ def prepare(
                 shared_error=shared,
                 without=carried,
             ),
-            *initialisation.optional_factors(
-                state, seen, there, sequence.fps, body, weights
-            ),
+            *initialisation.optional_factors(seen, sequence.fps, weights),
         ]
         if moving:
             contact = initialisation.ground_contact(
@@ -204,13 +195,7 @@ def motion_predictor(
     model = motion.load_motion_model(config.motion_model)
     clock = motion.make_clock(sequence.timestamps, model.fps)
     present = jnp.asarray(roots.present)
-    return graph.MotionPredictor(
-        motion.predict_between,
-        (model, clock),
-        body,
-        present,
-        COUPLED_OUTPUTS[config.motion_coupling],
-    )
+    return graph.MotionPredictor(motion.predict_between, (model, clock), body, present)
 
 
 def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Prediction:
@@ -234,7 +219,6 @@ def _settle_people(
         graph.HumanMotion,
         graph.RelativeOrientation,
         graph.RootSmoothness,
-        graph.StanceFoot,
         graph.GroundContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")

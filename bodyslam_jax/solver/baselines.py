@@ -2,8 +2,8 @@
 
 They see a flat step from the first state (poses do not add, steps do) and the lifted
 residuals. The motion model's prediction is made anew, and held, in each step of Adam.
-In the others it stays as it is at the start of a stage. What is coupled they all
-differentiate in full. Each is one program with all that it needs.
+In the others it stays as it is at the start of a stage. Each is one program with all
+that it needs.
 """
 
 import warnings
@@ -32,7 +32,7 @@ def run(name, problem, state, stage):
     A state that is not finite, or whose cost is not, is not returned: the one that the
     stage began with is.
     """
-    cost_of = lambda state: problem.refresh(state).follow(state).cost(state)
+    cost_of = lambda state: problem.refresh(state).cost(state)
     before = cost_of(state)
     found, count, result = _METHODS[name](problem, state, stage)
     cost = cost_of(found)
@@ -55,13 +55,13 @@ class _Flat(eqx.Module):
 
     def residual(self, step):
         place = self.retract(step)
-        rows = lifted(place, self.problem.follow(place))
+        rows = lifted(place, self.problem)
         return jnp.concatenate([r.reshape(-1) for r in rows])
 
     def cost(self, step):
         """With the motion predicted anew, and held."""
         place = self.retract(step)
-        return self.problem.refresh(place).follow(place).cost(place)
+        return self.problem.refresh(place).cost(place)
 
 
 def _flat(problem, state):

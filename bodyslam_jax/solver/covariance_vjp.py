@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, sizes_of
 from bodyslam_jax.solver.compilation import in_full_precision
-from bodyslam_jax.solver.coupling import with_coupling
 from bodyslam_jax.solver.levenberg_marquardt import final_of
 from bodyslam_jax.solver.linear_system import UNSEEN, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
@@ -28,7 +27,7 @@ def equations(problem: Problem, state: State) -> Final:
     problem = problem.with_prediction(problem.predict(state))
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state, sizes.dtype)
-    lin = _bent(problem, with_coupling(problem, lin, state), state, sizes)
+    lin = _bent(problem, lin, state, sizes)
     return final_of(lin, eliminate(problem, lin, sizes, _damping(lin, sizes)))
 
 

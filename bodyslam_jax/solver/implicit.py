@@ -24,8 +24,8 @@ from bodyslam_jax.solver.apart import join_poses
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
-from bodyslam_jax.solver.coupling import with_gradient
 from bodyslam_jax.solver.gmres import gmres
+from bodyslam_jax.solver.gradient import with_gradient
 from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
@@ -77,8 +77,7 @@ def _cotangent_of_problem(problem, state, cotangent):
         # About the place moved to, as the solver holds single coordinates: in the
         # chart of another place they are others, and what pulls at them is not 0.
         def cost(d):
-            place = moved.retract(d)
-            return fixed.follow(place).cost(place)
+            return fixed.cost(moved.retract(d))
 
         return jax.grad(cost)(zero)
 

@@ -2,7 +2,7 @@
 
 Steps are damped, and accepted on the true robust cost (`_trial`). The linearisation is
 kept after a rejected step. The motion model's prediction is frozen within a step and
-made anew after each accepted one, unless it is coupled (`_coupling`). Steps that gain
+made anew after each accepted one. Steps that gain
 little know what keypoints bend (`_curvature`). Landmarks that no step would bring back
 are triangulated anew (`_triangulation`).
 
@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, residual_of, robustify
 from bodyslam_jax.solver.blocks import Linearisation, sizes_of
-from bodyslam_jax.solver.coupling import with_coupling
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
@@ -235,8 +234,7 @@ def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
 def _linearise_anew(problem, observations, state, dtype):
     seen = problem.predict(state)
     problem = problem.with_prediction(seen)
-    lin = linearise(problem, observations, state, dtype)
-    return with_coupling(problem, lin, state), seen
+    return linearise(problem, observations, state, dtype), seen
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:

@@ -76,6 +76,6 @@ def _settle(
         of_tracks = 0.5 * jnp.sum(jnp.where(keep, here[0], there[0]))
     costs = [
         of_tracks if isinstance(f, Reprojection) else f.cost(moved)
-        for f in problem.follow(moved).factors
+        for f in problem.factors
     ]
     return moved, keep, jnp.stack(costs)

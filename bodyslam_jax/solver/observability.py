@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from bodyslam_jax.graph import (
     AspectRatioPrior,
     CameraPrior,
-    CameraSmoothness,
+    FrameFactor,
     IntrinsicsPrior,
     LandmarkPrior,
     Problem,
@@ -100,7 +100,10 @@ class _Scene:
 
     def is_steady(self) -> bool:
         """Whether something ties cameras to those before."""
-        return any(isinstance(x, CameraSmoothness) for x in self.problem.factors)
+        return any(
+            isinstance(x, FrameFactor) and not x.of_people and x.num_lags > 1
+            for x in self.problem.factors
+        )
 
     def stand_still(self) -> list[int]:
         """The people who do not walk, nor otherwise move their pelvis."""

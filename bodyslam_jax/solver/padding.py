@@ -75,7 +75,7 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
 def _pad_factor(factor, state, frames, landmarks):
     if isinstance(factor, LandmarkPrior):
         return LandmarkPrior(
-            place=extend(factor.place, 0, landmarks, 0.0),
+            position=extend(factor.position, 0, landmarks, 0.0),
             whitening=extend(factor.whitening, 0, landmarks, 0.0),
             loss=factor.loss,
         )

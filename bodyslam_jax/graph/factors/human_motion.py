@@ -1,45 +1,47 @@
-"""People move and turn as the motion model predicts (Section 3.6 of the paper).
+"""People move as the motion model predicts (e_mm, section 3.6 of the paper).
 
-Henning et al., BodySLAM, ECCV 2022. What all terms have in common is in `factor.py`.
+    e_k = C_WH,k-1^T (r_WH,k - r_WH,k-1) / L - r̃_k,    r_WH = s r'_WC + C_WC r_CH
+    r_k = W_k (e_k - ρ e_{k-1}) / sqrt(1 - ρ²),        W^T W = Σ^-1
+
+`r̃` is the predicted displacement of the pelvis; the residual is linear in the scale s.
+With a `body`, lengths are in leg lengths `L(β)`: in metres a smaller person in a
+smaller world would have smaller errors, and the estimate would shrink. The model's
+errors are modelled as AR(1) with correlation ρ. Default: `Σ` of the network times
+`weights.motion_inflation`² = 1, enlarged by an error common to all steps of a person
+(`weights.step_error` = 5 %), `weights.motion_correlation` = 0.8. The paper: in metres,
+`λ_mm = 100` (`weights.motion_sigma` = 0.1 m), independent.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.geometry.so3 import log
 from bodyslam_jax.graph.factor import FrameFactor, Key, Shared
 from bodyslam_jax.graph.losses import Loss, Squared
-from bodyslam_jax.graph.pelvis_displacement import before, displacement, displacements
+from bodyslam_jax.graph.pelvis_displacement import (
+    displacement,
+    displacements,
+    previous_frame,
+)
 from bodyslam_jax.graph.whitening import innovation
 from bodyslam_jax.motion import leg_length
 
 
 class HumanMotion(FrameFactor):
-    """The pelvis moves as the motion model predicts.
-
-    `e_k = C_WH_{k-1}^T (r_WH_k - r_WH_{k-1}) - r̃_k` with `r_WH = s r'_WC + C_WC r_CH`,
-    so that it is linear in s. With a correlation ρ the model's errors in successive
-    frames are not taken for independent: the residual is `e_k - ρ e_{k-1}` over its
-    own standard deviation.
-
-    With a `body`, lengths are in lengths of the leg, whose steps the model predicts.
-    Otherwise a smaller person in a smaller world has smaller errors in metres, and the
-    estimate shrinks.
-    """
+    """`r = W (e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`, `e` the error of a displacement."""
 
     translation: Float[Array, "h t 3"]
-    """r̃: predicted displacement from k-1 to k, in H_{k-1}, m (with `body`: legs)."""
+    """r̃: predicted displacement from k-1 to k in H_{k-1}, m; with a `body`, in leg
+    lengths."""
     whitening: Float[Array, "h t 3 3"]
     """`W` with `W^T W` the inverse of the covariance (m^-1); 0 where not predicted."""
     correlation: Float[Array, "h t"]
     """ρ between the errors of k-1 and k; 0 where k-1 has no prediction."""
     loss: Loss = Squared()
     correlated: bool = eqx.field(static=True, default=True)
-    """Whether any correlation is used; if not, a term spans two frames, not three."""
+    """Whether the errors are correlated; if not, `keys` span two frames, not three."""
     body: BodyModel | None = None
     of_people = True
     time_fields = ("translation", "whitening", "correlation")
@@ -66,8 +68,8 @@ class HumanMotion(FrameFactor):
         leg = unit_length(self.body, shared)
         error = displacement(window[1], window[0], shared.scale) / leg - translation
         if self.correlated:
-            last = displacement(window[2], window[1], shared.scale) / leg - previous
-            error = innovation(error, last, correlation)
+            earlier = displacement(window[2], window[1], shared.scale) / leg - previous
+            error = innovation(error, earlier, correlation)
         return whitening @ error
 
     def jacobians(self, state):
@@ -84,9 +86,9 @@ class HumanMotion(FrameFactor):
         whitening, last = self.whitening, jnp.zeros_like(jac)
         if self.correlated:
             rho = self.correlation[..., None]
-            error = error - rho * before(error)
+            error = error - rho * previous_frame(error)
             whitening = whitening / jnp.sqrt(1 - rho**2)[..., None]
-            last = -rho[..., None] * before(jac)
+            last = -rho[..., None] * previous_frame(jac)
         now, last = whitening @ jac, whitening @ last
         six = lambda x, i: x[..., 6 * i : 6 * i + 6]
         keys: dict[Key, Array] = {("scale", 0): (now + last)[..., 24:25]}
@@ -98,35 +100,6 @@ class HumanMotion(FrameFactor):
         if self.body is not None:
             keys["shape", 0] = (now + last)[..., 25:]
         return (whitening @ error[..., None])[..., 0], keys
-
-
-class RelativeOrientation(FrameFactor):
-    """The person turns as the motion model predicts: `Log(C̃^T C_WH_{k-1}^T C_WH_k)`.
-
-    The paper's model predicts it; its cost leaves it out.
-    """
-
-    rotation: Float[Array, "h t 3"]
-    """Rotation vector from H_{k-1} to H_k, rad."""
-    sigma: Float[Array, "h t"]
-    """Per axis, rad; `inf` where not predicted."""
-    loss: Loss = Squared()
-    of_people = True
-    time_fields = ("rotation", "sigma")
-    padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("camera", 0), ("camera", 1), ("root", 0), ("root", 1)
-
-    def data(self):
-        return self.rotation, self.sigma
-
-    def frame_residual(self, data, window, shared):
-        rotation, sigma = data
-        now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
-        predicted = jaxlie.SO3.exp(rotation).as_matrix()
-        return log(predicted.T @ before.T @ now) / sigma
 
 
 def unit_length(body: BodyModel | None, shared: Shared) -> Float[Array, ""]:

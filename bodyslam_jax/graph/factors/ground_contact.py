@@ -1,4 +1,13 @@
-"""People stand on the ground of the map: scale from what is under their feet."""
+"""People stand on the ground plane of the map.
+
+    r = (n^T (s r'_WC + C_WC p_C) + s d - SOLE) / σ
+
+In m. `n^T x' + d = 0` is the ground plane among the landmarks, in units of the map;
+`p_C` is the soft minimum, along n, of heels and toes. It relates metres of the body to
+units of the map, so scale is observable even where nobody walks. Default:
+`weights.ground_sigma` = 0.04 m, one error for the whole sequence: times the root of the
+number of frames. Ours.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +16,6 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
-from bodyslam_jax.graph.factors.stance import BODY25_FEET
 from bodyslam_jax.graph.keypoint_jacobian import (
     keypoint_jacobian,
     turning_joints,
@@ -15,26 +23,23 @@ from bodyslam_jax.graph.keypoint_jacobian import (
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
+HEELS_AND_TOES = (19, 21, 22, 24)
+"""Big toe and heel among the keypoints of BODY_25, left and right."""
 SOLE = 0.018
-"""How far the points of the feet lie above what the sole stands on, m."""
+"""Height of those keypoints above the sole, m."""
 _SOFTNESS = 0.01
-"""Points this much higher than the lowest count e times less, m."""
+"""Of the soft minimum: a point this much higher has e times less weight, m."""
 
 
 class GroundContact(FrameFactor):
-    """The lowest point of the feet is on a plane that is fixed in the map.
-
-    `(n^T (s r'_WC + C_WC p_C) + s d - SOLE) / σ`, where `n^T x' + d = 0` is the ground
-    among the landmarks and p_C the softly lowest of heels and toes. Metres of the body
-    meet units of the map at one place: scale is seen also where nobody walks.
-    """
+    """`r = (height of the lowest point of the feet above the plane - SOLE) / σ`."""
 
     body: BodyModel
     plane: Float[Array, " 4"]
     """Upward unit normal n, and d in units of the map."""
     sigma: Float[Array, "h t"]
-    """m; `inf` where feet are not seen. Where the plane lies is one error for all
-    frames: its standard deviation times the root of their number."""
+    """m; `inf` where feet are not visible. The plane has one error in all frames, so
+    this is its standard deviation times the root of their number."""
     loss: Loss = Squared()
     of_people = True
     time_fields = ("sigma",)
@@ -47,7 +52,7 @@ class GroundContact(FrameFactor):
 
     @property
     def limbs(self) -> Limbs:
-        return (turning_joints(self.body, "body25", BODY25_FEET),)
+        return (turning_joints(self.body, "body25", HEELS_AND_TOES),)
 
     def data(self):
         return self.sigma
@@ -59,7 +64,7 @@ class GroundContact(FrameFactor):
     def jacobian(self, data, window, shared):
         (frame,) = window
         points = keypoint_jacobian(self.body, frame.pose, shared.shape, "body25", 0.0)
-        feet = np.array(BODY25_FEET)
+        feet = np.array(HEELS_AND_TOES)
         p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
         height, up_C = self._heights(p_H, frame, shared)
         share = jax.nn.softmax(-height / _SOFTNESS)
@@ -78,7 +83,7 @@ class GroundContact(FrameFactor):
             ("scale", 0): (normal @ r_WC + offset)[None],
             ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
         }
-        parts = {touch: part[None] / data for touch, part in parts.items()}
+        parts = {key: part[None] / data for key, part in parts.items()}
         return (_soft_minimum(height) - SOLE)[None] / data, parts
 
     def scales(self, state: State) -> Float[Array, "h t"]:
@@ -92,7 +97,7 @@ class GroundContact(FrameFactor):
 
     def _lowest(self, frame, shared):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
-        height, _ = self._heights(p_H[np.array(BODY25_FEET)], frame, shared)
+        height, _ = self._heights(p_H[np.array(HEELS_AND_TOES)], frame, shared)
         return _soft_minimum(height)
 
     def _heights(self, p_H, frame, shared):

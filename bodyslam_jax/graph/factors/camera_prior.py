@@ -1,0 +1,40 @@
+"""A camera pose that is known beforehand.
+
+    r = [Log(C̃^T C'_WC), r'_WC - r̃'] / σ
+
+Dimensionless: a rotation vector over rad, then a centre over units of the map. Default:
+`config.PATH_SIGMA` = 0.01 of each, in frames in which a camera path was given. Ours.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.losses import Loss, Squared
+
+
+class CameraPrior(FrameFactor):
+    """`r = [Log(C̃^T C), r' - r̃'] / σ`, one row of six for each frame."""
+
+    cameras: Float[Array, "t 4 4"]
+    """T̃'_WC: camera to world, its centre in units of the map."""
+    sigma: Float[Array, "t 6"]
+    """Of rotation (rad) and of centre (units of the map); `inf` where unknown."""
+    loss: Loss = Squared()
+    of_people = False
+    time_fields = ("cameras", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        return (("camera", 0),)
+
+    def data(self):
+        return self.cameras, self.sigma
+
+    def frame_residual(self, data, window, shared):
+        measured, sigma = data
+        camera = window[0].camera
+        rotation = log(measured[:3, :3].T @ camera[:3, :3])
+        return jnp.concatenate([rotation, camera[:3, 3] - measured[:3, 3]]) / sigma

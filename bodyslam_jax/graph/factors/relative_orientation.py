@@ -1,0 +1,41 @@
+"""The person turns as the motion model predicts.
+
+    r = Log(C̃_k^T C_WH,k-1^T C_WH,k) / σ
+
+In rad. Off by default (`weights.orientation_sigma`). The paper's motion model predicts
+the turn, but the paper's cost does not use it. Ours.
+"""
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.losses import Loss, Squared
+
+
+class RelativeOrientation(FrameFactor):
+    """`r = Log(C̃^T C_WH,k-1^T C_WH,k) / σ`."""
+
+    rotation: Float[Array, "h t 3"]
+    """Log C̃: rotation vector from H_{k-1} to H_k, rad."""
+    sigma: Float[Array, "h t"]
+    """Per axis, rad; `inf` where not predicted."""
+    loss: Loss = Squared()
+    of_people = True
+    time_fields = ("rotation", "sigma")
+    padding = {"sigma": jnp.inf}
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        return ("camera", 0), ("camera", 1), ("root", 0), ("root", 1)
+
+    def data(self):
+        return self.rotation, self.sigma
+
+    def frame_residual(self, data, window, shared):
+        rotation, sigma = data
+        now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
+        predicted = jaxlie.SO3.exp(rotation).as_matrix()
+        return log(predicted.T @ before.T @ now) / sigma

@@ -1,0 +1,45 @@
+"""A regressed orientation of the person relative to the camera.
+
+    e_k = Log(C̃_CH,k^T C_CH,k),    r_k = (e_k - ρ e_{k-1}) / (σ sqrt(1 - ρ²))
+
+In rad, with AR(1) errors as in `BodyPosePrior`. Default: `weights.root_sigma` = 0.12
+rad and `weights.root_correlation` = 0.99 at 30 fps. Ours: the paper uses it as a start
+only.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.whitening import innovation
+
+
+class RootOrientation(FrameFactor):
+    """`r = (e_k - ρ e_{k-1}) / (σ sqrt(1 - ρ²))`, `e = Log(C̃_CH^T C_CH)`."""
+
+    orientation: Float[Array, "h t 3 3"]
+    """C̃_CH"""
+    sigma: Float[Array, "h t"]
+    """Stationary standard deviation per axis, rad; `inf` where not measured."""
+    correlation: Float[Array, "h t"]
+    """ρ between the errors of k-1 and k; 0 at the start of a run."""
+    loss: Loss = Squared()
+    of_people = True
+    time_fields = ("orientation", "sigma", "correlation")
+    padding = {"sigma": jnp.inf, "correlation": 0.0}
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        return ("root", 0), ("root", 1)
+
+    def data(self):
+        previous = jnp.roll(self.orientation, 1, axis=1)
+        return self.orientation, previous, self.sigma, self.correlation
+
+    def frame_residual(self, data, window, shared):
+        measured, previous, sigma, correlation = data
+        error = log(measured.T @ window[0].root[:3, :3])
+        before = log(previous.T @ window[1].root[:3, :3])
+        return innovation(error, before, correlation) / sigma
