@@ -26,6 +26,7 @@ from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.experiments.scenario import make_case
 from bodyslam_jax.experiments.scoring import trajectories
+from bodyslam_jax.geometry import so3
 
 WAYS = ("frozen", "refreshed")
 WRONG = (0.8, 1.2)
@@ -144,7 +145,7 @@ def drift(args, config):
                 bent = eqx.tree_at(lambda s: s.poses, right, wrong.poses)
                 longer, _ = stretch_and_error(motion, wrong, reference, weight)
                 posture, error = stretch_and_error(motion, bent, reference, weight)
-                turned = graph.rotation_between(right.poses, wrong.poses)
+                turned = so3.between(right.poses, wrong.poses)
                 there = prepared.roots.present
                 turned = np.degrees(np.sqrt(np.mean(np.asarray(turned)[there] ** 2)))
                 end = settled(free, at(share))[0].scale / true

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from bodyslam_jax import body
+from bodyslam_jax.body.kinematics_numpy import pose_joints
+from bodyslam_jax.geometry import so3_numpy
 
 N = 5  # frames; one size for all tests, so that little is compiled
 
@@ -231,3 +233,11 @@ def test_picture(default, tmp_path):
     path = tmp_path / "body.png"
     body.save_picture(default, path)
     assert path.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_chain_in_numpy_is_that_in_jax(default):
+    pose, beta, trans = (np.asarray(x) for x in some_bodies())
+    rest = np.asarray(body.rest_joints(default, beta))
+    R = so3_numpy.exp(pose.reshape(N, 24, 3))
+    _, x = pose_joints(R, rest, rest[:, 0] + trans)
+    np.testing.assert_allclose(body.joints(default, pose, beta, trans), x, atol=1e-12)

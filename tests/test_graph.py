@@ -17,6 +17,7 @@ from problems import bent, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 
@@ -265,7 +266,7 @@ def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
     )
     assert other.cost(state) == factor.cost(state)
     begins = factor.residual(state)[0, 2, 4]
-    error = g.rotation_between(factor.rotation, state.poses)
+    error = so3.between(factor.rotation, state.poses)
     assert jnp.allclose(begins, error[0, 2, 4] / 0.3, rtol=1e-12)
     one_by_one = factor.map_frames(
         lambda d, w, s, _: factor.frame_residual(d, w, s), state

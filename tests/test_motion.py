@@ -15,6 +15,7 @@ from test_motion_data import make_clip
 from bodyslam_jax import cli, io, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion import (
     MotionModel,
     Prediction,
@@ -35,7 +36,6 @@ from bodyslam_jax.motion.position_network import (
     nearest_turn,
 )
 from bodyslam_jax.motion.prediction import leg_length
-from bodyslam_jax.motion.rotations import matrix, vector
 from bodyslam_jax.motion.training.measures import Steps, error_correlation
 from bodyslam_jax.motion.yaw_removal import straightened
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
@@ -61,7 +61,7 @@ def walk():
     clip = make_clip(T)
     poses = jnp.asarray(clip.poses, jnp.float64)
     shape = 0.3 * jnp.ones(10)
-    return matrix(poses[:, 0]), poses[:, 1:], shape, jnp.ones(T, bool)
+    return so3.exp(poses[:, 0]), poses[:, 1:], shape, jnp.ones(T, bool)
 
 
 @eqx.filter_jit
@@ -73,7 +73,7 @@ def test_the_world_may_be_turned_at_will(model, body, walk, key):
     orientation, *rest = walk
     expected = run(model, body, orientation, *rest)
     for k in jax.random.split(key, 3):
-        world = matrix(3.0 * jax.random.normal(k, (3,)))
+        world = so3.exp(3.0 * jax.random.normal(k, (3,)))
         found = run(model, body, world @ orientation, *rest)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
@@ -85,7 +85,7 @@ def test_steady_turning_changes_no_step(model, body, walk):
     rate = jnp.full(T, -0.02)
     found = run(model, body, straightened(orientation, rate), *rest)
     np.testing.assert_allclose(found.translation, expected.translation, atol=1e-3)
-    turn = lambda seen: vector(matrix(jnp.array([0, -0.02, 0.0])) @ matrix(seen))
+    turn = lambda seen: so3.log(so3.exp(jnp.array([0, -0.02, 0.0])) @ so3.exp(seen))
     np.testing.assert_allclose(
         turn(found.rotation)[model.past :], expected.rotation[model.past :], atol=2e-3
     )
@@ -153,7 +153,7 @@ def test_derivatives_are_finite_where_rotations_are_singular(model, body, walk):
         )(orientation, body_pose, shape)
 
     still = jnp.zeros_like(body_pose)
-    half_turn = jnp.broadcast_to(matrix(jnp.array([0.0, jnp.pi, 0.0])), (T, 3, 3))
+    half_turn = jnp.broadcast_to(so3.exp(jnp.array([0.0, jnp.pi, 0.0])), (T, 3, 3))
     for r, p in (
         (orientation, body_pose),
         (jnp.broadcast_to(jnp.eye(3), (T, 3, 3)), still),
@@ -182,7 +182,7 @@ def test_nearest_turn_does_not_jump():
 
     @jax.jit
     def turns(reference):
-        angles = vector(matrix(reference))
+        angles = so3.log(so3.exp(reference))
         slope = jax.jacobian(nearest_turn)(jnp.zeros(3), reference)
         return angles, nearest_turn(angles, reference), slope
 
@@ -332,7 +332,7 @@ def made_up_track(prediction, orientation, scale, rng, outliers=0.0):
 def made_up_walk(seed, t, outliers):
     """Prediction, orientation, camera and offset, where the scale is 2.5."""
     rng = np.random.default_rng(seed)
-    orientation = np.asarray(matrix(jnp.asarray(rng.normal(0, 1, (t, 3)))))
+    orientation = np.asarray(so3.exp(jnp.asarray(rng.normal(0, 1, (t, 3)))))
     prediction = Prediction(
         translation=jnp.asarray(rng.normal(0.02, 0.01, (t, 3))),
         covariance=jnp.broadcast_to(jnp.eye(3), (t, 3, 3)),
@@ -369,7 +369,7 @@ def test_a_rollout_stays_a_motion(model, body, walk):
     speed = jnp.linalg.norm(jnp.diff(found.trans, axis=0), axis=-1) * 30
     assert float(speed.max()) < 8.0  # m/s
     np.testing.assert_array_equal(found.body_pose[:2], body_pose[:2])
-    world = matrix(jnp.array([0.3, 1.0, -2.0]))
+    world = so3.exp(jnp.array([0.3, 1.0, -2.0]))
     turned = rollout(model, body, world @ orientation[:2], body_pose[:2], shape, 150)
     np.testing.assert_allclose(turned.trans, found.trans @ world.T, atol=1e-6)
 

@@ -1,21 +1,20 @@
-"""Logarithms of rotations: values, and derivatives up to half a turn."""
+"""SO(3): values, derivatives up to half a turn, agreement of the two forms."""
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.geometry.so3 import compose, log, log_of
+from bodyslam_jax.geometry import so3, so3_numpy
+from bodyslam_jax.geometry.so3 import compose, exp, inverse_right_jacobian, log
 from bodyslam_jax.graph import retract_rotation
-from bodyslam_jax.graph.state import inverse_right_jacobian
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 AXES = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1], [2, -1, 2], [-1, 2, 0.5]])
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 ANGLES = [0.0, 1e-12, 1e-5, 1e-3, 1.0, 3.0, np.pi - 1e-6, np.pi]
-exp = lambda vector: jaxlie.SO3.exp(vector).as_matrix()
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -40,20 +39,22 @@ def test_the_logarithm_undoes_the_exponential(dtype):
 def test_a_further_turn_changes_it_as_the_jacobian_says(dtype, angle):
     """Also at exactly half a turn, where a person stands upright before a camera."""
 
-    def at(vector):
-        q = jaxlie.SO3.exp(vector)
-        # The vector that the branch is of.
-        base = log_of(q)
-        by_step = jax.jacfwd(lambda d: log_of(compose(q, jaxlie.SO3.exp(d))))
-        by_matrix = jax.jacrev(lambda d: log(q.as_matrix() @ exp(d)))
-        zero = jnp.zeros(3, dtype)
-        return inverse_right_jacobian(base), by_step(zero), by_matrix(zero)
+    zero = jnp.zeros(3, dtype)
+
+    def by_step(vector):
+        return compose(vector, zero), jax.jacfwd(lambda d: compose(vector, d))(zero)
+
+    def by_matrix(vector):
+        further = lambda d: log(exp(vector) @ exp(d))
+        return further(zero), jax.jacrev(further)(zero)
 
     vectors = jnp.asarray(angle * AXES, dtype)
-    expected, by_step, by_matrix = jax.jit(jax.vmap(at))(vectors)
     atol = 1e-8 if dtype == jnp.float64 else 2e-3
-    np.testing.assert_allclose(by_step, expected, atol=atol)
-    np.testing.assert_allclose(by_matrix, expected, atol=atol)
+    for function in (by_step, by_matrix):
+        # At half a turn either of two branches will do, with its own derivative.
+        branch, found = jax.jit(jax.vmap(function))(vectors)
+        expected = inverse_right_jacobian(branch)
+        np.testing.assert_allclose(found, expected, atol=atol)
 
 
 def test_there_and_back_is_the_identity_with_its_derivative():
@@ -75,3 +76,74 @@ def test_a_step_at_half_a_turn_moves_along_the_axis_too(axis):
     moved = jax.vmap(lambda step: retract_rotation(start, step))(steps)
     differences = (moved[:3] - moved[3:]).T / 2e-6
     np.testing.assert_allclose(found, differences, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_exponential_and_its_derivatives_are_exact_at_every_angle(dtype):
+    angles = [0.0, 1e-12, 1e-5, 0.0316, 0.0317, 0.5, 3.0, np.pi, 6.0, 9.0]
+    vectors = np.multiply.outer(angles, AXES).reshape(-1, 3)
+    found = jax.jit(exp)(jnp.asarray(vectors, dtype))
+    assert found.dtype == dtype
+    rounding = 1e-15 if dtype == jnp.float64 else 1e-6
+    np.testing.assert_allclose(
+        found, Rotation.from_rotvec(vectors).as_matrix(), atol=4 * rounding
+    )
+
+    def at(vector):
+        # dR = R [J_r dθ]x: from a matrix to the vector of its antisymmetric part.
+        derivative = jax.jacfwd(exp)(vector)
+        spin = jnp.einsum("ji,jka->ika", exp(vector), derivative)
+        return jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]]), jax.hessian(exp)(vector)
+
+    below = vectors[: 8 * len(AXES)]
+    right, second = jax.jit(jax.vmap(at))(jnp.asarray(below, dtype))
+    product = right @ jax.vmap(inverse_right_jacobian)(jnp.asarray(below, dtype))
+    eye = np.broadcast_to(np.eye(3), product.shape)
+    np.testing.assert_allclose(product, eye, atol=1e3 * rounding)
+    assert np.isfinite(second).all()
+
+
+def test_the_second_derivative_is_continuous_where_the_series_begins():
+    hessian = jax.jit(jax.hessian(exp))
+    edge = jnp.asarray(np.sqrt(1e-3) * AXES[3])
+    np.testing.assert_allclose(
+        hessian(edge * (1 - 1e-9)), hessian(edge * (1 + 1e-9)), atol=1e-8
+    )
+
+
+def test_numpy_has_the_same_functions_with_the_same_values():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(0, 1, (2, 4, 5, 3))
+    share = rng.uniform(0, 1, (4, 5))
+    R, S = so3_numpy.exp(a), so3_numpy.exp(b)
+    quaternion = so3_numpy.quaternion(a)
+    pairs = [
+        (so3_numpy.exp(a), so3.exp(a)),
+        (so3_numpy.log(R), so3.log(R)),
+        (so3_numpy.compose(a, b), so3.compose(a, b)),
+        (so3_numpy.between(a, b), so3.between(a, b)),
+        (so3_numpy.interpolate(R, S, share), so3.interpolate(R, S, share)),
+        (so3_numpy.from_quaternion(quaternion), so3.from_quaternion(quaternion)),
+    ]
+    for in_numpy, in_jax in pairs:
+        np.testing.assert_allclose(in_numpy, in_jax, atol=1e-12)
+
+
+def test_a_path_is_interpolated_between_its_nearest_poses():
+    rotations = so3_numpy.exp(np.random.default_rng(1).normal(0, 1, (3, 3)))
+    found = so3_numpy.interpolate_path(
+        np.array([0.0, 1.0, 3.0]), rotations, np.array([0.0, 0.25, 2.0, 3.0])
+    )
+    start, end = rotations[[0, 1]], rotations[[1, 2]]
+    half = so3_numpy.interpolate(start, end, np.array([0.25, 0.5]))
+    wanted = [rotations[0], half[0], half[1], rotations[2]]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+def test_the_optical_axis_is_turned_into_a_ray():
+    xy = np.array([[0.0, 0.0], [0.3, -0.4], [-2.0, 1.0]])
+    ray = np.column_stack([xy, np.ones(3)])
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    vectors = so3_numpy.optical_axis_to_ray(xy)
+    np.testing.assert_allclose(so3_numpy.exp(vectors)[:, :, 2], ray, atol=1e-12)
+    np.testing.assert_allclose(vectors[:, 2], 0.0)

@@ -13,7 +13,6 @@ import math
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,7 +24,9 @@ from bodyslam_jax.body.skeleton import (
     LEVELS,
     PARENTS,
     SURFACE_POINTS,
+    ancestors,
 )
+from bodyslam_jax.geometry import so3
 
 _PARENT = np.array(PARENTS[1:])
 
@@ -127,7 +128,7 @@ def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
     """Matrices of axis-angle vectors."""
     if pose.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"poses are of type {pose.dtype}, expected float32 or float64.")
-    return jaxlie.SO3.exp(pose.transpose(1, 0, 2)).as_matrix().transpose(0, 2, 3, 1)
+    return so3.exp(pose.transpose(1, 0, 2)).transpose(0, 2, 3, 1)
 
 
 def _under_root(body_pose):
@@ -241,17 +242,8 @@ def pose_feature(R):
 # the bone to joint i at rest and b_i = G_parent(i) o_i.
 
 
-def _ancestry():
-    below = np.zeros((24, 24))
-    for k in range(24):
-        i = k
-        while i >= 0:
-            below[k, i] = 1.0
-            i = PARENTS[i]
-    return below, below[_PARENT]
-
-
-_UP_TO_SELF, _UP_TO_PARENT = _ancestry()
+_UP_TO_SELF = ancestors().T
+_UP_TO_PARENT = _UP_TO_SELF[_PARENT]
 
 
 @jax.custom_jvp

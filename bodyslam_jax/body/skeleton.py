@@ -5,6 +5,9 @@ Joint order and kinematic tree: Loper et al., SMPL, 2015. Keypoint orders: OpenP
 `constants.JOINT_MAP` of SPIN (Kolotouros et al., 2019).
 """
 
+import numpy as np
+from jaxtyping import Float
+
 JOINT_NAMES: tuple[str, ...] = (
     "pelvis",
     "left_hip",
@@ -61,6 +64,15 @@ LEVELS: tuple[tuple[int, ...], ...] = (
     (22, 23),
 )
 """Joints by depth in the tree: those of one level move at the same time."""
+
+
+def ancestors() -> Float[np.ndarray, "24 24"]:
+    """1 where the joint of the row is the joint of the column or above it."""
+    above = np.eye(24)
+    for joint in range(1, 24):
+        above[:, joint] += above[:, PARENTS[joint]]
+    return above
+
 
 SURFACE_POINTS: tuple[str, ...] = (
     "nose",

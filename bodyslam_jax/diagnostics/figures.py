@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.export import Gait, gait_of_joints
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.gravity import find_stances
 
 _WALKING = (0.7, posture.RUNNING)
@@ -113,8 +113,8 @@ def turned_from_body(
     """
     if len(turn) < _FEWEST:
         return np.nan
-    apart = Rotation.from_rotvec(given).inv() * Rotation.from_matrix(turn)
-    angle = float(np.degrees(np.linalg.norm(np.median(apart.as_rotvec(), axis=0))))
+    apart = so3.between(given, so3.log(turn))
+    angle = float(np.degrees(np.linalg.norm(np.median(apart, axis=0))))
     return angle if angle < _FRONT_OR_BACK else np.nan
 
 

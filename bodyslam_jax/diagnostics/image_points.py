@@ -9,9 +9,10 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.kinematics_numpy import pose_joints
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 POINTS = slice(1, 15)
@@ -23,7 +24,6 @@ SWAPPED = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
 
 _JOINT = np.array([-1, 17, 19, 21, 16, 18, 20, -1, 2, 5, 8, 1, 4, 7])
 """SMPL's joint of each point; -1 are midpoints."""
-_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 _BEHIND = 1e6
 """Pixel of what is behind the camera: far from everything."""
 _FEWEST = 5
@@ -81,15 +81,7 @@ def body_points(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "h t 14 3"
     at = bodies.present
     rest = template + np.einsum("jcb,mb->mjc", directions, bodies.shapes[at])
     angles = bodies.poses[at].reshape(-1, 24, 3)[:, :22]
-    turn = Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix()
-    turn = turn.reshape(-1, 22, 3, 3)
-    G, x = np.empty_like(turn), np.empty_like(rest)
-    G[:, 0], x[:, 0] = turn[:, 0], rest[:, 0] + bodies.trans[at]
-    for k in range(1, 22):
-        parent = _PARENTS[k]
-        bone = rest[:, k] - rest[:, parent]
-        x[:, k] = x[:, parent] + np.einsum("mij,mj->mi", G[:, parent], bone)
-        G[:, k] = G[:, parent] @ turn[:, k]
+    _, x = pose_joints(so3.exp(angles), rest, rest[:, 0] + bodies.trans[at])
     points = x[:, _JOINT]
     points[:, NECK] = (points[:, R_SHOULDER] + points[:, L_SHOULDER]) / 2
     points[:, MID_HIP] = (points[:, R_HIP] + points[:, L_HIP]) / 2

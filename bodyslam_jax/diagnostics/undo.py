@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_MIRRORED
 from bodyslam_jax.diagnostics.explanations import ImageMap
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
@@ -37,8 +37,8 @@ def with_bodies_moved(
     trans, poses = bodies.trans.copy(), bodies.poses.copy()
     trans[at] = place(trans[at] + J_0) - J_0
     if R is not None:
-        root = Rotation.from_matrix(R) * Rotation.from_rotvec(poses[at][:, :3])
-        poses[at] = np.concatenate([root.as_rotvec(), poses[at][:, 3:]], axis=-1)
+        root = so3.log(R @ so3.exp(poses[at][:, :3]))
+        poses[at] = np.concatenate([root, poses[at][:, 3:]], axis=-1)
     bodies = dataclasses.replace(bodies, trans=trans, poses=poses)
     return dataclasses.replace(sequence, bodies=bodies)
 

@@ -12,8 +12,9 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.geometry import so3
 
 Alignment = Literal["A1", "A2", "A3", "A4"]
 """The appendix's alignments: A1 camera and person each on its own (the paper's tables),
@@ -57,7 +58,7 @@ def nearest_rotation(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
         -2,
     )
     _, vectors = jnp.linalg.eigh(davenport)
-    return jaxlie.SO3.from_quaternion_xyzw(vectors[..., -1]).as_matrix()
+    return so3.from_quaternion(vectors[..., -1])
 
 
 @nearest_rotation.defjvp

@@ -20,7 +20,7 @@ from bodyslam_jax.evaluation.alignment import (
     similarity_from_moments,
     umeyama,
 )
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 
 Chunking = Literal["wham", "tram"]
 CHUNK = 100
@@ -115,7 +115,7 @@ def relative_pose_errors(
     kept = lambda T: relative(jnp.where(valid[:, None, None], T, still))
     (R, t), (R_true, t_true) = kept(estimate), kept(truth)
     turned = jnp.swapaxes(R_true, -1, -2)
-    angle = norm(log(turned @ R))
+    angle = norm(so3.log(turned @ R))
     both = valid[step:] & valid[:-step]
     # |R_trueᵀ (t - t_true)| is the translation of E; the rotation keeps its length.
     return Errors(norm(t - t_true), both), Errors(angle, both)

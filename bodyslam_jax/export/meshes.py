@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS, BodyModel, rest_joints
 from bodyslam_jax.export.folder import frame_rate
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 
 
@@ -55,8 +55,8 @@ def write_bvh(path: Path, result: Result, body: BodyModel, person: int = 0) -> N
 
     joint(0, 0)
     num = len(result.timestamps)
-    turns = Rotation.from_rotvec(result.poses[person].reshape(-1, 3))
-    degrees = turns.as_euler("ZXY", degrees=True).reshape(num, 24, 3)[:, order]
+    turns = result.poses[person].reshape(num, 24, 3)
+    degrees = np.degrees(so3.euler(turns, "ZXY"))[:, order]
     pelvis = 100.0 * result.trans[person] + rest[0]
     table = np.concatenate([pelvis, degrees.reshape(num, 72)], axis=1)
     lines += ["MOTION", f"Frames: {num}", f"Frame Time: {1 / frame_rate(result):.8f}"]

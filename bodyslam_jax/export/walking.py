@@ -11,10 +11,10 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.export.folder import frame_rate
 from bodyslam_jax.export.statistics import runs
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 
 _GRAVITY = 9.81
@@ -91,7 +91,7 @@ def gait(result: Result, person: int) -> Gait | None:
     if not stretches:
         return None
     run = max(stretches, key=lambda run: run.stop - run.start)
-    ahead = Rotation.from_rotvec(result.poses[person, run, :3]).as_matrix()[:, :, 2]
+    ahead = so3.exp(result.poses[person, run, :3])[:, :, 2]
     return _steps(result.joints[person, run], ahead, frame_rate(result))
 
 

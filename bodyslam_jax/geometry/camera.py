@@ -1,4 +1,4 @@
-"""Pinhole cameras with or without OpenCV's distortion: project, unproject, triangulate.
+"""Pinhole cameras with or without OpenCV's distortion: project and unproject.
 
 Intrinsics are one array of 4 numbers `fx fy cx cy` (px) or 8, with `k1 k2 p1 p2` at the
 end. C has x right, y down, z forward; pixel (0, 0) is the top-left pixel's centre.
@@ -96,38 +96,6 @@ def undistort(
 
     # A scan, not an unrolled loop: ten linearisations in line would be slow to compile.
     return jax.lax.scan(lambda p, _: (newton(p), None), xy, length=iterations)[0]
-
-
-def triangulate(
-    intrinsics: Float[Array, "*#b i"],
-    T_WC: Float[Array, "*#b n 4 4"],
-    uv: Float[Array, "*#b n 2"],
-    weight: Float[Array, "*#b n"],
-) -> Float[Array, "*_ 3"]:
-    """Point of the world nearest to the rays of `n` pixels, in the least-squares sense.
-
-    Args:
-        weight: of each ray, 1/distance^2 makes distances into angles; 0 for padding.
-
-    Rays that are parallel, or fewer than two, give a finite point that means nothing:
-    look at the angle between them first. The world frame's unit is that of `T_WC`.
-    """
-    R_WC, r_WC = T_WC[..., :3, :3], T_WC[..., :3, 3]
-    ray_C = unproject(intrinsics[..., None, :], uv)
-    ray_C = ray_C / jnp.linalg.norm(ray_C, axis=-1, keepdims=True)
-    ray_W = jnp.einsum("...ij,...j->...i", R_WC, ray_C)
-    eye = jnp.eye(3, dtype=ray_W.dtype)
-    across = eye - ray_W[..., :, None] * ray_W[..., None, :]
-    across = weight[..., None, None] * across
-    total = jnp.sum(weight, axis=-1)
-    is_seen = total > 1e-30
-    total = jnp.where(is_seen, total, 1.0)
-    # Relative to the mean centre, which a far origin would otherwise drown in rounding.
-    middle = jnp.sum(weight[..., None] * r_WC, axis=-2) / total[..., None]
-    rhs = jnp.einsum("...nij,...nj->...i", across, r_WC - middle[..., None, :])
-    tiny = jnp.where(is_seen, 10 * jnp.finfo(weight.dtype).eps * total, 1.0)
-    normal = jnp.sum(across, axis=-3) + tiny[..., None, None] * eye
-    return middle + jnp.linalg.solve(normal, rhs[..., None])[..., 0]
 
 
 def _to_pixel(intrinsics: Array, xy: Array) -> Array:

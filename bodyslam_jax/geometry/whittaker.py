@@ -11,7 +11,8 @@ constant speed as it is, and halves amplitudes at the cutoff.
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import solveh_banded
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 def low_pass(
@@ -63,15 +64,11 @@ def low_pass_rotations(
     rotation may pass through π.
     """
     shape = angles.shape
-    q = (
-        Rotation.from_rotvec(angles.reshape(-1, 3))
-        .as_quat()
-        .reshape(len(angles), -1, 4)
-    )
+    q = so3.quaternion(angles).reshape(len(angles), -1, 4)
     same = np.sign((q[1:] * q[:-1]).sum(-1))
     sign = np.cumprod(np.where(same < 0, -1.0, 1.0), axis=0)
     q[1:] *= sign[..., None]
     smooth = low_pass(q, present, fps, cutoff).reshape(-1, 4)
-    found = Rotation.from_quat(smooth).as_rotvec().reshape(shape)
+    found = so3.log(so3.from_quaternion(smooth)).reshape(shape)
     keep = present.reshape(-1, *(1,) * (angles.ndim - 1))
     return np.where(keep, found, angles)

@@ -16,9 +16,6 @@ from bodyslam_jax.graph.factors.aspect_ratio_prior import (
     AspectRatioPrior as AspectRatioPrior,
 )
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior as BodyPosePrior
-from bodyslam_jax.graph.factors.body_pose_prior import (
-    rotation_between as rotation_between,
-)
 from bodyslam_jax.graph.factors.camera_prior import CameraPrior as CameraPrior
 from bodyslam_jax.graph.factors.ground_contact import HEELS_AND_TOES as HEELS_AND_TOES
 from bodyslam_jax.graph.factors.ground_contact import GroundContact as GroundContact
@@ -69,7 +66,6 @@ from bodyslam_jax.graph.problem import make_problem as make_problem
 from bodyslam_jax.graph.state import State as State
 from bodyslam_jax.graph.state import Step as Step
 from bodyslam_jax.graph.state import gauge as gauge
-from bodyslam_jax.graph.state import inverse_right_jacobian as inverse_right_jacobian
 from bodyslam_jax.graph.state import retract_pose as retract_pose
 from bodyslam_jax.graph.state import retract_rotation as retract_rotation
 from bodyslam_jax.graph.state import world_from_root as world_from_root

@@ -9,13 +9,13 @@ numbers a joint.
 """
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.skeleton import ancestors
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.keypoint_jacobian import (
-    ancestors,
     carried_by_joints,
     times,
 )
@@ -39,7 +39,7 @@ def keypoint_curvature(
     about the pelvis, then of each joint. Places are linear in shape. What pose blend
     shapes add is left out.
     """
-    R = jaxlie.SO3.exp(pose).as_matrix()
+    R = so3.exp(pose)
     found = carried_by_joints(body, R, shape, layout, bias)
     G, x = found.G, found.x
     path = jnp.asarray(ancestors(), pose.dtype)

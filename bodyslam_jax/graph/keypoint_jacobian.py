@@ -9,7 +9,6 @@ add to a vertex. Forward differentiation of the chain takes twenty times as long
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -20,17 +19,10 @@ from bodyslam_jax.body import (
     BodyModel,
     rest_joints,
 )
-from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
+from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS, ancestors
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import JOINTS
 from bodyslam_jax.graph.tracing import is_traced
-
-
-def ancestors() -> np.ndarray:
-    """1 where joint (row) is the other (column) or above it."""
-    above = np.eye(24)
-    for joint in range(1, 24):
-        above[:, joint] += above[:, PARENTS[joint]]
-    return np.minimum(above, 1.0)
 
 
 def turning_joints(
@@ -148,7 +140,7 @@ def keypoint_jacobian(
     """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
     by shape."""
     dtype = pose.dtype
-    R = jaxlie.SO3.exp(pose).as_matrix()
+    R = so3.exp(pose)
     found = carried_by_joints(body, R, shape, layout, bias)
     G, x, share = found.G, found.x, found.share
     count = share.shape[1]

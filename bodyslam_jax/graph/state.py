@@ -8,10 +8,9 @@ keypoint terms see neither the cameras nor `s`, and `s` is free to move.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import compose, log_of
+from bodyslam_jax.geometry import so3
 
 
 class Step(eqx.Module):
@@ -82,7 +81,7 @@ def retract_pose(
     pose: Float[Array, "*b 4 4"], step: Float[Array, "*b 6"]
 ) -> Float[Array, "*b 4 4"]:
     """`C Exp(step[:3])` and `r + step[3:]`."""
-    turn = jaxlie.SO3.exp(step[..., :3]).as_matrix()
+    turn = so3.exp(step[..., :3])
     top = jnp.concatenate(
         [
             pose[..., :3, :3] @ turn,
@@ -102,31 +101,12 @@ def retract_rotation(
     point: an axis-angle vector may leave the ball of radius pi, and does not jump
     there. Beyond 2 pi - 2 it comes back by a full turn, to the same rotation.
     """
-    moved = log_of(compose(jaxlie.SO3.exp(rotation), jaxlie.SO3.exp(step)))
+    moved = so3.compose(rotation, step)
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)
     far = squared > 4.0
     angle = jnp.sqrt(jnp.where(far, squared, 1.0))
     flipped = jnp.sum(moved * rotation, axis=-1, keepdims=True) < 0
     return jnp.where(far & flipped, moved * (1 - 2 * jnp.pi / angle), moved)
-
-
-def inverse_right_jacobian(
-    rotation: Float[Array, "*b 3"],
-) -> Float[Array, "*b 3 3"]:
-    """`d Log(Exp(θ) Exp(δ)) / dδ` at 0, `*b 3 3`; finite below a full turn."""
-    squared = jnp.sum(rotation**2, axis=-1)[..., None, None]
-    small = squared < 1e-4
-    safe = jnp.where(small, 1.0, squared)
-    angle = jnp.sqrt(safe)
-    half = 0.5 * angle
-    factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
-    factor = jnp.where(small, 1 / 12 + squared / 720, factor)
-    x, y, z = (rotation[..., i] for i in range(3))
-    zero = jnp.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    eye = jnp.eye(3, dtype=rotation.dtype)
-    return eye + 0.5 * skew + factor * (skew @ skew)
 
 
 def world_from_root(state: State) -> Float[Array, "h t 4 4"]:

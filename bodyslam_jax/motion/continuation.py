@@ -7,19 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import Window
 from bodyslam_jax.motion.prediction import (
     MotionModel,
     check_compatible,
     in_dtype,
     leg_length,
-)
-from bodyslam_jax.motion.rotations import (
-    change,
-    matrix,
-    transposed,
-    turned,
-    vector,
 )
 
 _FASTEST = 0.35
@@ -80,9 +74,9 @@ def rollout(
         blind = look(
             jnp.concatenate([turn, turn[-1:]]), jnp.concatenate([pose, pose[-1:]])
         )
-        turns = change(pose[-1], blind.body_pose)
-        next_pose = turned(pose[-1], _limited(turns))
-        spin = matrix(_limited(blind.rotation))
+        turns = so3.between(pose[-1], blind.body_pose)
+        next_pose = so3.compose(pose[-1], _limited(turns))
+        spin = so3.exp(_limited(blind.rotation))
         next_turn = turn[-1] @ spin
         turn = jnp.concatenate([turn, next_turn[None]])
         pose = jnp.concatenate([pose, next_pose[None]])
@@ -133,8 +127,8 @@ def _extended(turn, pose, past):
         return jnp.repeat(turn, past, 0), jnp.repeat(pose, past, 0)
     decay = np.cumsum(0.7 ** np.arange(1, missing + 1))[::-1]
     decay = jnp.asarray(decay.copy(), pose.dtype)
-    spin = vector(transposed(turn[1]) @ turn[0])
-    back_turn = turn[0] @ matrix(decay[:, None] * spin)
-    rate = change(pose[1], pose[0])
-    back_pose = turned(pose[0][None], decay[:, None, None] * rate)
+    spin = so3.log(so3.inverse(turn[1]) @ turn[0])
+    back_turn = turn[0] @ so3.exp(decay[:, None] * spin)
+    rate = so3.between(pose[1], pose[0])
+    back_pose = so3.compose(pose[0][None], decay[:, None, None] * rate)
     return jnp.concatenate([back_turn, turn]), jnp.concatenate([back_pose, pose])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bodyslam_jax.motion.rotations import vector
+from bodyslam_jax.geometry import so3
 
 
 class Window(eqx.Module):
@@ -116,5 +116,5 @@ def no_normalisation(size: int) -> Normalisation:
 
 def joint_angles(window: Window) -> Float[Array, "*b p 24 3"]:
     """The root's rotation vector, seen from H_{k-1}, and θ, of every frame (rad)."""
-    root = vector(window.rotation)[..., None, :]
+    root = so3.log(window.rotation)[..., None, :]
     return jnp.concatenate([root, window.body_pose], -2)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bodyslam_jax.body.skeleton import ANKLES, FEET
-from bodyslam_jax.motion import rotations
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import (
     Guess,
     Layer,
@@ -111,7 +111,7 @@ class MetricNetwork(eqx.Module):
     def posture_features(self, window: Window) -> Float[Array, "*b d"]:
         """How frames up to k-1 differ from frame k-1, and its posture."""
         angles = joint_angles(window)[..., -1 - self.posture_frames : -1, :, :]
-        change = rotations.change(angles[..., -1:, :, :], angles[..., :-1, :, :])
+        change = so3.between(angles[..., -1:, :, :], angles[..., :-1, :, :])
         flat = lambda x, n: x.reshape(*x.shape[:-n], -1)
         return jnp.concatenate([flat(change, 3), flat(angles[..., -1, 1:, :], 2)], -1)
 
@@ -149,7 +149,7 @@ class MetricNetwork(eqx.Module):
         leg = window.leg[..., None]
         change = self.change(window)
         last = window.body_pose[..., -2, :, :]
-        turned = rotations.turned(last, change[..., 1:, :])
+        turned = so3.compose(last, change[..., 1:, :])
         return Guess(
             translation=move * leg,
             cholesky=factor * leg[..., None],

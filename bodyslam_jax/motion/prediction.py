@@ -10,10 +10,10 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import Window
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
-from bodyslam_jax.motion.rotations import turned
 from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 
 
@@ -145,6 +145,6 @@ def predict(
             covariance, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (t, 3, 3))
         ),
         body_pose=front(guess.body_pose, body_pose),
-        rotation=front(turned(turn, guess.rotation), jnp.zeros((t, 3), dtype)),
+        rotation=front(so3.compose(turn, guess.rotation), jnp.zeros((t, 3), dtype)),
         valid=jnp.concatenate([jnp.zeros(past, bool), valid]),
     )

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
-from bodyslam_jax.motion.rotations import change, matrix, turned, vector
 
 
 class Clock(eqx.Module):
@@ -87,10 +87,10 @@ def predict_between(
 
     def at_ticks(angles: Array) -> Array:
         share = between.reshape(-1, *(1,) * (angles.ndim - 1))
-        step = change(angles[clock.frame], angles[following])
-        return turned(angles[clock.frame], share * step)
+        step = so3.between(angles[clock.frame], angles[following])
+        return so3.compose(angles[clock.frame], share * step)
 
-    C = matrix(at_ticks(vector(orientation)))
+    C = so3.exp(at_ticks(so3.log(orientation)))
     pose = at_ticks(body_pose)
     there = present[clock.frame] & (present[following] | (between == 0))
     seen = predict(network, body, C, pose, shape, there)
@@ -107,13 +107,13 @@ def predict_between(
     end = jnp.where(beyond > 0, last, clock.tick)
     start = jnp.concatenate([clock.tick[:1], clock.tick[:-1]])
     valid = (missing[end] == missing[start]) & (jnp.arange(len(steps)) > 0) & present
-    step = change(pose[end - 1], seen.body_pose[end])
+    step = so3.between(pose[end - 1], seen.body_pose[end])
     previous = jnp.concatenate([body_pose[:1], body_pose[:-1]])
     return Prediction(
         translation=jnp.einsum("tji,tj->ti", started, moved),
         covariance=seen.covariance[end] * (steps**2)[:, None, None]
         + jnp.where(valid, 0, 1)[:, None, None].astype(dtype) * jnp.eye(3, dtype=dtype),
-        body_pose=turned(previous, steps[:, None, None] * step),
+        body_pose=so3.compose(previous, steps[:, None, None] * step),
         rotation=seen.rotation[end] * steps[:, None],
         valid=valid,
     )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.motion.rotations import matrix, transposed, vector
+from bodyslam_jax.geometry import so3
 
 _SIGMA = 15
 """Standard deviation of the smoothing, frames at 30 fps: about half a stride."""
@@ -26,7 +26,7 @@ def turning_rate(
     `orientation` takes H to any one frame: the result depends neither on its heading
     nor on where up is. Frames that are not `present` count for nothing.
     """
-    step = vector(transposed(orientation[:-1]) @ orientation[1:])[:, 1]
+    step = so3.log(so3.inverse(orientation[:-1]) @ orientation[1:])[:, 1]
     known = (present[:-1] & present[1:]).astype(step.dtype)
     reach = min(3 * _SIGMA, len(orientation))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SIGMA) ** 2)
@@ -41,7 +41,7 @@ def straightened(
 ) -> Float[Array, "t 3 3"]:
     """The same relative rotations without `rate`: `C'_k = C'_{k-1} Y(-rate) ΔC_k`."""
     up = jnp.array([0.0, 1.0, 0.0], rate.dtype)
-    step = transposed(orientation[:-1]) @ orientation[1:]
-    step = matrix(-rate[1:, None] * up) @ step
+    step = so3.inverse(orientation[:-1]) @ orientation[1:]
+    step = so3.exp(-rate[1:, None] * up) @ step
     first = orientation[:1]
     return jax.lax.associative_scan(jnp.matmul, jnp.concatenate([first, step]))

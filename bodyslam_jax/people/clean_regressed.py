@@ -16,6 +16,7 @@ from scipy.linalg import solveh_banded
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
 from bodyslam_jax.people.facing import HALF_TURN, find_turned
@@ -29,7 +30,6 @@ from bodyslam_jax.people.person_state import (
     bodies_from_roots,
     roots_from_bodies,
 )
-from bodyslam_jax.people.rotations import matrices, slerp, vectors
 from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
     Skeleton,
@@ -125,8 +125,8 @@ def body_noise(bodies: Bodies) -> BodyNoise:
         if not middle.any():
             found.append((np.nan, np.nan, np.nan, np.full(10, np.nan)))
             continue
-        turns = matrices(poses.reshape(len(poses), 24, 3))
-        step = vectors(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
+        turns = so3.exp(poses.reshape(len(poses), 24, 3))
+        step = so3.log(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
         change = np.diff(step, axis=0)[middle]
         depth = np.diff(trans[:, 2], 2)[middle]
         found.append(
@@ -290,12 +290,12 @@ def _fill_gaps(roots: PersonState, person: int, longest: float) -> None:
         share = np.arange(1, b - a) / (b - a)
         gap = slice(a + 1, b)
         from_, to = np.broadcast_to(T_CH[[a, b], None, :3, :3], (2, len(share), 3, 3))
-        T_CH[gap, :3, :3] = slerp(from_, to, share)
+        T_CH[gap, :3, :3] = so3.interpolate(from_, to, share)
         T_CH[gap, :3, 3] = T_CH[a, :3, 3] + share[:, None] * (
             T_CH[b, :3, 3] - T_CH[a, :3, 3]
         )
         size = (2, len(share), 23, 3, 3)
-        from_, to = np.broadcast_to(matrices(pose[[a, b]])[:, None], size)
+        from_, to = np.broadcast_to(so3.exp(pose[[a, b]])[:, None], size)
         joint_share = np.repeat(share[:, None], 23, axis=1)
-        pose[gap] = vectors(slerp(from_, to, joint_share))
+        pose[gap] = so3.log(so3.interpolate(from_, to, joint_share))
         roots.present[person, gap] = True

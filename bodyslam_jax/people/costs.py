@@ -9,12 +9,11 @@ the squared whitened distance s, as in SMPLify (Bogo et al., 2016), but there in
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.geometry.so3 import log
 from bodyslam_jax.people.posture_prior import PosturePrior
 from bodyslam_jax.people.skeleton import Skeleton, place_points, pose_points
 
@@ -45,7 +44,7 @@ class Fit(eqx.Module):
     """Posture, in standard deviations of the prior's components."""
 
     def moved(self, step: Float[Array, "*b n"]) -> "Fit":
-        turn = jaxlie.SO3.exp(step[..., :3]).as_matrix()
+        turn = so3.exp(step[..., :3])
         position = self.position + step[..., 3:6]
         depth = jnp.maximum(position[..., 2:], DEPTH_FLOOR)
         return Fit(
@@ -215,7 +214,7 @@ def _unlike(
 ) -> Float[Array, " d"]:
     """How far a body is from the one guessed, in standard deviations; 0 where these are
     infinite."""
-    turn = log(orientation @ lifted.orientation.T) / lifted.turn_sigma
+    turn = so3.log(orientation @ lifted.orientation.T) / lifted.turn_sigma
     return jnp.concatenate([turn, (latent - lifted.latent) / lifted.latent_sigma])
 
 

@@ -11,8 +11,8 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.people.found import Found
 from bodyslam_jax.types import Intrinsics, Keypoints
 
@@ -66,10 +66,5 @@ def _turned(
     relative: Float[np.ndarray, "25 3"], uv: np.ndarray, intrinsics: Intrinsics
 ) -> Float[np.ndarray, "25 3"]:
     fx, fy, cx, cy = intrinsics.params[:4]
-    ray = np.array([(uv[0] - cx) / fx, (uv[1] - cy) / fy, 1.0])
-    ray /= np.linalg.norm(ray)
-    axis = np.cross([0.0, 0.0, 1.0], ray)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        return relative
-    return Rotation.from_rotvec(axis / sine * np.arcsin(sine)).apply(relative)
+    xy = np.array([(uv[0] - cx) / fx, (uv[1] - cy) / fy])
+    return relative @ so3.exp(so3.optical_axis_to_ray(xy)).T

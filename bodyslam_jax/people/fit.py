@@ -17,6 +17,7 @@ from scipy.ndimage import median_filter
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.depths import depth_costs
 from bodyslam_jax.people.keypoint_errors import (
@@ -29,7 +30,6 @@ from bodyslam_jax.people.lift import lift, load_lifter
 from bodyslam_jax.people.multistart import fit_frames
 from bodyslam_jax.people.person_state import PersonState, bodies_from_roots
 from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
-from bodyslam_jax.people.rotations import slerp
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
 from bodyslam_jax.people.viterbi import best_path
@@ -218,7 +218,7 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
         for a in (fit.position, fit.latent)
     )
     orientation = np.asarray(fit.orientation)
-    turned = slerp(orientation[before], orientation[after], share)
+    turned = so3.interpolate(orientation[before], orientation[after], share)
     dtype = fit.position.dtype
     return Fit(*(jnp.asarray(a, dtype) for a in (turned, position, latent)))
 

@@ -12,10 +12,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.camera import unproject
 from bodyslam_jax.people.costs import (
     DEPTH_FLOOR,
@@ -142,7 +142,7 @@ def _frame_starts(
     angles = jnp.arange(NUM_HEADINGS, dtype=dtype) * (2 * jnp.pi / NUM_HEADINGS)
     # Upright before the camera, facing it: H's y up is C's y down.
     facing = jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
-    turned = jax.vmap(lambda a: jaxlie.SO3.from_y_radians(a).as_matrix())(angles)
+    turned = so3.exp(angles[:, None] * jnp.array([0.0, 1.0, 0.0], dtype))
     orientation = jnp.concatenate(
         [_roll(uv, sigma) @ facing @ turned, lifted.orientation[None]]
     )
@@ -169,7 +169,7 @@ def _roll(uv: Array, sigma: Array) -> Float[Array, "3 3"]:
     safe = jnp.where(known, torso, jnp.array([0.0, -1.0], torso.dtype))
     angle = jnp.arctan2(safe[0], -safe[1])
     angle = jnp.where(jnp.abs(angle) > jnp.pi / 3, angle, 0.0)
-    return jaxlie.SO3.from_z_radians(angle).as_matrix()
+    return so3.exp(angle * jnp.array([0.0, 0.0, 1.0], angle.dtype))
 
 
 def _place(

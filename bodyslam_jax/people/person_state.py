@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel, rest_joints
-from bodyslam_jax.people.rotations import matrices, vectors
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies
 
 
@@ -32,7 +32,7 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> PersonState:
     present = np.asarray(bodies.present, bool)
     pelvis = _pelvis(body, bodies.shapes) + bodies.trans
     T_CH = np.tile(np.eye(4), (*present.shape, 1, 1))
-    T_CH[..., :3, :3] = matrices(bodies.poses[..., :3])
+    T_CH[..., :3, :3] = so3.exp(bodies.poses[..., :3])
     T_CH[..., :3, 3] = pelvis
     T_CH[~present] = np.eye(4)
     body_pose = bodies.poses[..., 3:].reshape(*present.shape, 23, 3).astype(float)
@@ -50,7 +50,7 @@ def bodies_from_roots(roots: PersonState, body: BodyModel) -> Bodies:
     That β is an estimate, no longer what a regressor said.
     """
     frames = roots.present.shape[1]
-    orientation = vectors(roots.T_CH[..., :3, :3])
+    orientation = so3.log(roots.T_CH[..., :3, :3])
     pose = roots.body_pose.reshape(*roots.present.shape, 69)
     shapes = np.repeat(roots.shape[:, None], frames, axis=1)
     trans = roots.T_CH[..., :3, 3] - _pelvis(body, shapes)

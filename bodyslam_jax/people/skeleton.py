@@ -10,11 +10,12 @@ which compiles and runs an order of magnitude slower.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import PARENTS, BodyModel, local_keypoints, rest_joints
+from bodyslam_jax.body.skeleton import LEVELS
+from bodyslam_jax.geometry import so3
 
 # Bone that carries each BODY_25 keypoint: SMPL's joint of that name, the head for the
 # face, the toe joint for toes, the ankle for heels.
@@ -23,8 +24,6 @@ _KEYPOINT_BONE = np.array(
     + [15, 15, 15, 15, 10, 10, 7, 11, 11, 8]
 )
 _CARRIER = np.concatenate([PARENTS, _KEYPOINT_BONE])
-_LEVELS = ((1, 4), (4, 7), (7, 10), (10, 15), (15, 18), (18, 20), (20, 22), (22, 24))
-"""Joints `first:last` whose parents are all in earlier ranges."""
 
 
 def _paths() -> np.ndarray:
@@ -109,7 +108,7 @@ def place_points(
     skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " s"]
 ) -> tuple[Float[Array, "24 3"], Float[Array, "25 3"]]:
     """Joints and keypoints in H, m, without derivatives."""
-    orientation = _orientations(jaxlie.SO3.exp(angles.reshape(21, 3)).as_matrix())
+    orientation = _orientations(so3.exp(angles.reshape(21, 3)))
     offset = skeleton.offset + skeleton.offset_shape @ shape
     carried = jnp.einsum("pij,pj->pi", orientation[_carriers()], offset)
     point = jnp.asarray(_PATH, angles.dtype) @ carried
@@ -121,9 +120,8 @@ def pose_points(
 ) -> Points:
     """The same with derivatives."""
     theta = angles.reshape(21, 3)
-    exp = lambda t: jaxlie.SO3.exp(t).as_matrix()
-    turn = exp(theta)
-    change = jax.vmap(jax.jacfwd(exp))(theta)
+    turn = so3.exp(theta)
+    change = jax.vmap(jax.jacfwd(so3.exp))(theta)
     # dR/dθ_a R' is the cross product's matrix of the axis about which θ_a turns.
     spin = jnp.einsum("jika,jlk->jila", change, turn)
     axis = jnp.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
@@ -158,7 +156,8 @@ def _orientations(turn: Float[Array, "21 3 3"]) -> Float[Array, "24 3 3"]:
     still = jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), (2, 3, 3))
     turn = jnp.concatenate([still[:1], turn, still])
     found = turn[:1]
-    for first, last in _LEVELS:
+    for level in LEVELS:
+        first, last = level[0], level[-1] + 1
         parent = jnp.array(PARENTS[first:last])
         found = jnp.concatenate([found, found[parent] @ turn[first:last]])
     return found

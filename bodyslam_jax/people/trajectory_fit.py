@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.people.costs import Fit, Lifted, Normal, Scene, linearise
 
 
@@ -106,7 +106,7 @@ def _temporal(ties: Ties, fit: Fit) -> Float[Array, "t n"]:
     before, earlier = _shifted(linear, 1), _shifted(linear, 2)
     linear = linear + ties.c1[:, 3:] * before + ties.c2[:, 3:] * earlier
     relative = fit.orientation @ jnp.swapaxes(_shifted(fit.orientation, 1), -1, -2)
-    turn = log(relative).at[0].set(0.0)
+    turn = so3.log(relative).at[0].set(0.0)
     return jnp.concatenate([turn - ties.c2[:, :3] * _shifted(turn, 1), linear], -1)
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.grouped_sums import sum_by
 
 
 @dataclasses.dataclass
@@ -161,13 +163,6 @@ def _linearise(
     return U, b_c, V, b_p, W[order], camera[order], point_of[moving][order]
 
 
-def sum_by(index: np.ndarray, values: np.ndarray, num: int) -> np.ndarray:
-    """Sums of `values` (m, ...) that share an index, (num, ...)."""
-    flat = values.reshape(len(index), -1)
-    sums = [np.bincount(index, column, num) for column in flat.T]
-    return np.stack(sums, axis=-1).reshape(num, *values.shape[1:])
-
-
 def _solve(
     system: tuple[np.ndarray, ...], damping: float, num_points: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
@@ -206,7 +201,7 @@ def _moved(
 ) -> Scene:
     R, centre, moved = scene.R_CW.copy(), scene.centre.copy(), scene.points.copy()
     if len(cameras):
-        R[cameras] = Rotation.from_rotvec(step_c[:, :3]).as_matrix() @ R[cameras]
+        R[cameras] = so3.exp(step_c[:, :3]) @ R[cameras]
         centre[cameras] += step_c[:, 3:]
     moved[points] += step_p
     return Scene(R, centre, moved)

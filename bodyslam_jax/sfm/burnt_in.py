@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.multiview import fit_rotation, unit_rays
+from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
 STILL = 0.5

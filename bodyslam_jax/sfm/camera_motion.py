@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.sfm.bundle import Views
-from bodyslam_jax.sfm.multiview import fit_rotation, unit_rays
+from bodyslam_jax.sfm.multiview import fit_rotation
 
 _FOLLOWED = 0.05
 """Share of the points that even a quick motion leaves."""

@@ -13,9 +13,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.sfm.bundle import Scene, Views, sum_by
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.sfm.bundle import Scene, Views
 
 _MOST_FRAMES, _MOST_POINTS = 26, 300
 _FEWEST_POINTS = 40
@@ -156,7 +157,7 @@ class _Unknowns:
 
     def moved(self, cameras: np.ndarray, points: np.ndarray, lens: np.ndarray):
         return _Unknowns(
-            Rotation.from_rotvec(cameras[:, :3]).as_matrix() @ self.R,
+            so3.exp(cameras[:, :3]) @ self.R,
             self.centre + cameras[:, 3:],
             self.points + points,
             self.lens + lens,

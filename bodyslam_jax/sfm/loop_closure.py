@@ -9,14 +9,14 @@ from several frames, is taken to be that point.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.triangulation import triangulate
 from bodyslam_jax.sfm.bundle import (
     Scene,
     Views,
     errors,
     jacobian_of_points,
-    sum_by,
 )
-from bodyslam_jax.sfm.multiview import triangulate
 from bodyslam_jax.sfm.relocalise import Pose, near, relocate, with_moved
 
 _LEAST_VIEWS, _MOST_VIEWS = 2, 8
@@ -125,7 +125,14 @@ class Revisits:
         # The first of a pair is seen by the cameras that were moved.
         frame = self.views.frame[rows] + (part % 2 == 0) * (len(both.centre) // 2)
         views = Views(frame, part // 2, self.views.xy[rows])
-        points, _, _ = triangulate(both, views, len(pairs), threshold / 2)
+        points = triangulate(
+            both.R_CW[views.frame],
+            both.centre[views.frame],
+            views.xy,
+            views.landmark,
+            len(pairs),
+            threshold / 2,
+        )
         error = errors(Scene(both.R_CW, both.centre, points), views) / threshold
         total = np.bincount(part, np.minimum(error, 3.0), len(parts))
         mean = total / np.bincount(part, minlength=len(parts))

@@ -6,9 +6,9 @@ when they are many, they may be what was taken for the scene.
 
 import numpy as np
 
+from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.burnt_in import noise_of, sampson
-from bodyslam_jax.sfm.multiview import unit_rays
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.types import Intrinsics, Tracks
 

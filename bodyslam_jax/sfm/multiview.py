@@ -2,9 +2,9 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from bodyslam_jax.sfm.bundle import Scene, Views, sum_by
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 def relative_pose(
@@ -43,88 +43,6 @@ def fit_rotation(
     return R, away
 
 
-def unit_rays(xy: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-    rays = np.concatenate([xy, np.ones_like(xy[:, :1])], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def triangulate(
-    scene: Scene, views: Views, num_landmarks: int, scale: float
-) -> tuple[Float[np.ndarray, "l 3"], Float[np.ndarray, " l"], Int[np.ndarray, " l"]]:
-    """Points nearest to all their rays, robustly; all landmarks at once.
-
-    Args:
-        scale: error at depth 1 from which a view is doubted (Cauchy).
-
-    Returns: points, the largest angle (rad) between the first ray and another, and the
-    number of views; a landmark without views has a point without meaning.
-    """
-    ray = np.einsum("mji,mj->mi", scene.R_CW[views.frame], unit_rays(views.xy))
-    centre = scene.centre[views.frame]
-    across = np.eye(3) - ray[:, :, None] * ray[:, None]
-    pull = np.einsum("mij,mj->mi", across, centre)
-    count = np.bincount(views.landmark, minlength=num_landmarks)
-    weight = np.ones(len(ray))
-    points = np.zeros((num_landmarks, 3))
-    for _ in range(4):
-        normal = sum_by(views.landmark, weight[:, None, None] * across, num_landmarks)
-        rhs = sum_by(views.landmark, weight[:, None] * pull, num_landmarks)
-        size = np.trace(normal, axis1=1, axis2=2)
-        normal += (1e-12 * size + 1e-30)[:, None, None] * np.eye(3)
-        points = np.linalg.solve(normal, rhs[..., None])[..., 0]
-        p_C = np.einsum(
-            "mij,mj->mi", scene.R_CW[views.frame], points[views.landmark] - centre
-        )
-        z = np.where(p_C[:, 2] > 1e-9, p_C[:, 2], 1e9)
-        error = np.linalg.norm(p_C[:, :2] / z[:, None] - views.xy, axis=-1) / scale
-        distance = np.linalg.norm(p_C, axis=-1) + 1e-12
-        weight = 1 / distance**2 / (1 + error**2)
-    points = _refine_points(scene, views, points, scale)
-    return points, widest_angle(scene, views, points, num_landmarks), count
-
-
-def _refine_points(
-    scene: Scene, views: Views, points: Float[np.ndarray, "l 3"], scale: float
-) -> Float[np.ndarray, "l 3"]:
-    """Gauss-Newton on reprojection errors. The point nearest to the rays is too near:
-    noise of their directions makes up parallax, a fifth where they are 0.5 deg apart.
-    """
-    R = scene.R_CW[views.frame]
-    for _ in range(5):
-        offset = points[views.landmark] - scene.centre[views.frame]
-        p_C = np.einsum("mij,mj->mi", R, offset)
-        front = p_C[:, 2] > 1e-9
-        z = np.where(front, p_C[:, 2], 1.0)[:, None]
-        seen = p_C[:, :2] / z
-        error = views.xy - seen
-        jac = (R[:, :2] - seen[:, :, None] * R[:, 2:]) / z[:, :, None]
-        weight = front / (1 + np.sum((error / scale) ** 2, axis=-1))
-        pull = np.einsum("mki,mk->mi", jac, error) * weight[:, None]
-        across = np.einsum("mki,mkj->mij", jac, jac) * weight[:, None, None]
-        normal = sum_by(views.landmark, across, len(points))
-        size = np.trace(normal, axis1=1, axis2=2)
-        normal += (1e-9 * size + 1e-30)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(
-            normal, sum_by(views.landmark, pull, len(points))[..., None]
-        )[..., 0]
-        points = points + step
-    return points
-
-
-def widest_angle(
-    scene: Scene, views: Views, points: Float[np.ndarray, "l 3"], num_landmarks: int
-) -> Float[np.ndarray, " l"]:
-    """Largest angle (rad) at each point between its first view and another."""
-    to = scene.centre[views.frame] - points[views.landmark]
-    to = to / np.maximum(np.linalg.norm(to, axis=-1, keepdims=True), 1e-12)
-    first = np.full(num_landmarks, len(to))
-    np.minimum.at(first, views.landmark, np.arange(len(to)))
-    apart = np.linalg.norm(to - to[first[views.landmark]], axis=-1)
-    angle = np.zeros(num_landmarks)
-    np.maximum.at(angle, views.landmark, 2 * np.arcsin(np.clip(apart / 2, 0, 1)))
-    return angle
-
-
 def resect(
     points: Float[np.ndarray, "n 3"],
     xy: Float[np.ndarray, "n 2"],
@@ -159,7 +77,7 @@ def resect(
         return None
     if not ok or inlier is None or len(inlier) < 6:
         return None
-    R = cv2.Rodrigues(rotvec)[0]
+    R = so3.exp(rotvec[:, 0])
     return refine_pose(R, -R.T @ t[:, 0], points, xy, threshold)
 
 
@@ -204,7 +122,7 @@ def refine_pose(
         H = A.T @ A
         H += 1e-9 * np.diag(np.diag(H)) + 1e-12 * np.eye(6)
         step = -np.linalg.solve(H, A.T @ b)
-        R = cv2.Rodrigues(step[:3])[0] @ R
+        R = so3.exp(step[:3]) @ R
         centre = centre + step[3:]
         if np.linalg.norm(step[3:]) > 100 * abs(start_z) + 1e-9:
             return None

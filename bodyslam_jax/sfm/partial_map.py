@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from bodyslam_jax.config import Structure
+from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.loop_closure import Revisits
-from bodyslam_jax.sfm.multiview import triangulate, widest_angle
 
 _ENOUGH = 20
 """Views of known points that tell how far points usually are."""
@@ -131,7 +131,14 @@ class Mapper:
         if not len(use):
             return
         views = self.views[use]
-        points, _, _ = triangulate(grown.scene, views, self.num_landmarks, self.pixel)
+        points = triangulate(
+            grown.scene.R_CW[views.frame],
+            grown.scene.centre[views.frame],
+            views.xy,
+            views.landmark,
+            self.num_landmarks,
+            self.pixel,
+        )
         trial = Scene(grown.scene.R_CW, grown.scene.centre, points)
         good = errors(trial, views) < self.threshold
         count = np.bincount(views.landmark, minlength=self.num_landmarks)
@@ -139,7 +146,7 @@ class Mapper:
         if not good.any():
             return
         seen = views[np.flatnonzero(good)]
-        angle = widest_angle(trial, seen, points, self.num_landmarks)
+        angle = widest_angle(trial.centre[seen.frame], seen.landmark, points)
         new = (fits >= 2) & (fits >= 0.6 * count) & (angle > _FLAT * self.min_angle)
         new &= self._parallax(trial, seen, grown) > self.min_angle
         grown.scene.points[new] = points[new]
@@ -157,7 +164,7 @@ class Mapper:
         near = np.isin(np.arange(self.num_frames), views.frame)
         at = grown.has_point[self.views.landmark] & near[self.views.frame]
         if np.count_nonzero(at) < _ENOUGH:
-            return widest_angle(trial, views, trial.points, self.num_landmarks)
+            return widest_angle(trial.centre[views.frame], views.landmark, trial.points)
         known = self.views[np.flatnonzero(at)]
         away = grown.scene.points[known.landmark] - grown.scene.centre[known.frame]
         usual = np.median(np.linalg.norm(away, axis=-1))
@@ -166,7 +173,7 @@ class Mapper:
         ray = trial.points - centre
         distance = np.linalg.norm(ray, axis=-1, keepdims=True)
         there = centre + usual * ray / np.maximum(distance, 1e-12)
-        return widest_angle(trial, views, there, self.num_landmarks)
+        return widest_angle(trial.centre[views.frame], views.landmark, there)
 
     def _mark(self, grown: PartialMap) -> None:
         """Sorts observations into inliers and outliers, and drops poor points."""
@@ -186,11 +193,9 @@ class Mapper:
         views = self.views[use]
         count = np.bincount(views.landmark, minlength=self.num_landmarks)
         fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
+        fitting = views[np.flatnonzero(good)]
         angle = widest_angle(
-            grown.scene,
-            views[np.flatnonzero(good)],
-            grown.scene.points,
-            self.num_landmarks,
+            grown.scene.centre[fitting.frame], fitting.landmark, grown.scene.points
         )
         bad = (fits < 2) | (fits < 0.5 * count) | (angle < _FLAT * self.min_angle)
         grown.has_point &= ~bad

@@ -5,9 +5,9 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation, Slerp
 
 from bodyslam_jax.config import Structure
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views, errors
 from bodyslam_jax.sfm.camera_motion import (
@@ -378,8 +378,7 @@ def interpolate_poses(
     if len(at) == 1:
         filled[:] = T_WC[at[0]]
         return filled
-    turns = Slerp(at, Rotation.from_matrix(T_WC[at, :3, :3]))
-    filled[:, :3, :3] = turns(time).as_matrix()
+    filled[:, :3, :3] = so3.interpolate_path(at, T_WC[at, :3, :3], time)
     for axis in range(3):
         filled[:, axis, 3] = np.interp(time, at, T_WC[at, axis, 3])
     filled[at] = T_WC[at]

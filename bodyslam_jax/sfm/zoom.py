@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.sfm.bundle import Views
-from bodyslam_jax.sfm.multiview import unit_rays
 from bodyslam_jax.types import Tracks
 
 LEAST_ZOOM = 0.04
@@ -95,7 +96,7 @@ def _turn_and_scale(
             J[..., 3] = size * q * free
             H = np.einsum("m,mki,mkj->ij", weight, J, J) + 1e-12 * np.eye(4)
             step = -np.linalg.solve(H, np.einsum("m,mki,mk->i", weight, J, r))
-            turn = cv2.Rodrigues(step[:3])[0] @ turn
+            turn = so3.exp(step[:3]) @ turn
             log_s += float(np.clip(step[3], -0.2, 0.2)) if free else 0.0
         away.append(float(np.median(np.linalg.norm(r, axis=-1))))
     return log_s, away[1], away[0]

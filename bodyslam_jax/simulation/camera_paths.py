@@ -8,8 +8,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.exact_scene import look_at
 
@@ -134,5 +134,5 @@ def _in_hand(
     T_WC = look_at(eye + handling.shake * smooth_noise(rng, t, 0.08, 3), target)
     tremble = handling.tremble * smooth_noise(rng, t, 0.08, 3)
     tremble[:, 2] += 0.03 * smooth_noise(rng, t, 1.0)[:, 0]
-    T_WC[:, :3, :3] = T_WC[:, :3, :3] @ Rotation.from_rotvec(tremble).as_matrix()
+    T_WC[:, :3, :3] = T_WC[:, :3, :3] @ so3.exp(tremble)
     return T_WC

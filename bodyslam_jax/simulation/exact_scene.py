@@ -8,7 +8,8 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,7 @@ def walk(
     pose[:, 18, 1], pose[:, 19, 1] = -0.4, 0.4
     T = np.tile(np.eye(4), (len(a), 1, 1))
     root = np.stack([zero, 0.08 * np.sin(a), 0.03 * np.cos(a)], axis=1)
-    T[:, :3, :3] = Rotation.from_rotvec(root).as_matrix()
+    T[:, :3, :3] = so3.exp(root)
     T[:, :3, 3] = np.stack(
         [0.02 * np.sin(a), 0.92 - 0.02 * np.cos(2 * a), 1.2 * timestamps], axis=1
     )
@@ -151,6 +152,6 @@ def _beside(
     )
     eye = person * [1, 0, 1] + [-4.0, 1.4, -0.5] + sway[:, :3] * [0.2, 0.1, 0.3]
     T = look_at(eye, person + 0.1 * sway[:, 3:])
-    shake = Rotation.from_rotvec(0.02 * sway[:, 3:] * [1, 1, 2]).as_matrix()
+    shake = so3.exp(0.02 * sway[:, 3:] * [1, 1, 2])
     T[:, :3, :3] = T[:, :3, :3] @ shake
     return T

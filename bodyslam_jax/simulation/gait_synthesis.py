@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, resample
 from bodyslam_jax.motion.capture.clips import leg_length, mirror
 from bodyslam_jax.simulation.posing import Person
@@ -101,8 +101,9 @@ class Soles:
         return points.reshape(-1, 4, 3)
 
 
-def _about_y(angle: Float[np.ndarray, " n"]) -> Rotation:
-    return Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0])
+def _about_y(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Rotation vectors about the vertical."""
+    return angle[:, None] * [0.0, 1.0, 0.0]
 
 
 class _Library:
@@ -113,7 +114,7 @@ class _Library:
         rest = person.rest
         self.clip = np.repeat(np.arange(len(clips)), [len(c.poses) for c in clips])
         self.poses = np.concatenate([c.poses for c in clips]).astype(float)
-        root = Rotation.from_rotvec(self.poses[:, 0])
+        root = so3.exp(self.poses[:, 0])
         # The path of the middle of the hips in proportion to the legs: captures and
         # models put the pelvis joint at different heights above the hips.
         below = [
@@ -124,9 +125,9 @@ class _Library:
         ]
         ratio = np.array([leg_length(rest) / c.leg_length for c in clips])
         hips = np.concatenate([c.trans for c in clips])
-        hips = hips + root.apply(np.array(below)[self.clip])
+        hips = hips + np.einsum("nij,nj->ni", root, np.array(below)[self.clip])
         self.pelvis = ratio[self.clip, None] * hips
-        self.pelvis -= root.apply((rest[1] + rest[2]) / 2 - rest[0])
+        self.pelvis -= root @ ((rest[1] + rest[2]) / 2 - rest[0])
         _, joints = person.joints(self.poses, np.zeros_like(self.pelvis))
         sole = self.soles(self.poses, self.pelvis)
         for c in range(len(clips)):
@@ -141,7 +142,7 @@ class _Library:
         speed = np.linalg.norm(self.sole_step, axis=2) * FPS
         weight = np.exp(-speed / 0.15 - np.maximum(sole[:, :, 1], 0) / 0.03) + 1e-9
         self.carries = weight / weight.sum(axis=1, keepdims=True)
-        forward = root.apply([0.0, 0.0, 1.0])
+        forward = root[:, :, 2]
         self.yaw = np.arctan2(forward[:, 0], forward[:, 2])
         self.heading = self._smooth_heading()
         self.features = self._features(joints)
@@ -160,9 +161,9 @@ class _Library:
             up = np.clip(gaussian_filter1d(allowed - angle, 0.7), 0.0, 1.0)
             axis = np.cross(along, [0.0, 1.0, 0.0])
             axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-            turned = Rotation.from_rotvec(up[:, None] * axis).as_matrix() @ G[:, toe]
+            turned = so3.exp(up[:, None] * axis) @ G[:, toe]
             local = np.swapaxes(G[:, ankle], 1, 2) @ turned
-            self.poses[:, toe] = Rotation.from_matrix(local).as_rotvec()
+            self.poses[:, toe] = so3.log(local)
 
     def _differences(self, x: np.ndarray) -> np.ndarray:
         """From the frame before; a clip's first frame repeats the second's."""
@@ -183,7 +184,7 @@ class _Library:
 
     def _features(self, joints: np.ndarray) -> np.ndarray:
         """Joints and their velocities seen from the heading: what must agree, m."""
-        level = _about_y(-self.yaw).as_matrix()
+        level = so3.exp(_about_y(-self.yaw))
         joints = np.einsum("tij,tkj->tki", level, joints)
         velocity = self._differences(joints) * FPS
         step = np.einsum("tij,tj->ti", level, self.step) * FPS
@@ -301,16 +302,15 @@ def _play(
     share = plan.share[:, 1]
     poses = np.empty((len(a), 24, 3))
     for j in range(24):
-        p = Rotation.from_rotvec(library.poses[a, j])
-        q = Rotation.from_rotvec(library.poses[b, j])
+        p = library.poses[a, j]
+        q = library.poses[b, j]
         if j == 0:
-            p, q = yaw_a * p, yaw_b * q
-        way = (p.inv() * q).as_rotvec() * share[:, None]
-        poses[:, j] = (p * Rotation.from_rotvec(way)).as_rotvec()
+            p, q = so3.compose(yaw_a, p), so3.compose(yaw_b, q)
+        poses[:, j] = so3.compose(p, share[:, None] * so3.between(p, q))
 
     sole = library.soles(poses, np.zeros((len(a), 3)))
     mix = lambda x, y: x * plan.share[:, :1, None] + y * share[:, None, None]
-    turn = lambda R, x: np.einsum("tij,tkj->tki", R.as_matrix(), x)
+    turn = lambda R, x: np.einsum("tij,tkj->tki", so3.exp(R), x)
     wanted = mix(turn(yaw_a, library.sole_step[a]), turn(yaw_b, library.sole_step[b]))
     carries = mix(library.carries[a, :, None], library.carries[b, :, None])
     step = (carries * (wanted - np.diff(sole, axis=0, prepend=sole[:1]))).sum(axis=1)

@@ -7,10 +7,11 @@ sequence does not share, and compiling would take longer than everything else.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.body import DETECTOR_BIAS, KEYPOINT_NAMES, PARENTS, BodyModel
+from bodyslam_jax.body import DETECTOR_BIAS, KEYPOINT_NAMES, BodyModel
+from bodyslam_jax.body.kinematics_numpy import pose_joints
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 class Person:
@@ -50,15 +51,7 @@ class Person:
         self, poses: Float[np.ndarray, "t 24 3"], pelvis: Float[np.ndarray, "t 3"]
     ) -> tuple[Float[np.ndarray, "t 24 3 3"], Float[np.ndarray, "t 24 3"]]:
         """Rotations and places of all joints in the frame the root turns into, m."""
-        R = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix()
-        R = R.reshape(*poses.shape, 3)
-        G, x = R.copy(), np.empty(poses.shape)
-        x[:, 0] = pelvis
-        for j in range(1, 24):
-            p = PARENTS[j]
-            G[:, j] = G[:, p] @ R[:, j]
-            x[:, j] = x[:, p] + G[:, p] @ (self.rest[j] - self.rest[p])
-        return G, x
+        return pose_joints(so3.exp(poses), self.rest, pelvis)
 
     def vertices(
         self,

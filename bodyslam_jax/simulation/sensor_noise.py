@@ -17,11 +17,11 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import KEYPOINT_SPREAD
 from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
 from bodyslam_jax.config import Simulation
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.simulation.posing import Person
 
 
@@ -263,9 +263,7 @@ def regress_bodies(
     slow = ar1(rng, (t, 3), noise.posture_correlation)
     error[:, 0] = noise.root_drift * slow
     error[:, 0] += noise.root_white * rng.standard_normal((t, 3))
-    true = Rotation.from_rotvec(poses_C.reshape(-1, 3))
-    wrong = true * Rotation.from_rotvec(error.reshape(-1, 3))
-    poses = wrong.as_rotvec().reshape(t, 72)
+    poses = so3.compose(poses_C.reshape(t, 24, 3), error).reshape(t, 72)
 
     shape = person.shape * rng.uniform(*noise.shape_shrink)
     shape = shape + noise.shape_white * rng.standard_normal(10)
@@ -298,21 +296,13 @@ def regress_bodies(
         axis=1,
     )
     poses_crop = poses.copy()
-    root = _to_ray(box[:, :2], intrinsics).inv() * Rotation.from_rotvec(poses[:, :3])
-    poses_crop[:, :3] = root.as_rotvec()
+    to_crop = so3.optical_axis_to_ray((box[:, :2] - intrinsics[2:]) / intrinsics[:2])
+    poses_crop[:, :3] = so3.between(to_crop, poses[:, :3])
     frame = np.flatnonzero(found)
     return Regressed(
         frame,
         *(x[frame] for x in (poses, shapes, trans, box, camera, poses_crop)),
     )
-
-
-def _to_ray(uv: Float[np.ndarray, "t 2"], intrinsics) -> Rotation:
-    """Smallest rotation that takes +z to the ray through a pixel (fx = fy)."""
-    xy = (uv - intrinsics[2:]) / intrinsics[:2]
-    length = np.linalg.norm(xy, axis=1, keepdims=True)
-    axis = np.stack([-xy[:, 1], xy[:, 0], np.zeros(len(xy))], axis=1)
-    return Rotation.from_rotvec(axis / np.maximum(length, 1e-12) * np.arctan(length))
 
 
 def crop_boxes(

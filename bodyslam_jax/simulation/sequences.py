@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Simulation
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, read_motion
 from bodyslam_jax.simulation.camera_paths import (
     HANDLING,
@@ -278,8 +278,7 @@ def measure(
             for array in keypoints:
                 array[:, [0, *range(15, 25)]] = 0.0
         poses_C = own.poses.copy()
-        root = Rotation.from_matrix(R_CW) * Rotation.from_rotvec(own.poses[:, 0])
-        poses_C[:, 0] = root.as_rotvec()
+        poses_C[:, 0] = so3.compose(so3.log(R_CW), own.poses[:, 0])
         bodies = regress_bodies(
             body, poses_C, joints_C[h, :, 0], keypoints, INTRINSICS,
             noise_of_bodies(settings), reg,

@@ -9,7 +9,8 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,12 +59,11 @@ def cameras_at(
     """
     window = T_WC[max(k - 1, 0) : k + 2]
     own = min(k, 1)
-    R = Rotation.from_matrix(window[:, :3, :3])
-    turned = (R[own].inv() * R).as_rotvec()
+    R = window[:, :3, :3]
+    turned = so3.log(R[own].T @ R)
     tau = (when * fps)[:, None]
     move = lambda terms: terms[0] + tau * terms[1] + tau**2 / 2 * terms[2]
     out = np.tile(np.eye(4), (len(tau), 1, 1))
-    turn = Rotation.from_rotvec(move(around(turned[:, None], own)))
-    out[:, :3, :3] = (R[own] * turn).as_matrix()
+    out[:, :3, :3] = R[own] @ so3.exp(move(around(turned[:, None], own)))
     out[:, :3, 3] = move(around(window[:, None, :3, 3], own))
     return out

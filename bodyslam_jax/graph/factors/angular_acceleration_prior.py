@@ -8,7 +8,7 @@ In rad per frame squared. Default: `weights.root_turning` = 0.015 rad at 30 fps.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 
@@ -32,4 +32,4 @@ class AngularAccelerationPrior(FrameFactor):
 
     def frame_residual(self, data, window, shared):
         now, before, first = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
-        return (log(before.T @ now) - log(first.T @ before)) / data
+        return (so3.log(before.T @ now) - so3.log(first.T @ before)) / data

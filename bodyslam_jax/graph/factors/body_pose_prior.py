@@ -11,14 +11,13 @@ motion model's prediction, `λ_posture = 1`, independent: `weights.posture_predi
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import compose, log_of
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
-from bodyslam_jax.graph.state import State, inverse_right_jacobian
+from bodyslam_jax.graph.state import State
 from bodyslam_jax.graph.whitening import innovation
 
 
@@ -57,19 +56,19 @@ class BodyPosePrior(FrameFactor):
 
     def frame_residual(self, data, window, shared):
         rotation, previous, sigma, correlation = data
-        error = rotation_between(rotation, window[0].pose)
+        error = so3.between(rotation, window[0].pose)
         if self.correlated:
-            earlier = rotation_between(previous, window[1].pose)
+            earlier = so3.between(previous, window[1].pose)
             error = innovation(error, earlier, correlation[:, None])
         return error / sigma[:, None]
 
     def residual(self, state: State) -> Float[Array, "h t 23 3"]:
-        return self._innovation(rotation_between(self.rotation, state.poses))[0]
+        return self._innovation(so3.between(self.rotation, state.poses))[0]
 
     def jacobians(self, state):
-        error = rotation_between(self.rotation, state.poses)
+        error = so3.between(self.rotation, state.poses)
         residual, now, earlier = self._innovation(error)
-        by_error = inverse_right_jacobian(error)
+        by_error = so3.inverse_right_jacobian(error)
         parts: dict[Key, Array] = {("pose", 0): now[..., None] * by_error}
         if self.correlated:
             parts["pose", 1] = earlier[..., None] * previous_frame(by_error)
@@ -84,10 +83,3 @@ class BodyPosePrior(FrameFactor):
         if not self.correlated:
             return error / self.sigma[..., None], 1 / self.sigma[..., None], earlier
         return now * error + earlier * previous_frame(error), now, earlier
-
-
-def rotation_between(
-    first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]
-) -> Float[Array, "*b 3"]:
-    """`Log(Exp(first)^T Exp(second))`, at most pi long."""
-    return log_of(compose(jaxlie.SO3.exp(-first), jaxlie.SO3.exp(second)))

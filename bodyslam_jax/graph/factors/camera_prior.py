@@ -9,7 +9,7 @@ Dimensionless: a rotation vector over rad, then a centre over units of the map. 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 
@@ -36,5 +36,5 @@ class CameraPrior(FrameFactor):
     def frame_residual(self, data, window, shared):
         measured, sigma = data
         camera = window[0].camera
-        rotation = log(measured[:3, :3].T @ camera[:3, :3])
+        rotation = so3.log(measured[:3, :3].T @ camera[:3, :3])
         return jnp.concatenate([rotation, camera[:3, 3] - measured[:3, 3]]) / sigma

@@ -7,10 +7,9 @@ the turn, but the paper's cost does not use it. Ours.
 """
 
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 
@@ -37,5 +36,5 @@ class RelativeOrientation(FrameFactor):
     def frame_residual(self, data, window, shared):
         rotation, sigma = data
         now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
-        predicted = jaxlie.SO3.exp(rotation).as_matrix()
-        return log(predicted.T @ before.T @ now) / sigma
+        predicted = so3.exp(rotation)
+        return so3.log(predicted.T @ before.T @ now) / sigma

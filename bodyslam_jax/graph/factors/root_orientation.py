@@ -10,7 +10,7 @@ only.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.geometry.so3 import log
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.whitening import innovation
@@ -40,6 +40,6 @@ class RootOrientation(FrameFactor):
 
     def frame_residual(self, data, window, shared):
         measured, previous, sigma, correlation = data
-        error = log(measured.T @ window[0].root[:3, :3])
-        before = log(previous.T @ window[1].root[:3, :3])
+        error = so3.log(measured.T @ window[0].root[:3, :3])
+        before = so3.log(previous.T @ window[1].root[:3, :3])
         return innovation(error, before, correlation) / sigma

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.atomic import write_npz
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
@@ -139,9 +139,9 @@ def _between(
     part = (at - low)[:, None]
     known = np.asarray(np.isfinite(poses).all(axis=1))[:, None]
     safe = np.where(known, poses, 0.0)
-    a, b = (Rotation.from_rotvec(safe[k].reshape(-1, 3)) for k in (low, high))
-    turn = (a.inv() * b).as_rotvec() * np.repeat(part, 24, axis=0)
-    between = (a * Rotation.from_rotvec(turn)).as_rotvec().reshape(-1, 72)
+    a, b = (safe[k].reshape(-1, 24, 3) for k in (low, high))
+    turn = part[:, :, None] * so3.between(a, b)
+    between = so3.compose(a, turn).reshape(-1, 72)
     between = np.where(part > 0, between, poses[low])
     between = np.where(known[low] & (known[high] | (part == 0)), between, np.nan)
     return between, (1 - part) * trans[low] + part * trans[high]

@@ -6,8 +6,8 @@ name.
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
 from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
@@ -138,7 +138,7 @@ def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     """Axis-angle of rotation matrices; NaN of those that are not finite."""
     finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], matrices, np.eye(3))
-    found = Rotation.from_matrix(safe).as_rotvec()
+    found = so3.log(safe)
     return np.where(finite[:, None], found, np.nan)
 
 

@@ -9,8 +9,8 @@ al. (ECCV 2022, Section 3.3) refer to.
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Intrinsics
 
 # Crops hold a person, and SPIN's smallest person is far larger than this.
@@ -64,14 +64,5 @@ def turn_to_camera(
     ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
     known = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
     ray, turn = np.where(known, ray, 0.0), np.where(known, orientation, 0.0)
-    turned = (ray_rotation(ray) * Rotation.from_rotvec(turn)).as_rotvec()
+    turned = so3.compose(so3.optical_axis_to_ray(ray), turn)
     return np.where(known, turned, np.nan)
-
-
-def ray_rotation(xy: Float[np.ndarray, "m 2"]) -> Rotation:
-    """Smallest rotation that takes +z to the ray through `xy` at depth 1."""
-    length = np.linalg.norm(xy, axis=-1, keepdims=True)
-    axis = np.concatenate([-xy[:, 1:], xy[:, :1]], axis=-1)  # z cross ray
-    axis = axis / np.where(length > 0, length, 1.0)
-    turned = np.arctan(length) * np.concatenate([axis, np.zeros_like(length)], -1)
-    return Rotation.from_rotvec(turned)

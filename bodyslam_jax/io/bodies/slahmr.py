@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
@@ -121,5 +121,4 @@ def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     both = np.hstack([R.reshape(-1, 9), rotvec])
     known = np.asarray(np.isfinite(both).all(axis=1))[:, None]
     safe = np.where(known[..., None], R, np.eye(3)), np.where(known, rotvec, 0.0)
-    turned = Rotation.from_matrix(safe[0]) * Rotation.from_rotvec(safe[1])
-    return np.where(known, turned.as_rotvec(), np.nan)
+    return np.where(known, so3.compose(so3.log(safe[0]), safe[1]), np.nan)

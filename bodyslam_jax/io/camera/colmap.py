@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
 
 _HALF = 0.5
 """px between COLMAP's pixel coordinates and those of pixel centres."""
@@ -83,7 +84,7 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     length = np.linalg.norm(numbers[:, :4], axis=1)
     if (abs(length - 1) > 0.05).any():
         raise ValueError(f"{path}: a quaternion of length {length.max():.3g}, not 1.")
-    R_CW = Rotation.from_quat(numbers[:, [1, 2, 3, 0]]).as_matrix()
+    R_CW = so3.from_quaternion(numbers[:, [1, 2, 3, 0]])
     T_WC = np.tile(np.eye(4), (len(numbers), 1, 1))
     T_WC[:, :3, :3] = np.swapaxes(R_CW, 1, 2)
     T_WC[:, :3, 3] = -np.einsum("nji,nj->ni", R_CW, numbers[:, 4:])

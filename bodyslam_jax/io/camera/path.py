@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation, Slerp
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.colmap import read_poses
 from bodyslam_jax.io.camera.tum import read_tum
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
@@ -89,9 +89,7 @@ def _at_times(
     known = inside & (gap <= _LONGEST_GAP)
     at = np.clip(timestamps, times[0], times[-1])
     T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
-    T_WC[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(
-        at
-    ).as_matrix()
+    T_WC[:, :3, :3] = so3.interpolate_path(times, poses[:, :3, :3], at)
     for axis in range(3):
         T_WC[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
     return T_WC, known

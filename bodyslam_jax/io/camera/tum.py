@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+
+from bodyslam_jax.geometry import so3_numpy as so3
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
@@ -45,7 +46,7 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
         worst = float(length[np.argmax(abs(length - 1))])
         raise ValueError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
     T_WC = np.tile(np.eye(4), (len(table), 1, 1))
-    T_WC[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    T_WC[:, :3, :3] = so3.from_quaternion(table[:, 4:])
     T_WC[:, :3, 3] = table[:, 1:4]
     return table[:, 0], T_WC
 
@@ -54,7 +55,7 @@ def write_tum(
     path: Path, timestamps: Float[np.ndarray, " t"], T_WC: Float[np.ndarray, "t 4 4"]
 ) -> None:
     """Writes timestamps (s) and poses (camera to world, m) as a TUM trajectory."""
-    xyzw = Rotation.from_matrix(T_WC[:, :3, :3]).as_quat()
+    xyzw = so3.quaternion(so3.log(T_WC[:, :3, :3]))
     np.savetxt(
         path,
         np.column_stack([timestamps, T_WC[:, :3, 3], xyzw]),

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import PARENTS
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import (
     Clip,
     leg_length,
     padded,
     rest_from_offsets,
 )
-from bodyslam_jax.motion.rotations import matrix, vector
 
 _NAMES = (
     "Hips LeftUpLeg,LHip RightUpLeg,RHip LowerBack,Spine,Chest LeftLeg,LKnee "
@@ -148,7 +148,7 @@ def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _log(matrices: Float[Array, "t j 3 3"]) -> Float[Array, "t j 3"]:
-    return vector(matrices)
+    return so3.log(matrices)
 
 
 def _forward(
@@ -161,7 +161,7 @@ def _forward(
         for channel in joint.channels:
             if channel in _TURNS:
                 axis = jnp.asarray(np.eye(3)[_TURNS.index(channel)], rows.dtype)
-                turn = turn @ matrix(jnp.deg2rad(rows[:, column, None]) * axis)
+                turn = turn @ so3.exp(jnp.deg2rad(rows[:, column, None]) * axis)
             column += 1
         turns.append(turns[joint.parent] @ turn if joint.parent >= 0 else turn)
     return jnp.stack(turns, 1)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax.motion.rotations import change, matrix, turned
+from bodyslam_jax.geometry import so3
 
 FPS = 30.0
 """Rate of every motion model, 1/s."""
@@ -85,7 +85,7 @@ def root_matrices(clip: Clip) -> Float[np.ndarray, "t 3 3"]:
 
 @jax.jit
 def _matrix(angles: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
-    return matrix(angles)
+    return so3.exp(angles)
 
 
 def mirror(clip: Clip) -> Clip:
@@ -119,8 +119,8 @@ def padded(function: Callable, *arrays: np.ndarray) -> np.ndarray:
 def _slerp(
     start: Float[Array, "n 24 3"], end: Float[Array, "n 24 3"], at: Float[Array, " n"]
 ) -> Float[Array, "n 24 3"]:
-    way = change(start, end) * at[:, None, None]
-    return turned(start, way)
+    way = so3.between(start, end) * at[:, None, None]
+    return so3.compose(start, way)
 
 
 def resample(clips: Sequence[Clip], fps: float = FPS) -> tuple[Clip, ...]:

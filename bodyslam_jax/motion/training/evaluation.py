@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, in_dtype, predict
-from bodyslam_jax.motion.rotations import change, matrix, transposed, vector
 from bodyslam_jax.motion.training.measures import Steps, summary
 from bodyslam_jax.motion.training.noise import disturb, drift
 
@@ -28,11 +28,11 @@ def _steps(
     present: Bool[Array, "c t"],
 ) -> tuple[Array, ...]:
     def one(poses, estimated, trans, shape, present):
-        frame = matrix(poses[:, 0])
+        frame = so3.exp(poses[:, 0])
         said: Prediction = predict(
             model,
             body,
-            matrix(estimated[:, 0]),
+            so3.exp(estimated[:, 0]),
             estimated[:, 1:],
             shape,
             present,
@@ -43,10 +43,10 @@ def _steps(
         )
         true = jnp.einsum("tba,tb->ta", before, step)
         previous = jnp.concatenate([jnp.zeros((1, 3), trans.dtype), true[:-1]])
-        posture = change(said.body_pose, poses[:, 1:])
+        posture = so3.between(said.body_pose, poses[:, 1:])
         angle = jnp.sqrt((posture**2).sum(-1) + 1e-12).mean(-1)
-        turn = transposed(before) @ frame
-        root = vector(transposed(matrix(said.rotation)) @ turn)
+        turn = so3.inverse(before) @ frame
+        root = so3.log(so3.inverse(so3.exp(said.rotation)) @ turn)
         gap = local_joints(body, said.body_pose, shape) - local_joints(
             body, poses[:, 1:], shape
         )
@@ -179,6 +179,6 @@ def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, " 3"]:
     """Mean displacement of training clips in H_{k-1}, m a frame at 30 fps."""
     moves = []
     for clip in resample([clip for clip in dataset if clip.phase == 0], FPS):
-        turn = np.asarray(matrix(jnp.asarray(clip.poses[:-1, 0])))
+        turn = np.asarray(so3.exp(jnp.asarray(clip.poses[:-1, 0])))
         moves.append(np.einsum("tba,tb->ta", turn, np.diff(clip.trans, axis=0)))
     return np.concatenate(moves).mean(0)

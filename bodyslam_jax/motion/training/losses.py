@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import apply_layers, lower_triangle
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
-from bodyslam_jax.motion.rotations import change
 from bodyslam_jax.motion.training.sampling import Batch
 
 
@@ -83,5 +83,5 @@ def apply_posture(
 def posture_goal(batch: Batch) -> Float[Array, "s l 24 3"]:
     """The rotation that leads from the (noisy) last posture to the true next one."""
     last = batch.window.body_pose[..., -2, :, :]
-    turns = change(last, batch.pose[..., 1:, :])
+    turns = so3.between(last, batch.pose[..., 1:, :])
     return jnp.concatenate([batch.pose[..., :1, :], turns], -2)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
-from bodyslam_jax.motion.rotations import turned
+from bodyslam_jax.geometry import so3
 
 CORRELATION = 0.96
 """Correlation of the slow error from one frame at 30 fps to the next."""
@@ -44,4 +44,4 @@ def disturb(
     poses: Float[Array, "*b 24 3"], noise: Float[Array, "*b 24 3"]
 ) -> Float[Array, "*b 24 3"]:
     """Turns each joint by a further small rotation, in its own frame (rad)."""
-    return turned(poses, noise)
+    return so3.compose(poses, noise)

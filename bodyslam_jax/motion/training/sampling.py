@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import (
     FPS,
     LEFT_RIGHT,
@@ -26,7 +27,6 @@ from bodyslam_jax.motion.capture.clips import (
 )
 from bodyslam_jax.motion.network import Window
 from bodyslam_jax.motion.prediction import leg_length
-from bodyslam_jax.motion.rotations import matrix, transposed, vector
 from bodyslam_jax.motion.training.noise import disturb, drift
 
 DENSE = 4
@@ -135,17 +135,17 @@ def draw(
     noise = _errors(keys[4:8], s, past + l, settings)
     estimated = disturb(poses, noise)
 
-    true = matrix(poses[:, :, 0])
+    true = so3.exp(poses[:, :, 0])
     before, after = true[:, past - 1 : -1], true[:, past:]
     leg = leg_length(body, shape)
     rest = rest_joints(body, shape)
     below = ((rest[:, 1] + rest[:, 2]) / 2 - rest[:, 0]) / leg[:, None]
     path = path - jnp.einsum("sfab,sb->sfa", true, below)
     step = path[:, past:] - path[:, past - 1 : -1]
-    turn = vector(transposed(before) @ after)
+    turn = so3.log(so3.inverse(before) @ after)
     joints = local_joints(body, estimated[:, :, 1:], shape[:, None])
     window = jax.vmap(_windows, (0, 0, 0, None))(
-        matrix(estimated[:, :, 0]),
+        so3.exp(estimated[:, :, 0]),
         joints / leg[:, None, None, None],
         estimated[:, :, 1:],
         past,

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import (
     Frame,
     FrameFactor,
     Problem,
     State,
-    inverse_right_jacobian,
     squared_norm,
 )
 from bodyslam_jax.solver.apart import groups_of, pick, split_poses
@@ -115,7 +115,7 @@ def _derivatives(factor, keys, state, sums):
 
     turns: tuple = (None,) * factor.num_lags
     if any(name == "pose" for name, _ in local):
-        turn = inverse_right_jacobian(state.poses)
+        turn = so3.inverse_right_jacobian(state.poses)
         turns = tuple(shift_back(turn, lag) for lag in range(factor.num_lags))
     return factor.map_frames(one, state, turns)
 

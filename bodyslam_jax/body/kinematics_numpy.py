@@ -1,0 +1,33 @@
+"""The kinematic chain in NumPy, where a compiler would take longer than the work.
+
+The equations of `kinematics`, which a test compares, on the same tree.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body.skeleton import PARENTS
+
+
+def pose_joints(
+    R: Float[np.ndarray, "n j 3 3"],
+    rest: Float[np.ndarray, "*#n j 3"],
+    pelvis: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n j 3 3"], Float[np.ndarray, "n j 3"]]:
+    """Rotations and positions (m) of the first `j` joints in the frame of the root.
+
+    `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
+
+    Args:
+        R: rotation of each joint in its parent's frame.
+        rest: joints at rest J, m; one set, or one for each body.
+        pelvis: position of joint 0, m.
+    """
+    G, x = R.copy(), np.empty(R.shape[:3])
+    x[:, 0] = pelvis
+    for k in range(1, R.shape[1]):
+        parent = PARENTS[k]
+        bone = rest[..., k, :] - rest[..., parent, :]
+        G[:, k] = G[:, parent] @ R[:, k]
+        x[:, k] = x[:, parent] + (G[:, parent] @ bone[..., None])[..., 0]
+    return G, x

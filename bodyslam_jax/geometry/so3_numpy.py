@@ -1,0 +1,91 @@
+"""The rotation group SO(3) in NumPy, for stages that run once per clip.
+
+The functions of `so3` under the same names, on SciPy's `Rotation`, which is used
+nowhere else. A module of its own, so that reading files and structure from motion do
+not import JAX. Rotation vectors are in rad, quaternions in order x y z w.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+
+def exp(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Rotation matrix of a rotation vector."""
+    return _of_vector(vector).as_matrix().reshape(*vector.shape, 3)
+
+
+def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
+    """Rotation vector of a rotation matrix, at most π long.
+
+    A matrix that is not quite orthogonal is replaced by the nearest rotation.
+
+    **Raises:** `ValueError` for matrices that are not finite or mirror.
+    """
+    return _of_matrix(rotation).as_rotvec().reshape(rotation.shape[:-1])
+
+
+def compose(
+    first: Float[np.ndarray, "*b 3"], second: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "*b 3"]:
+    """`Log(Exp(first) Exp(second))`: `second` is in the frame that `first` leads to."""
+    product = _of_vector(first) * _of_vector(second)
+    return product.as_rotvec().reshape(second.shape)
+
+
+def between(
+    first: Float[np.ndarray, "*b 3"], second: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "*b 3"]:
+    """`Log(Exp(first)ᵀ Exp(second))`: the rotation from one to the other, in the frame
+    of the first; at most π long."""
+    return compose(-first, second)
+
+
+def interpolate(
+    start: Float[np.ndarray, "*b 3 3"],
+    end: Float[np.ndarray, "*b 3 3"],
+    share: Float[np.ndarray, "*b"],
+) -> Float[np.ndarray, "*b 3 3"]:
+    """Matrices on the shortest geodesic from `start` (share 0) to `end` (share 1)."""
+    whole = log(np.swapaxes(start, -1, -2) @ end)
+    return start @ exp(share[..., None] * whole)
+
+
+def interpolate_path(
+    times: Float[np.ndarray, " n"],
+    rotations: Float[np.ndarray, "n 3 3"],
+    at: Float[np.ndarray, " t"],
+) -> Float[np.ndarray, "t 3 3"]:
+    """Matrices at the times `at`, which lie within increasing `times` (n >= 2)."""
+    return Slerp(times, Rotation.from_matrix(rotations))(at).as_matrix()
+
+
+def from_quaternion(xyzw: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Rotation matrix of a quaternion of any length but 0."""
+    rotation = Rotation.from_quat(xyzw.reshape(-1, 4))
+    return rotation.as_matrix().reshape(*xyzw.shape[:-1], 3, 3)
+
+
+def quaternion(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 4"]:
+    """Unit quaternion of a rotation vector."""
+    return _of_vector(vector).as_quat().reshape(*vector.shape[:-1], 4)
+
+
+def euler(vector: Float[np.ndarray, "*b 3"], order: str) -> Float[np.ndarray, "*b 3"]:
+    """Intrinsic Euler angles (rad) of a rotation vector, in an order such as `ZXY`."""
+    return _of_vector(vector).as_euler(order).reshape(vector.shape)
+
+
+def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 3"]:
+    """Rotation vector of the smallest rotation from +z to the ray (x, y, 1)."""
+    tangent = np.linalg.norm(xy, axis=-1, keepdims=True)
+    axis = np.stack([-xy[..., 1], xy[..., 0], np.zeros(xy.shape[:-1])], axis=-1)
+    return np.arctan(tangent) * axis / np.where(tangent > 0, tangent, 1.0)
+
+
+def _of_vector(vector: np.ndarray) -> Rotation:
+    return Rotation.from_rotvec(vector.reshape(-1, 3))
+
+
+def _of_matrix(rotation: np.ndarray) -> Rotation:
+    return Rotation.from_matrix(rotation.reshape(-1, 3, 3))
