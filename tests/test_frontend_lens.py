@@ -9,7 +9,7 @@ from test_frontend_motion import CAMERA, SIZE, camera_error, scene
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.pipeline import sfm_stage
-from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion
+from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion_warning
 from bodyslam_jax.sfm.zoom import without_zoom
 from bodyslam_jax.types import Bodies, Keypoints, Sequence, Tracks
 
@@ -137,8 +137,8 @@ def test_traffic_is_warned_of_and_a_scene_alone_is_not():
     both = with_traffic(tracks, 120)
     alone = reconstruct(tracks, CAMERA, 60)
     crowded = reconstruct(both, CAMERA, 60)
-    assert second_motion(tracks, alone, CAMERA) is None
-    assert "move together" in (second_motion(both, crowded, CAMERA) or "")
+    assert second_motion_warning(tracks, alone, CAMERA) is None
+    assert "move together" in (second_motion_warning(both, crowded, CAMERA) or "")
 
 
 def test_a_cut_within_one_scene_is_said():

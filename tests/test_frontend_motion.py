@@ -462,8 +462,8 @@ def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
     tracks = Tracks(tracks.frame[now] - first, landmark, tracks.uv[now])
     truth = simulated.T_WC[first : first + num]
     away = []
-    for thin in (incremental._THIN, 0):
-        monkeypatch.setattr(incremental, "_THIN", thin)
+    for thin in (incremental.FEW_POINTS, 0):
+        monkeypatch.setattr(incremental, "FEW_POINTS", thin)
         config = Structure(join_tracks=False)
         found = reconstruct(tracks, sequence.intrinsics, num, config)
         assert found.registered.all()
@@ -531,7 +531,7 @@ def test_points_that_noise_draws_nearer_are_not_preferred():
         every & known[landmark],
         np.arange(len(known)),
     )
-    builder._triangulate(grown, np.flatnonzero(~known[landmark]))
+    builder.make_points(grown, np.flatnonzero(~known[landmark]))
     new = grown.has_point & ~known
     assert new.sum() > 50
     ratio = scene.points[new, 2] / truth[new, 2]

@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation, Structure
-from bodyslam_jax.sfm import reconstruct, split_tracks, told_by_other_pieces
+from bodyslam_jax.sfm import information_from_other_pieces, reconstruct, split_tracks
 from bodyslam_jax.sfm.bundle import Scene, Views, errors, jacobian_of_points
-from bodyslam_jax.sfm.loop_closure import Revisits, told_by_others
+from bodyslam_jax.sfm.loop_closure import Revisits
 from bodyslam_jax.sfm.relocalise import near, relocate, with_moved
+from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 
 PIXEL = 1 / 500
 
@@ -181,7 +182,7 @@ def test_what_other_tracks_tell_sums_to_what_all_views_say(scene):
     shown = np.concatenate([np.arange(40), np.arange(40)])
     shown[79] = 79  # its own
     whole = Scene(scene.R_CW, scene.centre, np.tile(scene.points, (2, 1)))
-    told = told_by_others(whole, views, shown)
+    told = information_from_other_tracks(whole, views, shown)
     J = jacobian_of_points(whole, views)
     square = np.einsum("mki,mkj->mij", J, J)
     np.testing.assert_allclose(
@@ -207,7 +208,7 @@ def test_long_tracks_are_cut_into_pieces_that_know_of_each_other(scene):
     T_WC = np.tile(np.eye(4), (6, 1, 1))
     T_WC[:, :3, :3] = np.swapaxes(scene.R_CW, 1, 2)
     T_WC[:, :3, 3] = scene.centre
-    told = told_by_other_pieces(T_WC, scene.points, views.frame, piece, of)
+    told = information_from_other_pieces(T_WC, scene.points, views.frame, piece, of)
     J = jacobian_of_points(scene, views)
     square = np.einsum("mki,mkj->mij", J, J)
     assert len(of) == 80

@@ -246,7 +246,7 @@ def a_person(frames=4):
 
 def test_a_known_stature_makes_the_person_as_tall_and_keeps_the_image():
     body, roots = load_body_model(dtype=jnp.float64), a_person()
-    statures = people.of_each({None: Measured(1.9, 0.005)}, [0])
+    statures = people.statures_of({None: Measured(1.9, 0.005)}, [0])
     found = people.with_statures(roots, statures, body, np.array([1.0]))
     before, after = (stature(body, r.shape[0]) for r in (roots, found))
     assert abs(after - 1.9) < 0.004 < abs(before - 1.9)
@@ -256,7 +256,7 @@ def test_a_known_stature_makes_the_person_as_tall_and_keeps_the_image():
     vague = people.with_statures(roots, {0: Measured(1.9, 1.0)}, body, np.array([1.0]))
     assert abs(stature(body, vague.shape[0]) - before) < 0.01
     with pytest.raises(ValueError, match="height: given for person 3"):
-        people.of_each({3: Measured(1.8, 0.02)}, [0, 1])
+        people.statures_of({3: Measured(1.8, 0.02)}, [0, 1])
 
 
 def test_stature_and_scale_are_measurements_of_the_graph():

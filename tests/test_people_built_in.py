@@ -30,7 +30,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def found(scene):
-    return people.find_tracked(scene[1], 30.0)
+    return people.find_people_tracked(scene[1], 30.0)
 
 
 def sequence(images):
@@ -59,7 +59,7 @@ def test_a_rendered_walker_is_found_in_every_frame(scene, found):
 
 
 def test_the_same_images_give_the_same_people(scene, found):
-    again = people.find_tracked(scene[1], 30.0)
+    again = people.find_people_tracked(scene[1], 30.0)
     for name in ("frame", "points", "person", "silhouettes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
 
@@ -70,7 +70,7 @@ def test_no_connection_is_made(scene, monkeypatch):
 
     monkeypatch.setattr(socket, "socket", refused)
     monkeypatch.setattr(socket, "getaddrinfo", refused)
-    assert len(people.find_tracked(scene[1][:2], 30.0).frame) == 2
+    assert len(people.find_people_tracked(scene[1][:2], 30.0).frame) == 2
 
 
 def test_silhouettes_cover_the_body(scene, found):
@@ -124,7 +124,7 @@ def test_who_has_no_body_is_not_estimated_where_bodies_are_given(scene, found):
 
 def test_who_is_too_small_is_masked_only(scene):
     settings = Detect(min_height=2000.0)
-    found = people.find_tracked(scene[1][:4], 30.0, settings)
+    found = people.find_people_tracked(scene[1][:4], 30.0, settings)
     assert len(found.frame) and (found.person == -1).all()
     whole = with_people(scene[1][:4], found)
     assert whole.keypoints is None and "nobody was found" in whole.warnings[-1]
@@ -134,7 +134,7 @@ def test_who_is_too_small_is_masked_only(scene):
 def test_a_video_without_people(scene):
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(4)]
-    found = people.find_tracked(images, 30.0)
+    found = people.find_people_tracked(images, 30.0)
     assert (found.person == -1).all() and not found.warnings
     assert with_people(images, found).keypoints is None
 
@@ -156,7 +156,7 @@ def test_a_still_video_without_people_ends_well(tmp_path):
 @pytest.mark.parametrize("detect", ["auto", "none"])
 def test_given_keypoints_come_first(scene, detect, monkeypatch):
     """The networks are not even opened, nor where nobody is to be looked for."""
-    monkeypatch.setattr(people, "find_tracked", lambda *a: pytest.fail("looked"))
+    monkeypatch.setattr(people, "find_people_tracked", lambda *a: pytest.fail("looked"))
     given = simulation.as_sequence(scene[0])
     if detect == "none":
         given = dataclasses.replace(given, keypoints=None)
@@ -172,7 +172,7 @@ def test_a_network_that_is_missing_or_damaged_is_one_line(harm, tmp_path, monkey
     if harm == "damaged":
         (tmp_path / "movenet_multipose.onnx").write_bytes(b"half a network")
     with pytest.raises(ValueError, match="install bodyslam-jax again") as caught:
-        people.find_tracked([], 30.0)
+        people.find_people_tracked([], 30.0)
     assert "movenet_multipose.onnx" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert [name for name, _ in people.network_status()] == [

@@ -173,7 +173,7 @@ def test_names_that_a_detector_exchanges_turn_nobody_round(
     given = regressed(truth, 2, 2.0, 1.0) if with_bodies else None
     error = heading_error(estimated(truth, given, seen, body), truth.bodies)
     assert error.max() < 60
-    renamed, which = people.unexchanged(seen, FPS)
+    renamed, which = people.correct_left_right(seen, FPS)
     assert which[0, frames].mean() > 0.9
     assert np.delete(which[0], frames, axis=0).mean() < 0.02
     right = frames[which[0, frames].all(axis=1)]
@@ -196,7 +196,7 @@ def test_who_turns_round_is_left_to_turn(truth, body):
     seen = detected(_seen_of(truth, wanted, body), 3, 1.0)
     found = estimated(truth, given, seen, body)
     assert heading_error(found, wanted).max() < 45
-    assert not people.unexchanged(seen, FPS)[1].any()
+    assert not people.correct_left_right(seen, FPS)[1].any()
 
 
 def _seen_of(truth: Sequence, bodies: Bodies, body) -> Sequence:

@@ -1,18 +1,17 @@
-"""Where up is, from trunks, standing feet and the map's ground.
+"""The direction of gravity, from trunks, standing feet and the map's ground plane.
 
-Nothing measures gravity. Three cues tell it, each with an error of its own:
+Without an accelerometer three cues determine it, each with an error of its own:
 
-- People keep their trunk upright, to some degrees. Leaning across the image is seen;
-  leaning towards the camera is mostly inferred, and less sure.
-- Most of what people walk on is level, to a degree or so, and some of it slopes.
-  Where it lies is seen twice: by the feet that stand on it, and by the points of the
-  map that lie in one plane below the camera.
+- People keep their trunk upright, to some degrees. Lean across the view is observed in
+  the image; lean along the view is mostly inferred and less accurate.
+- Most ground that people walk on is level, to a degree or so, and some of it slopes.
+  Its plane is estimated twice: from the feet that stand on it, and from the points of
+  the map that lie in one plane below the camera.
 
-The plane is found first (`feet_plane` and `find_ground`, weighted by their
-covariances), then its normal and the trunks' mean are combined. Either can be far off,
-on a hill or where postures are wrong; so each has a narrow and a wide error, and the
-result is the mean over the four combinations, each weighed by how well it explains the
-angle between the two.
+The two planes are fused by their covariances; then the plane's normal and the trunks'
+mean are combined. Either can be far off, on a hill or where postures are wrong. So each
+has a mixture of a narrow and a wide error distribution, and the result is the posterior
+mean over the four combinations.
 
 Small angles: a direction is its first and third coordinate over its second, in a frame
 whose y axis is nearly up.
@@ -45,8 +44,8 @@ _FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
 _STANCE = 0.02
 """Least standard deviation of the height of a foot that stands, m."""
 _SIZE = 0.05
-"""By which share a person's size may be off: by that of the camera's height over them
-their feet are too high or too low, all alike."""
+"""Relative standard deviation of a person's size. A person who is estimated too large
+has all stances too low or too high by that share of the camera's height above them."""
 _SHORTEST_STANCE = 0.1
 """s"""
 _OFF_THE_PLANE = 0.25
@@ -56,8 +55,8 @@ _OFF_THE_PLANE = 0.25
 STANDING_SPEED = 0.6
 """The lower foot stands where it is slower than this, m/s."""
 _SPEED_WINDOW = 0.1
-"""Speeds of feet are taken over so many seconds: noise of single frames, which an
-estimate has and people have not, counts less."""
+"""s, over which the speed of a foot is measured, so that the noise of single frames is
+averaged out."""
 
 
 def standing_feet(
@@ -112,7 +111,7 @@ def find_upright(
     fitted: Bool[np.ndarray, " h"],
     known: Float[np.ndarray, " 3"] | None = None,
 ) -> Upright:
-    """Up by all cues there are, in a frame whose y axis is roughly up.
+    """Up from all available cues, in a frame whose y axis is roughly up.
 
     Args:
         trunks: y axes of the people's root frames, unit vectors.
@@ -120,9 +119,9 @@ def find_upright(
         eyes: centres of the camera, m.
         landmarks: points of the map, m; none where the camera did not move.
         fitted: whether a person's body was fitted to keypoints, not regressed.
-        known: up as an accelerometer has it, to `GRAVITY_SIGMA`.
+        known: up measured by an accelerometer, with `GRAVITY_SIGMA`.
     """
-    told = _trunks(trunks, present, eyes, feet, fps, fitted)
+    trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps)
     height = _height_of_camera(eyes, stances)
     planes = [feet_plane(stances, _SIZE * height)]
@@ -130,26 +129,28 @@ def find_upright(
     ground = _fused([plane for plane in planes if plane is not None])
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
     if known is not None:
-        told, worse = _with_known(told, known), 0.0
-    tilt, slope, sigma = _combined(told, ground, worse)
+        trunk_tilt, worse = _with_measured(trunk_tilt, known), 0.0
+    tilt, slope, sigma = _combined(trunk_tilt, ground, worse)
     up = np.array([tilt[0], 1.0, tilt[1]])
     up /= np.linalg.norm(up)
     return Upright(
         up=up,
         sigma=sigma,
-        trunks=np.nan if told is None else float(np.linalg.norm(told[0] - tilt)),
+        trunks=np.nan
+        if trunk_tilt is None
+        else float(np.linalg.norm(trunk_tilt[0] - tilt)),
         ground=float(np.arctan(np.linalg.norm(slope))),
     )
 
 
-def _with_known(told, up):
-    """Trunks and a measurement of up, as one: a small tilt and its covariance, rad²."""
+def _with_measured(trunk_tilt, up):
+    """The trunks' tilt fused with an accelerometer's, and its covariance, rad²."""
     tilt, weight = up[[0, 2]] / up[1], np.eye(2) / GRAVITY_SIGMA**2
-    if told is None:
+    if trunk_tilt is None:
         return tilt, np.linalg.inv(weight)
-    trunk = np.linalg.inv(told[1])
+    trunk = np.linalg.inv(trunk_tilt[1])
     covariance = np.linalg.inv(trunk + weight)
-    return covariance @ (trunk @ told[0] + weight @ tilt), covariance
+    return covariance @ (trunk @ trunk_tilt[0] + weight @ tilt), covariance
 
 
 def _trunks(trunks, present, eyes, feet, fps, fitted):
@@ -158,12 +159,12 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
     for h in np.flatnonzero(present.any(axis=1)):
         here = present[h]
         own = trunks[h, here]
-        own = own[own[:, 1] > 0.2]  # who lies down says nothing
+        own = own[own[:, 1] > 0.2]  # people who lie down are left out
         if not len(own):
             continue
         tilt = own[:, [0, 2]] / own[:, 1:2]
         mean = np.median(tilt, axis=0)
-        # Postures last: a person holds one for about a second.
+        # Postures are correlated in time: about one independent sample a second.
         seconds = max(1.0, len(own) / fps)
         scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
         view = (feet[h, here].mean(axis=1) - eyes[here])[:, [0, 2]]
@@ -232,7 +233,7 @@ def feet_plane(
     design = np.column_stack(
         [x[:, [0, 2]], np.ones(len(x)), people[:, None] == np.arange(len(stances))]
     )
-    # 45 degrees, and as high as you like: hardly a prior, but a solution always.
+    # A weak prior (slope of 45 degrees, any height) makes the system regular.
     prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
     sigma, weight = 5 * _STANCE, np.ones(len(x))
     for _ in range(20):
@@ -268,7 +269,7 @@ def map_plane(
     near = np.abs(away) < 0.05 * height
     flat = landmarks[near][:, [0, 2]]
     flat = flat - flat.mean(axis=0)
-    # One in ten: errors of neighbouring points are not independent.
+    # Errors of neighbouring points are correlated: ten count as one.
     information = flat.T @ flat / 10 / max(float(np.var(away[near])), 1e-12)
     covariance = np.linalg.inv(information + np.eye(2))
     return Plane(
@@ -278,7 +279,8 @@ def map_plane(
 
 
 def _fused(planes: list[Plane]) -> Plane | None:
-    """The mean weighted by information; what disagrees is all less sure (Birge)."""
+    """The mean weighted by information; its covariance is enlarged by the Birge ratio
+    where the planes disagree."""
     if not planes:
         return None
     weights = [np.linalg.inv(plane.covariance) for plane in planes]
@@ -294,19 +296,19 @@ def _fused(planes: list[Plane]) -> Plane | None:
 
 
 def _combined(
-    told: tuple[np.ndarray, np.ndarray] | None, ground: Plane | None, worse: float
+    trunk_tilt: tuple[np.ndarray, np.ndarray] | None, ground: Plane | None, worse: float
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
     """The tilt of up, the slope of the ground, and the standard deviation of the less
     sure direction of up, rad."""
     unknown = np.full(2, np.nan)
-    if told is None and ground is None:
+    if trunk_tilt is None and ground is None:
         return np.zeros(2), unknown, np.inf
     if ground is None:
-        return told[0], unknown, _largest(told[1])
-    if told is None:
+        return trunk_tilt[0], unknown, _largest(trunk_tilt[1])
+    if trunk_tilt is None:
         level = ground.covariance + _LEVEL**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
-    mean, trunk = told
+    mean, trunk = trunk_tilt
     sloping, steep = _SLOPES
     # Up is `mean + e`, with covariance `trunk`; the ground's gradient is `slope - up`.
     apart = ground.gradient + mean
@@ -323,7 +325,7 @@ def _combined(
         tilts.append(mean - own @ explained)
         slopes.append(sigma**2 * explained)
         covariances.append(own - own @ np.linalg.solve(total, own))
-    # Where nothing explains it the widest has to.
+    # If all likelihoods underflow the widest combination is taken.
     weight = np.array(density) + 1e-300 * np.array([0, 0, 0, 1])
     weight = weight / weight.sum()
     tilt = weight @ np.array(tilts)

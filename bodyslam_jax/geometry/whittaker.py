@@ -1,11 +1,12 @@
-"""A low pass for postures and paths of people, as gait laboratories apply it.
+"""A low-pass filter for postures and paths of people, as used in gait laboratories.
 
-The optimum follows each frame's keypoints, noise included, and the graph holds
-postures together only by the regressor's correlated errors: to smooth more there would
-shrink the swing of the legs, on which scale rests. So noise is taken out after scale
-is known. Whittaker's smoother minimises `|x - y|² + λ |D² x|²` over each run of frames;
-its gain at frequency f is `1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, keeps
-constant speed as it is, and halves amplitudes at the cutoff.
+The estimate follows each frame's keypoints, noise included, as the graph ties postures
+of successive frames only by the AR(1) errors of the regressor: stronger smoothing
+within the estimation would shrink the swing of the legs, from which the scale is
+estimated. So noise is filtered afterwards. Whittaker's smoother minimises
+`|x - y|² + λ |D² x|²` over each run of frames; its gain at frequency f is
+`1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, preserves constant speed, and
+halves amplitudes at the cutoff.
 """
 
 import numpy as np

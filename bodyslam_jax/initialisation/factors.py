@@ -164,7 +164,7 @@ def people_factors(
     factors: list[graph.Factor] = []
     there = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
-        keypoints, _ = people.unexchanged(sequence.keypoints, sequence.fps)
+        keypoints, _ = people.correct_left_right(sequence.keypoints, sequence.fps)
         sequence = dataclasses.replace(sequence, keypoints=keypoints)
         pixel = people.as_body_keypoints(
             keypoints,

@@ -9,7 +9,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people.clean_regressed import prepare_bodies
 from bodyslam_jax.people.fit import fit_bodies
-from bodyslam_jax.people.sides import unexchanged
+from bodyslam_jax.people.sides import correct_left_right
 from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
@@ -20,7 +20,7 @@ def estimate_bodies(
     keypoints; else nobody."""
     camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
     if keypoints is not None:
-        keypoints, _ = unexchanged(keypoints, fps)
+        keypoints, _ = correct_left_right(keypoints, fps)
     if sequence.bodies is None:
         if keypoints is None:
             return nobody(sequence.num_frames)

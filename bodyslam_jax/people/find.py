@@ -70,7 +70,7 @@ class _Frame:
     others: list[np.ndarray]
 
 
-def find_tracked(
+def find_people_tracked(
     images: Iterable[UInt8[np.ndarray, "y x 3"]],
     fps: float,
     settings: Detect = Detect(),

@@ -41,7 +41,7 @@ _LONGEST = 5
 """Frames over which names are compared: in more a limb may be anywhere."""
 
 
-def unexchanged(
+def correct_left_right(
     keypoints: Keypoints, fps: float
 ) -> tuple[Keypoints, Bool[np.ndarray, "h t 2"]]:
     """Keypoints with names that make one motion; whose arms and legs were renamed."""

@@ -29,7 +29,7 @@ def linear_stature(body: BodyModel) -> LinearStature:
     return LinearStature(float(up[top] - up[bottom]), by_shape[top] - by_shape[bottom])
 
 
-def of_each(
+def statures_of(
     heights: Mapping[int | None, Measured], numbers: Sequence[int]
 ) -> dict[int, Measured]:
     """Statures by place among the people that have these `numbers`; what is given for

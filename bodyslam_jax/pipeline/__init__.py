@@ -234,7 +234,7 @@ def _tracked(
 ) -> Sequence:
     """The same by the networks that ship."""
     counter = Counter("detection", sequence.num_frames)
-    find = lambda: people.find_tracked(
+    find = lambda: people.find_people_tracked(
         io.frames(sequence),
         sequence.fps,
         config.detection,

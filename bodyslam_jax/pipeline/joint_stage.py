@@ -59,7 +59,7 @@ def prepare(
     roots = people.roots_from_bodies(bodies, body)
     fitted = people.without_bodies(sequence)
     numbers = config.person or range(len(roots.present))
-    statures = people.of_each(config.heights(), list(dict.fromkeys(numbers)))
+    statures = people.statures_of(config.heights(), list(dict.fromkeys(numbers)))
     measured = roots.shape
     if statures:
         unsure = np.where(fitted, 1.0, config.weights.shape_sigma)

@@ -75,7 +75,7 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
     sequence = dataclasses.replace(sequence, intrinsics=model.intrinsics)
     cameras = _of_model(sequence, model, config)
     warnings = (*warnings, *model.warnings, *cameras.warnings)
-    moved = sfm.second_motion(model.tracks, model.found, model.intrinsics)
+    moved = sfm.second_motion_warning(model.tracks, model.found, model.intrinsics)
     if moved is not None:
         warnings = (*warnings, moved)
     return dataclasses.replace(cameras, warnings=warnings, zoom=model.zoom)
@@ -128,7 +128,7 @@ def _cut(cameras: SfmResult, span: int) -> SfmResult:
     tracks = cameras.tracks
     of, piece = sfm.split_tracks(tracks.frame, tracks.landmark, span)
     kept = cameras.keep
-    told = sfm.told_by_other_pieces(
+    told = sfm.information_from_other_pieces(
         cameras.T_WC, cameras.landmarks, tracks.frame[kept], piece[kept], of
     )
     count = np.bincount(of)[of]

@@ -5,11 +5,15 @@ from bodyslam_jax.sfm.burnt_in import without_burnt_in as without_burnt_in
 from bodyslam_jax.sfm.camera_model import CameraModel as CameraModel
 from bodyslam_jax.sfm.camera_model import find_camera_model as find_camera_model
 from bodyslam_jax.sfm.features import brisk_status as brisk_status
-from bodyslam_jax.sfm.loop_closure import split_tracks as split_tracks
-from bodyslam_jax.sfm.loop_closure import told_by_other_pieces as told_by_other_pieces
-from bodyslam_jax.sfm.moving_points import second_motion as second_motion
+from bodyslam_jax.sfm.moving_points import (
+    second_motion_warning as second_motion_warning,
+)
 from bodyslam_jax.sfm.person_mask import SILHOUETTE_STEP as SILHOUETTE_STEP
 from bodyslam_jax.sfm.scene_tracks import track as track
 from bodyslam_jax.sfm.sfm import Reconstruction as Reconstruction
 from bodyslam_jax.sfm.sfm import reconstruct as reconstruct
+from bodyslam_jax.sfm.track_splitting import (
+    information_from_other_pieces as information_from_other_pieces,
+)
+from bodyslam_jax.sfm.track_splitting import split_tracks as split_tracks
 from bodyslam_jax.sfm.zoom import without_zoom as without_zoom

@@ -1,8 +1,8 @@
 """A small bundle adjustment in NumPy, for the front end alone.
 
 Reprojection errors of points in undistorted images, a Cauchy loss, Levenberg--Marquardt
-with the points eliminated (Schur complement). It serves to grow a reconstruction; the
-estimate that counts is the graph's.
+with the points eliminated (Schur complement). It serves incremental mapping only;
+the final estimate is that of the factor graph.
 """
 
 import dataclasses
@@ -40,8 +40,8 @@ class Views:
 
 _NEAR = 1e-6
 _DAMPING, _LEAST = 1e-8, 1e-13
-"""Of the diagonal, at first and at least: the softest bend of a long path is some 1e-10
-as stiff as one camera."""
+"""Initial and least damping, relative to the diagonal: the smallest eigenvalue of a
+long path is some 1e-10 of that of a single camera."""
 
 
 def errors(scene: Scene, views: Views) -> Float[np.ndarray, " m"]:

@@ -1,13 +1,12 @@
-"""Points that are no part of the scene: they stay at one pixel while the scene moves.
+"""Overlays: tracks that stay at one pixel and are not part of the scene.
 
 Text, logos and displays burnt into a video, dirt on the lens, and parts of the vehicle
-or hand that carries the camera give tracks that are long, strong and wrong. A point
-that stays at its pixel may also be far away, or straight ahead of a camera that goes
-forward, and everything stays where the camera stands. So a point is told by the motion
-of the others: a rotation, or an essential matrix, is fitted to those that move, and a
-point that stays where neither lets it stay, in most pairs of frames in which it is
-seen, is burnt in. Where the camera only translates, any point may stay that is at
-infinity, and is left alone.
+or hand that carries the camera give long tracks with strong contrast. A scene point may
+stay at its pixel too: far away, straight ahead of a camera that moves forward, or with
+a static camera. So a rotation or an essential matrix is fitted to the points that move;
+a still point that contradicts it in most pairs of frames is classified as burnt in.
+Under pure translation a point at infinity stays still without contradiction, and is
+kept.
 """
 
 import dataclasses
@@ -23,20 +22,23 @@ from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
 STILL = 0.5
-"""Displacement up to which a point may be still in images of 1280 px, px."""
+"""Displacement up to which a point counts as still, px: assumes tracking noise of about
+0.15 px (1 σ) in images of up to 1280 px, and in proportion in larger ones."""
 _GAPS = (6, 15, 30, 60)
 """Frames between the two of a pair."""
 _MOST_ANCHORS = 300
 _TIMES_STILL = 4.0
-"""Displacement of the points that move, of that of those that do not, from which the
-two can be told apart."""
+"""Ratio of the displacement of moving to that of still points from which the two can be
+separated."""
 _FEWEST_MOVERS = 15
 _FEWEST_INCONSISTENT = 2
 _FEWEST_TELLING = (3, 0.1)
-"""Pairs in which all move but some, and their share of those in which some are still:
-fewer may be an instant in which something crosses before a camera that stands."""
+"""Least number of pairs in which a scene moves beside still points, and their share of
+the pairs with still points: fewer may be an object that crosses before a static
+camera."""
 _SHARE_INCONSISTENT = 0.4
-"""Of the pairs in which a point is still: a point of the scene fits nearly always."""
+"""Share of a still point's pairs that must contradict: scene points nearly always
+fit."""
 _FEWEST_ALWAYS, _MEAN_ALWAYS = 6, 0.7
 """Pairs of a point, and its mean distance in the same unit, that contradict as well."""
 _TOLERANCE = 3.0
@@ -45,21 +47,21 @@ of `STILL`, from which a point contradicts it."""
 _CELLS = 8
 """Along the longer side: the motion of the camera is seen all over the image."""
 _LEAST_COVER, _LEAST_ROWS = 1.0, 3
-"""Cells that move over cells that only stay, and rows and columns that move: less may
-be traffic before a camera that stands still."""
+"""Least ratio of moving to still cells, and least rows and columns of moving cells:
+less may be traffic before a static camera."""
 _AROUND = 15
 """Frames before and after a burnt-in point in which its place is masked."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BurntIn:
-    """What stays at its pixel and cannot be of the scene."""
+    """Classification of the tracks that stay at their pixel."""
 
     of_landmark: Bool[np.ndarray, " l"]
     still: Bool[np.ndarray, " l"]
     """Tracks that stay at their pixel, of the scene or not."""
     num_pairs: int
-    """Pairs of frames that could tell."""
+    """Pairs of frames with enough motion for the test."""
 
     @property
     def found(self) -> bool:
@@ -106,11 +108,11 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
         against[ids[still]] += away[still] > _TOLERANCE
         total[ids[still]] += np.minimum(away[still], _TOLERANCE)
     often = against >= np.maximum(_FEWEST_INCONSISTENT, _SHARE_INCONSISTENT * tested)
-    # Or by less, but all the time: a camera held by hand may turn by a little only.
+    # Or by less in nearly all pairs: a hand-held camera may rotate by little only.
     always = (tested >= _FEWEST_ALWAYS) & (total > _MEAN_ALWAYS * tested)
     burnt = often | always
     burnt &= telling >= max(_FEWEST_TELLING[0], _FEWEST_TELLING[1] * resting)
-    # Tracks that stay for a while only, as where two objects cross, are of the scene.
+    # Tracks that are still only for a while, as at occlusions, are kept.
     burnt &= stays >= 0.5 * pairs
     return BurntIn(burnt, (stays >= 0.5 * pairs) & (pairs > 0), telling)
 
@@ -171,7 +173,7 @@ def masks_of(
         size: width and height, px.
         radius: px
     """
-    # One entry a place: text lasts, and its points come and go.
+    # Nearby observations are merged: text persists while its tracks come and go.
     place = np.round(uv / max(1, radius // 3)).astype(np.int64)
     _, of = np.unique(place, axis=0, return_inverse=True)
     of = of.ravel()
@@ -202,10 +204,10 @@ def _pairs(num_frames: int) -> Iterator[tuple[int, int]]:
 def _contradiction(
     xy_a: np.ndarray, xy_b: np.ndarray, movers: np.ndarray, limit: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """How far each pair of points is from what the motion of the movers allows, in
-    units of what may be, and which of the movers show that motion.
+    """Distance of each pair from the motion model of the movers, in robust standard
+    deviations, and which movers are inliers of that model.
 
-    A rotation is tried first: any essential matrix with its rotation fits one as well.
+    A rotation is tried first: under pure rotation the essential matrix is undetermined.
     """
     a, b = xy_a[movers], xy_b[movers]
     R, away = fit_rotation(unit_rays(a), unit_rays(b), limit)

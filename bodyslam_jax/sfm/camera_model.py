@@ -1,8 +1,9 @@
-"""Which camera the tracks were taken with: the one supposed, or what they show instead.
+"""Intrinsics from the tracks: pixel aspect ratio, radial distortion and zoom.
 
-Reconstruction and examination of the lens in turn. What is found is used where there is
-no doubt of it, and said in any case; what camera.json says is overruled only where the
-tracks contradict it by many standard deviations and fit far better without it.
+Reconstruction and self-calibration alternate. A deviation from the assumed camera is
+applied where it is significant, and reported otherwise; values of camera.json are
+overruled only where the tracks contradict them by many standard deviations and the
+reprojection error falls clearly without them.
 """
 
 import dataclasses
@@ -51,10 +52,10 @@ class CameraModel:
 def find_camera_model(
     tracks: Tracks, intrinsics: Intrinsics, num_frames: int, config: Structure
 ) -> CameraModel:
-    """The camera that was supposed unless the tracks show another.
+    """The given camera, corrected where the tracks contradict it.
 
-    Shape of pixels, one coefficient of distortion and a zoom are sought, where the
-    camera moves; a zoom also where it does not.
+    Pixel aspect ratio, one radial coefficient and a zoom are estimated if the camera
+    translates; only a zoom if it rotates.
     """
     given, zoom = intrinsics, np.zeros(num_frames)
     warnings: list[str] = []
@@ -70,9 +71,9 @@ def find_camera_model(
             break
         _log.debug("lens: %s", lens)
         least = 0.01 if zoom.any() else LEAST_ZOOM
-        better, more, said = _improved(lens, intrinsics, given, least)
+        better, more, doubts = _improved(lens, intrinsics, given, least)
         if turn == 0:
-            warnings += said
+            warnings += doubts
         if better is None and more is None:
             break
         trial = zoom if more is None else zoom + more - np.median(more)
@@ -127,7 +128,7 @@ def _examine(
     num = int(tracks.landmark.max()) + 1
     of = np.full(num, -1)
     of[found.landmark_ids] = np.arange(len(found.landmark_ids))
-    # Also what did not fit: under a wrong lens that is what tells.
+    # Outliers too: under a wrong lens model they carry the information.
     use = (of[tracks.landmark] >= 0) & found.registered[tracks.frame]
     xy = rays(tracks.uv[use], K, distortion)
     views = Views(tracks.frame[use], of[tracks.landmark[use]], xy)
@@ -139,14 +140,14 @@ def _examine(
 def _improved(
     lens: Lens, intrinsics: Intrinsics, given: Intrinsics, least_zoom: float
 ) -> tuple[Intrinsics | None, np.ndarray | None, list[str]]:
-    """The camera and the zoom to add, where they are beyond doubt; and what is said of
-    what is not."""
+    """The corrected camera and the zoom to add, where significant (else `None`); and
+    messages on deviations that are not applied."""
     params = np.asarray(intrinsics.params, float).copy()
     K = as_opencv(params)[0]
     corner = np.hypot(intrinsics.width / K[0, 0], intrinsics.height / K[1, 1]) / 2
     sigmas = _SIGMAS if given.is_guess else _GIVEN_SIGMAS
     may = given.is_guess or lens.gain > _GIVEN_GAIN
-    said: list[str] = []
+    doubts: list[str] = []
     changed = False
     ratio, zooms = params[0] / params[1], None
     if lens.zoom_range > max(least_zoom, _SIGMAS * lens.zoom_sigma):
@@ -159,8 +160,8 @@ def _improved(
             changed = True
         else:
             shown = ratio * np.exp(lens.aspect)
-            said.append(
-                f"the tracks say that fx/fy is {shown:.2f} ± "
+            doubts.append(
+                f"the tracks indicate that fx/fy is {shown:.2f} ± "
                 f"{shown * lens.aspect_sigma:.2f}, not {ratio:.2f}: is the video "
                 "stretched? Not used; give camera.json of the video as it is."
             )
@@ -171,13 +172,13 @@ def _improved(
             params[4] += lens.radial
             changed = True
         else:
-            said.append(
-                f"the tracks say that the lens is distorted, k1 = {lens.radial:.3f} ± "
+            doubts.append(
+                f"the tracks indicate a distorted lens, k1 = {lens.radial:.3f} ± "
                 f"{lens.radial_sigma:.3f} ({100 * bend:.0f} % at the corners) beyond "
                 "what is known of it: not used; give camera.json."
             )
     better = dataclasses.replace(intrinsics, params=params) if changed else None
-    return better, zooms, said
+    return better, zooms, doubts
 
 
 def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
@@ -208,14 +209,14 @@ def _changes(given: Intrinsics, used: Intrinsics) -> list[str]:
     before, after = (c.params[0] / c.params[1] for c in (given, used))
     if abs(np.log(after / before)) > 1e-3:
         text.append(
-            f"the tracks say that fx/fy is {after:.3f} where {source} has {before:.3f} "
+            f"the tracks indicate fx/fy = {after:.3f} where {source} has {before:.3f} "
             "(pixels that are not square: a stretched video): used."
         )
     k1 = used.params[4] if len(used.params) == 8 else 0.0
     known = given.params[4] if len(given.params) == 8 else 0.0
     if abs(k1 - known) > 1e-6:
         text.append(
-            f"the tracks say that the lens is distorted, k1 = {k1:.3f} where {source} "
+            f"the tracks indicate a distorted lens, k1 = {k1:.3f} where {source} "
             f"has {known:.3f}: used."
         )
     return text

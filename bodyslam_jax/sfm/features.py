@@ -27,15 +27,15 @@ def make_brisk(threshold: int, octaves: int) -> Any:
 
 
 def brisk_status() -> str:
-    """One line for people: where BRISK is, or how to get it."""
+    """One line of text: which module has BRISK, or how to get it."""
     home = _home_of_brisk()
     return _NO_BRISK if home is None else f"found in {home.__name__} {cv2.__version__}"
 
 
 def _home_of_brisk() -> Any | None:
     """The module that has BRISK: OpenCV 5 moved it to the contributed ones."""
-    places = (cv2, getattr(cv2, "xfeatures2d", None))
-    return next((p for p in places if hasattr(p, "BRISK_create")), None)
+    modules = (cv2, getattr(cv2, "xfeatures2d", None))
+    return next((p for p in modules if hasattr(p, "BRISK_create")), None)
 
 
 def spread(
@@ -51,7 +51,7 @@ def spread(
     """Picks points that cover the image: the strongest in each cell that lacks some.
 
     Args:
-        taken: points there are already; they count for their cell.
+        taken: existing points; they count for their cell.
         size: width and height, px.
         cell: side of a cell, px.
         quota: points wanted in each cell.
@@ -84,7 +84,7 @@ def spread(
 def epipolar_inliers(
     xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which pairs fit one essential matrix; all of them if too few to tell.
+    """Which pairs fit one essential matrix; all of them if there are too few to test.
 
     Args:
         xy_a, xy_b: undistorted points at depth 1.

@@ -1,10 +1,10 @@
-"""What the tracks say of the lens: shape of pixels, distortion, and zoom over time.
+"""Self-calibration from the tracks: pixel aspect ratio, distortion, zoom over time.
 
-A reconstruction supposes one pinhole camera. Bundle adjustment of some of its frames
-with the ratio of the focal lengths, one radial coefficient and a focal length that
-changes piecewise linearly tells whether that was right. Their errors are those of the
-tracks as they are: scores are summed over each track, as its errors last (the sandwich
-estimator of clustered errors, Liang & Zeger, Biometrika 1986).
+The reconstruction assumes one pinhole camera. This module tests the assumption by
+bundle adjustment of some of its frames with the ratio of the focal lengths, one radial
+coefficient and a piecewise linear focal length as additional parameters. Their
+covariance allows for errors that are correlated within a track: the sandwich estimator
+for clustered errors (Liang & Zeger, Biometrika 1986).
 """
 
 import copy
@@ -23,16 +23,16 @@ _FEWEST_POINTS = 40
 _FRAMES_A_KNOT = 15
 _MOST_KNOTS = 8
 _FOCAL, _ASPECT, _RADIAL, _KNOT = 0.2, 0.4, 0.5, 0.5
-"""Standard deviations of what may be beforehand."""
+"""Prior standard deviations: logarithms of focal length and aspect, k1, log zoom."""
 _CAUCHY = 2.0
 """Scale of the loss, in standard deviations of an observation."""
 _ITERATIONS = 45
 _DOUBT = 3.0
-"""Standard deviations from which it is asked which deviation it is."""
+"""Significance from which the deviations are tested one by one."""
 _SHARE = 0.75
-"""Of the gain of all, from which one alone explains it."""
+"""Share of the total decrease in cost from which a single deviation suffices."""
 _HELD = 1e12
-"""Information on what is held."""
+"""Information on parameters that are held constant."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Lens:
     """Deviations from one pinhole camera with square pixels, with their errors."""
 
     aspect: float
-    """Logarithm of `fx / fy`, over that of the camera supposed."""
+    """Logarithm of `fx / fy`, relative to the assumed camera."""
     aspect_sigma: float
     radial: float
     """k1, of directions at depth 1."""
@@ -50,9 +50,9 @@ class Lens:
     zoom_sigma: float
     """Of the largest change."""
     focal: float
-    """Logarithm of the focal length, over that of the camera supposed."""
+    """Logarithm of the focal length, relative to the assumed camera."""
     gain: float
-    """Part by which all this lowers the median error."""
+    """Relative decrease of the median error."""
 
     @property
     def zoom_range(self) -> float:
@@ -66,7 +66,7 @@ def examine_lens(
     *,
     pixel: float,
 ) -> Lens | None:
-    """The lens that explains `views` best; None if too little is seen.
+    """The most probable lens given `views`; `None` if there are too few observations.
 
     Args:
         scene: cameras and points to begin with.
@@ -99,14 +99,14 @@ def examine_lens(
         scene.points[points],
         np.zeros(3 + fit.basis.shape[1]),
     )
-    # On the same footing: adjusted as long without a lens, then with one.
+    # For a fair comparison the plain camera is adjusted as long as the full model.
     plain, plain_error, _ = fit.solve(start, pixel / 5, free=False)
     focal, _, _ = fit.alone(slice(0, 1)).solve(plain, pixel / 5, free=True)
     found, error, spread = fit.solve(focal, pixel / 5, free=True)
     if spread is None:
         return None
     if (np.abs(found.lens[1:]) > _DOUBT * np.sqrt(np.diag(spread))[1:]).any():
-        # What one of them explains alone is not shared out between all.
+        # If a single deviation suffices the others stay at zero.
         sigma = max(error / 1.18, pixel / 5)
         gain = fit.cost(focal, sigma) - fit.cost(found, sigma)
         singles = []

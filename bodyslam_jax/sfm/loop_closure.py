@@ -1,31 +1,29 @@
-"""Places seen again: which tracks show one and the same point of the map.
+"""Loop closure: tracks that observe one and the same point of the map are joined.
 
-Whoever follows points begins a new track where a lost one comes back. Left so, a camera
-that turns away and back builds its map anew each time, and the map's size drifts by
-tens of per cent. Once the map tells where a point is, a track that is seen just there,
-from several frames, is taken to be that point.
+A point tracker begins a new track where a lost point comes back into view. Without loop
+closure a camera that turns away and back maps the same scene twice, and the scale of
+the map drifts by tens of per cent. A track whose observations in several frames agree
+with the projection of an existing landmark becomes part of that landmark.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bodyslam_jax.geometry.grouped_sums import sum_by
 from bodyslam_jax.geometry.triangulation import triangulate
 from bodyslam_jax.sfm.bundle import (
     Scene,
     Views,
     errors,
-    jacobian_of_points,
 )
 from bodyslam_jax.sfm.relocalise import Pose, near, relocate, with_moved
 
 _LEAST_VIEWS, _MOST_VIEWS = 2, 8
-"""Registered frames in which a track must have been seen; that are looked at."""
+"""Registered frames in which a track must be observed; the most that are tested."""
 _WIDE = 10.0
-"""Error, in thresholds, that drift may amount to."""
+"""Largest drift of the map, in thresholds, that is searched."""
 _REACH = 2.0
-"""Error, in thresholds, up to which a point is tried: points without much parallax are
-not where they seem to be."""
+"""Error, in thresholds, up to which a landmark is a candidate: those with little
+parallax have inaccurate positions."""
 _FITS = 0.7
 """Mean error, in thresholds, of a point that explains two tracks."""
 _RIVAL = 1.5
@@ -33,7 +31,7 @@ _RIVAL = 1.5
 
 
 class Revisits:
-    """Tracks that were found to be of one point, and the landmark that each shows."""
+    """Which tracks observe the same point, and the landmark that each belongs to."""
 
     def __init__(self, views: Views, num_tracks: int):
         self.track = views.landmark.copy()
@@ -62,13 +60,15 @@ class Revisits:
         registered: Bool[np.ndarray, " t"],
         threshold: float,
     ) -> tuple[list[tuple[int, int]], float]:
-        """Landmarks seen in `frame` that lie where another one is, which it does not
-        see: (one, other) pairs; and how far the map has drifted meanwhile, as an error
-        at depth 1.
+        """Pairs of landmarks (one, other) that may be the same point: `one` is observed
+        in `frame`, `other` is not but projects to the same pixel.
+
+        The second value is the drift of the map between the two, as an error at
+        depth 1.
 
         Args:
             seen: landmarks observed in the frame.
-            known: which landmarks have a point.
+            known: landmarks that are triangulated.
             registered: frames whose camera is known.
             threshold: error at depth 1 up to which an observation fits.
         """
@@ -115,8 +115,8 @@ class Revisits:
         registered: np.ndarray,
         threshold: float,
     ) -> Float[np.ndarray, " p"]:
-        """Error of the one point that explains both of a pair best, for that of the two
-        which it explains worse; in thresholds, each observation's no more than 3."""
+        """Mean reprojection error of the point triangulated from both of a pair, of the
+        one of the two that it fits worse; in thresholds, each error clipped at 3."""
         if not pairs:
             return np.zeros(0)
         parts = [self._some_views(i, registered) for pair in pairs for i in pair]
@@ -141,8 +141,8 @@ class Revisits:
     def _one_each(
         self, pairs: list[tuple[int, int]], misfit: np.ndarray
     ) -> list[tuple[int, int]]:
-        """The best pairs without a rival, in which no landmark would be seen twice in
-        one frame."""
+        """The best pairs that are unambiguous and after which no landmark is observed
+        twice in one frame."""
         rated: dict[int, list[tuple[float, int]]] = {}
         for (i, j), m in zip(pairs, misfit, strict=True):
             rated.setdefault(i, []).append((float(m), j))
@@ -171,7 +171,7 @@ class Revisits:
         return rows
 
     def part(self, error: Float[np.ndarray, " m"]) -> list[int]:
-        """Takes tracks out again that do not fit.
+        """Separates joined tracks again whose reprojection error is too large.
 
         Args:
             error: of each observation, in thresholds; NaN where it has none.
@@ -192,65 +192,3 @@ class Revisits:
             if len(tracks) == 1:
                 del self.members[landmark]
         return loose
-
-
-def split_tracks(
-    frame: Int[np.ndarray, " m"], track: Int[np.ndarray, " m"], longest: int
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " m"]]:
-    """Cuts tracks that span more than `longest` frames into equal pieces.
-
-    Returns: the track that each piece is of, and the piece of each observation.
-    """
-    if not len(frame):
-        return np.zeros(0, int), np.zeros(0, int)
-    first = np.full(int(track.max()) + 1, frame.max() + 1)
-    last = np.full(len(first), -1)
-    np.minimum.at(first, track, frame)
-    np.maximum.at(last, track, frame)
-    span = last - first + 1
-    count = -(-span // longest)
-    part = (frame - first[track]) * count[track] // span[track]
-    most = max(int(count.max()), 1)
-    key, piece = np.unique(track * most + part, return_inverse=True)
-    return key // most, piece.ravel()
-
-
-def told_by_others(
-    scene: Scene, views: Views, shown: Int[np.ndarray, " l"]
-) -> Float[np.ndarray, "l 3 3"]:
-    """Information on each track's point that other tracks of the same point hold (or
-    pieces of tracks).
-
-    Each track is told a share of the others', such that the shares of a point sum to
-    what all its observations say. Cameras are taken as known; errors are in units of
-    depth 1.
-
-    Args:
-        views: observations that fit, of tracks.
-        shown: the landmark that each track shows.
-    """
-    seen = Views(views.frame, shown[views.landmark], views.xy)
-    J = jacobian_of_points(scene, seen)
-    own = sum_by(views.landmark, np.einsum("mki,mkj->mij", J, J), len(shown))
-    _, point = np.unique(shown, return_inverse=True)
-    tracks = np.unique(views.landmark)
-    count = np.bincount(point[tracks], minlength=len(shown))[point]
-    total = sum_by(point, own, len(shown))[point]
-    return (total - own) / np.maximum(count - 1, 1)[:, None, None]
-
-
-def told_by_other_pieces(
-    T_WC: Float[np.ndarray, "t 4 4"],
-    landmarks: Float[np.ndarray, "l 3"],
-    frame: Int[np.ndarray, " m"],
-    piece: Int[np.ndarray, " m"],
-    of: Int[np.ndarray, " p"],
-) -> Float[np.ndarray, "p 3 3"]:
-    """`told_by_others` for the pieces of tracks of `landmarks`.
-
-    Args:
-        of: the landmark that each piece is of.
-    """
-    C_WC = T_WC[:, :3, :3]
-    scene = Scene(np.swapaxes(C_WC, 1, 2), T_WC[:, :3, 3], landmarks)
-    return told_by_others(scene, Views(frame, piece, np.zeros((len(frame), 2))), of)

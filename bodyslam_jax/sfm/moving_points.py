@@ -1,7 +1,7 @@
-"""Points that move together, but not as the scene does: traffic, a crowd, reflections.
+"""A second rigid motion among the outliers: traffic, a crowd, reflections.
 
-The reconstruction leaves them out as outliers, which is right as long as they are few:
-when they are many, they may be what was taken for the scene.
+The reconstruction rejects such points as outliers. If they are many, the roles may be
+exchanged and the camera path may be relative to them; so a warning is given.
 """
 
 import numpy as np
@@ -15,16 +15,16 @@ from bodyslam_jax.types import Intrinsics, Tracks
 _GAP = 8
 _MOST_PAIRS = 60
 _FAR, _SIGMAS = 2.0, 5.0
-"""Distance from what the camera's motion allows, px and in standard deviations, from
-which a point moves by itself."""
+"""Distance from the epipolar line, px and in standard deviations of the tracks, beyond
+which a point moves by itself; 2 px assume noise of up to 0.4 px at any image size."""
 _ALIKE = 0.3
 """Difference of the displacements of neighbours that move together, of their size."""
 _MANY = 0.15
-"""Share of the points from which there is something to be said."""
+"""Share of the points from which a warning is given."""
 _FEWEST = 6
 
 
-def second_motion(
+def second_motion_warning(
     tracks: Tracks, found: Reconstruction, intrinsics: Intrinsics
 ) -> str | None:
     """A warning where many points move together against the scene that was found."""

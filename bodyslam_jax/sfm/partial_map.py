@@ -1,4 +1,4 @@
-"""A map on its way: its points, what fits them, and tracks joined or parted."""
+"""A map while it grows: triangulation, inliers, bundle adjustment, joined tracks."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,24 +12,25 @@ from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.loop_closure import Revisits
 
 _ENOUGH = 20
-"""Views of known points that tell how far points usually are."""
+"""Observations of triangulated points from which the usual distance is estimated."""
 _FLAT = 0.5
 """Share of the smallest angle that a point may itself have."""
 _DRIFTED = 1.0
-"""Error of a place seen again, in thresholds, from which the loop is closed at once."""
+"""Drift at a revisited point, in thresholds, from which the loop is closed at once."""
 _CLOSING = (8.0, 3.0)
-"""Scales of the loss with which it is, in pixels: what joins must not seem outliers."""
+"""Scales of the loss in successive adjustments, px: wide at first, so that the joined
+tracks are not rejected as outliers."""
 _ROUNDS, _SETTLED = 6, 0.01
-"""Times that joins are looked at again, and the share of observations of which another
-landmark is then thought that ends it."""
+"""Most rounds of joining and separating tracks, and the share of observations that
+change their landmark below which the rounds end."""
 
 Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
-"""Adjusts the free cameras and all points of `views` in place, as `_bundle.adjust`."""
+"""Adjusts the free cameras and all points of `views` in place, as `bundle.adjust`."""
 
 
 @dataclasses.dataclass
 class PartialMap:
-    """A reconstruction on its way."""
+    """An incomplete reconstruction."""
 
     scene: Scene
     registered: Bool[np.ndarray, " t"]
@@ -37,11 +38,11 @@ class PartialMap:
     inlier: Bool[np.ndarray, " m"]
     """Observations that fit, of those in registered frames."""
     shown: Int[np.ndarray, " l"]
-    """The landmark that each track shows: its own, unless tracks were joined."""
+    """The landmark that each track observes: its own, unless tracks were joined."""
 
 
 class Mapper:
-    """What makes points of views and adjusts them, over the frames of one shot."""
+    """Triangulation and adjustment over the frames of one shot."""
 
     def __init__(
         self,
@@ -86,8 +87,8 @@ class Mapper:
             self._close(grown)
 
     def _settle(self, grown: PartialMap, frames: np.ndarray) -> None:
-        """Joins and parts tracks until that changes little: what was joined wrongly
-        while the map was bent is seen to be once it is less so."""
+        """Joins and separates tracks until little changes: false joins show once the
+        map is less distorted."""
         for turn in range(_ROUNDS):
             if not self.revisits.members:
                 return
@@ -97,12 +98,12 @@ class Mapper:
             for k in frames[turn % 2 :: 2]:
                 self._join(grown, int(k))
             self._refine(grown, self._free(grown))
-            self._triangulate(grown, self._views_of(grown))
+            self.make_points(grown, self._views_of(grown))
             if np.mean(self.views.landmark != before) < _SETTLED:
                 return
 
     def _close(self, grown: PartialMap) -> None:
-        """Spreads what the map has drifted over all that was seen since."""
+        """Distributes the drift over the loop by bundle adjustment."""
         use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
         for loss in _CLOSING:
             adjust(
@@ -118,15 +119,16 @@ class Mapper:
         return np.flatnonzero(grown.registered[self.views.frame])
 
     def _views_seen_in(self, grown: PartialMap, k: int) -> np.ndarray:
-        """All views of the points that frame `k` sees and that are not known yet."""
+        """All observations of the points in frame `k` that are not triangulated yet."""
         wanted = np.zeros(self.num_landmarks, dtype=bool)
         wanted[self.views.landmark[self.of_frame[k]]] = True
         wanted &= ~grown.has_point
         use = wanted[self.views.landmark] & grown.registered[self.views.frame]
         return np.flatnonzero(use)
 
-    def _triangulate(self, grown: PartialMap, use: np.ndarray) -> None:
-        """Makes points of landmarks that have none, where the views `use` allow it."""
+    def make_points(self, grown: PartialMap, use: np.ndarray) -> None:
+        """Triangulates landmarks without a point from the observations `use`, where
+        they agree and have enough parallax."""
         use = use[~grown.has_point[self.views.landmark[use]]]
         if not len(use):
             return
@@ -155,11 +157,11 @@ class Mapper:
         grown.inlier[use[kept]] = good[kept]
 
     def _parallax(self, trial: Scene, views: Views, grown: PartialMap) -> np.ndarray:
-        """Largest angle (rad) between the rays to each landmark, were it as far away as
-        points usually are that the same cameras see.
+        """Parallax (rad) of each landmark if it were at the median distance of the
+        points that the same cameras observe.
 
-        The angle at the point itself would choose points that noise has drawn nearer:
-        the map would shrink, the more so the further it grows.
+        The parallax at the triangulated point itself would select points that noise has
+        drawn nearer: the map would shrink as it grows.
         """
         near = np.isin(np.arange(self.num_frames), views.frame)
         at = grown.has_point[self.views.landmark] & near[self.views.frame]
@@ -172,8 +174,8 @@ class Mapper:
         centre[views.landmark] = trial.centre[views.frame]
         ray = trial.points - centre
         distance = np.linalg.norm(ray, axis=-1, keepdims=True)
-        there = centre + usual * ray / np.maximum(distance, 1e-12)
-        return widest_angle(trial.centre[views.frame], views.landmark, there)
+        shifted = centre + usual * ray / np.maximum(distance, 1e-12)
+        return widest_angle(trial.centre[views.frame], views.landmark, shifted)
 
     def _mark(self, grown: PartialMap) -> None:
         """Sorts observations into inliers and outliers, and drops poor points."""

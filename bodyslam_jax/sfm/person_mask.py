@@ -170,7 +170,7 @@ def _pixel(point: np.ndarray) -> tuple[int, int]:
 
 
 def _fill_gaps(keypoints: Keypoints, max_gap: int) -> Float[np.ndarray, "h t 25 3"]:
-    """Keypoints with short gaps bridged: who is not detected is still there."""
+    """Keypoints with short gaps bridged, so that a missed detection is masked too."""
     points = np.concatenate([keypoints.uv, keypoints.confidence[..., None]], axis=-1)
     num_frames = points.shape[1]
     for person in points:

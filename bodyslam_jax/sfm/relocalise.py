@@ -1,4 +1,4 @@
-"""Where a camera is by points that were mapped long ago: the map may have drifted."""
+"""Relocalisation: the camera pose from landmarks mapped earlier, before the drift."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -44,10 +44,10 @@ def relocate(
     threshold: float,
     share: float,
 ) -> tuple[Pose | None, float]:
-    """Where the camera is by `points`, `None` if too few agree; and how far that is
-    from `pose`: the median shift of the points that agree, at depth 1.
+    """The camera pose from `points`, `None` if too few agree; and the drift from
+    `pose`: the median shift of the points that agree, at depth 1.
 
-    Most of the pairs may be wrong, but only right ones agree.
+    Most of the pairs may be wrong matches; only correct ones agree on a pose.
 
     Args:
         which: which image point a row is of; several rows may share one.
@@ -57,19 +57,19 @@ def relocate(
     agree = lambda seen: len(
         np.unique(which[np.linalg.norm(seen - xy, axis=-1) < threshold])
     )
-    here = _project(points, pose)
+    before = _project(points, pose)
     R, centre = pose
     # Where the map has hardly drifted, no wide loss need be tried.
-    for scale in _ANNEALED[2 if agree(here) > least else 0 :]:
+    for scale in _ANNEALED[2 if agree(before) > least else 0 :]:
         found = refine_pose(R, centre, points, xy, scale * threshold)
         if found is None:
             return None, 0.0
         R, centre, _ = found
-    there = _project(points, (R, centre))
-    if agree(there) <= least:
+    after = _project(points, (R, centre))
+    if agree(after) <= least:
         return None, 0.0
-    fits = np.linalg.norm(there - xy, axis=-1) < threshold
-    away = np.linalg.norm(there - here, axis=-1)[fits]
+    fits = np.linalg.norm(after - xy, axis=-1) < threshold
+    away = np.linalg.norm(after - before, axis=-1)[fits]
     return (R, centre), float(np.median(away))
 
 
@@ -79,7 +79,8 @@ def _project(points: np.ndarray, pose: Pose) -> np.ndarray:
 
 
 def with_moved(scene: Scene, frame: int, pose: Pose) -> Scene:
-    """All cameras, and once more, moved rigidly as `frame` is to `pose`."""
+    """All cameras, followed by copies that are moved by the rigid transform which takes
+    camera `frame` to `pose`."""
     R, centre = pose
     turn = R.T @ scene.R_CW[frame]
     R_CW = scene.R_CW @ turn.T

@@ -1,8 +1,8 @@
-"""Images -> tracks of the scene alone: without what is burnt in or only a border.
+"""Images -> tracks of the scene: overlays and black borders are masked.
 
-Points are followed once; where some prove to be no part of the scene, their places are
-hidden, as people are, and all is followed anew: text takes its share of the points, and
-in a dark scene all of them.
+Points are tracked once. If some are classified as burnt in, their neighbourhoods are
+masked like people and tracking is repeated: text takes a share of the points, and in a
+dark scene all of them.
 """
 
 import dataclasses
@@ -86,15 +86,15 @@ def track(
 def _only_here(cover: float) -> str:
     return (
         f"all points that stand still lie in {100 * cover:.0f} % of the image: if that "
-        "is text over a scene too dark to see, what is said of the camera is wrong."
+        "is text over a scene too dark to see, the camera motion found is wrong."
     )
 
 
 def _unwanted(
     tracks: Tracks, sequence: Sequence
 ) -> tuple[Bool[np.ndarray, " l"], bool, float]:
-    """Tracks that are burnt in, or that may be if nothing else is seen; whether that is
-    sure; and the share of the image near such as may be."""
+    """Candidates for masking: burnt-in tracks, or all still tracks if most are still;
+    whether that is certain; and the share of the image near uncertain candidates."""
     burnt = find_burnt_in(tracks, sequence.intrinsics, sequence.num_frames)
     if burnt.found or not len(tracks.landmark):
         return burnt.of_landmark, True, 0.0
@@ -102,7 +102,7 @@ def _unwanted(
     if still.mean() < _MANY_STILL:
         return burnt.of_landmark, True, 0.0
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
-    # What is not near a point that stays is where a hidden scene would be looked for.
+    # Elsewhere in the image a scene may be found once still points are masked.
     near = np.zeros((size[1], size[0]), dtype=np.uint8)
     for x, y in np.unique(np.round(tracks.uv[still] / 8), axis=0) * 8:
         cv2.circle(near, (int(x), int(y)), max(size) // 20, 1, -1)
@@ -113,7 +113,7 @@ def _unwanted(
 def _confirmed(
     before: Tracks, after: Tracks, wanted: Bool[np.ndarray, " l"], sequence: Sequence
 ) -> bool:
-    """Whether what is seen beside the hidden points moves against them."""
+    """Whether new points beside the masked ones move against them."""
     these = wanted[before.landmark]
     both = Tracks(
         np.concatenate([before.frame[these], after.frame]),
@@ -160,7 +160,7 @@ class _Border:
         """Takes another image into account."""
         for axis, lines in enumerate((image[::4].T, image[:, ::4])):
             if lines.shape[0] != len(self.darkest[axis]):
-                return  # of another size than was said, which is refused elsewhere
+                return  # a wrong image size is refused by the reader
             ranks = lines.shape[1] // 8, lines.shape[1] // 2
             part = np.partition(lines, ranks, axis=1)
             self.darkest[axis] = np.minimum(self.darkest[axis], part[:, ranks[0]])

@@ -19,15 +19,20 @@ from bodyslam_jax.sfm.camera_motion import (
     stillness,
 )
 from bodyslam_jax.sfm.incremental import Builder, build_map
-from bodyslam_jax.sfm.loop_closure import told_by_others
 from bodyslam_jax.sfm.partial_map import PartialMap, Refine
+from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
 
 _EXPLAINED, _TESTED = 0.3, 200
-"""Share of the observations that a known camera path must explain, and how many there
-must be to tell."""
+"""Least share of inliers under a given camera path, and least number of observations
+for this test."""
+
+_CERTAIN_PARALLAX = 6.0
+"""Residual of a pure rotation, in `Structure.rotation_error`, beyond which the camera
+certainly translates: 6 px at the default, assuming that tracking noise (0.5 px at
+640x480) and a wrong focal length together stay below it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +42,7 @@ class Reconstruction:
     kind: Kind
     """`moving`: all below holds. `rotation`: the camera only turns, its centre is 0 and
     the landmarks are directions (distance 1). `static`: it does not even turn.
-    `failed`: nothing could be said; poses are the identity."""
+    `failed`: no estimate; poses are the identity."""
     T_WC: Float[np.ndarray, "t 4 4"]
     """Camera to world. The world is the first registered camera, its unit the median
     distance of landmarks from it."""
@@ -49,10 +54,10 @@ class Reconstruction:
     inlier: Bool[np.ndarray, " m"]
     """Which of the `m` observations given they are."""
     landmark_ids: Int[np.ndarray, " l"]
-    """Which of the landmarks given these are; a long track is several landmarks."""
+    """Index of each among the given landmarks; a long track is several landmarks."""
     prior_information: Float[np.ndarray, "l 3 3"]
-    """Information that other tracks of the same point hold on each landmark's place,
-    px² per squared unit of the map: to be divided by the variance of a pixel."""
+    """Information of other tracks of the same point on each landmark's position, px²
+    per squared unit of the map: to be divided by the variance of a pixel."""
     error: float
     """Median reprojection error of the inliers, px."""
     unit: float = 1.0
@@ -70,7 +75,7 @@ def reconstruct(
     path: CameraPath | None = None,
     static: bool = False,
 ) -> Reconstruction:
-    """Structure from motion that says what kind of motion there was.
+    """Structure from motion, with a classification of the camera motion.
 
     After a cut only the longest shot is reconstructed; the other frames hold the
     nearest pose and are not registered. Every frame gets a pose.
@@ -130,10 +135,10 @@ def reconstruct(
         inlier[within] = grown.inlier
         found = _moving(problem, grown, inlier, (first, last), warnings)
         extent = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
-        # A wrong focal length makes even a turning camera seem to move a little.
-        if away > 6 or extent > config.min_baseline:
+        # A wrong focal length makes even a rotating camera seem to move a little.
+        if away > _CERTAIN_PARALLAX or extent > config.min_baseline:
             return found
-    elif away > 6:
+    elif away > _CERTAIN_PARALLAX:
         text = "no pair of frames has enough parallax to start a map."
         return _nothing(problem, "failed", (*warnings, text))
     text = (
@@ -154,7 +159,7 @@ class _Problem:
 
 
 def _on_a_tripod(problem: _Problem) -> Reconstruction:
-    """A camera that is known to stand: located in every frame, points or none."""
+    """A camera on a tripod by the user's statement: the identity in every frame."""
     if len(np.unique(problem.views.frame)) > 1:
         every = np.ones(len(problem.views.frame), bool)
         found = _fixed(problem, every, "static", None, ())
@@ -170,7 +175,7 @@ def _on_a_tripod(problem: _Problem) -> Reconstruction:
 def _along(
     problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
 ) -> Reconstruction:
-    """The map of a camera whose path is known, and the frames that the path lacks.
+    """The map along a given camera path, and poses of frames that the path lacks.
 
     **Raises:** `ValueError` if most points fit no place in the scene.
     """
@@ -242,7 +247,7 @@ def _longest_shot(
 
 
 def _turning_error(pairs: np.ndarray) -> float:
-    """Error (rad) of a pure rotation for the pairs that it explains worst."""
+    """Residual (rad) of a pure rotation for the pairs that it fits worst."""
     if not len(pairs):
         return np.inf
     telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
@@ -274,7 +279,9 @@ def _moving(
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
     T_WC = interpolate_poses(T_WC, registered)
     views = Views(views.frame, of, views.xy)
-    prior_information = told_by_others(grown.scene, views, grown.shown[ids])
+    prior_information = information_from_other_tracks(
+        grown.scene, views, grown.shown[ids]
+    )
     prior_information = (problem.focal * unit) ** 2 * (R0 @ prior_information @ R0.T)
     return _pack(
         problem,
@@ -369,7 +376,8 @@ def _pack(
 def interpolate_poses(
     T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t 4 4"]:
-    """Fills poses that are not known: between neighbours, held before and after."""
+    """Interpolates missing poses between neighbours, held before the first and after
+    the last."""
     at = np.flatnonzero(known)
     if not len(at) or known.all():
         return T_WC

@@ -1,8 +1,9 @@
 """Images -> tracks of static points, about 200 a frame, spread over the image.
 
-BRISK finds the points; pyramidal Lucas--Kanade follows each from frame to frame, there
-and back. BRISK's descriptors bring back points that were lost for a while. Epipolar
-RANSAC over a gap removes what does not move with the scene; people are masked out.
+BRISK detects the points; pyramidal Lucas--Kanade (KLT) tracks each from frame to frame,
+forward and backward. BRISK descriptors recover points that were lost for a while.
+Epipolar RANSAC over a gap of frames removes points that do not move with the scene;
+people are masked.
 """
 
 import dataclasses
@@ -29,6 +30,9 @@ _NUM_KEYFRAMES = 12
 _FEWEST_MOVING = 15
 _TIMES_STILL = 4.0
 """Displacement of a point that moves, of that of one that may be still."""
+_ROUND_TRIP = 0.5
+"""Largest forward-backward error of KLT, px: assumes subpixel noise of 0.1 to 0.2 px,
+which depends on the window and contrast and hardly on the image size."""
 _LEAST_CONTRAST = 6
 """BRISK's threshold in the flattest image, grey levels."""
 
@@ -47,7 +51,7 @@ def follow(
     """Follows points through the images of a sequence, once.
 
     Args:
-        hidden: a mask (255) for each frame of what is looked at no more than people.
+        hidden: a mask (255) for each frame, added to those of the people.
         look: called with each gray image.
         progress: called with the number of frames done and their total.
 
@@ -148,13 +152,13 @@ class _Tracker:
         return Tracks(frame[kept], landmark.astype(np.int64), uv[kept])
 
     def _follow(self, image: np.ndarray, mask: np.ndarray | None) -> None:
-        """From the previous image, there and back again."""
+        """KLT from the previous image, with the forward-backward check."""
         assert self.previous is not None
         live = self.live
         guess = live.uv + live.step
         uv, ok = self._flow(self.previous, image, live.uv, guess)
         back, ok_back = self._flow(image, self.previous, uv, live.uv)
-        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < 0.5)
+        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < _ROUND_TRIP)
         ok &= self._inside(uv, mask)
         live.step, live.uv = uv - live.uv, uv
         self.live = live.keep(ok)
@@ -300,7 +304,7 @@ class _Tracker:
             then, guess = key.uv[lost[pairs[:, 0]]], seen[pairs[:, 1]]
             now, ok = self._flow(key.image, gray, then, guess, 1)
             back, ok_back = self._flow(gray, key.image, now, then, 1)
-            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < 0.5)
+            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < _ROUND_TRIP)
             ok &= np.linalg.norm(now - guess, axis=-1) < 4.0
             ids, then, now = key.ids[lost[pairs[ok, 0]]], then[ok], now[ok]
             _, a, b = np.intersect1d(key.ids, self.live.ids, return_indices=True)

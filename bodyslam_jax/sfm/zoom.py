@@ -1,9 +1,9 @@
-"""A zoom: its detection where the camera does not travel, and how it is undone.
+"""Zoom of a camera that only rotates: detection, and removal from tracks and images.
 
-A camera that only turns and zooms maps directions by a rotation and a scale about the
-principal point. One that goes forward scales near things more than far ones, unless
-there is nothing but one distance: over an interval in which the scale changes by some
-per cent, the two differ by pixels.
+Rotation and zoom map directions by a rotation and a scale about the principal point.
+Forward motion scales near points more than far ones: over an interval in which the
+scale changes by some per cent the two models differ by pixels, unless all points are
+equally far away.
 """
 
 from collections.abc import Iterable, Iterator
@@ -18,13 +18,13 @@ from bodyslam_jax.sfm.bundle import Views
 from bodyslam_jax.types import Tracks
 
 LEAST_ZOOM = 0.04
-"""Logarithm of the ratio of focal lengths from which there is a zoom."""
+"""Logarithm of the ratio of focal lengths from which a zoom is reported."""
 _LINK = 5
 """Frames between two of the chain."""
 _FEWEST = 20
 _PAIRS = 12
 _BETTER = 3.0
-"""Times that a scale lowers the error of a rotation, or it is not needed."""
+"""Least ratio of the residuals of a rotation without and with a scale."""
 
 
 def turning_zoom(
