@@ -34,6 +34,7 @@ _HOME = {
     "read_sequence": "io",
     "run": "pipeline",
     "solve": "solver",
+    "stack_pairs": "evaluation",
 }
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

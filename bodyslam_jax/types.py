@@ -1,8 +1,11 @@
-"""What goes in: one checked description of a video and all that is known about it.
+"""The data that the stages hand on, from the input to the result. Plain NumPy, no JAX.
 
-Plain NumPy, no JAX. A `Sequence` is what the readers make and what the pipeline
-takes; every array is finite, every index is in range, missing means a flag or a
-confidence of zero, never NaN.
+Readers make a `Sequence`, structure from motion a `SfmResult`, the joint optimisation a
+`JointEstimate`, and the pipeline a `Result`. Every array is finite and every index in
+range; what is missing has a flag or a confidence of zero, never NaN.
+
+Frames: W world, C camera (x right, y down, z forward), H body root. `T_WC` maps points
+from C to W. Axes: `t` frames, `h` people, `l` landmarks, `m` observations.
 """
 
 import dataclasses
@@ -14,22 +17,24 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
-    """A calibrated camera: OpenCV's model, with pixel (0, 0) a pixel's centre."""
+    """A camera in OpenCV's model; pixel (0, 0) is the centre of the top-left pixel."""
 
     params: Float[np.ndarray, " i"]
     """`fx fy cx cy` (px), then `k1 k2 p1 p2` if distorted: 4 or 8 numbers."""
     width: int
+    """px"""
     height: int
+    """px"""
     is_guess: bool = False
-    """Whether the focal length was guessed, so that the graph should refine it."""
+    """Whether the focal length was guessed; it is refined then."""
     focal_sigma: float | None = None
-    """Standard deviation of the focal length, px, where somebody who knows it roughly
-    gave it: it is refined within that. `None` for a calibration, which is held, and for
-    a guess, whose standard deviation is a setting."""
+    """Standard deviation, px, of a focal length that the user gave; it is refined with
+    this as its prior. `None` for a calibration, which is kept constant, and for a
+    guess, whose standard deviation is a setting."""
 
     @property
     def is_refined(self) -> bool:
-        """Whether the focal length is a variable of the estimate."""
+        """Whether the focal length is a variable of the optimisation."""
         return self.is_guess or self.focal_sigma is not None
 
 
@@ -38,104 +43,118 @@ class Keypoints:
     """Detected keypoints of `h` people in `t` frames, in BODY_25 order."""
 
     uv: Float[np.ndarray, "h t 25 2"]
-    """Pixels; 0 where there is none."""
+    """px; 0 where the keypoint is missing."""
     confidence: Float[np.ndarray, "h t 25"]
-    """0 is missing; larger is surer. Detectors do not agree on what 1 means."""
+    """0 where the keypoint is missing; else positive. The scale is the detector's."""
     depth: Float[np.ndarray, "h t 25"] | None = None
-    """How far behind the middle of the hips a network takes them to be, m; 0 where it
-    says nothing. Coarse: it tells which limb is in front."""
+    """Depth in the camera relative to the middle of the hips, m, positive away from
+    the camera, as regressed by a network; 0 where it is missing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
-    """Given bodies of `h` people in the camera frame, per frame."""
+    """Bodies of `h` people that were regressed or given, in each frame's camera."""
 
     present: Bool[np.ndarray, "h t"]
+    """Where there is a body; the other arrays are 0 elsewhere."""
     poses: Float[np.ndarray, "h t 72"]
-    """Axis-angle, rad, root first; the root turns the body into the camera frame."""
+    """SMPL's joint rotations, axis-angle, rad; the first is `R_CH` of the root."""
     shapes: Float[np.ndarray, "h t 10"]
     """SMPL β."""
     trans: Float[np.ndarray, "h t 3"]
-    """m: the pelvis joint is at `J_0(β) + trans` in the camera frame."""
+    """m; the pelvis joint is at `J_0(β) + trans` in C."""
     shapes_regressed: bool = True
-    """Whether β is a network's guess, drawn to the mean, not measured or optimised."""
+    """Whether β was regressed by a network, and so is biased towards the mean shape;
+    false if it was measured or optimised."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracks:
-    """Static points followed through the video: one row per observation."""
+    """Points of the static scene tracked through the video, one row per observation."""
 
     frame: Int[np.ndarray, " m"]
+    """Index of the frame, 0 to t - 1."""
     landmark: Int[np.ndarray, " m"]
-    """Index of the point, 0 to `num_landmarks - 1`."""
+    """Index of the point, 0 to l - 1."""
     uv: Float[np.ndarray, "m 2"]
     """px"""
     warnings: tuple[str, ...] = ()
-    """What was left out while following them."""
+    """What was left out while tracking, for the report."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraPath:
-    """Camera poses that came with a video."""
+    """Camera poses that were given with a video."""
 
     T_WC: Float[np.ndarray, "t 4 4"]
-    """Camera to world; identity where not known."""
+    """Camera to world, in m if `metric`; identity where not known."""
     known: Bool[np.ndarray, " t"]
+    """Frames whose pose was given."""
     metric: bool
     """Whether translations are in metres; else their unit is arbitrary."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
-    """Everybody whom a detector found in `t` frames, also who is not estimated: `n`
-    times somebody. They move, so that nothing of them belongs in the map."""
+class DetectedPeople:
+    """Everybody whom a detector found, one row per person and frame (`n` rows).
+
+    It includes people who are not estimated: they move, and are kept out of the map.
+    """
 
     frame: Int[np.ndarray, " n"]
-    points: Float[np.ndarray, "n 25 3"]
+    """Index of the frame, 0 to t - 1."""
+    keypoints: Float[np.ndarray, "n 25 3"]
     """BODY_25: u px, v px, confidence."""
     silhouettes: UInt8[np.ndarray, "t y x8"] | None = None
-    """Where people are at every fourth pixel of every fourth row, eight bits to a
-    byte, as `np.packbits` has them."""
+    """Masks of people at every fourth pixel of every fourth row, eight pixels to a byte
+    (`np.packbits`)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MaskUse:
-    """How given masks are used, where they are not simply one for each frame."""
+    """How a folder of masks is used, if not as one mask per frame."""
 
     files: tuple[tuple[str, ...], ...]
-    """For each frame of the video the names of its masks, which are put together."""
+    """For each frame of the video the names of its masks, whose union is taken."""
     inverted: bool = False
-    """Whether zero is person."""
+    """Whether zero marks people."""
     with_keypoints: bool = False
-    """Whether people's keypoints are masked, too."""
+    """Whether regions around people's keypoints are masked, too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """One input: `t` frames and whatever is known about them."""
+    """One input: `t` frames and all measurements in them."""
 
     name: str
+    """Of the folder or file, for messages."""
     frames: Path | None
     """Video file or folder of images; `None` if only tracks are given."""
     timestamps: Float[np.ndarray, " t"]
-    """s"""
+    """s, increasing."""
     intrinsics: Intrinsics
+    """Of all frames."""
     keypoints: Keypoints | None = None
+    """Of the people who are estimated, in the order of `bodies`."""
     bodies: Bodies | None = None
+    """Given or regressed bodies of the same people."""
     tracks: Tracks | None = None
+    """Given point tracks; without them points are tracked in the images."""
     masks: Path | None = None
-    """Folder of person masks, one image per frame of the video, whose order they have;
+    """Folder of person masks, one image per frame of the video, in the same order;
     non-zero is person."""
     mask_use: MaskUse | None = None
-    """Where masks are used in another way."""
+    """How the masks are used, if in another way."""
     picks: Int[np.ndarray, " t"] | None = None
-    """Which frames of the video these are, if not all: its rate varied."""
+    """Indices of these frames in the video; `None` if all of it is used."""
     groundtruth: Path | None = None
+    """Folder of the true camera and bodies, which the estimate does not use."""
     camera_path: CameraPath | None = None
-    seen: Seen | None = None
-    """All people in the images, for their masks."""
+    """Given camera poses."""
+    detected: DetectedPeople | None = None
+    """All people in the images, who are kept out of the map."""
     warnings: tuple[str, ...] = ()
-    """What was guessed or dropped while reading, for the report."""
+    """What was guessed or left out while reading, for the report."""
 
     @property
     def num_frames(self) -> int:
@@ -150,40 +169,49 @@ class Sequence:
 
 @dataclasses.dataclass(frozen=True)
 class SfmResult:
-    """The up-to-scale reconstruction after bundle adjustment."""
+    """The reconstruction by structure from motion, after bundle adjustment.
+
+    The unit of its map is arbitrary: *map units* below.
+    """
 
     kind: str
-    """`moving`, `rotation` (no parallax) or `static`."""
+    """Camera motion: `moving`, `rotation` (no parallax), `static` or `failed`."""
     T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world, map units."""
     registered: Bool[np.ndarray, " t"]
-    """Frames that were located; the poses of others are filled in."""
+    """Frames whose pose was estimated; the poses of others are interpolated."""
     landmarks: Float[np.ndarray, "l 3"]
+    """W, map units."""
     tracks: Tracks
     """Observations of `landmarks`."""
     keep: Bool[np.ndarray, " m"]
-    """Observations that fit."""
+    """Inliers among `tracks`."""
     prior_information: Float[np.ndarray, "l 3 3"]
-    """Information on `prior_mean` from other sightings, px² per squared unit of the
-    map."""
+    """Information on `prior_mean`, from observations of the same point that are not in
+    `tracks`, px² per squared map unit."""
     prior_mean: Float[np.ndarray, "l 3"]
-    """Where all sightings of the same point place each landmark."""
+    """Position of each landmark by all observations of the same point, W, map
+    units."""
     pixel_sigma: float
-    """Robust standard deviation of those, px."""
+    """Robust standard deviation of the inliers' reprojection errors, px."""
     intrinsics: Float[np.ndarray, " i"]
+    """`fx fy cx cy` (px), then `k1 k2 p1 p2` if distorted."""
     focal_sigma: float
-    """Standard deviation of a focal length that was found, px; NaN if it was not."""
+    """Standard deviation of an estimated focal length, px; NaN if it was held."""
     costs: tuple[float, float]
-    """Before and after bundle adjustment."""
+    """Cost before and after bundle adjustment."""
     warnings: tuple[str, ...]
+    """What was guessed or left out, for the report."""
     path: Float[np.ndarray, "t 4 4"] | None = None
-    """Poses T_WC that were given with the video, in the map's unit and world; identity
-    where not known."""
+    """Poses T_WC that were given with the video, in the world and unit of the map;
+    identity where not known."""
     path_known: Bool[np.ndarray, " t"] | None = None
+    """Frames whose pose was given."""
     path_scale: float = float("nan")
-    """m per unit of the map, as that path has it; NaN if it is not metric."""
+    """m per map unit by the given path; NaN if that is not metric."""
     zoom: Float[np.ndarray, " t"] | None = None
-    """Logarithm of each frame's focal length over that of `intrinsics`, which is that
-    of the images with the zoom undone; None where the camera does not zoom."""
+    """Logarithm of each frame's focal length relative to that of `intrinsics`, which
+    describe the images with the zoom undone; `None` if the camera does not zoom."""
 
     @property
     def focal(self) -> float:
@@ -192,8 +220,8 @@ class SfmResult:
 
     @property
     def within(self) -> Bool[np.ndarray, " t"]:
-        """Frames of the shot that was looked at, from the first that is located to the
-        last. Nothing ties others, as beyond a cut, to it."""
+        """Frames from the first to the last registered one; frames beyond, such as those
+        after a cut, share no points with the map."""
         frames = np.arange(len(self.registered))
         located = np.flatnonzero(self.registered)
         if self.kind == "failed" or not len(located):
@@ -203,20 +231,21 @@ class SfmResult:
 
 @dataclasses.dataclass(frozen=True)
 class ScaleStart:
-    """The first guess of s, in closed form: its cues, weighted by their errors."""
+    """Initial scale s (m per map unit): the mean of its cues, weighted by their inverse
+    variances. A cue that is absent is 1 with an infinite standard error."""
 
     motion: float = 1.0
-    """From how people move; 1 if that says nothing."""
+    """From the motion model's prediction of people's displacement."""
     motion_error: float = float("inf")
-    """Its standard error; infinite if people's motion says nothing."""
+    """Standard error of `motion`."""
     ground: float = 1.0
-    """From where they stand on the map's ground."""
+    """From the height of people's feet above the ground plane of the map."""
     ground_error: float = float("inf")
-    """Its standard error; infinite if no ground is seen under the feet."""
+    """Standard error of `ground`."""
     path: float = 1.0
-    """From a camera path that is known in metres."""
+    """From a given camera path in metres."""
     path_error: float = float("inf")
-    """Its standard error; infinite without one."""
+    """Standard error of `path`."""
 
     @property
     def _weights(self) -> Float[np.ndarray, " 3"]:
@@ -224,12 +253,12 @@ class ScaleStart:
         return np.array(errors) ** -2.0
 
     def without_motion(self) -> "ScaleStart":
-        """The same without the cue of people's motion."""
+        """Without the cue of people's motion."""
         return dataclasses.replace(self, motion=1.0, motion_error=float("inf"))
 
     @property
     def value(self) -> float:
-        """s; 1 if no cue says anything, so that the map stays in its own unit."""
+        """s; 1 without any cue, so that the map keeps its own unit."""
         weight = self._weights
         if not weight.any():
             return 1.0
@@ -238,64 +267,77 @@ class ScaleStart:
 
     @property
     def standard_error(self) -> float:
-        """Infinite if no cue says anything."""
+        """Of `value`; infinite without any cue."""
         total = self._weights.sum()
         return float(total**-0.5) if total else float("inf")
 
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate:
-    """The graph's optimum."""
+    """The optimum of the factor graph: cameras, people, landmarks and scale."""
 
     scale: float
+    """m per map unit."""
     start: ScaleStart
-    """What motion and ground said of the scale by themselves."""
+    """The initial scale and its cues."""
     scale_sigma: float
     """Standard deviation of `scale`; NaN if it was not computed or not estimated."""
     shape_covariance: Float[np.ndarray, "h 10 10"]
+    """Marginal covariance of each person's β; NaN if it was not computed."""
     unobserved: tuple[str, ...]
-    """What the measurements do not determine, a line each."""
+    """What the measurements do not determine, a line each, for the report."""
     cameras: Float[np.ndarray, "t 4 4"]
+    """T_WC, map units."""
     roots: Float[np.ndarray, "h t 4 4"]
+    """T_CH of each person's root; the translation is the pelvis joint, m."""
     poses: Float[np.ndarray, "h t 23 3"]
+    """Rotations of the joints but the root, axis-angle, rad."""
     shapes: Float[np.ndarray, "h 10"]
+    """SMPL β."""
     landmarks: Float[np.ndarray, "l 3"]
+    """W, map units."""
     intrinsics: Float[np.ndarray, " i"]
+    """`fx fy cx cy` (px), then `k1 k2 p1 p2` if distorted."""
     present: Bool[np.ndarray, "h t"]
+    """Frames in which the person is estimated."""
     status: str
+    """Of the solver, as in `solver.Solution.status`."""
     stages: tuple[dict, ...]
+    """Costs, iterations and durations of each stage, for the summary."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """An estimate (or a ground truth) for `t` frames, `h` people, `l` landmarks."""
+    """An estimate or a ground truth: `t` frames, `h` people, `l` landmarks, in the
+    metric world, of an estimate with y up."""
 
     timestamps: Float[np.ndarray, " t"]
     """s"""
     T_WC: Float[np.ndarray, "t 4 4"]
     """Camera to world, m."""
     scale: float
-    """Metres per unit of the up-to-scale reconstruction."""
+    """m per unit of the map of structure from motion."""
     intrinsics: Float[np.ndarray, " i"]
-    """`fx fy cx cy` px, then `k1 k2 p1 p2` if distorted."""
+    """`fx fy cx cy` (px), then `k1 k2 p1 p2` if distorted."""
     landmarks: Float[np.ndarray, "l 3"]
-    """m, world."""
+    """W, m."""
     poses: Float[np.ndarray, "h t 72"]
-    """Axis-angle, rad; the root turns the body into the world frame."""
+    """SMPL's joint rotations, axis-angle, rad; the first is `R_WH` of the root."""
     trans: Float[np.ndarray, "h t 3"]
-    """m: pelvis joint minus `J_0(β)`."""
+    """m; the pelvis joint is at `J_0(β) + trans` in W."""
     betas: Float[np.ndarray, "h 10"]
+    """SMPL β."""
     joints: Float[np.ndarray, "h t 24 3"]
-    """m, world."""
+    """W, m."""
     present: Bool[np.ndarray, "h t"]
-    """Whether the person is there; rows where not are finite fill, not estimates."""
+    """Frames in which the person is known; elsewhere the arrays hold finite fill."""
     summary: dict = dataclasses.field(default_factory=dict)
-    """What goes to `summary.json`."""
+    """Content of `summary.json`."""
 
     @property
     def located(self) -> Bool[np.ndarray, " t"]:
-        """Frames whose camera is an estimate: `frames_used` of the summary, first and
-        last, if it says so. Beyond a cut poses are finite fill."""
+        """Frames whose camera was estimated: from the first to the last of the summary's
+        `frames_used`, if it has them. Poses of others are finite fill."""
         frames = np.arange(len(self.timestamps))
         used = self.summary.get("frames_used")
         if not (isinstance(used, list) and len(used) == 2):

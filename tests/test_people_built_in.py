@@ -98,13 +98,13 @@ def test_silhouettes_cover_the_body(scene, found):
 def with_people(images, found, **changes):
     start = dataclasses.replace(sequence(images), **changes)
     points, person = found.by_frame(len(images))
-    return io.with_detections(start, points, person=person, seen=found.seen())
+    return io.with_detections(start, points, person=person, detected=found.detected())
 
 
 def test_people_become_keypoints_and_everybody_is_seen(scene, found):
     whole = with_people(scene[1], found)
     assert whole.keypoints.uv.shape == (1, FRAMES, 25, 2)
-    assert len(whole.seen.frame) == len(found.frame)
+    assert len(whole.detected.frame) == len(found.frame)
 
 
 def test_who_has_no_body_is_not_estimated_where_bodies_are_given(scene, found):

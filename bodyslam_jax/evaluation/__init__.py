@@ -6,7 +6,7 @@ from bodyslam_jax.evaluation.alignment import align as align
 from bodyslam_jax.evaluation.alignment import umeyama as umeyama
 from bodyslam_jax.evaluation.association import associate as associate
 from bodyslam_jax.evaluation.association import evaluate as evaluate
-from bodyslam_jax.evaluation.association import pad_frames as pad_frames
+from bodyslam_jax.evaluation.association import stack_pairs as stack_pairs
 from bodyslam_jax.evaluation.datasets import convert_3dpw as convert_3dpw
 from bodyslam_jax.evaluation.datasets import convert_emdb as convert_emdb
 from bodyslam_jax.evaluation.datasets import convert_rich as convert_rich
@@ -38,6 +38,7 @@ from bodyslam_jax.evaluation.metrics import (
 )
 from bodyslam_jax.evaluation.metrics import trajectory_error as trajectory_error
 from bodyslam_jax.evaluation.metrics import world_mpjpe as world_mpjpe
+from bodyslam_jax.evaluation.padding import pad_frames as pad_frames
 from bodyslam_jax.evaluation.plausibility import FIGURES as FIGURES
 from bodyslam_jax.evaluation.readers import read_groundtruth as read_groundtruth
 from bodyslam_jax.evaluation.readers import read_result as read_result

@@ -1,7 +1,7 @@
 """Two results brought together: same moments, same people."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -23,7 +23,14 @@ from bodyslam_jax.evaluation.errors import (
     evaluate_trajectories,
 )
 from bodyslam_jax.evaluation.metrics import Errors, trajectory_error
-from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.evaluation.padding import bucket, pad_frames, pad_people, to_bucket
+from bodyslam_jax.evaluation.resampling import (
+    Samples,
+    interval_of,
+    resample,
+    samples_of,
+    without_holes,
+)
 from bodyslam_jax.types import Result
 
 
@@ -33,23 +40,51 @@ def evaluate(
     body: BodyModel | None = None,
     offset: float = 0.0,
 ) -> Evaluation:
-    """Every error of `result` against `truth`.
+    """Every error of `result` against `truth`, in m, rad and s.
 
-    Results are first associated in time and person (`associate`, on the host).
-    `Trajectories`, which are associated already, pass straight to the pure
-    `evaluate_trajectories`: jit, vmap and differentiate this function with those.
+    Two `Result`s are first associated in time and person, by `associate` and with its
+    arguments `body` and `offset` (s). Two `Trajectories` are associated already; with
+    those this function jits, vmaps and differentiates:
+    `jax.jit(jax.vmap(evaluate))(*stack_pairs(pairs))`. Lengths are padded to a few
+    (`padding.bucket`), each compiled once.
 
-    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
+    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other,
+    or the two are of different kinds.
     """
     if isinstance(result, Trajectories) and isinstance(truth, Trajectories):
-        return evaluate_trajectories(result, truth)
+        return _evaluate(to_bucket(result), to_bucket(truth))
     if not isinstance(result, Result) or not isinstance(truth, Result):
         raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
-    *pair, feet, scope = _associate(result, truth, body, offset)
-    return dataclasses.replace(_evaluate(*pair), feet=feet, scope=scope)
+    estimate, reference, feet, scope = _associate(result, truth, body, offset)
+    found = _evaluate(to_bucket(estimate), to_bucket(reference))
+    return dataclasses.replace(found, feet=feet, scope=scope)
 
 
 _evaluate = eqx.filter_jit(evaluate_trajectories)
+
+
+def stack_pairs(
+    pairs: Iterable[tuple[Result, Result]], body: BodyModel | None = None
+) -> tuple[Trajectories, Trajectories]:
+    """Estimates and truths of pairs (result, truth), associated, padded and stacked.
+
+    Pairs with fewer frames or people than others get masked ones; errors of people whom
+    a pair lacks are NaN.
+
+    **Raises:** `ValueError` if there is no pair, and as `associate`.
+    """
+    associated = [associate(result, truth, body) for result, truth in pairs]
+    if not associated:
+        raise ValueError("No pair of a result and a truth to stack.")
+    frames = bucket(max(len(truth.camera_valid) for _, truth in associated))
+    people = max(len(truth.present) for _, truth in associated)
+    estimates, truths = (
+        [pad_people(pad_frames(x, frames), people) for x in side]
+        for side in zip(*associated, strict=True)
+    )
+    # Stacked on the host: nothing is compiled for a number of pairs.
+    stack = lambda *x: jnp.asarray(np.stack([np.asarray(one) for one in x]))
+    return jax.tree.map(stack, *estimates), jax.tree.map(stack, *truths)
 
 
 def associate(
@@ -81,12 +116,12 @@ def _associate(
 ) -> tuple[Trajectories, Trajectories, str, Scope]:
     """Estimate, truth, which points the feet are, and what is compared."""
     times = result.timestamps + offset
-    slower = _interval(times) >= 0.999 * _interval(truth.timestamps)
-    at = _without_holes(times if slower else truth.timestamps)
+    slower = interval_of(times) >= 0.999 * interval_of(truth.timestamps)
+    at = without_holes(times if slower else truth.timestamps)
     feet, true_feet, kind = _feet(result, truth, body)
-    found = _resample(_host(result, feet), times, at)
-    true = _resample(_host(truth, true_feet), truth.timestamps, at)
-    overlap = np.flatnonzero(found.close & true.close)
+    found = resample(samples_of(result, feet), times, at)
+    true = resample(samples_of(truth, true_feet), truth.timestamps, at)
+    overlap = np.flatnonzero(found.available & true.available)
     if not len(overlap):
         raise ValueError(
             f"The result spans {_span(times)}, the ground truth "
@@ -94,7 +129,7 @@ def _associate(
             "other; `offset` (s; `--offset`) shifts the result's clock."
         )
     frames = slice(overlap[0], overlap[-1] + 1)
-    fps = 1 / _interval(at)
+    fps = 1 / interval_of(at)
     everybody = range(len(found.present)), range(len(true.present))
     pair = (
         _bundle(found, frames, everybody[0], fps),
@@ -102,7 +137,7 @@ def _associate(
     )
     who, true_who = _match(*pair)
     partner = dict(zip(true_who, who, strict=True))
-    rate = _interval(truth.timestamps) * fps
+    rate = interval_of(truth.timestamps) * fps
     scope = _scope(truth, (found, true), partner, rate)
     found, true = (
         _bundle(found, frames, who, fps),
@@ -113,7 +148,7 @@ def _associate(
 
 def _scope(
     truth: Result,
-    pair: tuple["_Host", "_Host"],
+    pair: tuple[Samples, Samples],
     partner: dict[int, int],
     rate: float,
 ) -> Scope:
@@ -154,138 +189,20 @@ def _from_a_line(points: Float[np.ndarray, "t 3"]) -> float:
     return float(np.linalg.norm(spread[1:]) / np.sqrt(len(points)))
 
 
-def _without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:
-    """The moments, and those between where frames are missing, a hundred at most."""
-    interval = _interval(times)
-    filled = [
-        np.linspace(a, b, min(max(round((b - a) / interval), 1), _HOLE), endpoint=False)
-        for a, b in zip(times[:-1], times[1:], strict=True)
-    ]
-    return np.concatenate([*filled, times[-1:]])
-
-
-_HOLE = 101
-"""Steps across missing frames at most."""
-
-
-def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
-    """The same with frames that do not count added to the end: equal shapes stack."""
-    missing = num_frames - trajectories.T_WC.shape[0]
-
-    def pad(x: Array, axis: int, mode: str = "edge") -> Array:
-        return jnp.pad(x, [(0, missing * (i == axis)) for i in range(x.ndim)], mode)
-
-    return Trajectories(
-        pad(trajectories.T_WC, 0),
-        pad(trajectories.camera_valid, 0, "constant"),
-        pad(trajectories.joints, 1),
-        pad(trajectories.present, 1, "constant"),
-        pad(trajectories.feet, 1),
-        trajectories.fps,
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Host:
-    """`Trajectories` before they are cut to size, and which frames have data."""
-
-    T_WC: np.ndarray
-    camera_valid: np.ndarray
-    joints: np.ndarray
-    present: np.ndarray
-    feet: np.ndarray
-    close: np.ndarray
-
-
-def _host(result: Result, feet: np.ndarray) -> _Host:
-    has_camera = bool(result.summary.get("has_camera", True))
-    every = np.ones(len(result.timestamps), bool)
-    camera = result.located & has_camera
-    return _Host(result.T_WC, camera, result.joints, result.present, feet, every)
-
-
-def _interval(times: Float[np.ndarray, " t"]) -> float:
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
-
-
 def _span(times: Float[np.ndarray, " t"]) -> str:
     return f"{times[0]:.3f} to {times[-1]:.3f} s"
 
 
-def brackets(
-    times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frames before and after each moment, the weight of the latter, whether close.
-
-    A weight strictly between 0 and 1 interpolates, and never across a gap; `close` is
-    where there is data to interpolate, or a frame within half a frame.
-    """
-    interval = _interval(times)
-    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    gap = np.maximum(times[after] - times[before], 1e-12)
-    weight = np.clip((at - times[before]) / gap, 0, 1)
-    nearest = np.round(weight)
-    # Timestamps are rounded in files, and a gap is nothing to interpolate across.
-    blend = (abs(weight - nearest) > 1e-3) & (gap <= 1.5 * interval)
-    distance = np.minimum(abs(at - times[before]), abs(at - times[after]))
-    return (
-        before,
-        after,
-        np.where(blend, weight, nearest),
-        blend | (distance <= 0.5001 * interval),
-    )
-
-
-def interpolate_poses(
-    T: Float[np.ndarray, "t 4 4"],
-    before: np.ndarray,
-    after: np.ndarray,
-    weight: np.ndarray,
-) -> Float[np.ndarray, "u 4 4"]:
-    """Poses between frames: centres linearly, rotations on the geodesic."""
-    w = weight[:, None, None]
-    found = (1 - w) * T[before] + w * T[after]
-    if np.any((weight > 0) & (weight < 1)):
-        start, end = T[before, :3, :3], T[after, :3, :3]
-        found[:, :3, :3] = so3.interpolate(start, end, weight)
-    return found
-
-
-def _resample(host: _Host, times: np.ndarray, at: np.ndarray) -> _Host:
-    """The same at other moments; `close` says where there was data to take."""
-    if not len(times):
-        raise ValueError("A result without frames cannot be evaluated.")
-    before, after, weight, close = brackets(times, at)
-
-    def positions(x: np.ndarray) -> np.ndarray:
-        w = weight[:, None, None]
-        return (1 - w) * x[:, before] + w * x[:, after]
-
-    def flags(x: np.ndarray) -> np.ndarray:
-        known = (x[..., before] | (weight == 1)) & (x[..., after] | (weight == 0))
-        return known & close
-
-    return _Host(
-        interpolate_poses(host.T_WC, before, after, weight),
-        flags(host.camera_valid),
-        positions(host.joints),
-        flags(host.present),
-        positions(host.feet),
-        close,
-    )
-
-
 def _bundle(
-    host: _Host, frames: slice, people: Sequence[int], fps: float
+    samples: Samples, frames: slice, people: Sequence[int], fps: float
 ) -> Trajectories:
     who = list(people)
     return Trajectories(
-        jnp.asarray(host.T_WC[frames]),
-        jnp.asarray(host.camera_valid[frames]),
-        jnp.asarray(host.joints[who][:, frames]),
-        jnp.asarray(host.present[who][:, frames]),
-        jnp.asarray(host.feet[who][:, frames]),
+        jnp.asarray(samples.T_WC[frames]),
+        jnp.asarray(samples.camera_valid[frames]),
+        jnp.asarray(samples.joints[who][:, frames]),
+        jnp.asarray(samples.present[who][:, frames]),
+        jnp.asarray(samples.feet[who][:, frames]),
         jnp.asarray(fps),
     )
 
@@ -296,7 +213,7 @@ def _match(found: Trajectories, true: Trajectories) -> tuple[list[int], list[int
     if num <= 1 and num_true <= 1:
         both = list(range(min(num, num_true)))
         return both, both
-    loss = np.asarray(_loss_of_all_pairs(found, true))
+    loss = np.asarray(_loss_of_all_pairs(to_bucket(found), to_bucket(true)))
     never = np.isnan(loss)
     who, true_who = linear_sum_assignment(np.where(never, 1e6, loss))
     pairs = sorted(
@@ -350,23 +267,29 @@ def _feet(
 
 def _feet_of(result: Result, body: BodyModel) -> np.ndarray | None:
     """Toes and heels, if the joints are this body's, to a centimetre."""
-    mine, points = _joints_and_feet(body, *_pose_shape_trans(result, body))
-    apart = np.max(np.abs(np.asarray(mine) - result.joints), (-2, -1))
-    return np.asarray(points) if np.all(apart[result.present] < 0.01) else None
+    joints, feet = _joints_and_feet(result, body)
+    apart = np.max(np.abs(joints - result.joints), (-2, -1))
+    return feet if np.all(apart[result.present] < 0.01) else None
+
+
+def _joints_and_feet(result: Result, body: BodyModel) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (h, t, 24, 3) and toes and heels (h, t, 4, 3) of the posed body, m."""
+    people, frames = result.present.shape
+    betas = np.broadcast_to(result.betas[:, None], (people, frames, 10))
+    # One row a person and frame, and masked rows: few lengths are compiled.
+    rows = np.zeros((bucket(people * frames), 72 + 10 + 3))
+    rows[: people * frames] = np.concatenate(
+        [result.poses, betas, result.trans], axis=-1
+    ).reshape(-1, rows.shape[1])
+    found = _pose_rows(body, jnp.asarray(rows, body.dtype))
+    joints, feet = (np.asarray(x)[: people * frames] for x in found)
+    shape = lambda x: x.reshape(people, frames, *x.shape[1:])
+    return shape(joints), shape(feet)
 
 
 @eqx.filter_jit
-def _joints_and_feet(body, pose, shape, trans):
+def _pose_rows(body: BodyModel, rows: Float[Array, "n 85"]) -> tuple[Array, Array]:
+    pose, shape, trans = rows[:, :72], rows[:, 72:82], rows[:, 82:]
     points = keypoints(body, pose, shape, trans, layout="body25")
-    return joints(body, pose, shape, trans), points[
-        ..., np.array(BODY25_TOES_AND_HEELS), :
-    ]
-
-
-def _pose_shape_trans(result: Result, body: BodyModel) -> tuple[Array, Array, Array]:
-    dtype = body.template.dtype
-    return (
-        jnp.asarray(result.poses, dtype),
-        jnp.asarray(result.betas[:, None], dtype),
-        jnp.asarray(result.trans, dtype),
-    )
+    feet = points[:, np.array(BODY25_TOES_AND_HEELS)]
+    return joints(body, pose, shape, trans), feet

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, joints
-from bodyslam_jax.evaluation.association import brackets, interpolate_poses
+from bodyslam_jax.evaluation.resampling import bracket, interpolate_poses
 from bodyslam_jax.io import read_tum as read_tum
 from bodyslam_jax.types import Result
 
@@ -140,8 +140,9 @@ def _timeline(
     if longest is None or len(longest["poses"]) <= len(times):
         return times, T_WC
     at = times[0] + np.arange(len(longest["poses"])) / longest["fps"]
-    before, after, weight, close = brackets(times, at)
-    return at[close], interpolate_poses(T_WC, before, after, weight)[close]
+    between = bracket(times, at)
+    available = between.available
+    return at[available], interpolate_poses(T_WC, between)[available]
 
 
 def _tell_beyond(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
@@ -168,7 +169,8 @@ def _at(
         and abs(np.median(np.diff(times)) * fps - 1) < 0.02
     ):
         own = times  # frame by frame, whatever the camera's clock does
-    before, after, weight, close = brackets(own, times)
+    between = bracket(own, times)
+    before, after, weight = between.before, between.after, between.weight
     w = weight[:, None]
     nearest = np.where(weight < 0.5, before, after)
     trans, joint, present = person["trans"], person["joints"], person["present"]
@@ -179,7 +181,7 @@ def _at(
         "trans": (1 - w) * trans[before] + w * trans[after],
         "betas": person["betas"],
         "joints": (1 - w[..., None]) * joint[before] + w[..., None] * joint[after],
-        "present": close & known,
+        "present": between.available & known,
     }
 
 

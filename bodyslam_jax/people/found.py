@@ -7,7 +7,7 @@ from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.people import blazepose
 from bodyslam_jax.people.detect import to_body25
-from bodyslam_jax.types import Seen
+from bodyslam_jax.types import DetectedPeople
 
 AGREES = 0.12
 """Distance of MoveNet's and BlazePose's ankle, and median of all keypoints, of the
@@ -52,9 +52,9 @@ class Found:
         ends = np.searchsorted(frame, np.arange(1, num_frames))
         return np.split(points, ends), np.split(person, ends)
 
-    def seen(self) -> Seen:
-        """Everybody, for the masks."""
-        return Seen(self.frame, self.points, self.silhouettes)
+    def detected(self) -> DetectedPeople:
+        """Everybody, to be kept out of the map."""
+        return DetectedPeople(self.frame, self.points, self.silhouettes)
 
 
 def find_relative(pose: blazepose.Pose) -> Float[np.ndarray, "25 3"]:

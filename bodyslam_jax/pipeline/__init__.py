@@ -250,7 +250,7 @@ def _tracked(
         points,
         config.association,
         person=person,
-        seen=found.seen(),
+        detected=found.detected(),
     )
     if sequence.keypoints is None:
         return sequence

@@ -238,7 +238,7 @@ def estimate(
 
     **Raises:** as `prepare`, unless a detector looked at all images and found nobody.
     """
-    looked = sequence.seen is not None and sequence.keypoints is None
+    looked = sequence.detected is not None and sequence.keypoints is None
     if looked and cameras.kind != "moving" and not len(bodies.present):
         return without_anything(cameras)
     prepared = prepare(sequence, cameras, bodies, body, config)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.io.masks import read_mask, resized_to
 from bodyslam_jax.io.video import list_images
-from bodyslam_jax.types import Keypoints, MaskUse, Seen, Sequence
+from bodyslam_jax.types import DetectedPeople, Keypoints, MaskUse, Sequence
 
 # BODY_25 limbs and their half widths, of the person's height.
 _LIMBS = (
@@ -47,7 +47,7 @@ _BEYOND = (
 )
 _LEAST_CONFIDENCE = 0.05
 SILHOUETTE_STEP = 4
-"""Pixels between two of a silhouette (`Seen.silhouettes`)."""
+"""Pixels between two of a silhouette (`DetectedPeople.silhouettes`)."""
 _MAX_GAP = 1.0
 """Time over which a person who is not detected is still masked, s."""
 
@@ -74,7 +74,7 @@ def person_masks(
             for person in people:
                 draw_person(mask, person[k], margin)
             yield mask
-    elif sequence.keypoints is not None or sequence.seen is not None:
+    elif sequence.keypoints is not None or sequence.detected is not None:
         people = np.zeros((0, sequence.num_frames, 25, 3))
         if sequence.keypoints is not None:
             people = _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
@@ -82,8 +82,8 @@ def person_masks(
             mask = np.zeros(size, dtype=np.uint8)
             for person in people:
                 draw_person(mask, person[k], margin)
-            if sequence.seen is not None:
-                _draw_seen(mask, sequence.seen, k, margin)
+            if sequence.detected is not None:
+                _draw_detected(mask, sequence.detected, k, margin)
             yield mask
     else:
         for _ in range(sequence.num_frames):
@@ -117,13 +117,15 @@ def _painted(sequence: Sequence) -> Float[np.ndarray, "h t 25 3"]:
     return _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
 
 
-def _draw_seen(mask: UInt8[np.ndarray, "y x"], seen: Seen, k: int, margin: float):
+def _draw_detected(
+    mask: UInt8[np.ndarray, "y x"], people: DetectedPeople, k: int, margin: float
+) -> None:
     """Paints everybody whom a detector found in frame `k`."""
-    for index in np.flatnonzero(seen.frame == k):
-        draw_person(mask, seen.points[index], margin)
-    if seen.silhouettes is None:
+    for index in np.flatnonzero(people.frame == k):
+        draw_person(mask, people.keypoints[index], margin)
+    if people.silhouettes is None:
         return
-    small = np.unpackbits(seen.silhouettes[k], axis=1)
+    small = np.unpackbits(people.silhouettes[k], axis=1)
     radius = max(1, round(margin * 0.25 * mask.shape[0] / SILHOUETTE_STEP))
     small = cv2.dilate(small, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
     large = small.repeat(SILHOUETTE_STEP, axis=0).repeat(SILHOUETTE_STEP, axis=1)

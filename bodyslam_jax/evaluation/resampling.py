@@ -1,0 +1,129 @@
+"""A result at other moments: positions linearly, rotations on the geodesic, no gaps."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.types import Result
+
+_MAX_FILLED = 101
+"""Steps that a gap in the timestamps is filled with, at most."""
+_ROUNDING = 1e-3
+"""Part of a frame's interval by which timestamps are rounded in files."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """Cameras and people of one side at `t` moments, on the host."""
+
+    T_WC: Float[np.ndarray, "t 4 4"]
+    """Camera to world, m."""
+    camera_valid: Bool[np.ndarray, " t"]
+    joints: Float[np.ndarray, "h t 24 3"]
+    """m, world."""
+    present: Bool[np.ndarray, "h t"]
+    feet: Float[np.ndarray, "h t f 3"]
+    """m, world."""
+    available: Bool[np.ndarray, " t"]
+    """Moments at which there was a frame, or two to interpolate between."""
+
+
+def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:
+    """A result at its own timestamps, with the given points of the feet."""
+    has_camera = bool(result.summary.get("has_camera", True))
+    every = np.ones(len(result.timestamps), bool)
+    camera = result.located & has_camera
+    return Samples(result.T_WC, camera, result.joints, result.present, feet, every)
+
+
+def interval_of(times: Float[np.ndarray, " t"]) -> float:
+    """Median time between frames, s; 1/30 for a single frame."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+
+
+def without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:
+    """The timestamps, with moments added where frames are missing, at most 100 a gap.
+
+    Nothing is known at the added ones, so that no difference is taken across a gap.
+    """
+    interval = interval_of(times)
+    count = lambda gap: min(max(round(gap / interval), 1), _MAX_FILLED)
+    filled = [
+        np.linspace(a, b, count(b - a), endpoint=False)
+        for a, b in zip(times[:-1], times[1:], strict=True)
+    ]
+    return np.concatenate([*filled, times[-1:]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Brackets:
+    """The two frames around each of `u` moments."""
+
+    before: Int[np.ndarray, " u"]
+    after: Int[np.ndarray, " u"]
+    weight: Float[np.ndarray, " u"]
+    """Of `after`, 0 to 1. Strictly between only where frames are interpolated, which is
+    never across a gap of more than one and a half frames."""
+    available: Bool[np.ndarray, " u"]
+    """Where there are frames to interpolate, or one within half a frame."""
+
+
+def bracket(times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]) -> Brackets:
+    """The frames (at `times`, s) around each moment of `at` (s)."""
+    interval = interval_of(times)
+    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = np.maximum(times[after] - times[before], 1e-12)
+    weight = np.clip((at - times[before]) / gap, 0, 1)
+    nearest = np.round(weight)
+    blend = (abs(weight - nearest) > _ROUNDING) & (gap <= 1.5 * interval)
+    distance = np.minimum(abs(at - times[before]), abs(at - times[after]))
+    available = blend | (distance <= 0.5001 * interval)
+    return Brackets(before, after, np.where(blend, weight, nearest), available)
+
+
+def interpolate_poses(
+    T: Float[np.ndarray, "t 4 4"], between: Brackets
+) -> Float[np.ndarray, "u 4 4"]:
+    """Poses between frames: centres linearly, rotations on the geodesic."""
+    weight = between.weight
+    w = weight[:, None, None]
+    found = (1 - w) * T[between.before] + w * T[between.after]
+    # What is not finite stays NaN.
+    blend = (weight > 0) & (weight < 1) & np.isfinite(found).all(axis=(1, 2))
+    if blend.any():
+        ends = (T[frames[blend], :3, :3] for frames in (between.before, between.after))
+        found[blend, :3, :3] = so3.interpolate(*ends, weight[blend])
+    return found
+
+
+def resample(
+    samples: Samples, times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]
+) -> Samples:
+    """The samples, which are at `times` (s), at the moments of `at` (s).
+
+    **Raises:** `ValueError` if there is no frame.
+    """
+    if not len(times):
+        raise ValueError("A result without frames cannot be evaluated.")
+    between = bracket(times, at)
+    before, after, weight = between.before, between.after, between.weight
+
+    def positions(x: np.ndarray) -> np.ndarray:
+        w = weight[:, None, None]
+        return (1 - w) * x[:, before] + w * x[:, after]
+
+    def flags(x: np.ndarray) -> np.ndarray:
+        known = (x[..., before] | (weight == 1)) & (x[..., after] | (weight == 0))
+        return known & between.available
+
+    return Samples(
+        interpolate_poses(samples.T_WC, between),
+        flags(samples.camera_valid),
+        positions(samples.joints),
+        flags(samples.present),
+        positions(samples.feet),
+        between.available,
+    )
