@@ -1,6 +1,7 @@
 """Presets and settings files, which options override."""
 
 import dataclasses
+import difflib
 import functools
 import inspect
 import itertools
@@ -61,8 +62,11 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     changes = {}
     for name, value in found.items():
         if name not in known:
+            close = difflib.get_close_matches(str(name), known, n=1)
+            hint = f"did you mean `{close[0]}`?" if close else ""
             raise ValueError(
-                f"{where}: no setting `{name}`; expected one of {sorted(known)}."
+                f"{where}: no setting `{name}`; "
+                f"{hint or f'expected one of {sorted(known)}.'}"
             )
         old = getattr(base, name)
         kind = hints[name]
