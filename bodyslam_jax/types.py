@@ -220,7 +220,8 @@ class SfmResult:
 
     @property
     def within(self) -> Bool[np.ndarray, " t"]:
-        """Frames from the first to the last registered one; frames beyond, such as those
+        """Frames from the first to the last registered one; frames beyond, such as
+        those
         after a cut, share no points with the map."""
         frames = np.arange(len(self.registered))
         located = np.flatnonzero(self.registered)

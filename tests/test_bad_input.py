@@ -97,7 +97,7 @@ def command(monkeypatch, capsys, tmp_path):
     def reached(*args, **kwargs):
         raise AssertionError("computed from an input that is wrong")
 
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
     monkeypatch.setattr(people, "estimate_bodies", reached)
     monkeypatch.setattr(sfm_stage, "estimate", reached)
 

@@ -1,23 +1,32 @@
+import contextlib
 import importlib.metadata
+import io
+import json
 import os
+import re
 import subprocess
 import sys
 import types
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+import tyro
 from body_cases import make_raw, write
 
+import bodyslam_jax
 from bodyslam_jax import cli
-from bodyslam_jax.cli import environment
-from bodyslam_jax.cli import estimate as commands
+from bodyslam_jax.cli import environment, estimate, folders, jax_setup
 from bodyslam_jax.config import Config
+from bodyslam_jax.export.summary import describe
+from bodyslam_jax.types import Intrinsics, Sequence
 
 
 def _run(monkeypatch, capsys, *argv):
     """The command in this process: exit code, standard output, standard error."""
     monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     out = capsys.readouterr()
@@ -40,10 +49,114 @@ def test_help_imports_no_jax():
 def test_help_says_what_the_tool_does_and_its_commands(monkeypatch, capsys):
     code, out, _ = _run(monkeypatch, capsys, "--help")
     assert code == 0 and "in metres" in out and "bodyslam demo" in out
-    for command in ("run", "demo", "evaluate", "doctor"):
-        assert f"• {command}" in out
+    for command in ("run", "demo", "evaluate", "body-model", "doctor"):
+        assert f"\n  {command} " in out
     code, out, _ = _run(monkeypatch, capsys, "body-model", "--help")
-    assert code == 0 and "SMPL" in out
+    assert code == 0 and "SMPL" in out and "\n  convert " in out
+    assert _run(monkeypatch, capsys)[0] == 2
+
+
+def test_version(monkeypatch, capsys):
+    code, out, _ = _run(monkeypatch, capsys, "--version")
+    assert code == 0 and out == f"bodyslam {bodyslam_jax.__version__}\n"
+
+
+_FACTS = """height focal fov camera camera-path camera-path-metric static-camera gravity
+fps start end person device""".split()
+
+
+def test_help_shows_what_a_newcomer_needs_and_help_all_the_rest(monkeypatch, capsys):
+    for command in cli.COMMANDS:
+        code, short, _ = _run(monkeypatch, capsys, *command.split(), "--help")
+        assert code == 0
+        assert len(re.findall(r"^  --", short, re.MULTILINE)) <= 25, command
+        code, long, _ = _run(monkeypatch, capsys, *command.split(), "--help-all")
+        assert code == 0 and len(long) >= len(short)
+    _, short, _ = _run(monkeypatch, capsys, "run", "--help")
+    _, long, _ = _run(monkeypatch, capsys, "run", "--help-all")
+    for name in _FACTS:
+        assert re.search(rf"^  --(\[no-\])?{name}\b", short, re.MULTILINE), name
+    assert "--weights.pixel-sigma" in long and "--weights.pixel-sigma" not in short
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_option_is_one_that_is_parsed(name):
+    """`options` reads signatures by itself; tyro has the same ones, with defaults."""
+    command = cli.COMMANDS[name].function
+    found = cli.options(command)
+    tyro_help = io.StringIO()
+    with contextlib.redirect_stdout(tyro_help), pytest.raises(SystemExit):
+        tyro.cli(command, args=["--help"])
+    parsed = set(re.findall(r"--[a-z][\w.-]*", tyro_help.getvalue())) - {"--help"}
+    declared = {flag for one in found for flag in one.flags}
+    assert declared <= parsed
+    assert all(one.about.endswith((".", ")")) for one in found)
+
+
+@pytest.mark.parametrize(
+    "argv, message",
+    [
+        ("rnu x", "no command 'rnu'; did you mean run?"),
+        ("body-model chek x", "body-model: no command 'chek'; did you mean check?"),
+        ("run x --strat 3", "run: no option --strat; did you mean --start?"),
+        ("run x --hieght=1.8", "run: no option --hieght; did you mean --height?"),
+        ("run x --pixel-sigma 1", "did you mean --weights.pixel-sigma?"),
+        ("run x --weights.pixel-sgima 1", "did you mean --weights.pixel-sigma?"),
+        ("evaluate a b --start 3", "it is an option of bodyslam run, demo, experiment"),
+        ("run x --nosuch", "`bodyslam run --help-all` lists all."),
+    ],
+)
+def test_the_option_that_was_meant_is_suggested(monkeypatch, capsys, argv, message):
+    code, _, err = _run(monkeypatch, capsys, *argv.split())
+    assert code == 2 and message in err and len(err.splitlines()) == 1
+
+
+def test_docs_of_the_command_line_are_up_to_date():
+    """`python tools/make_cli_docs.py` writes them."""
+    file = Path(__file__).parents[1] / "docs" / "cli.md"
+    assert file.read_text() == cli.reference()
+
+
+def _a_sequence(name="walk", frames=8):
+    return Sequence(
+        name=name,
+        frames=None,
+        timestamps=np.arange(frames) / 30,
+        intrinsics=Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480),
+    )
+
+
+def test_a_run_without_a_folder_goes_to_a_free_or_unfinished_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, second = Path("runs/walk"), Path("runs/walk-2")
+    assert folders.default_folder(_a_sequence()) == first
+    (first / ".cache").mkdir(parents=True)
+    assert folders.default_folder(_a_sequence()) == first
+    (first / ".cache" / "source.json").write_text(json.dumps(describe(_a_sequence())))
+    assert folders.default_folder(_a_sequence()) == first
+    assert folders.default_folder(_a_sequence(frames=9)) == second
+    (first / "summary.json").write_text("{}")
+    assert folders.default_folder(_a_sequence()) == second
+
+
+def test_what_is_run_and_where_it_goes_is_the_first_line(
+    monkeypatch, capsys, caplog, tmp_path
+):
+    summary = {"status": "ok", "headline": ["walk: ok"], "warnings": [], "reasons": []}
+    monkeypatch.setattr("bodyslam_jax.io.read_sequence", lambda *_, **__: _a_sequence())
+    monkeypatch.setattr(
+        "bodyslam_jax.pipeline.run_to_folder",
+        lambda *_: types.SimpleNamespace(summary=summary),
+    )
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.compiles_first", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = _run(monkeypatch, capsys, "run", "walk.mp4")
+    assert code == 0
+    assert caplog.messages == ["run: walk.mp4, 8 frames -> runs/walk"]
+    assert out.splitlines()[-1].endswith(" runs/walk/report.html")
+    caplog.clear()
+    code, out, _ = _run(monkeypatch, capsys, "run", "walk.mp4", "--quiet")
+    assert code == 0 and not caplog.messages and "walk: ok" in out
 
 
 def test_a_reader_that_leaves_is_no_error():
@@ -194,22 +307,14 @@ def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
     assert _run(monkeypatch, capsys, "convert-dataset", "nosuch")[0] == 2
 
 
-def test_the_first_run_says_that_it_compiles(monkeypatch, tmp_path, caplog):
-    import jax
-
-    from bodyslam_jax.cli import estimate as commands
-
+def test_programs_are_compiled_first_where_none_is_kept(tmp_path):
     kept = jax.config.jax_compilation_cache_dir
-    caplog.set_level("INFO")
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
-        commands._announce_compilation()
-        assert "first run: programs are compiled" in caplog.text
-        caplog.clear()
+        assert jax_setup.compiles_first()
         (tmp_path / "compiled").mkdir()
         (tmp_path / "compiled" / "program").write_text("compiled")
-        commands._announce_compilation()
-        assert caplog.text == ""
+        assert not jax_setup.compiles_first()
     finally:
         jax.config.update("jax_compilation_cache_dir", kept)
 
@@ -218,12 +323,12 @@ def test_how_to_compile_is_set_once_where_it_is_known(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--a=1")
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.10.9")
     for _ in range(2):
-        cli._compile_quickly()
+        jax_setup.set_compiler_flags()
         wanted = "--a=1 --xla_cpu_use_fusion_emitters=false"
         assert os.environ["XLA_FLAGS"] == wanted
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.2.3")
-    cli._compile_quickly()
+    jax_setup.set_compiler_flags()
     assert os.environ["XLA_FLAGS"] == ""
 
 
@@ -237,7 +342,7 @@ def test_what_makes_a_result_doubtful_is_printed(capsys, tmp_path, status, code)
     reason |= {"status": status, "advice": "look at the overlay"}
     summary = {"status": status, "headline": [f"walk: {status}"], "warnings": []}
     summary["reasons"] = [] if status == "ok" else [reason]
-    assert commands._finish(types.SimpleNamespace(summary=summary), tmp_path) == code
+    assert estimate.finish(types.SimpleNamespace(summary=summary), tmp_path) == code
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"walk: {status}"
     told = f"{status}: knees are bent by 60 degrees. What to do: look at the overlay."
@@ -252,4 +357,4 @@ def test_a_gpu_that_is_not_there_is_no_traceback(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["bodyslam", "run", "x", "--device", "gpu"])
     with pytest.raises(SystemExit) as end:
         cli.main()
-    assert "--device gpu: JAX sees no GPU" in str(end.value)
+    assert "--device gpu: JAX finds no GPU" in str(end.value)

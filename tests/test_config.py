@@ -27,17 +27,13 @@ NAN, INF = float("nan"), float("inf")
         (Config, "smoothing_hz", -3.0, "more than 0, and finite, or nothing"),
         (Config, "overlay", 1, "true or false"),
         (Config, "body_model", 3, "a text, or nothing"),
-        (Tracking, "cells", 0, "1 or more"),
-        (Tracking, "cells", 8.0, "a whole number"),
-        (Tracking, "window", 2, "3 or more"),
-        (Tracking, "octaves", -1, "0 or more"),
-        (Tracking, "keyframe_gap", True, "a whole number"),
+        (Tracking, "num_points", 0, "1 or more"),
+        (Tracking, "num_points", 8.0, "a whole number"),
+        (Tracking, "num_points", True, "a whole number"),
         (Structure, "landmark_span", 1, "2 or more"),
-        (Structure, "max_error", NAN, "more than 0, and finite"),
-        (Structure, "static_motion", -0.1, "0 or more"),
-        (Detect, "min_score", 1.5, "0 to 1"),
+        (Structure, "focal_runs", NAN, "more than 0, and finite"),
+        (Detect, "min_height", -0.1, "0 or more"),
         (Association, "max_gap", INF, "0 or more, and finite"),
-        (PeopleFit, "detector_bias", 2.0, "0 to 1"),
         (PeopleFit, "regressor_shape_gain", 0.0, "more than 0, and finite, or nothing"),
         (GraphWeights, "keypoint_sigma", "abc", "a number, or nothing"),
         (GraphWeights, "landmark_loss", None, "a number"),
@@ -60,7 +56,7 @@ def test_settings_that_mean_nothing_are_refused(kind, name, value, expected):
 def test_settings_that_mean_something_are_let_in():
     Config()
     Config.paper()
-    Tracking(octaves=0, person_margin=0.0)
+    Detect(min_height=0.0)
     GraphWeights(step_error=0.0, motion_correlation=0.0)
     weights = GraphWeights()
     # What says nothing; what is mapped over may not be known yet.
@@ -68,15 +64,20 @@ def test_settings_that_mean_something_are_let_in():
         object.__setattr__(weights, "posture_sigma", value)
         weights.__post_init__()
     dataclasses.replace(Config(), smoothing_hz=None)
-    PeopleFit(upright_sigma=INF, limit_sigma=INF)
+    PeopleFit(limit_sigma=INF)
     Structure(focal_accuracy=INF)
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        ("tracking: {cells: 8}", "tracking: no setting `cells`; expected one of"),
+        ("wieghts: {}", "no setting `wieghts`; did you mean `weights`?"),
         ("smoothing_hz: 0.0", "smoothing_hz: found 0.0, expected more than 0"),
-        ("tracking: {cells: 0}", "tracking: cells: found 0, expected 1 or more"),
+        (
+            "tracking: {num_points: 0}",
+            "tracking: num_points: found 0, expected 1 or more",
+        ),
     ],
 )
 def test_a_file_of_settings_is_named_with_what_is_wrong_in_it(tmp_path, text, expected):

@@ -366,7 +366,7 @@ def _made_up(label):
 
 def _run(monkeypatch, argv):
     monkeypatch.setattr(sys, "argv", ["bodyslam", "experiment", *argv])
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     return stopped.value.code

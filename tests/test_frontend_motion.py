@@ -522,7 +522,7 @@ def test_points_that_noise_draws_nearer_are_not_preferred():
     views = Views(frame, landmark, offset[:, :2] / offset[:, 2:] + noise)
     truth = scene.points.copy()
     known = np.arange(count) < 100
-    builder = Builder(views, num, count, 500.0, Structure(min_angle=0.5))
+    builder = Builder(views, num, count, 500.0, Structure())
     every = np.ones(len(frame), bool)
     grown = PartialMap(
         scene,

@@ -15,6 +15,7 @@ from test_frontend_motion import plane_images
 from test_people_detect import constant_network, raw_output
 
 from bodyslam_jax import cli, io, people, pipeline, sfm
+from bodyslam_jax.cli import interrupts
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline.stage_cache import Cache
 
@@ -38,7 +39,7 @@ def sequence(tmp_path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
 
     def run(*argv) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
@@ -93,45 +94,52 @@ def heard():
 @pytest.mark.usefixtures("heard")
 def test_an_interrupt_waits_until_jax_is_loaded():
     reached = False
-    with pytest.raises(KeyboardInterrupt), cli._interrupts_held():
+    with pytest.raises(KeyboardInterrupt), interrupts.deferred():
         signal.raise_signal(signal.SIGINT)
         reached = True
     assert reached
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.usefixtures("heard")
 def test_an_interrupt_that_became_another_error_is_an_interrupt(
     sequence, command, monkeypatch, tmp_path
 ):
     """As where it hits the import of a compiled module, which then fails in its way."""
-    monkeypatch.setattr(cli, "_INTERRUPTS", [])
 
     def broken(*args, **kwargs):
-        try:
-            cli._interrupt()
-        except KeyboardInterrupt as error:
-            raise SystemError("initialization failed") from error
+        raise SystemError("initialization failed")
 
     monkeypatch.setattr(sfm, "track", broken)
+    assert command("run", sequence, "--out", tmp_path / "run")[0] == 3
+    monkeypatch.setattr(interrupts, "arrived", lambda: True)
     code, said = command("run", sequence, "--out", tmp_path / "run")
     assert code == 130 and "the same command continues it" in said
-    cli._INTERRUPTS.clear()
-    monkeypatch.setattr(sfm, "track", lambda *a, **k: 1 / 0)
-    assert command("run", sequence, "--out", tmp_path / "run")[0] == 3
+
+
+STUBBORN = """
+import time
+from bodyslam_jax.cli import interrupts
+interrupts.install()
+while True:
+    try:
+        print("ready", flush=True)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass  # as compiled code and callbacks of the garbage collector do
+"""
 
 
 @pytest.mark.usefixtures("heard")
-def test_an_interrupt_that_python_drops_comes_again():
-    """Where it hits a callback of the garbage collector, as JAX has one."""
-
-    class Dropped:
-        exc_type = KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        cli._interrupt_again(Dropped())
-        for _ in range(400):
-            time.sleep(0.05)
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's")
+def test_an_interrupt_that_is_not_noticed_ends_the_process_all_the_same():
+    process = subprocess.Popen(
+        [sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said.decode() == "bodyslam: interrupted; the same command continues it\n"
 
 
 def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path):

@@ -297,7 +297,7 @@ def test_weights_for_another_body_stop_a_run_at_its_door(
         keypoints=Keypoints(np.zeros((1, 30, 25, 2)), np.zeros((1, 30, 25))),
     )
     monkeypatch.setattr(io, "read_sequence", lambda *_, **__: sequence)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
     argv = ["bodyslam", "run", "video", "--out", str(tmp_path / "run")]
     argv += ["--motion-model", str(tmp_path / "m.npz")]
     monkeypatch.setattr(sys, "argv", argv)

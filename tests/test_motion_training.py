@@ -87,7 +87,7 @@ def weights(model):
 def command(monkeypatch, capsys, *argv):
     """`bodyslam train-motion` in this process: exit code, output, error."""
     monkeypatch.setattr(sys, "argv", ["bodyslam", "train-motion", *map(str, argv)])
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     out = capsys.readouterr()

@@ -128,7 +128,7 @@ def sequence(tmp_path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
 
     def run(*argv) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])

@@ -60,6 +60,3 @@ def body_check(file: Input, /, *, gender: _Gender | None = None) -> None:
     from bodyslam_jax import body
 
     print(body.check(file, gender))
-
-
-ACTIONS = {"show": body_show, "convert": body_convert, "check": body_check}

@@ -84,6 +84,3 @@ def tum_amass(
     from bodyslam_jax import evaluation
 
     print(evaluation.convert_tum_amass(trajectory, motion, out, images))
-
-
-DATASETS = {"emdb": emdb, "3dpw": threedpw, "rich": rich, "tum-amass": tum_amass}

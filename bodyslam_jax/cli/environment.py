@@ -13,6 +13,14 @@ _PACKAGES = (
 _CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
 
 
+def doctor() -> None:
+    """Prints versions, devices, codecs, networks and body models of this machine."""
+    rows = report()
+    width = max(len(name) for name, _ in rows)
+    for name, finding in rows:
+        print(f"{name:<{width}}  {finding}")
+
+
 def report() -> list[tuple[str, str]]:
     """Lines of `(what, finding)`; never raises because something is missing."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}")]

@@ -1,4 +1,4 @@
-"""From a video to a run folder, and what is said of it."""
+"""`bodyslam run`, `demo` and `evaluate`."""
 
 import logging
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any
 
 import tyro
 
+from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.cli.types import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
@@ -16,7 +17,7 @@ def run(
     input: Input,
     /,
     *,
-    out: Path,
+    out: Path | None = None,
     keypoints: Path | None = None,
     bodies: Path | None = None,
     camera: Path | None = None,
@@ -30,7 +31,8 @@ def run(
 
     Args:
         input: Sequence folder, video file or folder of images.
-        out: Run folder to write; an interrupted one is finished.
+        out: Run folder to write; an interrupted run in it is continued. Without it
+            runs/NAME, NAME from the input, numbered if an earlier run is there.
         keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
         bodies: Regressed bodies of any supported tool, if not in the input.
         camera: camera.json, if not in the input.
@@ -42,8 +44,8 @@ def run(
         config: Settings of every stage.
     """
     from bodyslam_jax import io, pipeline
+    from bodyslam_jax.cli.folders import default_folder
 
-    _announce_compilation()
     sequence = io.read_sequence(
         input,
         keypoints=keypoints,
@@ -54,8 +56,9 @@ def run(
         config=config.association,
         known=config,
     )
-    result = pipeline.run_to_folder(sequence, out, config)
-    return _finish(result, out)
+    out = out or default_folder(sequence)
+    _announce(f"run: {input}, {sequence.num_frames} frames", out)
+    return finish(pipeline.run_to_folder(sequence, out, config), out)
 
 
 def demo(
@@ -79,12 +82,15 @@ def demo(
     """
     from bodyslam_jax import pipeline
 
-    _announce_compilation()
-    result = pipeline.demo(out, config, from_pixels=from_pixels)
-    return _finish(result, out)
+    _announce("demo: a rendered walker", out)
+    return finish(pipeline.demo(out, config, from_pixels=from_pixels), out)
 
 
-def _finish(result: Any, out: Path) -> int:
+def finish(result: Any, out: Path) -> int:
+    """Prints what was found, why it may be doubtful, what was written and the command
+    to look at it; returns the exit code."""
+    from bodyslam_jax.cli.folders import look_at
+
     for line in result.summary["headline"]:
         print(line)
     for reason in result.summary["reasons"]:
@@ -93,7 +99,9 @@ def _finish(result: Any, out: Path) -> int:
         )
     for warning in result.summary["warnings"]:
         print(f"warning: {warning}")
-    print(f"{out / 'report.html'}")
+    files = sorted(file.name for file in out.glob("[!.]*") if file.is_file())
+    print(f"written to {out}: {', '.join(files)}")
+    print(f"look at it: {look_at(out)}")
     return 0 if result.summary["status"] == "ok" else 3
 
 
@@ -136,10 +144,8 @@ def evaluate(
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
 
 
-def _announce_compilation() -> None:
-    """Says that programs are compiled first, where none is in JAX's cache yet."""
-    import jax
-
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if folder and not (Path(folder).is_dir() and any(Path(folder).iterdir())):
-        log.info("first run: programs are compiled, which takes minutes, and kept")
+def _announce(what: str, out: Path) -> None:
+    """Logs what is run and where the result goes."""
+    log.info("%s -> %s", what, out)
+    if jax_setup.compiles_first():
+        log.info("first run: compiling takes minutes; later runs use the same programs")

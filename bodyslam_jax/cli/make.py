@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
@@ -32,9 +33,11 @@ def simulate(
     """
     from bodyslam_jax import simulation
 
-    simulation.check_folder(out, config)  # said now, not after a minute
+    log.info("simulate: %s, %s -> %s", config.sequence, config.family, out)
+    simulation.check_folder(out, config)  # before a minute of simulating
     simulation.write_sequence(out, simulation.simulate(config))
     print(out)
+    log.info("estimate it: bodyslam run %s", shlex.quote(str(out)))
 
 
 def train_motion(
@@ -57,9 +60,11 @@ def train_motion(
     """
     from bodyslam_jax import motion
 
+    log.info("train-motion: %s, %s network -> %s", data, config.network, out)
     with _progress() as report:
         motion.train_from_data(data, out, config, report, body_model)
     print(out)
+    log.info("use it: bodyslam run VIDEO --motion-model %s", shlex.quote(str(out)))
 
 
 @contextlib.contextmanager
@@ -115,6 +120,7 @@ def experiment(
         _make_each_core_a_device()
     from bodyslam_jax import experiments
 
+    log.info("experiment: %s -> %s", name, out)
     for path in experiments.run_experiment(name, out, on, config):
         print(path)
 

@@ -1,6 +1,7 @@
-"""Where options start: presets and files of settings."""
+"""Presets and settings files, which options override."""
 
 import dataclasses
+import difflib
 import functools
 import inspect
 import itertools
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.config import Config, MotionTraining
 
 
@@ -18,9 +20,13 @@ def base_config(argv: list[str]) -> Config:
     **Raises:** `ValueError` if the file is not a config.yaml.
     """
 
-    config = Config.paper() if option(argv, "--preset") == "paper" else Config()
+    config = Config.paper() if _is_paper(argv) else Config()
     path = option(argv, "--settings")
     return config if path is None else read_settings(Path(path), config)
+
+
+def _is_paper(argv: list[str]) -> bool:
+    return option(argv, "--preset") == "paper"
 
 
 def option(argv: list[str], flag: str) -> str | None:
@@ -56,8 +62,11 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     changes = {}
     for name, value in found.items():
         if name not in known:
+            close = difflib.get_close_matches(str(name), known, n=1)
+            hint = f"did you mean `{close[0]}`?" if close else ""
             raise ValueError(
-                f"{where}: no setting `{name}`; expected one of {sorted(known)}."
+                f"{where}: no setting `{name}`; "
+                f"{hint or f'expected one of {sorted(known)}.'}"
             )
         old = getattr(base, name)
         kind = hints[name]
@@ -79,23 +88,26 @@ def _merged(found: Any, base: Any, where: str) -> Any:
         raise ValueError(f"{where}: {error}") from None
 
 
-def starting_from(
-    command: Callable[..., Any], config: Config | MotionTraining
-) -> Callable[..., Any]:
-    """The same command with another default of its `config`, if it is of that kind."""
+def prepared(command: Callable[..., Any], argv: list[str]) -> Callable[..., Any]:
+    """The command with JAX set up before it runs, and with the default settings that
+    `--preset` and `--settings` select."""
     signature = inspect.signature(command)
-    if "config" not in signature.parameters:
-        return command
-    if not isinstance(signature.parameters["config"].default, type(config)):
-        return command
+    argument = signature.parameters.get("config")
+    if argument is not None:
+        default = argument.default
+        if isinstance(default, Config):
+            default = base_config(argv)
+        elif (
+            isinstance(default, MotionTraining) and option(argv, "--preset") == "paper"
+        ):
+            default = MotionTraining.paper()
+        changed = {**signature.parameters, "config": argument.replace(default=default)}
+        signature = signature.replace(parameters=list(changed.values()))
 
     @functools.wraps(command)
-    def started(*args: Any, **kwargs: Any) -> Any:
+    def run(*args: Any, **kwargs: Any) -> Any:
+        jax_setup.prepare(getattr(kwargs.get("config"), "device", None))
         return command(*args, **kwargs)
 
-    parameters = [
-        p.replace(default=config) if p.name == "config" else p
-        for p in signature.parameters.values()
-    ]
-    started.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
-    return started
+    run.__signature__ = signature  # pyright: ignore
+    return run

@@ -32,8 +32,6 @@ class GraphWeights:
     """Geman-McClure scale, in standard deviations of one keypoint, before the
     inflation. With `keypoint_sigma` in those of a keypoint of confidence 1, for all
     keypoints: the same distance in px, as in Bogo et al. (100 px)."""
-    motion_inflation: float = 1.0
-    """Factor on the motion model's own standard deviation, 1."""
     step_error: float = 0.05
     """Error that all of a person's steps share, as a share of them: people differ, and
     postures are wrong for seconds. Without it steps would outvote the body's size."""

@@ -320,7 +320,6 @@ def _steps(seen, shapes, body, weights, shared_error):
         covariance = jnp.where(valid[..., None, None], seen.covariance, eye)
         lower = jnp.linalg.cholesky(covariance)
         whitening = jnp.linalg.solve(lower, jnp.broadcast_to(eye, lower.shape))
-        whitening = whitening / weights.motion_inflation
     else:
         whitening = jnp.broadcast_to(eye / weights.motion_sigma, (*valid.shape, 3, 3))
     whitening = jnp.where(valid[..., None, None], whitening, 0.0)

@@ -21,11 +21,14 @@ from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
 from bodyslam_jax.people.facing import HALF_TURN, find_turned
 from bodyslam_jax.people.keypoint_errors import (
+    ROBUST_SCALE,
     in_pixels,
     keypoint_sigma,
     pixels_per_metre,
 )
 from bodyslam_jax.people.person_state import (
+    DEPTH_JITTER,
+    POSITION_JITTER,
     PersonState,
     bodies_from_roots,
     roots_from_bodies,
@@ -38,6 +41,8 @@ from bodyslam_jax.people.skeleton import (
 )
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
+_DEPTH_ERROR = 0.05
+"""Standard deviation of a regressor's depth, as a share of it."""
 _BUCKET = 64
 _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
@@ -78,7 +83,7 @@ def prepare_bodies(
     is person h of `keypoints`.
     """
     roots = roots_from_bodies(bodies, body)
-    skeleton = make_skeleton(body, settings.detector_bias)
+    skeleton = make_skeleton(body, 0.0)
     prepared = PersonState(
         present=roots.present.copy(),
         T_CH=roots.T_CH.copy(),
@@ -100,7 +105,7 @@ def prepare_bodies(
         if np.isfinite(sigma).any():
             sigma = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
         orientation, position = _place_person(
-            skeleton, intrinsics, prepared, h, where, uv, sigma, fps, settings
+            skeleton, intrinsics, prepared, h, where, uv, sigma, fps
         )
         T_CH[where, :3, :3] = orientation
         T_CH[where, :3, 3] = position
@@ -154,14 +159,13 @@ def _place_person(
     uv: np.ndarray,
     sigma: np.ndarray,
     fps: float,
-    settings: PeopleFit,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
     dtype = skeleton.offset.dtype
     T_CH = roots.T_CH[person, where]
     both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ HALF_TURN], axis=1)
     angles = roots.body_pose[person, where, :21].reshape(-1, 63)
-    depth_sigma = settings.depth_error * T_CH[:, 2, 3]
+    depth_sigma = _DEPTH_ERROR * T_CH[:, 2, 3]
     rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
     length = -len(where) % _BUCKET
     padded = [
@@ -170,14 +174,14 @@ def _place_person(
     ]
     shape = jnp.zeros(NUM_SHAPE, dtype).at[:10].set(roots.shape[person])
     camera = jnp.asarray(intrinsics.params, dtype)
-    scale = jnp.asarray(settings.robust_scale, dtype)
+    scale = jnp.asarray(ROBUST_SCALE, dtype)
     found = _place_bodies(skeleton, camera, shape, scale, *padded)
     position, predicted = (np.asarray(a[: len(where)], float) for a in found)
     facing = find_turned(
-        T_CH[:, :3, :3], where / fps, predicted, uv, sigma, settings.robust_scale
+        T_CH[:, :3, :3], where / fps, predicted, uv, sigma, ROBUST_SCALE
     )
     each, state = np.arange(len(where)), facing.turned.astype(int)
-    return both[each, state], _smooth(position[each, state], where, fps, settings)
+    return both[each, state], _smooth(position[each, state], where, fps)
 
 
 @eqx.filter_jit
@@ -232,15 +236,14 @@ def _smooth(
     position: Float[np.ndarray, "m 3"],
     where: np.ndarray,
     fps: float,
-    settings: PeopleFit,
 ) -> Float[np.ndarray, "m 3"]:
     """Direction and depth as robustly smoothed curves, at the frames `where`."""
     depth = position[:, 2]
     mean_depth = float(np.median(depth))
     slow = (30 / fps) ** 1.5
-    across = settings.position_jitter * slow / mean_depth
+    across = POSITION_JITTER * slow / mean_depth
     coordinates = np.column_stack([position[:, :2] / depth[:, None], depth])
-    jitter = (across, across, settings.depth_jitter * slow)
+    jitter = (across, across, DEPTH_JITTER * slow)
     x, y, z = (
         _smooth_curve(values, where, sigma)
         for values, sigma in zip(coordinates.T, jitter)

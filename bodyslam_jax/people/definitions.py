@@ -15,10 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
-from bodyslam_jax.people.keypoint_errors import in_pixels, keypoint_sigma
+from bodyslam_jax.people.keypoint_errors import (
+    CORRELATION_TIME,
+    ROBUST_SCALE,
+    in_pixels,
+    keypoint_sigma,
+)
 from bodyslam_jax.people.person_state import PersonState
 from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
@@ -39,7 +43,6 @@ def as_body_keypoints(
     intrinsics: Intrinsics,
     body: BodyModel,
     fps: float,
-    settings: PeopleFit = PeopleFit(),
 ) -> Keypoints:
     """Keypoints where the detector would have put them, had it the body's definitions.
 
@@ -58,7 +61,7 @@ def as_body_keypoints(
         depth = np.maximum(T_CH[:, 2, 3], DEPTH_FLOOR)
         sigma = keypoint_sigma(keypoints, intrinsics, int(h))[where]
         sigma = in_pixels(sigma, focal / depth)
-        alike = max(1.0, settings.correlation_time * fps)
+        alike = max(1.0, CORRELATION_TIME * fps)
         shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
         angles = roots.body_pose[h, where, :21].reshape(-1, 63)
         rows = (T_CH[:, :3, :3], T_CH[:, :3, 3], angles, uv[h, where])
@@ -66,7 +69,7 @@ def as_body_keypoints(
         last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
         silent = np.full((length, 25), np.inf)
         sigma = np.concatenate([sigma * np.sqrt(alike), silent])
-        numbers = (*map(last, rows), sigma, shape, settings.robust_scale)
+        numbers = (*map(last, rows), sigma, shape, ROBUST_SCALE)
         arrays = (jnp.asarray(a, skeleton.offset.dtype) for a in numbers)
         shift = np.asarray(_shift(skeleton, camera, *arrays), float)
         uv[h, where] -= shift[: len(where)]

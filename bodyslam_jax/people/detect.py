@@ -52,6 +52,12 @@ POSE = Model(
     134,
 )
 
+_LEAST_SCORE = 0.5
+"""Score of a box that holds a person."""
+_MOST_OVERLAP = 0.45
+"""Intersection over union above which two boxes are one person's."""
+_MOST_PEOPLE = 8
+"""People of an image that are looked at, the largest ones first."""
 _STRIDES = (8, 16, 32)
 _PAD = 114
 _CROP_MARGIN = 1.25
@@ -84,7 +90,7 @@ def detect_people(
     pose = _session(settings.pose, POSE, offline)
     found = []
     for index, image in enumerate(images):
-        boxes = find_boxes(detector, image, settings)
+        boxes = find_boxes(detector, image)
         points = [find_keypoints(pose, image, box) for box in boxes]
         found.append(np.array(points).reshape(-1, 25, 3))
         if progress is not None:
@@ -125,7 +131,7 @@ def model_path(own: str | None, model: Model, offline: bool) -> Path:
 
 
 def find_boxes(
-    session: Any, image: UInt8[np.ndarray, "y x 3"], settings: Detect
+    session: Any, image: UInt8[np.ndarray, "y x 3"]
 ) -> Float[np.ndarray, "p 4"]:
     """Boxes `x0 y0 x1 y1` (px) of the largest people in an image."""
     tensor = session.get_inputs()[0]
@@ -137,10 +143,10 @@ def find_boxes(
     at = lambda count: (np.arange(count) + 0.5) / scale - 0.5
     canvas[:rows, :columns] = sample(image, at(columns), at(rows))
     (raw,) = session.run(None, {tensor.name: canvas.transpose(2, 0, 1)[None]})
-    boxes, score = decode_yolox(raw[0], (height, width), settings.min_score)
-    boxes = boxes[suppress(boxes, score, settings.max_overlap)]
+    boxes, score = decode_yolox(raw[0], (height, width), _LEAST_SCORE)
+    boxes = boxes[suppress(boxes, score, _MOST_OVERLAP)]
     area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    return boxes[np.argsort(-area)[: settings.max_people]] / scale
+    return boxes[np.argsort(-area)[:_MOST_PEOPLE]] / scale
 
 
 def decode_yolox(

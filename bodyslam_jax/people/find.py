@@ -31,6 +31,10 @@ from bodyslam_jax.people.regions import behind, covered, regions, square_around
 from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
 from bodyslam_jax.sfm import SILHOUETTE_STEP
 
+_SEARCH_INTERVAL = 0.33
+"""Time between two searches of the whole image, s."""
+_MOST_PEOPLE = 8
+"""People that are followed, the largest ones first."""
 _COARSE, _SEARCH, _FINE = 320, 640, 1280
 """Longer side of the image in MoveNet's input, px: for people who fill the image, for
 most, and for small ones."""
@@ -102,9 +106,9 @@ class _Finder:
         self.movenet = open_network(MOVENET)
         self.blazepose = open_network(BLAZEPOSE)
         self.fps, self.settings, self.association = fps, settings, association
-        self.whom = settings.min_height, settings.max_people
+        self.whom = settings.min_height, _MOST_PEOPLE
         self.tracker = Tracker(fps, association.max_gap)
-        self.interval = max(1, round(settings.search_interval * fps))
+        self.interval = max(1, round(_SEARCH_INTERVAL * fps))
         self.next_search, self.last_search, self.searches = 0, -_SOONER, 0
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}

@@ -21,6 +21,9 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.depths import depth_costs
 from bodyslam_jax.people.keypoint_errors import (
+    CORRELATION_TIME,
+    MIN_KEYPOINTS,
+    ROBUST_SCALE,
     find_present,
     in_pixels,
     keypoint_sigma,
@@ -28,7 +31,12 @@ from bodyslam_jax.people.keypoint_errors import (
 )
 from bodyslam_jax.people.lift import lift, load_lifter
 from bodyslam_jax.people.multistart import fit_frames
-from bodyslam_jax.people.person_state import PersonState, bodies_from_roots
+from bodyslam_jax.people.person_state import (
+    DEPTH_JITTER,
+    POSITION_JITTER,
+    PersonState,
+    bodies_from_roots,
+)
 from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
@@ -39,6 +47,17 @@ log = logging.getLogger(__name__)
 
 _BUCKET = 64
 """Frames are padded to a multiple of this, so that few shapes are compiled."""
+_START_INTERVAL = 0.1
+"""Time between the frames that are fitted from many starts, s."""
+_MOST_STEPS = 30
+"""Gauss-Newton steps over all frames."""
+_LEAN_SIGMA = 0.4
+"""Standard deviation of the lean towards or from the camera, sine of the angle."""
+_TURN_JITTER = 0.03
+"""Standard deviation of the orientation's second difference at 30 fps, rad."""
+_MOTION_SCALE = 2.0
+"""Factor on the posture prior's innovations: people move less predictably than in the
+motion data."""
 _FASTEST = 8.0
 """m/s across the line of sight, above which it is not the same person."""
 
@@ -94,12 +113,12 @@ def make_scene(
     dtype = body.joint_template.dtype
     number = lambda value: jnp.asarray(value, dtype)
     return Scene(
-        make_skeleton(body, settings.detector_bias),
+        make_skeleton(body, 0.0),
         load_posture_prior(fps, dtype),
         number(intrinsics.params),
-        number(settings.robust_scale),
+        number(ROBUST_SCALE),
         number(settings.limit_sigma),
-        number(settings.upright_sigma**-2),
+        number(_LEAN_SIGMA**-2),
         number(settings.lift_scale or 1.0),
     )
 
@@ -119,12 +138,12 @@ def _fit_person(
     uv, sigma = uv[fitted], sigma[fitted]
     lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
-    start, cuts = _start(scene, uv, sigma_px, depth[fitted], lifted, fps, settings)
+    start, cuts = _start(scene, uv, sigma_px, depth[fitted], lifted, fps)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
     sigma_px = in_pixels(sigma, focal / depth)
-    frames_alike = max(1.0, settings.correlation_time * fps)
+    frames_alike = max(1.0, CORRELATION_TIME * fps)
     dtype = scene.intrinsics.dtype
     length = -len(uv) % _BUCKET
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
@@ -139,11 +158,11 @@ def _fit_person(
         jnp.asarray(pad(uv, 0.0), dtype),
         jnp.asarray(pad(sigma_px * np.sqrt(frames_alike), np.inf), dtype),
         lifted.widened(jnp.asarray(wider, dtype)),
-        make_ties(scene.prior, cuts, len(uv) + length, fps, settings),
+        make_ties(scene.prior, cuts, len(uv) + length, fps),
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
-    chain, value = solve_chain(problem, chain, settings.max_steps)
+    chain, value = solve_chain(problem, chain, _MOST_STEPS)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
 
@@ -174,15 +193,14 @@ def _start(
     depth: np.ndarray,
     lifted: Lifted,
     fps: float,
-    settings: PeopleFit,
 ) -> tuple[Fit, np.ndarray]:
     """The best path through the fits of every few frames, for all frames.
 
     **Returns:** the fits, and the frames at which another track begins.
     """
-    enough = np.sum(np.isfinite(sigma_px), axis=1) >= settings.min_keypoints
+    enough = np.sum(np.isfinite(sigma_px), axis=1) >= MIN_KEYPOINTS
     known = np.flatnonzero(enough)
-    stride = max(1, round(settings.start_interval * fps))
+    stride = max(1, round(_START_INTERVAL * fps))
     chosen = np.unique(
         [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
     )
@@ -223,9 +241,7 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
     return Fit(*(jnp.asarray(a, dtype) for a in (turned, position, latent)))
 
 
-def make_ties(
-    prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float, settings: PeopleFit
-) -> Ties:
+def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) -> Ties:
     """How frames hang together; nothing crosses a cut.
 
     The first frame of a track has the posture's stationary prior, the second the
@@ -239,14 +255,10 @@ def make_ties(
     size = 6 + len(a1)
     weight, c1, c2 = np.zeros((3, frames, size))
     jitter = (
-        np.array(
-            [settings.turn_jitter] * 3
-            + [settings.position_jitter] * 2
-            + [settings.depth_jitter]
-        )
+        np.array([_TURN_JITTER] * 3 + [POSITION_JITTER] * 2 + [DEPTH_JITTER])
         * (30 / fps) ** 1.5
     )
-    loose = settings.motion_scale**2
+    loose = _MOTION_SCALE**2
     weight[:, :6], c1[:, :6], c2[:, :6] = jitter**-2, -2.0, 1.0
     weight[:, 6:], c1[:, 6:], c2[:, 6:] = 1 / (innovation * loose), -a1, -a2
     for first in (0, *cuts):

@@ -14,6 +14,14 @@ _DETECTOR_FLOOR = 1.0
 """px: no detector is better, however small the person."""
 
 
+MIN_KEYPOINTS = 6
+"""Keypoints that a frame must have for its body to be fitted."""
+CORRELATION_TIME = 0.15
+"""Time for which errors of a keypoint stay the same, s: frames within it count once."""
+ROBUST_SCALE = 4.0
+"""Scale of the robust loss on keypoints, in their standard deviations."""
+
+
 def keypoint_sigma(
     keypoints: Keypoints, intrinsics: Intrinsics, person: int
 ) -> Float[np.ndarray, "t 25"]:
@@ -36,7 +44,7 @@ def find_present(
     sigma: Float[np.ndarray, "t 25"], fps: float, settings: PeopleFit
 ) -> Bool[np.ndarray, " t"]:
     """Frames with keypoints enough, and short gaps between them."""
-    enough = np.sum(np.isfinite(sigma), axis=1) >= settings.min_keypoints
+    enough = np.sum(np.isfinite(sigma), axis=1) >= MIN_KEYPOINTS
     present = enough.copy()
     known = np.flatnonzero(enough)
     for a, b in zip(known[:-1], known[1:]):

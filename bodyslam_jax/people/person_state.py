@@ -10,6 +10,11 @@ from bodyslam_jax.body import BodyModel, rest_joints
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies
 
+DEPTH_JITTER = 0.005
+"""Standard deviation of the second difference of a pelvis' depth at 30 fps, m."""
+POSITION_JITTER = 0.015
+"""The same across the line of sight, m; includes a shaking camera."""
+
 
 @dataclasses.dataclass(frozen=True)
 class PersonState:

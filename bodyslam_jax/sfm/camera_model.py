@@ -17,7 +17,7 @@ from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views
 from bodyslam_jax.sfm.burnt_in import noise_of
 from bodyslam_jax.sfm.lens import Lens, examine_lens
-from bodyslam_jax.sfm.sfm import Reconstruction, reconstruct
+from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
 from bodyslam_jax.sfm.zoom import LEAST_ZOOM, tracks_without_zoom, turning_zoom
 from bodyslam_jax.types import Intrinsics, Tracks
 
@@ -59,7 +59,7 @@ def find_camera_model(
     """
     given, zoom = intrinsics, np.zeros(num_frames)
     warnings: list[str] = []
-    turning = _turning_zoom(tracks, intrinsics, num_frames, config)
+    turning = _turning_zoom(tracks, intrinsics, num_frames)
     if turning is not None:
         zoom = turning - np.median(turning)
     centre = np.asarray(intrinsics.params[2:4], float)
@@ -108,14 +108,14 @@ def zoom_warning(zoom: Float[np.ndarray, " t"]) -> str:
 
 
 def _turning_zoom(
-    tracks: Tracks, intrinsics: Intrinsics, num_frames: int, config: Structure
+    tracks: Tracks, intrinsics: Intrinsics, num_frames: int
 ) -> np.ndarray | None:
     if not len(tracks.frame):
         return None
     K, distortion = as_opencv(intrinsics.params)
     views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
     # Errors of both views, whose length has a median of 1.18 standard deviations.
-    limit = max(config.rotation_error, 2.0 * 1.18 * np.sqrt(2) * noise_of(tracks))
+    limit = max(TURNING_ERROR, 2.0 * 1.18 * np.sqrt(2) * noise_of(tracks))
     return turning_zoom(views, num_frames, limit / K[0, 0])
 
 

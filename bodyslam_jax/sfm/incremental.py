@@ -17,6 +17,10 @@ from bodyslam_jax.types import CameraPath
 
 _log = logging.getLogger(__name__)
 
+_FIRST_PAIRS = 4
+"""Pairs of frames that are tried as the start of the map."""
+MIN_SHARED = 12
+"""Points that two frames must share to be related."""
 _RELAXED = 3
 """Rounds with a smaller parallax threshold where cameras cannot be located."""
 FEW_POINTS, _NEIGHBOURS = 25, 10
@@ -40,8 +44,7 @@ def build_map(
             keyframes, as from `rotation_error`.
     """
     builder = make()
-    count = builder.config.max_first_pairs
-    grown = builder.build(keyframes, first_pairs(pairs, count))
+    grown = builder.build(keyframes, first_pairs(pairs, _FIRST_PAIRS))
     if grown is None:
         return None
     best = builder, grown
@@ -50,7 +53,7 @@ def build_map(
         before, after = pairs[:, :2] < thinnest, pairs[:, :2] > thinnest
         beyond = before if builder.origin > thinnest else after
         other = make()
-        starts = first_pairs(pairs[beyond.all(axis=1)], count)
+        starts = first_pairs(pairs[beyond.all(axis=1)], _FIRST_PAIRS)
         again = other.build(keyframes, starts)
         located = lambda growing: np.count_nonzero(growing.registered[keyframes])
         if (
@@ -195,11 +198,11 @@ class Builder(Mapper):
             self.views.landmark[self.of_frame[b]],
             return_indices=True,
         )
-        if len(i) < self.config.min_shared:
+        if len(i) < MIN_SHARED:
             return None
         at_a, at_b = self.of_frame[a][i], self.of_frame[b][j]
         pose = relative_pose(self.views.xy[at_a], self.views.xy[at_b], self.pixel)
-        if pose is None or pose[2].sum() < self.config.min_shared:
+        if pose is None or pose[2].sum() < MIN_SHARED:
             return None
         R, t, good = pose
         scene = Scene(
@@ -216,7 +219,7 @@ class Builder(Mapper):
             np.arange(self.num_landmarks),
         )
         self.make_points(grown, np.concatenate([at_a[good], at_b[good]]))
-        if grown.has_point.sum() < self.config.min_shared:
+        if grown.has_point.sum() < MIN_SHARED:
             return None
         self._refine(grown, grown.registered & (np.arange(self.num_frames) != a))
         return grown

@@ -11,6 +11,11 @@ from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.loop_closure import Revisits
 
+_OUTLIER = 2.0
+"""Reprojection error beyond which an observation is an outlier, px."""
+_LEAST_ANGLE = 0.5
+"""Smallest angle between the rays of a point, degrees; smaller ones are tried where
+cameras cannot be located otherwise."""
 _ENOUGH = 20
 """Observations of triangulated points from which the usual distance is estimated."""
 _FLAT = 0.5
@@ -59,8 +64,8 @@ class Mapper:
         self.joining = False
         self.num_frames, self.num_landmarks = num_frames, num_landmarks
         self.pixel: float = 1 / focal
-        self.threshold: float = config.max_error / focal
-        self.min_angle = np.radians(config.min_angle)
+        self.threshold: float = _OUTLIER / focal
+        self.min_angle = np.radians(_LEAST_ANGLE)
         self.refine = refine or self._adjust
         order = np.argsort(views.frame, kind="stable")
         bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))

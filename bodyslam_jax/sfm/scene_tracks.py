@@ -19,7 +19,7 @@ from bodyslam_jax.sfm.burnt_in import (
     masks_of,
     without_burnt_in,
 )
-from bodyslam_jax.sfm.tracks import follow
+from bodyslam_jax.sfm.tracks import CELLS, WINDOW, follow
 from bodyslam_jax.types import Sequence, Tracks
 
 _MOST_PASSES = 3
@@ -68,7 +68,7 @@ def track(
             break
         these = wanted[found.landmark]
         trial = [*hidden, (found.frame[these], found.uv[these])]
-        masks = _masks(trial, inside, sequence, config)
+        masks = _masks(trial, inside, sequence)
         again = follow(sequence, config, hidden=masks, progress=progress)
         bordered = False
         if not sure and wanted.any() and not _confirmed(found, again, wanted, sequence):
@@ -128,12 +128,11 @@ def _masks(
     hidden: list[tuple[np.ndarray, np.ndarray]],
     inside: tuple[int, int, int, int],
     sequence: Sequence,
-    config: Tracking,
 ) -> Iterator[UInt8[np.ndarray, "y x"]]:
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
-    reach = config.window // 2 + 2
+    reach = WINDOW // 2 + 2
     # Points are picked a fifth of a cell apart: between two there is text as well.
-    radius = max(reach, round(0.2 * max(size) / config.cells) + 2)
+    radius = max(reach, round(0.2 * max(size) / CELLS) + 2)
     frame, uv = (np.concatenate([part[i] for part in hidden]) for i in (0, 1))
     x, y, w, h = inside
     outside = np.full((size[1], size[0]), 255, dtype=np.uint8)

@@ -18,19 +18,28 @@ from bodyslam_jax.sfm.camera_motion import (
     rotations_only,
     stillness,
 )
-from bodyslam_jax.sfm.incremental import Builder, build_map
+from bodyslam_jax.sfm.incremental import MIN_SHARED, Builder, build_map
 from bodyslam_jax.sfm.partial_map import PartialMap, Refine
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
 
+_KEYFRAME_MOTION = 0.03
+"""Motion of points between keyframes, of the image's longer side."""
+_STATIC_MOTION = 0.6
+"""Motion of points below which the camera stands still, px."""
+TURNING_ERROR = 1.0
+"""Error of a pure rotation below which there is no parallax to use, px."""
+_LEAST_BASELINE = 0.08
+"""Extent of the camera path below which the camera only turns, of the median distance
+of landmarks."""
 _EXPLAINED, _TESTED = 0.3, 200
 """Least share of inliers under a given camera path, and least number of observations
 for this test."""
 
 _CERTAIN_PARALLAX = 6.0
-"""Residual of a pure rotation, in `Structure.rotation_error`, beyond which the camera
+"""Residual of a pure rotation, in `TURNING_ERROR`, beyond which the camera
 certainly translates: 6 px at the default, assuming that tracking noise (0.5 px at
 640x480) and a wrong focal length together stay below it."""
 
@@ -106,7 +115,7 @@ def reconstruct(
         return _along(problem, path, config, refine)
     if static:
         return _on_a_tripod(problem)
-    first, last, warnings = _longest_shot(views, num_frames, config.min_shared)
+    first, last, warnings = _longest_shot(views, num_frames, MIN_SHARED)
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
     if len(np.unique(shot.frame)) < 2:
@@ -116,13 +125,13 @@ def reconstruct(
             text = "one frame shows no motion."
         return _nothing(problem, "failed", (*warnings, text))
     still = stillness(shot) * focal
-    if still < config.static_motion:
+    if still < _STATIC_MOTION:
         text = f"the camera stands still (points wander {still:.2f} px)."
         return _fixed(problem, within, "static", None, (*warnings, text))
-    motion = config.keyframe_motion * max(intrinsics.width, intrinsics.height) / focal
-    keyframes = choose_keyframes(shot, first, last, motion, config.min_shared)
+    motion = _KEYFRAME_MOTION * max(intrinsics.width, intrinsics.height) / focal
+    keyframes = choose_keyframes(shot, first, last, motion, MIN_SHARED)
     pairs = rotation_error(shot, keyframes, 1 / focal)
-    away = _turning_error(pairs) * focal / config.rotation_error
+    away = _turning_error(pairs) * focal / TURNING_ERROR
     built = None
     if away > 1:
         size = (num_frames, num_landmarks)
@@ -136,7 +145,7 @@ def reconstruct(
         found = _moving(problem, grown, inlier, (first, last), warnings)
         extent = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
         # A wrong focal length makes even a rotating camera seem to move a little.
-        if away > _CERTAIN_PARALLAX or extent > config.min_baseline:
+        if away > _CERTAIN_PARALLAX or extent > _LEAST_BASELINE:
             return found
     elif away > _CERTAIN_PARALLAX:
         text = "no pair of frames has enough parallax to start a map."
@@ -195,18 +204,16 @@ def _along(
     if tested < _TESTED or share >= _EXPLAINED:
         return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
     shot = problem.views
-    motion = config.keyframe_motion * max(
-        problem.intrinsics.width, problem.intrinsics.height
-    )
+    motion = _KEYFRAME_MOTION * max(problem.intrinsics.width, problem.intrinsics.height)
     keyframes = choose_keyframes(
         shot,
         int(shot.frame.min()),
         int(shot.frame.max()),
         motion / problem.focal,
-        config.min_shared,
+        MIN_SHARED,
     )
     pairs = rotation_error(shot, keyframes, 1 / problem.focal)
-    if _turning_error(pairs) * problem.focal < config.rotation_error:
+    if _turning_error(pairs) * problem.focal < TURNING_ERROR:
         text = (
             "the images show no parallax along the given path: the camera only turns."
         )

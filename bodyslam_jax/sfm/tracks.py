@@ -35,6 +35,18 @@ _ROUND_TRIP = 0.5
 which depends on the window and contrast and hardly on the image size."""
 _LEAST_CONTRAST = 6
 """BRISK's threshold in the flattest image, grey levels."""
+_CONTRAST, _OCTAVES = 20, 3
+"""BRISK's threshold at the start, grey levels, and octaves of its pyramid."""
+CELLS = 8
+"""Cells along the longer side of the image, over which points are spread."""
+WINDOW = 21
+"""Side of the window that Lucas--Kanade follows, px (OpenCV's default)."""
+_EPIPOLAR_LIMIT = 1.5
+"""Distance from the epipolar line beyond which a point is dropped, px."""
+_RIGID_GAP = 10
+"""Frames over which points must fit one rigid motion."""
+_PERSON_MARGIN = 0.06
+"""Width that is masked around people's keypoints, of the person's height."""
 
 
 Mask = UInt8[np.ndarray, "y x"]
@@ -59,7 +71,7 @@ def follow(
     """
     tracker = _Tracker(sequence, config)
     images = frames(sequence, gray=True)
-    masks = person_masks(sequence, config.person_margin)
+    masks = person_masks(sequence, _PERSON_MARGIN)
     if hidden is not None:
         masks = (
             other if mask is None else cv2.bitwise_or(mask, other)
@@ -112,15 +124,13 @@ class _Tracker:
         self.config = config
         self.size = (sequence.intrinsics.width, sequence.intrinsics.height)
         self.K, self.distortion = as_opencv(sequence.intrinsics.params)
-        self.brisk = make_brisk(config.threshold, config.octaves)
+        self.brisk = make_brisk(_CONTRAST, _OCTAVES)
         self.live = _Live(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
         self.previous: np.ndarray | None = None
-        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(
-            maxlen=config.keyframe_gap + 1
-        )
+        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_RIGID_GAP + 1)
         self.rows: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.next_id = 0
-        self.threshold = config.threshold
+        self.threshold = _CONTRAST
         self.last_refill = -_REFILL_GAP
         self.keyframes: deque[_Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
         self.last_keyframe = -_KEYFRAME_STEP
@@ -176,7 +186,7 @@ class _Tracker:
             b,
             uv.astype(np.float32).reshape(-1, 1, 2),
             guess.astype(np.float32).reshape(-1, 1, 2),
-            winSize=(self.config.window, self.config.window),
+            winSize=(WINDOW, WINDOW),
             maxLevel=levels,
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -215,7 +225,7 @@ class _Tracker:
         inlier = epipolar_inliers(
             self._normalise(uv[then]),
             self._normalise(live.uv[now]),
-            self.config.max_epipolar / self.K[0, 0],
+            _EPIPOLAR_LIMIT / self.K[0, 0],
         )
         keep[now[~inlier]] = False
         self.live = live.keep(keep)
@@ -236,7 +246,7 @@ class _Tracker:
             return
         uv = np.array([p.pt for p in found], dtype=np.float64)
         response = np.array([p.response for p in found], dtype=np.float64)
-        cell = -(-max(self.size) // self.config.cells)
+        cell = -(-max(self.size) // CELLS)
         # Cells under a person or without texture give their share to the others.
         occupied = np.unique(uv.astype(np.int64) // cell, axis=0)
         quota = -(-wanted // max(len(occupied), 1))
@@ -313,6 +323,6 @@ class _Tracker:
             inlier = epipolar_inliers(
                 self._normalise(np.concatenate([key.uv[a], then])),
                 self._normalise(np.concatenate([self.live.uv[b], now])),
-                self.config.max_epipolar / self.K[0, 0],
+                _EPIPOLAR_LIMIT / self.K[0, 0],
             )[len(a) :]
             self.live = self.live.add(ids[inlier], now[inlier])

@@ -1,0 +1,61 @@
+"""All commands, and the options that `--help` shows of the long ones."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from bodyslam_jax.cli.body import body_check, body_convert, body_show
+from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
+from bodyslam_jax.cli.environment import doctor
+from bodyslam_jax.cli.estimate import demo, evaluate, run
+from bodyslam_jax.cli.make import experiment, simulate, train_motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A function of the command line."""
+
+    function: Callable[..., Any]
+    shown: frozenset[str] = frozenset()
+    """Arguments and settings that `--help` lists; all if empty."""
+
+
+def _command(function: Callable[..., Any], shown: str = "") -> Command:
+    return Command(function, frozenset(shown.split()))
+
+
+COMMANDS = {
+    "run": _command(
+        run,
+        """input out keypoints bodies camera masks preset settings detect device overlay
+        height focal fov camera_path camera_path_metric static_camera gravity fps start
+        end person""",
+    ),
+    "demo": _command(demo, "out from_pixels preset settings device overlay"),
+    "evaluate": _command(evaluate),
+    "simulate": _command(
+        simulate,
+        "out sequence family length seed motion noise people hiding render",
+    ),
+    "train-motion": _command(
+        train_motion, "data out body_model preset network past seed epochs"
+    ),
+    "experiment": _command(
+        experiment,
+        """name out preset settings sequences family frames noise motion seed
+        motion_models device overlay""",
+    ),
+    "convert-dataset emdb": _command(emdb),
+    "convert-dataset 3dpw": _command(threedpw),
+    "convert-dataset rich": _command(rich),
+    "convert-dataset tum-amass": _command(tum_amass),
+    "body-model show": _command(body_show),
+    "body-model convert": _command(body_convert),
+    "body-model check": _command(body_check),
+    "doctor": _command(doctor),
+}
+"""By name; commands of one group share the first word."""
+GROUPS = {
+    "body-model": "Body model files: SMPL and models of its shape, SMPL-H, SMPL-X.",
+    "convert-dataset": "Sequence folders with ground truth, made from datasets.",
+}

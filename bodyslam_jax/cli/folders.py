@@ -1,0 +1,39 @@
+"""Where a run goes that names no folder, and how to look at a finished one."""
+
+import itertools
+import shlex
+import sys
+from pathlib import Path
+
+from bodyslam_jax.types import Sequence
+
+_ROOT = Path("runs")
+_OPENERS = {"darwin": "open", "win32": "start"}
+
+
+def default_folder(sequence: Sequence) -> Path:
+    """`runs/NAME`, or `runs/NAME-2` and so on where an earlier run is finished.
+
+    An unfinished run of the same input is continued.
+    """
+    name = sequence.name or "run"
+    for number in itertools.count(1):
+        folder = _ROOT / (name if number == 1 else f"{name}-{number}")
+        if not folder.exists() or _is_unfinished(folder, sequence):
+            return folder
+    raise AssertionError("unreachable")
+
+
+def look_at(folder: Path) -> str:
+    """The command that opens a run's report."""
+    opener = _OPENERS.get(sys.platform, "xdg-open")
+    return f"{opener} {shlex.quote(str(folder / 'report.html'))}"
+
+
+def _is_unfinished(folder: Path, sequence: Sequence) -> bool:
+    from bodyslam_jax.export.summary import describe
+    from bodyslam_jax.pipeline.stage_cache import Cache
+
+    if any(not entry.name.startswith(".") for entry in folder.iterdir()):
+        return False
+    return Cache(folder / ".cache").owner() in (None, describe(sequence))
