@@ -337,7 +337,7 @@ class Result:
 
     @property
     def located(self) -> Bool[np.ndarray, " t"]:
-        """Frames whose camera was estimated: from the first to the last of the summary's
+        """Frames whose camera was estimated: the first to the last of the summary's
         `frames_used`, if it has them. Poses of others are finite fill."""
         frames = np.arange(len(self.timestamps))
         used = self.summary.get("frames_used")
