@@ -1,8 +1,8 @@
 """Hundreds of (result, truth) pairs in one jitted, vmapped call.
 
-Copy this to evaluate many runs at once: read, associate and pad each pair on the host,
-stack them, and call `evaluate` under `vmap` and `jit`. Without arguments the pairs are
-made up, and the pairs per second are what is asked:
+Copy this to evaluate many runs at once: read the pairs, associate, pad and stack them
+on the host (`stack_pairs`), and call `evaluate` under `vmap` and `jit`. Without
+arguments the pairs are made up, and the pairs per second are measured:
 
     python benchmarks/evaluate_batch.py [--pairs 300] [--frames 300]
     python benchmarks/evaluate_batch.py RUN GROUNDTRUTH [RUN GROUNDTRUTH ...]
@@ -21,32 +21,8 @@ from bodyslam_jax.types import Result
 
 
 def evaluate_pairs(pairs: list[tuple[Result, Result]]) -> evaluation.Evaluation:
-    """Every error of every pair; each value has one entry per pair.
-
-    Pairs of different length are padded to the longest; all need as many people.
-    """
-    return evaluate_stacked(*stack_pairs(pairs))
-
-
-def stack_pairs(
-    pairs: list[tuple[Result, Result]],
-) -> tuple[evaluation.Trajectories, evaluation.Trajectories]:
-    """Estimates and truths on common frames and people, padded and stacked."""
-    associated = [evaluation.associate(result, truth) for result, truth in pairs]
-    counts = {len(truth.present) for _, truth in associated}
-    if len(counts) > 1:
-        raise ValueError(
-            f"Pairs with {', '.join(map(str, sorted(counts)))} people: stack those "
-            "with as many."
-        )
-    longest = max(len(truth.camera_valid) for _, truth in associated)
-    estimates, truths = (
-        [evaluation.pad_frames(trajectories, longest) for trajectories in side]
-        for side in zip(*associated, strict=True)
-    )
-    # NumPy: hundreds of small arrays are stacked at once, nothing is compiled.
-    stack = lambda side: jax.tree.map(lambda *x: np.stack(x), *side)
-    return stack(estimates), stack(truths)
+    """Every error of every pair; each value has one entry per pair."""
+    return evaluate_stacked(*evaluation.stack_pairs(pairs))
 
 
 evaluate_stacked = jax.jit(jax.vmap(evaluation.evaluate))
@@ -112,7 +88,7 @@ def main() -> None:
                 f"  of {len(known)}"
             )
 
-    estimates, truths = stack_pairs(pairs)
+    estimates, truths = evaluation.stack_pairs(pairs)
     longest = truths.camera_valid.shape[1]
     times = []
     for _ in range(5):

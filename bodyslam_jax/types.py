@@ -220,9 +220,8 @@ class SfmResult:
 
     @property
     def within(self) -> Bool[np.ndarray, " t"]:
-        """Frames from the first to the last registered one; frames beyond, such as
-        those
-        after a cut, share no points with the map."""
+        """Frames from the first to the last registered one; others, such as those after
+        a cut, share no points with the map."""
         frames = np.arange(len(self.registered))
         located = np.flatnonzero(self.registered)
         if self.kind == "failed" or not len(located):
@@ -337,8 +336,8 @@ class Result:
 
     @property
     def located(self) -> Bool[np.ndarray, " t"]:
-        """Frames whose camera was estimated: the first to the last of the summary's
-        `frames_used`, if it has them. Poses of others are finite fill."""
+        """Frames whose camera was estimated: from the first to the last of
+        `frames_used` in the summary, if it has them. Other poses are finite fill."""
         frames = np.arange(len(self.timestamps))
         used = self.summary.get("frames_used")
         if not (isinstance(used, list) and len(used) == 2):

@@ -1,9 +1,9 @@
 """Body model files: found, read, checked, written.
 
-SMPL's files under their usual names and in their usual forms: the original pickle, and
-`.npz` with the same names of arrays. SMPL-H and SMPL-X have more joints (hands, jaw,
-eyes). At rest those follow the wrist or the head rigidly, so that their weights simply
-belong to it, and the body is driven by SMPL's 72 numbers.
+SMPL's files have their usual names and forms: the original pickle, and `.npz` with the
+same names of arrays. SMPL-H and SMPL-X have more joints (hands, jaw, eyes), which are
+kept at rest: their skinning weights are added to those of the wrist or head, and the
+body has SMPL's 72 pose parameters.
 """
 
 import json
@@ -65,9 +65,9 @@ def search_paths(gender: str = "neutral") -> list[Path]:
     """Where a body model is looked for when none is named, in this order.
 
     The file or folder in the environment variable `BODYSLAM_BODY_MODEL`, then the
-    user's folder for data. After them comes the body that ships with the package.
+    user's folder for data. The body that ships with the package comes after these.
     """
-    return [path for place in _places() for path in _candidates(place, gender)]
+    return [path for folder in _folders() for path in candidates(folder, gender)]
 
 
 def load_body_model(
@@ -80,12 +80,12 @@ def load_body_model(
 
     - `path`: a file (SMPL, SMPL-H, SMPL-X; `.pkl` or `.npz`) or a folder with the usual
         names.
-    - `gender`: `neutral`, `female` or `male`; which file of a folder, and what the name
-        of a file must not contradict. Without it a folder's neutral file, or any file.
-    - `dtype`: of the arrays; by default JAX's own default.
+    - `gender`: `neutral`, `female` or `male`: selects the file of a folder, and must
+        not contradict the name of a file. Without it a folder's neutral file.
+    - `dtype`: of the arrays; by default JAX's default.
 
-    **Raises:** `ValueError`, saying where it was looked for if there is no file, or
-    what is wrong with the one there is.
+    **Raises:** `ValueError`, with the paths that were tried if there is no file, or
+    what is wrong with the file.
     """
     file = _find(path, gender)
     model = _assemble(file, checked(file, read_arrays(file)))
@@ -96,9 +96,9 @@ def load_body_model(
 
 
 def check(path: str | Path, gender: str | None = None) -> str:
-    """What a body model file is, in one line; arguments as for `load_body_model`.
+    """A body model file's kind and size in one line; arguments as `load_body_model`.
 
-    **Raises:** `ValueError`, in one line, if it is not usable as a body model.
+    **Raises:** `ValueError`, one line, if it is not usable as a body model.
     """
     file = _find(path, gender)
     raw = checked(file, read_arrays(file))
@@ -115,11 +115,11 @@ def check(path: str | Path, gender: str | None = None) -> str:
 def write_npz(model: BodyModel, path: str | Path) -> None:
     """Writes SMPL's own layout, 24 joints, so that other tools for SMPL can read it.
 
-    Pose blend shapes that the model lacks are written as zeros. Nothing half-written
-    stays behind: the file appears when it is complete.
+    Pose blend shapes that the model lacks are written as zeros. The file appears when
+    it is complete.
 
-    **Raises:** `ValueError` if the path is not of a `.npz`; `OSError`, naming it, if it
-    cannot be written.
+    **Raises:** `ValueError` if the path has not the suffix `.npz`; `OSError`, naming
+    it, if it cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -148,7 +148,7 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """The arrays in a `.npz` or a pickle, told apart by content; nothing is checked."""
+    """The arrays of a `.npz` or a pickle, recognised by content; not yet checked."""
     if zipfile.is_zipfile(file):
         arrays = {}
         try:
@@ -157,7 +157,7 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
                     try:
                         arrays[name] = archive[name]
                     except ValueError as error:
-                        # SMPL-X keeps objects beside its arrays; they are not needed.
+                        # SMPL-X has objects beside its arrays, which are not needed.
                         if "Object arrays" not in str(error):
                             raise
         except Exception as error:
@@ -169,13 +169,14 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
     return read_pickle(file)
 
 
-def _places() -> list[Path]:
-    places = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
+def _folders() -> list[Path]:
+    folders = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
     home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return [*places, Path(home) / "bodyslam" / "body_models"]
+    return [*folders, Path(home) / "bodyslam" / "body_models"]
 
 
-def _candidates(place: Path, gender: str) -> list[Path]:
+def candidates(place: Path, gender: str) -> list[Path]:
+    """The files of one gender that `place`, a file or folder, may stand for."""
     if gender not in _GENDERS:
         raise ValueError(f"gender {gender!r}, expected neutral, female or male.")
     if place.suffix in (".npz", ".pkl") or place.is_file():
@@ -187,10 +188,10 @@ def _candidates(place: Path, gender: str) -> list[Path]:
 
 def _find(path: str | Path | None, gender: str | None) -> Path:
     wanted = gender or "neutral"
-    places = _places() if path is None else [Path(path)]
+    places = _folders() if path is None else [Path(path)]
     is_set = path is None and bool(os.environ.get(VARIABLE))
     note = f" ({VARIABLE} is set)" if is_set else ""
-    for candidate in (file for place in places for file in _candidates(place, wanted)):
+    for candidate in (file for place in places for file in candidates(place, wanted)):
         if candidate.is_file():
             of = named_gender(candidate)
             if gender and of not in (gender, None):
@@ -205,7 +206,10 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
 
 
 def named_gender(file: Path) -> str | None:
-    """As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl`, `female/model.npz`."""
+    """The gender in a file's name; `None` without one.
+
+    As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl` or `female/model.npz`.
+    """
     name = (file.parent.name if file.stem == "model" else file.stem).lower()
     words = re.split(r"[^a-z]+", name)
     found = {g for g in _GENDERS if g in words or g[0] in words}
@@ -213,7 +217,7 @@ def named_gender(file: Path) -> str | None:
 
 
 def _tried(place: Path, gender: str) -> str:
-    files = _candidates(place, gender)
+    files = candidates(place, gender)
     if files == [place]:
         return str(place)
     names = ", ".join(str(file.relative_to(place)) for file in files[:2])
@@ -221,7 +225,7 @@ def _tried(place: Path, gender: str) -> str:
 
 
 def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
-    """Arrays of a `BodyModel`, float64: 24 joints whatever the file has."""
+    """Fields of a `BodyModel` with 24 joints, arrays in float64."""
     template, weights, regressor = raw["v_template"], raw["weights"], raw["J_regressor"]
     shape_dirs, pose_dirs = raw["shapedirs"][:, :, :10], raw["posedirs"]
     num_joints = weights.shape[1]
@@ -233,8 +237,8 @@ def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
             while body_joint >= 22:
                 body_joint = parents[body_joint]
             merged[:, body_joint] += weights[:, j]
-        # SMPL's hand joint is where the middle finger starts: the fourth joint of each
-        # hand, of 15.
+        # SMPL's hand joint is the base of the middle finger, the fourth of the 15
+        # joints of each hand.
         first = num_joints - 30
         rows = [*range(22), first + 3, first + 18]
         weights, regressor = merged, regressor[rows]
@@ -258,20 +262,20 @@ def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
 
 
 def _picks(template: np.ndarray, regressor: np.ndarray) -> np.ndarray:
-    """Vertices of the surface points of a mesh that does not name them."""
+    """Vertices of `SURFACE_POINTS` for a mesh whose file does not name them."""
     top = int(template[:, 1].argmax())
     if len(template) in _PICKS:
         return np.array([*_PICKS[len(template)], top])
-    # An unknown mesh: where the default body has them, relative to head and ankles,
-    # for the size of this one.
-    known = load_body_model(DEFAULT)
-    joints, picks = np.asarray(known.joint_template), np.asarray(known.picks)
-    points = np.asarray(known.template)[picks]
-    here = regressor @ template
-    size = np.ptp(template[:, 1]) / np.ptp(np.asarray(known.template)[:, 1])
+    # An unknown mesh: the vertices nearest to the default body's points, relative to
+    # head and ankles and scaled by the stature.
+    default = load_body_model(DEFAULT)
+    joints, picks = np.asarray(default.joint_template), np.asarray(default.picks)
+    points = np.asarray(default.template)[picks]
+    own_joints = regressor @ template
+    size = np.ptp(template[:, 1]) / np.ptp(np.asarray(default.template)[:, 1])
     anchor = [ANKLES[0] if "left" in n else ANKLES[1] for n in SURFACE_POINTS]
     is_foot = [n.endswith(("toe", "heel")) for n in SURFACE_POINTS]
     anchor = np.where(is_foot, anchor, HEAD)
-    target = here[anchor] + size * (points - joints[anchor])
+    target = own_joints[anchor] + size * (points - joints[anchor])
     near = np.linalg.norm(template[None] - target[:, None], axis=-1).argmin(1)
     return np.append(near[:-1], top)

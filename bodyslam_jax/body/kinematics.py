@@ -1,11 +1,12 @@
-"""From pose and shape to joints and keypoints; no vertex but the picked ones.
+"""Forward kinematics: joints and keypoints of a pose and shape.
 
 SMPL (Loper et al., 2015): the joints at rest are linear in the shape,
 `J(β) = J_0 + J_s β`; joint k turns about its parent's frame,
 `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
 
-Inside, the batch is the last axis: the 3x3 products are then plain arithmetic on long
-vectors, one level of the tree at a time.
+Keypoints on the skin need a few vertices (`BodyModel.picks`) only. Inside, the batch
+is the last axis: products of 3x3 matrices are then arithmetic on long vectors, one
+level of the kinematic tree at a time.
 """
 
 import functools
@@ -83,9 +84,9 @@ def local_keypoints(
     **Arguments:**
 
     - `layout`: `body25`, `coco17` or `halpe26`; names are in `KEYPOINT_NAMES`.
-    - `bias`: 0 takes each keypoint to be SMPL's joint of that name, as projections of
-        bodies do; 1 puts hips, neck and shoulders where detectors trained on COCO put
-        them (`DETECTOR_BIAS`). Keypoints are linear in it.
+    - `bias`: 0 for keypoints at SMPL's joints of the same names, 1 for hips, neck and
+        shoulders where detectors trained on COCO put them (`DETECTOR_BIAS`); keypoints
+        are linear in it.
     """
     batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
     beta = flatten(shape, batch, 1)
@@ -108,9 +109,9 @@ def keypoints(
 
 
 class Posed:
-    """The joints of `n` bodies about the pelvis, batch last; lives within one function.
+    """Joints of `n` bodies relative to the pelvis, batch last; never leaves a jit.
 
-    The frame is the one into which the root's rotation turns.
+    The frame is the one that the root's rotation maps to.
     """
 
     def __init__(self, R, rest, G, x):
@@ -119,9 +120,9 @@ class Posed:
         self.rest = rest
         """Joints at rest, m, (24, 3, n)."""
         self.G = G
-        """Rotations, (24, 3, 3, n)."""
+        """Rotations of all joints to that frame, (24, 3, 3, n)."""
         self.x = x
-        """Places, m, (24, 3, n)."""
+        """Positions of all joints, m, (24, 3, n)."""
 
 
 def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
@@ -132,7 +133,7 @@ def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
 
 
 def _under_root(body_pose):
-    """Rotations of all joints, the root's none."""
+    """Rotations of all joints; the root's is the identity."""
     R = rotations(body_pose)
     return jnp.concatenate([_identity(R), R])
 
@@ -147,7 +148,8 @@ def pose_joints(
         return template[:, :, None] + moved.reshape(*template.shape, -1)
 
     J_0, J_s = model.joint_template, model.joint_shape_dirs
-    # Bones of their own, not differences of joints: a product less to differentiate.
+    # Bones from their own blend shapes, not as differences of joints: one product less
+    # to differentiate.
     bones = of_shape(J_0[1:] - J_0[_PARENT], J_s[1:] - J_s[_PARENT])
     return Posed(R, of_shape(J_0, J_s), *_chain(R, bones))
 
@@ -177,7 +179,7 @@ def flatten(x, batch, num_axes):
 
 
 def pelvis_place(model, shape, trans):
-    """Where the pelvis is, (3, n), of a flat batch."""
+    """Position of the pelvis, m, (3, n), of a flat batch."""
     return (model.joint_template[0] + shape @ model.joint_shape_dirs[0].T + trans).T
 
 
@@ -234,12 +236,12 @@ def pose_feature(R):
     return (R[1:] - eye).reshape(207, R.shape[-1])
 
 
-# The chain itself, with its own derivative. Differentiating the products of matrices
-# level by level is slow to compile and to run. But a small turn φ_k of joint k about
-# its own place (axis-angle, in the outer frame) moves every joint below it rigidly, so
+# The kinematic chain with a derivative of its own: differentiating the matrix products
+# level by level is slow to compile and to run. A small rotation φ_k of joint k about
+# its position (axis-angle, outer frame) moves every joint below it rigidly:
 #   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x b_i + G_parent(i) do_i),
-# sums over i from the root down to k, products with constant matrices of ones; o_i is
-# the bone to joint i at rest and b_i = G_parent(i) o_i.
+# with sums over i from the root to k, computed as products with constant 0-1 matrices;
+# o_i is the bone to joint i at rest and b_i = G_parent(i) o_i.
 
 
 _UP_TO_SELF = ancestors().T
@@ -278,7 +280,7 @@ def _chain_jvp(primals, tangents):
 
 
 def _identity(R):
-    """The root's rotation where it has none, (1, 3, 3, n)."""
+    """Identity rotations of the root, (1, 3, 3, n)."""
     eye = jnp.eye(3, dtype=R.dtype)[..., None]
     return jnp.broadcast_to(eye, (1, 3, 3, R.shape[-1]))
 

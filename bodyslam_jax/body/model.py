@@ -1,4 +1,4 @@
-"""A body as arrays: what SMPL's equations need, and nothing else."""
+"""SMPL's parameters as arrays."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,29 +15,31 @@ class BodyModel(eqx.Module):
     template: Float[Array, "v 3"]
     """Rest vertices of the mean shape, m."""
     shape_dirs: Float[Array, "v 3 10"]
-    """How vertices move per unit of β, m."""
+    """Shape blend shapes: displacement of vertices per unit of β, m."""
     pose_dirs: Float[Array, "v 3 p"]
-    """How vertices move per entry of `R - I` of joints 1, 2, ..., m; p may be 0."""
+    """Pose blend shapes: displacement of vertices per entry of `R - I` of joints 1, 2,
+    ..., m; p may be 0."""
     joint_template: Float[Array, "24 3"]
-    """`J_0(β=0)` and the other joints of the mean shape at rest, m."""
+    """Joints of the mean shape at rest, m; the first is `J_0(β=0)`."""
     joint_shape_dirs: Float[Array, "24 3 10"]
-    """How joints at rest move per unit of β, m."""
+    """Displacement of joints at rest per unit of β, m."""
     joint_regressor: Float[Array, "24 v"]
-    """Joints from rest vertices; only for writing files."""
+    """Weights of the rest vertices in each joint; needed for writing files only."""
     skin_joint: Int[Array, "v k"]
     """The joints that each vertex follows; padded with joint 0."""
     skin_weight: Float[Array, "v k"]
-    """How much it follows each; rows sum to 1, 0 is padding."""
+    """Skinning weight of each of these joints; rows sum to 1, 0 is padding."""
     faces: Int[Array, "f 3"]
+    """Vertices of the triangles."""
     picks: Int[Array, " 12"]
     """The vertices of `SURFACE_POINTS`."""
     blocks: tuple[tuple[int, int, tuple[int, ...]], ...] = eqx.field(static=True)
-    """Runs of vertices (first, one past the last) and the few joints that each follows:
+    """Runs of vertices (first, one past the last) and the few joints that each follows;
     skinning a run needs no others."""
     name: str = eqx.field(static=True)
-    """Where the body comes from: the file's name."""
+    """Of the file, without suffix."""
     kind: str = eqx.field(static=True)
-    """`default`, `smpl`, `smplh` or `smplx`: what the file was."""
+    """Kind of the file: `default`, `smpl`, `smplh` or `smplx`."""
 
     @property
     def num_vertices(self) -> int:
@@ -61,11 +63,11 @@ def sparse_rows(
 def runs_of_vertices(
     weights: Float[np.ndarray, "v 24"],
 ) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
-    """Cuts the vertices, in the order that they have, where other joints take over.
+    """Runs of vertices, in the mesh's order, that follow few joints each.
 
-    A mesh lists its parts one after another, so that long runs follow few joints. The
-    cuts have the least cost of (vertices x joints) by dynamic programming over cells of
-    vertices; a cut has its price (compiling): there are about four runs in a body.
+    Meshes list the parts of the body one after another. The cuts minimise the sum of
+    (vertices x joints), plus a constant per run for its compilation, by dynamic
+    programming over cells of vertices; a body has about four runs.
     """
     v = len(weights)
     cell, price = max(1, -(-v // 400)), float(v + 1000)

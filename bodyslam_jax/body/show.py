@@ -1,7 +1,7 @@
-"""A picture of a body model: what it can look like, and whether it moves as it should.
+"""A picture of a body model: its shape components and a few postures.
 
-matplotlib's own 3D is slow and hides faces badly; an orthographic view of shaded
-triangles, far ones first, is enough here.
+Orthographic views of shaded triangles, drawn back to front: matplotlib's 3D axes are
+slow and order faces wrongly.
 """
 
 from pathlib import Path
@@ -51,9 +51,9 @@ POSTURES: dict[str, dict[str, tuple[float, float, float]]] = {
 
 
 def save_picture(model: BodyModel, path: str | Path) -> None:
-    """Draws shape components at ±2σ (front) and postures (side) to an image file.
+    """Draws shape components at ±2σ and postures to an image file.
 
-    **Raises:** `ValueError` if the path's suffix is none of an image.
+    **Raises:** `ValueError` if the path has not the suffix of an image format.
     """
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
@@ -101,7 +101,8 @@ def posture(name: str, dtype=None):
 def draw_body(
     axis, points, faces, from_side=False, at=(0.0, 0.0), colour=(0.75, 0.78, 0.85)
 ) -> None:
-    """Shaded triangles on matplotlib axes, seen from the front or the person's left."""
+    """Draws shaded triangles on matplotlib axes, viewed from the front or the left of
+    the person."""
     from matplotlib.collections import PolyCollection
 
     if from_side:  # from +x: forward is to the left

@@ -63,7 +63,7 @@ LEVELS: tuple[tuple[int, ...], ...] = (
     (20, 21),
     (22, 23),
 )
-"""Joints by depth in the tree: those of one level move at the same time."""
+"""Joints by depth in the kinematic tree."""
 
 
 def ancestors() -> Float[np.ndarray, "24 24"]:
@@ -120,7 +120,7 @@ KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
         ),
     ),
 }
-"""What each keypoint of a detector's layout is, in the layout's own order."""
+"""Names of the keypoints of each detector's layout, in the layout's order."""
 
 
 def _other_side(name: str) -> str:
@@ -165,14 +165,14 @@ KEYPOINT_SPREAD: dict[str, tuple[float, ...]] = {
     layout: tuple(_SPREAD[name.rsplit("_", 1)[-1]] for name in names)
     for layout, names in KEYPOINT_NAMES.items()
 }
-"""How far annotators of COCO disagree, as a share of the square root of the person's
-area in pixels (the σ of COCO's and COCO-WholeBody's OKS; neck and head by analogy)."""
+"""Standard deviation of COCO's annotators, relative to the square root of the person's
+area in pixels (σ of COCO's and COCO-WholeBody's OKS; neck and head by analogy)."""
 
 KEYPOINT_JOINT: dict[str, int] = {
     "mid_hip": 0,
     **{name: j for j, name in enumerate(JOINT_NAMES) if "spine" not in name},
 }
-"""The SMPL joint of each keypoint that is one."""
+"""SMPL's joint of each keypoint that has one."""
 
 DETECTOR_BIAS: dict[str, tuple[float, float, float]] = {
     "left_hip": (-0.012, -0.020, 0.018),

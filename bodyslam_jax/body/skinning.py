@@ -1,7 +1,8 @@
-"""From pose and shape to the vertices of the skin.
+"""Linear blend skinning: vertices of a pose and shape.
 
 SMPL (Loper et al., 2015): `v = Σ_j w_j (G_j (v_rest - J_j) + x_j)` with
-`v_rest = template + S β + P vec(R - I)`. Two ways to compute it, chosen by the shapes:
+`v_rest = template + S β + P vec(R - I)`. If all frames share one β, rest vertices and
+weights are multiplied once (`_skin_shared`), else for each frame (`_skin_each`).
 """
 
 import math
@@ -22,8 +23,8 @@ from bodyslam_jax.body.kinematics import (
 from bodyslam_jax.body.model import BodyModel
 
 _CHUNK_SHARED, _CHUNK_EACH = 32, 16
-"""Frames computed together, with one β and with many: what they need fits a CPU's
-cache, and a long video does not need more memory than its result."""
+"""Frames per chunk, with one β and with one for each: a chunk fits a CPU's cache, and a
+long video needs little memory beyond its result."""
 
 
 @jax.jit

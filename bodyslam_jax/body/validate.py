@@ -1,4 +1,4 @@
-"""Whether arrays are a body model: each rule that a later stage relies on, once."""
+"""Checks of a body model's arrays: every rule that later stages rely on."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ _NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table",
 
 
 def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays as float64 or int64, with `parents` and, if named, `picks`.
+    """The checked arrays in float64 or int64, with `parents` and, if named, `picks`.
 
     **Raises:** `ValueError`, one line: the file, what was found, what was expected.
     """

@@ -1,7 +1,7 @@
-"""Two results brought together: same moments, same people."""
+"""Two results on common frames and people; their errors."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -55,9 +55,13 @@ def evaluate(
         return _evaluate(to_bucket(result), to_bucket(truth))
     if not isinstance(result, Result) or not isinstance(truth, Result):
         raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
-    estimate, reference, feet, scope = _associate(result, truth, body, offset)
-    found = _evaluate(to_bucket(estimate), to_bucket(reference))
-    return dataclasses.replace(found, feet=feet, scope=scope)
+    pair = _associate(result, truth, body, offset)
+    length = bucket(len(pair.estimate.available))
+    found = _evaluate(
+        pair.estimate.trajectories(pair.fps, length),
+        pair.truth.trajectories(pair.fps, length),
+    )
+    return dataclasses.replace(found, feet=pair.feet, scope=pair.scope)
 
 
 _evaluate = eqx.filter_jit(evaluate_trajectories)
@@ -92,29 +96,44 @@ def associate(
 ) -> tuple[Trajectories, Trajectories]:
     """Estimate and truth on common frames and people.
 
-    Time: `offset` (s) is added to the result's timestamps. The slower of the two sets
-    the frames; the faster is interpolated there (positions linearly, rotations on the
-    geodesic), across at most one and a half of its own frames; at its ends and gaps the
-    nearest frame within half a frame is taken. Other frames are dropped or masked, and
-    where frames are missing there are masked ones: nothing is a difference across them.
+    Time: `offset` (s) is added to the result's timestamps. The frames are those of the
+    slower of the two; the faster is interpolated (positions linearly, rotations on the
+    geodesic) across at most one and a half of its own frames. At its ends and gaps the
+    nearest frame within half a frame is taken; other frames are dropped or masked. Gaps
+    are filled with masked frames, so that no difference is taken across them.
 
-    People: the pairing with the least total loss, `e / (e + 1 m)` of the H-ATE of a
-    frame under alignment A3 (A1 without a camera), and 1 for a frame of the truth that
-    the estimate lacks, so that a piece of a track does not beat the whole. People
-    without partner are left out (`Evaluation.scope` says who).
+    People: the assignment with the least total loss. The loss of a pair is the mean
+    over the truth's frames of `e / (e + 1 m)`, with `e` the frame's H-ATE under
+    alignment A3 (A1 without a camera), and 1 where the estimate lacks the person, so
+    that a fragment of a track does not win over the whole. People without a partner are
+    left out and listed in `Evaluation.scope`.
 
     Feet: toes and heels of `body` if both sides' joints are that body's, else the ankle
     and foot joints.
 
     **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
     """
-    return _associate(result, truth, body, offset)[:2]
+    pair = _associate(result, truth, body, offset)
+    return pair.estimate.trajectories(pair.fps), pair.truth.trajectories(pair.fps)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Associated:
+    """A result and a truth on common frames and people."""
+
+    estimate: Samples
+    truth: Samples
+    fps: float
+    """1/s"""
+    feet: str
+    """The kind of foot points, in words."""
+    scope: Scope
 
 
 def _associate(
     result: Result, truth: Result, body: BodyModel | None, offset: float
-) -> tuple[Trajectories, Trajectories, str, Scope]:
-    """Estimate, truth, which points the feet are, and what is compared."""
+) -> _Associated:
+    """`associate`, on the host: nothing is compiled for a number of frames."""
     times = result.timestamps + offset
     slower = interval_of(times) >= 0.999 * interval_of(truth.timestamps)
     at = without_holes(times if slower else truth.timestamps)
@@ -130,20 +149,12 @@ def _associate(
         )
     frames = slice(overlap[0], overlap[-1] + 1)
     fps = 1 / interval_of(at)
-    everybody = range(len(found.present)), range(len(true.present))
-    pair = (
-        _bundle(found, frames, everybody[0], fps),
-        _bundle(true, frames, everybody[1], fps),
-    )
-    who, true_who = _match(*pair)
+    who, true_who = _match(found.cut(frames), true.cut(frames), fps)
     partner = dict(zip(true_who, who, strict=True))
     rate = interval_of(truth.timestamps) * fps
     scope = _scope(truth, (found, true), partner, rate)
-    found, true = (
-        _bundle(found, frames, who, fps),
-        _bundle(true, frames, true_who, fps),
-    )
-    return found, true, kind, scope
+    pair = found.cut(frames, who), true.cut(frames, true_who)
+    return _Associated(*pair, fps, kind, scope)
 
 
 def _scope(
@@ -152,8 +163,11 @@ def _scope(
     partner: dict[int, int],
     rate: float,
 ) -> Scope:
-    """What of the truth is compared, in frames of which `rate` (1) go on one of its
-    own; also those of its frames that the result's time does not reach."""
+    """How much of the truth is compared, in frames of the comparison.
+
+    `rate` is their number per frame of the truth. Frames of the truth outside the
+    result's time count as not compared.
+    """
     found, true = pair
 
     def counts(both: np.ndarray, own: np.ndarray) -> tuple[int, int]:
@@ -182,7 +196,7 @@ def _scope(
 
 
 def _from_a_line(points: Float[np.ndarray, "t 3"]) -> float:
-    """Root mean square distance from the line that fits best, m; NaN if a point is."""
+    """RMS distance from the best-fitting line, m; NaN if a point is not finite."""
     if not np.isfinite(points).all():
         return np.nan
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -193,27 +207,16 @@ def _span(times: Float[np.ndarray, " t"]) -> str:
     return f"{times[0]:.3f} to {times[-1]:.3f} s"
 
 
-def _bundle(
-    samples: Samples, frames: slice, people: Sequence[int], fps: float
-) -> Trajectories:
-    who = list(people)
-    return Trajectories(
-        jnp.asarray(samples.T_WC[frames]),
-        jnp.asarray(samples.camera_valid[frames]),
-        jnp.asarray(samples.joints[who][:, frames]),
-        jnp.asarray(samples.present[who][:, frames]),
-        jnp.asarray(samples.feet[who][:, frames]),
-        jnp.asarray(fps),
-    )
-
-
-def _match(found: Trajectories, true: Trajectories) -> tuple[list[int], list[int]]:
-    """Who is who: estimate's and truth's person of each pair, in the truth's order."""
+def _match(found: Samples, true: Samples, fps: float) -> tuple[list[int], list[int]]:
+    """Indices of the estimate's and the truth's person of each pair, in the truth's
+    order."""
     num, num_true = len(found.present), len(true.present)
     if num <= 1 and num_true <= 1:
         both = list(range(min(num, num_true)))
         return both, both
-    loss = np.asarray(_loss_of_all_pairs(to_bucket(found), to_bucket(true)))
+    length = bucket(len(found.available))
+    pair = found.trajectories(fps, length), true.trajectories(fps, length)
+    loss = np.asarray(_loss_of_all_pairs(*pair))
     never = np.isnan(loss)
     who, true_who = linear_sum_assignment(np.where(never, 1e6, loss))
     pairs = sorted(
@@ -244,7 +247,7 @@ def _loss_of_all_pairs(
         )
         lost = error.value / (error.value + 1.0)
         whole = Errors(jnp.where(valid, lost, 1.0), true_present)
-        # NaN where they are never known together.
+        # NaN if the two are never present together.
         return jnp.where(jnp.any(valid), whole.mean(), jnp.nan)
 
     over_truth = jax.vmap(loss, (None, None, 0, 0))
@@ -256,7 +259,7 @@ def _loss_of_all_pairs(
 def _feet(
     result: Result, truth: Result, body: BodyModel | None
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Foot points of both sides, of the same kind, and which."""
+    """Foot points of both sides (h, t, 4, 3; m), and their kind in words."""
     if body is not None:
         feet, true_feet = (_feet_of(x, body) for x in (result, truth))
         if feet is not None and true_feet is not None:

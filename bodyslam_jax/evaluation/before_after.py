@@ -1,6 +1,7 @@
-"""How far off a run is: cameras alone with arbitrary scale, then all of it in metres.
+"""Errors of a run before and after the joint optimisation.
 
-The difference is what people are for: the first has no unit until the truth lends it.
+Before it, structure from motion has cameras of arbitrary scale; after it, everything is
+in metres.
 """
 
 import dataclasses
@@ -21,14 +22,14 @@ _HEADLINE = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "scale")
 def errors(
     result: Result, cameras: SfmResult, truth: Result, body: BodyModel
 ) -> dict[str, dict[str, float | str]]:
-    """What `bodyslam evaluate` says, before and after the joint estimate.
+    """The errors of `bodyslam evaluate` before and after the joint optimisation.
 
-    Cameras alone are judged, if they moved, by what needs neither scale nor people; for
-    all else a word says what is missing. Without people that is all there is to say.
+    Cameras alone have those errors that need neither scale nor people, if they moved;
+    for others a word names what is missing. Without people there are no others.
     """
     after = evaluation.evaluate(result, truth, body)
     found: dict[str, dict[str, float | str]] = {}
-    # The people stay, unheeded: with them it is the same program.
+    # With the same people, so that the same compiled program is used.
     unscaled = dataclasses.replace(result, T_WC=cameras.T_WC)
     before = evaluation.evaluate(unscaled, truth, body)
     if cameras.kind == "moving" and np.isfinite(before["c_ate_sim3"]):
@@ -44,7 +45,7 @@ def errors(
 
 
 def headline(errors: dict[str, dict[str, float | str]]) -> list[str]:
-    """A line for each column of `errors`: what is first looked at."""
+    """The main errors, a line for each column of `errors`."""
     lines = []
     for name, found in errors.items():
         parts = [

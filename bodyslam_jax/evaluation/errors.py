@@ -1,4 +1,4 @@
-"""All errors of an estimate at once: a pure function of two aligned-in-time bundles."""
+"""All errors of an estimate at once, as a pure function of associated trajectories."""
 
 from collections.abc import Iterator
 
@@ -13,76 +13,77 @@ from bodyslam_jax.evaluation.alignment import Alignment, align, is_point
 
 NOBODY = -1
 STILL = 0.01
-"""m; a camera whose path has a smaller radius (root mean square) stands still."""
+"""m; a camera with a smaller RMS distance from its mean position stands still."""
 STRAIGHT = 0.1
-"""m, root mean square; how far about a path that is straighter a person is turned,
-alignment A1 hardly tells, and J-ATE is of little else."""
+"""m; RMS distance from a line below which a person's path does not determine the
+rotation about it in alignment A1, on which J-ATE then depends."""
 
 
 class Trajectories(eqx.Module):
-    """A camera and `h` people over `t` frames: what is compared, in one world frame.
+    """A camera and `h` people over `t` frames in one world frame.
 
-    Two of them are comparable when frame `k` is the same moment and person `i` the same
-    person in both; `associate` makes such a pair of two results.
+    Two of them can be compared if frame `k` is the same moment and person `i` the same
+    person in both; `associate` makes such a pair from two results.
     """
 
     T_WC: Float[Array, "*b t 4 4"]
     """Camera to world, m."""
     camera_valid: Bool[Array, "*b t"]
-    """Where the camera is known."""
+    """Frames in which the camera is known."""
     joints: Float[Array, "*b h t 24 3"]
-    """m"""
+    """m, world."""
     present: Bool[Array, "*b h t"]
-    """Where the person is known."""
+    """Frames in which the person is known."""
     feet: Float[Array, "*b h t f 3"]
-    """Points of the feet for `foot_sliding`, m."""
+    """Points of the feet for `foot_sliding`, m, world."""
     fps: Float[Array, "*b"]
     """1/s"""
 
 
 class Pair(eqx.Module):
-    """A person of the truth, and who of the estimate was taken for them."""
+    """A person of the truth, and the person of the estimate assigned to them."""
 
     truth: int
+    """Index in the truth."""
     estimate: int
-    """`NOBODY` if they are not found."""
+    """Index in the estimate; `NOBODY` if none is assigned."""
     frames: int
-    """In which both are known."""
+    """Frames in which both are known."""
     of_frames: int
-    """In which the truth is known."""
+    """Frames in which the truth is known."""
 
 
 class Scope(eqx.Module):
-    """How much of a truth an evaluation is about."""
+    """How much of a truth is compared."""
 
     cameras: int
     """Frames in which both cameras are known."""
     of_cameras: int
-    """In which the truth's is."""
+    """Frames in which the true camera is known."""
     people: tuple[Pair, ...]
     """One for each person of the truth."""
     others: int
-    """People of the estimate who are none of the truth's."""
+    """People of the estimate who are assigned to nobody of the truth."""
     straight: tuple[bool, ...] = ()
-    """For each of `people`: whether, where compared, their true pelvis stays within
-    `STRAIGHT` of a line."""
+    """For each of `people`: whether the true pelvis stays within `STRAIGHT` of a line,
+    in the frames compared."""
 
 
 class Evaluation(eqx.Module):
     """Errors by name in m, rad, s: `found["c_ate_se3"]` is a mean, `..._rmse` its RMSE.
 
-    A mapping: `keys`, `items`, `in` and `len` work. NaN where the truth (or the
-    estimate) lacks what the error is about, and where a frame that counts is NaN.
+    A mapping: `keys`, `items`, `in` and `len` work. An error is NaN if the truth or the
+    estimate lacks what it needs, or if a frame that counts is not finite.
     """
 
     values: dict[str, Float[Array, "*b"]]
-    """Cameras, and the mean over people of theirs."""
+    """Errors of the camera, and means over people of theirs."""
     people: dict[str, Float[Array, "*b h"]]
-    """The same names, person by person, in the truth's order; those matched only."""
+    """Errors of each assigned person, in the truth's order."""
     feet: str = eqx.field(static=True, default="the points given")
-    """What `foot_sliding` is of."""
+    """The points that `foot_sliding` is of, in words."""
     scope: Scope | None = None
-    """What was compared; `None` for `Trajectories`, which are all compared."""
+    """How much was compared; `None` for `Trajectories`, which are compared entirely."""
 
     def __getitem__(self, name: str) -> Float[Array, "*b"]:
         return self.values[name]
@@ -104,17 +105,17 @@ class Evaluation(eqx.Module):
 
 
 def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evaluation:
-    """Every error of module `_metrics`; jits, and vmaps over leading axes.
+    """Every error of module `metrics`; a pure function to jit, vmap and differentiate.
 
     `c_` is the camera, `h_` the human centre, `j_` the joints. `_se3` and `_sim3` are
     alignment A1 (camera and person each on its own), `_a2`, `_a3`, `_a4` the other
     three in SE(3). `scale` is that of the camera's Sim(3) alignment (paper: "scale
     error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
-    `STILL` has no scale, no Sim(3) and turns nothing: these and A2 are NaN then. An
-    estimated one that does not move at all has no scale and no Sim(3) either.
+    `STILL` determines neither scale nor rotation: `scale`, `_sim3` and `_a2` are NaN.
+    So are `scale` and `_sim3` for an estimated camera that does not move at all.
 
-    `gravity_error` and the figures of module `_plausibility` take y for up in the
-    estimate, as it is in a result.
+    `gravity_error` and the figures of module `plausibility` assume that y is up in the
+    estimate, as in a `Result`.
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
@@ -141,20 +142,23 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
         for side in (estimate, truth):
             broken |= _is_broken(side.T_WC, camera_valid)
             broken |= jax.vmap(_is_broken)(side.joints, counts)
+        # Also C-ATE under A3 and A4, which would exist by the camera alone.
+        absent = ~jnp.any(estimate.present | truth.present, 1)
+        people = {k: jnp.where(absent, jnp.nan, x) for k, x in people.items()}
         mean = lambda value: _mean_over_people(value, broken)
         values |= {name: mean(value) for name, value in people.items()}
     return Evaluation(values, people)
 
 
 def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether something that counts is not a number."""
+    """Whether a value in a frame that counts is not finite."""
     return jnp.any(valid & ~jnp.all(jnp.isfinite(x), tuple(range(1, x.ndim))))
 
 
 def _mean_over_people(
     value: Float[Array, " h"], broken: Bool[Array, " h"]
 ) -> Float[Array, ""]:
-    """Over those for whom the error exists; NaN if it is NaN as what counts is."""
+    """Over the people for whom the error exists; NaN if one's input is not finite."""
     exists = ~jnp.isnan(value) | broken
     return metrics.Errors(value, exists).mean()
 
@@ -168,7 +172,7 @@ def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array,
 
 
 def _stands(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether the camera is in one place, but for rounding; of any unit."""
+    """Whether the camera's positions coincide but for rounding, in any unit."""
     (centre,) = metrics.only(valid, T_WC[:, :3, 3])
     count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
     mean = jnp.sum(centre, 0) / count
@@ -269,19 +273,19 @@ def _person_errors(
         every = metrics.world_mpjpe(joints, true_joints, valid, "all", chunking)
         values |= _both(f"w_mpjpe{suffix}", first) | _both(f"wa_mpjpe{suffix}", every)
     values |= _both("rte", metrics.root_trajectory_error(centre, true_centre, valid))
-    seen = valid & camera_valid
+    in_view = valid & camera_valid
     in_camera, true_in_camera = (
-        metrics.camera_frame(*metrics.only(seen, points, T_WC))
+        metrics.camera_frame(*metrics.only(in_view, points, T_WC))
         for points, T_WC in ((joints, estimate.T_WC), (true_joints, truth.T_WC))
     )
-    values |= _both("mpjpe", metrics.mpjpe(in_camera, true_in_camera, seen))
+    values |= _both("mpjpe", metrics.mpjpe(in_camera, true_in_camera, in_view))
     values |= _both("pa_mpjpe", metrics.pa_mpjpe(joints, true_joints, valid))
     values |= _both(
         "acceleration_error",
         metrics.acceleration_error(
             metrics.hip_centred(in_camera),
             metrics.hip_centred(true_in_camera),
-            seen,
+            in_view,
             estimate.fps,
         ),
     )

@@ -1,11 +1,10 @@
 """Errors of cameras and people, each with its exact definition and its source.
 
 Arrays of one person and one camera over `t` frames; `valid` marks the frames that
-count, and what stands in the others is ignored. An error is an array with its own mask
-(`Errors`), of which `mean` and `rmse` are taken. SI units: m, rad, s. Estimate first,
-truth second. Differences in time are taken between valid frames that are neighbours,
-never across a gap; RTE and the 100-frame chunks drop invalid frames first, as their
-sources do.
+count, and values in others are ignored. An error is an array with a mask of its own
+(`Errors`), which has a `mean` and an `rmse`. SI units: m, rad, s. Estimate first, truth
+second. Differences in time are taken between neighbouring valid frames, never across a
+gap; RTE and the 100-frame chunks drop invalid frames first, as their sources do.
 """
 
 from typing import Literal
@@ -28,17 +27,17 @@ CHUNK = 100
 
 
 class Errors(eqx.Module):
-    """One error per frame (and joint), and which of them exist."""
+    """One error per frame (and joint), and a mask of those that exist."""
 
     value: Float[Array, "*n"]
     valid: Bool[Array, "*n"]
 
     def mean(self) -> Float[Array, ""]:
-        """Mean over what exists; NaN if nothing does."""
+        """Mean over the errors that exist; NaN without any."""
         return self._average(self.value)
 
     def rmse(self) -> Float[Array, ""]:
-        """Root of the mean square over what exists; NaN if nothing does."""
+        """Root of the mean square over the errors that exist; NaN without any."""
         square = self._average(self.value**2)
         return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
 
@@ -57,7 +56,8 @@ def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
 
 
 def only(valid: Bool[Array, " t"], *arrays: Float[Array, "t ..."]) -> list[Array]:
-    """Zeros where frames do not count, so that not even NaN there spreads."""
+    """The arrays with zeros in frames that do not count, so that NaN there does not
+    propagate."""
     shaped = lambda x: valid.reshape(valid.shape + (1,) * (x.ndim - 1))
     return [jnp.where(shaped(x), x, 0) for x in arrays]
 
@@ -160,10 +160,8 @@ def pa_mpjpe(
 
 
 def _chunks(valid: Bool[Array, " t"], chunking: Chunking):
-    """Chunk and place within it of each frame, counting valid frames only.
-
-    Also which frames belong to a chunk at all: TRAM drops some.
-    """
+    """Chunk of each frame, its index within the chunk counting valid frames only, and
+    whether it belongs to a chunk at all: TRAM drops some."""
     rank = jnp.cumsum(valid) - 1
     if chunking == "wham":
         return rank // CHUNK, rank % CHUNK, valid

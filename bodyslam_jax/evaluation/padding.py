@@ -3,10 +3,11 @@
 What is added is masked: errors are those of the unpadded trajectories, to rounding.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from bodyslam_jax.evaluation.errors import Trajectories
 
@@ -27,16 +28,25 @@ def bucket(num_frames: int) -> int:
 
 def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
     """The same with masked frames added at the end, up to `num_frames`."""
-    missing = num_frames - trajectories.T_WC.shape[0]
-    if not missing:
-        return trajectories
-    return Trajectories(
-        _pad(trajectories.T_WC, 0, missing, "edge"),
-        _pad(trajectories.camera_valid, 0, missing),
-        _pad(trajectories.joints, 1, missing, "edge"),
-        _pad(trajectories.present, 1, missing),
-        _pad(trajectories.feet, 1, missing, "edge"),
-        trajectories.fps,
+    t = trajectories
+    if num_frames == t.T_WC.shape[0]:
+        return t
+    arrays = padded_frames(
+        (t.T_WC, t.camera_valid, t.joints, t.present, t.feet), num_frames
+    )
+    return Trajectories(*map(jnp.asarray, arrays), t.fps)
+
+
+def padded_frames(arrays: tuple[Any, ...], num_frames: int) -> tuple[Any, ...]:
+    """The same arrays of `Trajectories`, `T_WC` to `feet`, with masked frames added."""
+    T_WC, camera_valid, joints, present, feet = arrays
+    missing = num_frames - len(T_WC)
+    return (
+        _pad(T_WC, 0, missing, "edge"),
+        _pad(camera_valid, 0, missing),
+        _pad(joints, 1, missing, "edge"),
+        _pad(present, 1, missing),
+        _pad(feet, 1, missing, "edge"),
     )
 
 
@@ -51,9 +61,9 @@ def pad_people(trajectories: Trajectories, num_people: int) -> Trajectories:
     return Trajectories(
         trajectories.T_WC,
         trajectories.camera_valid,
-        _pad(trajectories.joints, 0, missing),
-        _pad(trajectories.present, 0, missing),
-        _pad(trajectories.feet, 0, missing),
+        jnp.asarray(_pad(trajectories.joints, 0, missing)),
+        jnp.asarray(_pad(trajectories.present, 0, missing)),
+        jnp.asarray(_pad(trajectories.feet, 0, missing)),
         trajectories.fps,
     )
 
@@ -63,10 +73,9 @@ def to_bucket(trajectories: Trajectories) -> Trajectories:
     return pad_frames(trajectories, bucket(trajectories.T_WC.shape[0]))
 
 
-def _pad(x: Array, axis: int, missing: int, mode: str = "constant") -> Array:
+def _pad(x: Any, axis: int, missing: int, mode: str = "constant") -> Any:
     widths = [(0, missing * (i == axis)) for i in range(x.ndim)]
     if isinstance(x, jax.core.Tracer):
         return jnp.pad(x, widths, mode)
     # On the host: `jnp.pad` would be compiled for each shape.
-    pad = np.pad(np.asarray(x), widths, mode)  # pyright: ignore[reportCallIssue]
-    return jnp.asarray(pad)
+    return np.pad(np.asarray(x), widths, mode)  # pyright: ignore[reportCallIssue]

@@ -1,8 +1,8 @@
-"""Figures of one side alone, estimate or truth: gravity, feet, knees, acceleration.
+"""Plausibility of one side, estimate or truth: gravity, feet, knees, acceleration.
 
-Errors of trajectories do not see that somebody slides, floats or crouches. These are
-the figures by which a result is doubted (`bodyslam_jax.diagnostics`), as functions that
-jit and map; each is told of the estimate and of the truth, side by side.
+Errors of trajectories do not show that a person slides, floats or crouches. These are
+the quantities by which `bodyslam_jax.diagnostics` judges a result, as functions that
+jit and vmap; they are reported for the estimate and for the truth.
 """
 
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from bodyslam_jax.evaluation.metrics import norm, only
 _HIPS, _KNEES, _ANKLES, _FEET = map(np.array, (HIPS, KNEES, ANKLES, FEET))
 _LOWEST = np.array(ANKLES_AND_FEET)
 _UPRIGHT = float(np.cos(np.radians(35.0)))
-"""People's trunks are this near an axis of the world, if that is up."""
+"""Cosine of the angle between people's mean trunk and the up axis, at least."""
 Y = np.array([0.0, 1.0, 0.0])
 """Up in a result."""
 
@@ -31,8 +31,10 @@ Y = np.array([0.0, 1.0, 0.0])
 def up_axis(
     joints: Float[Array, "h t 24 3"], present: Bool[Array, "h t"]
 ) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
-    """The axis of the world that is up, the one along which trunks point on average,
-    and whether that is known: it is within 35 degrees of that, and somebody is there.
+    """The axis of the world that is up, and whether it is known.
+
+    It is the axis nearest to the mean direction of people's trunks, and known if that
+    is within 35 degrees.
     """
     trunk = jnp.where(
         present[..., None], joints[..., NECK, :] - joints[..., PELVIS, :], 0
@@ -51,15 +53,15 @@ def gravity_error(
     valid: Bool[Array, " t"],
     true_up: Float[Array, " 3"],
 ) -> Float[Array, ""]:
-    """Mean angle between up in the estimate, y, and in the truth, seen from the camera,
-    rad: no alignment has a part in it. NaN without cameras."""
+    """Mean angle between the up directions of estimate (y) and truth in the camera's
+    frame, rad, which needs no alignment. NaN without cameras."""
     T, true_T = (
         jnp.where(valid[:, None, None], x, jnp.eye(4, dtype=x.dtype))
         for x in (T_WC, true_T_WC)
     )
     up = T[:, 1, :3]
     true_up_C = jnp.einsum("tji,j->ti", true_T[:, :3, :3], true_up)
-    # Of small angles the sine is exact, where the cosine is flat.
+    # By sine and cosine: the arc cosine is inaccurate at small angles.
     angle = jnp.arctan2(norm(jnp.cross(up, true_up_C)), jnp.sum(up * true_up_C, -1))
     return _mean(angle, valid)
 
@@ -70,7 +72,7 @@ def posture_figures(
     up: Float[Array, " 3"],
     fps: Float[Array, ""],
 ) -> dict[str, Float[Array, ""]]:
-    """One person's figures, in rad, m, s.
+    """Quantities of one person's posture and motion, in rad, m, s.
 
     `knee`, `straighter_knee`: mean angle between thigh and shin, of both and of the
     straighter leg. `feet_low`, `feet_high`: 5th and 95th percentile of the height of
@@ -121,7 +123,7 @@ def _mean(x: Float[Array, " n"], valid: Bool[Array, " n"]) -> Float[Array, ""]:
 def _quantile(
     x: Float[Array, "*n"], valid: Bool[Array, "*#n"], share: float
 ) -> Float[Array, ""]:
-    """Of what counts; NaN if nothing does, or if a number that counts is none."""
+    """Quantile of the valid values; NaN without any, or if one of them is NaN."""
     if not x.size:  # differences of one frame or two
         return jnp.full((), jnp.nan, x.dtype)
     broken = jnp.any(jnp.isnan(x) & valid)

@@ -40,7 +40,7 @@ def read_result(path: Path) -> Result:
     what was expected.
     """
     file = path / "result.npz" if path.is_dir() else path
-    arrays = _load_npz(file)
+    arrays = load_npz(file)
     missing = [name for name in _RUN_FIELDS if name not in arrays]
     if missing:
         raise ValueError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
@@ -78,8 +78,8 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     `path` is a folder with `camera.txt` (TUM, camera to world) and `body.npz` (AMASS
     style; or `body_0.npz`, `body_1.npz` ... for several people), a sequence folder with
     such a `groundtruth/`, a run folder, or one such file. Bodies start at the camera's
-    first timestamp. Joints that a file does not hold come from `body`. What is not
-    known is absent: `summary["has_camera"]` is false, or there are no people.
+    first timestamp. Bodies without joints are posed with `body`. Without a camera
+    `summary["has_camera"]` is false; without bodies there are no people.
 
     **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
     what was expected.
@@ -95,19 +95,19 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
         bodies = sorted(path.glob("body.npz")) or sorted(path.glob("body_*.npz"))
         landmarks = path / "landmarks.npy"
     elif path.suffix == ".npz":
-        if "T_WC" in _load_npz(path):
+        if "T_WC" in load_npz(path):
             return read_result(path)
         cameras, bodies, landmarks = [], [path], None
     else:
         cameras, bodies, landmarks = [path], [], None
     if not cameras and not bodies:
         raise ValueError(f"{path}: neither camera.txt nor body.npz in this folder.")
-    people = [_read_body(file, body) for file in bodies]
+    people = [read_body(file, body) for file in bodies]
     camera = read_tum(cameras[0]) if cameras else None
     times, T_WC = _timeline(camera, people)
     if camera is not None:
         for file, person in zip(bodies, people, strict=True):
-            _tell_beyond(file, person, times)
+            _warn_of_rest(file, person, times)
     placed = [_at(person, times, camera is not None) for person in people]
     stack = lambda name, *shape: np.reshape(
         [person[name] for person in placed], (len(placed), *shape)
@@ -130,7 +130,7 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
 def _timeline(
     camera: tuple[np.ndarray, np.ndarray] | None, people: list[dict[str, Any]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The denser of camera and bodies sets the moments; the camera's poses there."""
+    """Timestamps of the denser of camera and bodies, and the camera's poses there."""
     longest = max(people, key=lambda p: len(p["poses"]), default=None)
     if camera is None:
         assert longest is not None
@@ -145,7 +145,7 @@ def _timeline(
     return at[available], interpolate_poses(T_WC, between)[available]
 
 
-def _tell_beyond(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
+def _warn_of_rest(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
     """Warns of bodies after the last true camera, which are left out."""
     num, fps = len(person["poses"]), person["fps"]
     beyond = times[0] + (num - 1) / fps - times[-1]
@@ -160,7 +160,7 @@ def _tell_beyond(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
 def _at(
     person: dict[str, Any], times: np.ndarray, has_camera: bool
 ) -> dict[str, np.ndarray]:
-    """One person at the moments of the timeline."""
+    """One person at the given timestamps."""
     num, fps = len(person["poses"]), person["fps"]
     own = times[0] + np.arange(num) / fps
     if (
@@ -168,13 +168,13 @@ def _at(
         and num == len(times) > 1
         and abs(np.median(np.diff(times)) * fps - 1) < 0.02
     ):
-        own = times  # frame by frame, whatever the camera's clock does
+        own = times  # frame by frame, also if the camera's rate varies
     between = bracket(own, times)
     before, after, weight = between.before, between.after, between.weight
     w = weight[:, None]
     nearest = np.where(weight < 0.5, before, after)
     trans, joint, present = person["trans"], person["joints"], person["present"]
-    # Of a place between two frames both must be known.
+    # Between two frames, both must be known.
     known = (present[before] | (weight == 1)) & (present[after] | (weight == 0))
     return {
         "poses": person["poses"][nearest],
@@ -185,12 +185,12 @@ def _at(
     }
 
 
-def _read_body(path: Path, body: BodyModel) -> dict[str, Any]:
+def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
     """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10.
 
     An optional `present` (t,) says in which frames the person is known.
     """
-    arrays = _load_npz(path)
+    arrays = load_npz(path)
     missing = [name for name in ("poses", "trans", "betas") if name not in arrays]
     rate = next((n for n in _RATES if n in arrays), None)
     if missing or rate is None:
@@ -272,7 +272,7 @@ def _landmarks(path: Path | None) -> np.ndarray:
     return _float(found)
 
 
-def _load_npz(path: Path) -> dict[str, np.ndarray]:
+def load_npz(path: Path) -> dict[str, np.ndarray]:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file.")
     try:
@@ -286,10 +286,10 @@ _UNREADABLE = (
     *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, AttributeError),
     *(OSError, NotImplementedError),
 )
-"""What NumPy raises of damaged archives."""
+"""Errors that NumPy raises on damaged archives."""
 
 _OBJECTS = ("marker_data", "marker_labels")
-"""Of AMASS; not needed, and at times pickled."""
+"""Arrays of AMASS that are not needed, and pickled in some files."""
 
 
 def _float(array: Any) -> np.ndarray:

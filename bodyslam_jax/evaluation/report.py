@@ -1,4 +1,4 @@
-"""Errors as rows, as a table, as JSON; and what they are about, in a line."""
+"""Errors as rows, a table or JSON; and what was compared, in words."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from bodyslam_jax.evaluation.errors import (
 )
 
 _FEW = 3
-"""Poses, from which on an alignment leaves errors to be seen."""
+"""Poses from which an alignment leaves errors."""
 
 _MM, _PERCENT, _DEGREES = 1e3, 100.0, 180 / math.pi
 ROWS: tuple[tuple[str, str, str, float], ...] = (
@@ -64,7 +64,7 @@ ROWS: tuple[tuple[str, str, str, float], ...] = (
 
 
 def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
-    """What, mean, RMSE and unit of every error that exists, ready to print."""
+    """Label, mean, RMSE and unit of every error that exists, as text."""
 
     def cell(name: str, factor: float) -> str:
         value = float(evaluation[name]) * factor if name in evaluation else math.nan
@@ -84,19 +84,17 @@ def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
 
 
 def to_table(evaluation: Evaluation) -> str:
-    """The errors as aligned text: mean and RMSE, mm and degrees where customary.
-
-    What was compared stands above, if it is known.
-    """
+    """The errors as aligned text: mean and RMSE, in mm and degrees where customary;
+    above them what was compared, if it is known."""
     rows = [("", "mean", "RMSE", "unit"), *to_rows(evaluation)]
     width = max(len(row[0]) for row in rows)
     lines = [f"{a:<{width}}  {b:>9}  {c:>9}  {d}".rstrip() for a, b, c, d in rows]
-    said = [] if evaluation.scope is None else [describe(evaluation.scope), ""]
-    return "\n".join([*said, lines[0], "-" * (width + 31), *lines[1:]])
+    scope = [] if evaluation.scope is None else [describe(evaluation.scope), ""]
+    return "\n".join([*scope, lines[0], "-" * (width + 31), *lines[1:]])
 
 
 def describe(scope: Scope) -> str:
-    """What was compared, in a line: cameras, and whom with whom."""
+    """What was compared, in a line: frames of the camera, and pairs of people."""
     parts = [f"cameras in {scope.cameras} of {scope.of_cameras} frames"]
     if not scope.of_cameras:
         parts = ["no true cameras"]
@@ -113,7 +111,10 @@ def describe(scope: Scope) -> str:
 
 
 def gaps(scope: Scope, least: float = 0.9) -> list[str]:
-    """What errors do not tell, as they leave it out: warnings, a line each."""
+    """Warnings about parts of the truth that the errors leave out, a line each.
+
+    `least` is the share of frames below which a comparison is incomplete.
+    """
     found = []
     if scope.cameras < least * scope.of_cameras:
         found.append(
@@ -143,7 +144,7 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
 
 
 def _compared(scope: Scope) -> dict[str, Any]:
-    """As `dict`s; who is not found has no number."""
+    """As dictionaries; the number of a person who is not found is `None`."""
     people = [
         {**vars(pair), "estimate": None if pair.estimate == NOBODY else pair.estimate}
         for pair in scope.people

@@ -1,10 +1,13 @@
-"""A result at other moments: positions linearly, rotations on the geodesic, no gaps."""
+"""Results at other timestamps: positions linearly, rotations on the geodesic."""
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.evaluation.errors import Trajectories
+from bodyslam_jax.evaluation.padding import padded_frames
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 
@@ -28,6 +31,26 @@ class Samples:
     """m, world."""
     available: Bool[np.ndarray, " t"]
     """Moments at which there was a frame, or two to interpolate between."""
+
+    def cut(self, frames: slice, people: list[int] | None = None) -> "Samples":
+        """A range of frames, and some people in a given order."""
+        everybody = list(range(len(self.present)))
+        who = everybody if people is None else people
+        return Samples(
+            self.T_WC[frames],
+            self.camera_valid[frames],
+            self.joints[who][:, frames],
+            self.present[who][:, frames],
+            self.feet[who][:, frames],
+            self.available[frames],
+        )
+
+    def trajectories(self, fps: float, num_frames: int | None = None) -> Trajectories:
+        """As JAX arrays, padded with masked frames up to `num_frames`; `fps` in 1/s."""
+        arrays = (self.T_WC, self.camera_valid, self.joints, self.present, self.feet)
+        if num_frames is not None:
+            arrays = padded_frames(arrays, num_frames)
+        return Trajectories(*map(jnp.asarray, arrays), jnp.asarray(fps))
 
 
 def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:

@@ -1,4 +1,4 @@
-"""`.npz` files of other people: opened without unpickling, checked array by array."""
+"""`.npz` files of unknown origin: opened without unpickling, checked by array."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,11 @@ def open_npz(path: Path) -> "np.lib.npyio.NpzFile":
 
 
 def numbers(path: Path, archive: Any, key: str, *, finite: bool = True) -> np.ndarray:
-    """A float64 array of an archive; `ValueError` if not all finite numbers, unless
-    `finite` is false."""
+    """A float64 array of an archive.
+
+    **Raises:** `ValueError`, naming the file, if the array holds anything but numbers
+    or, unless `finite` is false, numbers that are not finite.
+    """
     try:
         array = archive[key]
     except Exception as error:

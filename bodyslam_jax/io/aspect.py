@@ -1,8 +1,7 @@
-"""Pixels that are not square: what the file says of them, and what the camera does.
+"""Pixels that are not square: the container's aspect ratio against the calibration's.
 
-Images are never stretched: keypoints, masks and results stay in the pixels that are
-stored, and the two focal lengths differ. `fx / fy` is the height of a pixel over its
-width.
+Images are never stretched: keypoints, masks and results are in the stored pixels, and
+fx differs from fy. `fy / fx` is the width of a pixel over its height.
 """
 
 import dataclasses
@@ -13,12 +12,12 @@ from bodyslam_jax.io.video import Footage
 from bodyslam_jax.types import Intrinsics
 
 _SQUARE = 0.01
-"""Difference from 1 of a ratio that is 1."""
+"""Difference of a ratio from 1 that counts as none."""
 
 
 def at_size_of(intrinsics: Intrinsics, footage: Footage) -> Intrinsics:
-    """The camera in the pixels that are stored, where it was given for those shown:
-    players stretch the images of such a video to square pixels."""
+    """The camera in stored pixels, if it was calibrated in images that a player has
+    stretched to square pixels."""
     shown = round(footage.width * footage.pixel_aspect), footage.height
     stored = footage.width, footage.height
     if shown == stored or (intrinsics.width, intrinsics.height) != shown:
@@ -31,18 +30,18 @@ def at_size_of(intrinsics: Intrinsics, footage: Footage) -> Intrinsics:
 
 
 def aspect_warnings(intrinsics: Intrinsics, footage: Footage) -> tuple[str, ...]:
-    """What is to be said of pixels that are not square."""
-    said = footage.pixel_aspect
+    """Warnings about pixels that are not square."""
+    declared = footage.pixel_aspect
     used = float(intrinsics.params[1] / intrinsics.params[0])
-    if abs(said - 1) < _SQUARE:
+    if abs(declared - 1) < _SQUARE:
         return ()
     name = footage.path.name
-    if abs(used / said - 1) < _SQUARE:
+    if abs(used / declared - 1) < _SQUARE:
         return (
-            f"{name}: its pixels are {said:.4g} times as wide as high, as it says "
+            f"{name}: its pixels are {declared:.4g} times as wide as high, as it says "
             "itself: fx and fy differ by that.",
         )
     return (
-        f"{name}: says that its pixels are {said:.4g} times as wide as high, but "
+        f"{name}: says that its pixels are {declared:.4g} times as wide as high, but "
         f"camera.json has fy/fx = {used:.4g}: camera.json used.",
     )

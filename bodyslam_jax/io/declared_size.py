@@ -1,4 +1,4 @@
-"""The size of the images that a file says it is about, against that of the video."""
+"""Sizes of images that a file declares, compared with that of the video."""
 
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ Size = tuple[float, float]
 """Width and height, px."""
 
 _SAME_ASPECT = 0.015
-"""Relative difference of two aspects that is left by rounding to even sizes."""
+"""Relative difference of two aspect ratios that rounding to even sizes may leave."""
 _BEYOND = 0.1
-"""Share of the points beyond a size from which the points are not in images of it."""
+"""Share of the points outside the declared size from which that size is not theirs."""
 
 
 def size_in(path: Path, data: Any) -> Size | None:
@@ -78,11 +78,13 @@ def factor_to(
     what: str,
     warn: Warn,
 ) -> float:
-    """What pixels of images of the size `declared` are multiplied by, for those of the
-    video; by `scaled`.
+    """The factor, for `scaled`, from pixels of images of size `declared` to pixels of
+    the video of `size` (width, height).
 
     Args:
-        points: some of them, (n, 2), to see whether they can be in such images.
+        points: some of the points (n, 2; px), to check that they fit images of the
+            declared size.
+        what: the points are, for messages.
 
     **Raises:** `InvalidContent` if the images are of another aspect, or turned.
     """
@@ -108,5 +110,6 @@ def factor_to(
 
 
 def scaled(uv: np.ndarray, factor: float) -> np.ndarray:
-    """Pixels of resized images: corners stay where they are, not pixels' centres."""
+    """Pixels in images resized by `factor`, which keeps the images' corners, not the
+    centres of pixels."""
     return (uv + 0.5) * factor - 0.5

@@ -1,7 +1,8 @@
 """Names of images, or of files about them -> frames of the video.
 
 Tools count from 0, from 1 or from where a longer video was cut, and some leave out the
-images in which they found nobody. What the names leave open is assumed with a warning.
+images in which they found nobody. Where the names are ambiguous, the likeliest reading
+is taken, with a warning.
 """
 
 import re
@@ -18,11 +19,12 @@ _SUFFIX = re.compile(
 
 
 _SPARSEST = 100
-"""Times as many frames as are named, above which the numbers are others: times, say."""
+"""Ratio of the last number to the count of names above which the numbers are no frame
+numbers, but times for example."""
 
 
 class InvalidContent(ValueError):
-    """What is wrong with a file's content; the caller adds the file's name."""
+    """An error in a file's content; whoever catches it adds the file's name."""
 
 
 def frames_of_names(
@@ -68,9 +70,9 @@ def frames_of_names(
 
 
 def gap_among(images: Sequence[str]) -> str | None:
-    """What to warn of where numbers in the names of a video's images leave some out.
+    """A warning if the numbers in the names of a video's images have gaps.
 
-    One in ten may: where more are wide, images were thinned to another rate.
+    With gaps at more than one image in ten, images were thinned on purpose: no warning.
     """
     numbers = _numbers([_stem(name) for name in images]) or []
     steps = [b - a for a, b in zip(numbers, numbers[1:])]
@@ -160,14 +162,12 @@ def _first(
         if complete and unbroken:
             warn(
                 f"{what} numbered 0 to {last} for {num_frames} frames: taken as "
-                "counted "
-                f"from 0, the first {len(numbers)}; but what writes every frame that "
-                "it "
-                "sees has been given fewer, perhaps every n-th."
+                f"counted from 0, the first {len(numbers)}; but the tool, which writes "
+                "every frame, may have been given every n-th frame only."
             )
         return 0
-    # Whoever lists every image would have listed number 0, but some have been deleted
-    # where there are gaps.
+    # A tool that lists every image would have listed number 0, unless files have been
+    # deleted, as gaps in the numbers show.
     zero = 1 if complete and unbroken and first == 1 else 0
     warn(
         f"{what} numbered {first} to {last} for {num_frames} frames: taken as counted "

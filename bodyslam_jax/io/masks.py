@@ -1,7 +1,7 @@
-"""Masks that are given: which file is of which frame, and whether they can be right.
+"""Person masks: which file belongs to which frame, and whether they are plausible.
 
-A look at some of them, when the input is read: inverted masks, masks of another size,
-of another video or without anybody in them would be noticed by nothing but a bad map.
+Some of them are checked when the input is read. Masks that are inverted, of another
+size, of another video or empty would otherwise only show as a bad map.
 """
 
 from pathlib import Path
@@ -15,22 +15,27 @@ from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.video import list_images
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, MaskUse
 
-_LOOKED_AT = 12
-"""Masks that are looked at when the input is read."""
+_NUM_CHECKED = 12
+"""Masks that are checked when the input is read."""
 _SURE = 0.3
-_FEWEST_POINTS = 20
-_MOST = 0.5
-"""Share of the image that people seldom fill, and of masks that say the same."""
-_BORDER = 0.75
+"""Confidence of a keypoint that is compared with the masks."""
+_MIN_POINTS = 20
+"""Points of a person, in all checked frames, for a comparison."""
+_MAX_AREA = 0.5
+"""Share of the image that people seldom fill."""
+_MAX_BORDER = 0.75
 """Share of the image's border that people never fill."""
-_OUTSIDE = 0.35
-"""Share of a person's points within the masks below which these are not theirs."""
+_MIN_COVERED = 0.35
+"""Share of a person's points within the masks; with less, masks are not theirs."""
 _NOTHING_LEFT = 0.9
-_NEAR = 0.02
-"""Of the image's longer side: keypoints may be so far outside a mask's rim."""
-_SAME_ASPECT = 0.015
+"""Share of the image from which too little is left for tracking."""
+_MARGIN = 0.02
+"""Distance of a keypoint from a mask that still counts as within, as a share of the
+image's longer side."""
+_ASPECT_TOLERANCE = 0.015
+"""Difference of the logarithms of two aspect ratios that counts as none."""
 _ABOUT_PELVIS = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.5, -0.2, 0.3)])
-"""m, of places that belong to most bodies, in whatever posture."""
+"""Points relative to the pelvis, m, that lie on most bodies in any posture."""
 
 
 def read_masks(
@@ -43,25 +48,25 @@ def read_masks(
     bodies: Bodies | None = None,
     warn: Warn,
 ) -> MaskUse:
-    """How the masks in a folder are to be used, after a look at some of them.
+    """How the masks in a folder are to be used, after checking some of them.
 
-    Masks whose zeros are the people are inverted, with a warning, and masks of another
-    size but the same shape resized. Where masks do not cover the people, or are not
-    there for all frames, people's keypoints are painted, too.
+    Masks in which zero marks people are inverted, and masks of another size but the
+    same aspect ratio are resized, both with a warning. If masks do not cover the
+    people, or some frames have none, regions around keypoints are masked, too.
 
-    **Raises:** `ValueError`, naming folder or file, if there are not as many masks as
-    frames, and numbers in their names do not say which are missing, or if their shape
-    is not the images'.
+    **Raises:** `ValueError`, naming folder or file, if masks are missing and the
+    numbers in their names do not tell which, or if their aspect ratio is not that of
+    the images.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: not a folder of mask images.")
     names = [path.name for path in list_images(folder)]
     files, missing = _by_frame(folder, names, num_frames, images, warn)
-    there = [k for k in range(num_frames) if k not in missing]
-    looked_at = np.unique(np.linspace(0, len(there) - 1, _LOOKED_AT).astype(int))
+    present = [k for k in range(num_frames) if k not in missing]
+    checked = np.unique(np.linspace(0, len(present) - 1, _NUM_CHECKED).astype(int))
     size = (intrinsics.width, intrinsics.height)
     masks, resized = {}, ""
-    for k in (there[i] for i in looked_at):
+    for k in (present[i] for i in checked):
         masks[k] = read_mask(folder / files[k][0])
         found = (masks[k].shape[1], masks[k].shape[0])
         if found != size:
@@ -75,8 +80,8 @@ def read_masks(
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
-    """Where a mask is not zero; of a lossy image, where it is bright. An image that has
-    nothing but transparency to tell is read by that.
+    """Where a mask is not zero; in a lossy format, where it is bright. An image of one
+    colour with a varying alpha channel is read by that channel.
 
     **Raises:** `ValueError`, naming the file, if it is no image.
     """
@@ -96,12 +101,12 @@ def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
 def resized_to(
     path: Path, mask: Bool[np.ndarray, "y x"], size: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """The mask for images of that size (width, height).
+    """The mask resized to `size` (width, height; px).
 
-    **Raises:** `ValueError`, naming the file, if its shape is another.
+    **Raises:** `ValueError`, naming the file, if its aspect ratio is another.
     """
     height, width = mask.shape
-    if abs(np.log(width / height * size[1] / size[0])) > _SAME_ASPECT:
+    if abs(np.log(width / height * size[1] / size[0])) > _ASPECT_TOLERANCE:
         raise ValueError(
             f"{path}: {width}x{height} px, but the video is {size[0]}x{size[1]} px."
         )
@@ -112,8 +117,8 @@ def resized_to(
 def _by_frame(
     folder: Path, names: list[str], num_frames: int, images: tuple[str, ...], warn: Warn
 ) -> tuple[list[tuple[str, ...]], set[int]]:
-    """The masks of each frame, and the frames without one of their own, which have
-    those before and after."""
+    """Names of the masks of each frame, and the frames without a mask of their own,
+    which use the nearest ones before and after."""
     if len(names) == num_frames:
         return [(name,) for name in names], set()
     count = f"{len(names)} masks, but the video has {num_frames} frames"
@@ -154,7 +159,7 @@ def _by_frame(
 def _points(
     people: Keypoints | None, bodies: Bodies | None, intrinsics: Intrinsics
 ) -> Float[np.ndarray, "h t n 3"] | None:
-    """Of each person in each frame points (u px, v px, 1 where it is there, else 0)."""
+    """Image points of each person in each frame: u px, v px, 1 or 0 if missing."""
     if people is not None:
         sure = people.confidence > _SURE
         seen = sure if sure.any() else people.confidence > 0
@@ -163,21 +168,21 @@ def _points(
         return None
     place = bodies.trans[:, :, None] + _ABOUT_PELVIS
     uv = project_points(intrinsics, place.reshape(-1, 3)).reshape(*place.shape[:3], 2)
-    there = np.broadcast_to(bodies.present[..., None], uv.shape[:3])
-    return np.concatenate([uv, there[..., None].astype(float)], axis=-1)
+    present = np.broadcast_to(bodies.present[..., None], uv.shape[:3])
+    return np.concatenate([uv, present[..., None].astype(float)], axis=-1)
 
 
 def _judged(
     masks: dict[int, np.ndarray], points: np.ndarray | None, warn: Warn
 ) -> tuple[bool, bool]:
-    """Whether masks are inverted, and whether they cover anybody then."""
+    """Whether masks are inverted, and whether they cover the people, then."""
     area = float(np.median([mask.mean() for mask in masks.values()]))
     border = float(np.median([_on_border(mask) for mask in masks.values()]))
     within = _within(masks, points)
     least = within.min(initial=1.0)
-    inverted = bool(border > _BORDER and area > _MOST and least < _OUTSIDE)
+    inverted = bool(border > _MAX_BORDER and area > _MAX_AREA and least < _MIN_COVERED)
     if not len(within):
-        inverted = border > _BORDER and _MOST < area < 1
+        inverted = border > _MAX_BORDER and _MAX_AREA < area < 1
     if inverted:
         what = "they touch nearly all of its border"
         if len(within):
@@ -187,7 +192,7 @@ def _judged(
     if area > _NOTHING_LEFT:
         warn(f"masks: {100 * area:.0f} % of the image: little is left to follow.")
     most = within.max(initial=0.0)
-    if len(within) and most < _OUTSIDE:
+    if len(within) and most < _MIN_COVERED:
         what = "nothing" if area == 0 else f"{100 * most:.0f} % of people's points"
         warn(
             f"masks: cover {what}: of another video? People's keypoints are masked "
@@ -198,15 +203,15 @@ def _judged(
 
 
 def _within(masks: dict[int, np.ndarray], points: np.ndarray | None) -> np.ndarray:
-    """For each person of whom enough is seen, the share of points in the masks."""
+    """For each person with enough points, the share of them within the masks."""
     if points is None:
         return np.zeros(0)
     count, hit = np.zeros(len(points)), np.zeros(len(points))
     for k, mask in masks.items():
-        near = 2 * max(1, round(_NEAR * max(mask.shape))) + 1
+        near = 2 * max(1, round(_MARGIN * max(mask.shape))) + 1
         wide = cv2.dilate(mask.astype(np.uint8), np.ones((near, near), np.uint8))
         height, width = mask.shape
-        if mask.mean() > _MOST:
+        if mask.mean() > _MAX_AREA:
             wide = mask.astype(np.uint8)
         u, v = np.round(points[:, k, :, 0]), np.round(points[:, k, :, 1])
         inside = (points[:, k, :, 2] > 0) & (u >= 0) & (v >= 0)
@@ -214,7 +219,7 @@ def _within(masks: dict[int, np.ndarray], points: np.ndarray | None) -> np.ndarr
         at = np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)
         count += inside.sum(axis=1)
         hit += (inside & (wide[at] > 0)).sum(axis=1)
-    enough = count >= _FEWEST_POINTS
+    enough = count >= _MIN_POINTS
     return hit[enough] / count[enough]
 
 

@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from bodyslam_jax.body.skeleton import BODY25
 from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
-_MID_HIP = 8
+_MID_HIP = BODY25["mid_hip"]
+_UNMATCHED = 1e6
+"""Cost of two people who are never in the same frame."""
 
 
 def pair(
@@ -16,13 +19,14 @@ def pair(
 ) -> tuple[Keypoints, Bodies]:
     """Puts keypoints and bodies of the same person at the same index.
 
-    By the distance of the projected pelvis from the hips in the image. Whoever has only
-    one of the two is kept, with confidence 0 or not present.
+    Optimal assignment by the distance in the image of the projected pelvis from the
+    middle of the hips, relative to the person's height. People with only one of the two
+    are kept, with confidence 0 or not present.
     """
     num_k, num_b = len(keypoints.uv), len(bodies.present)
-    cost = np.full((num_k, num_b), 1e6)
+    cost = np.full((num_k, num_b), _UNMATCHED)
     for j in range(num_b):
-        # The pelvis of a body of average size; only the difference of people matters.
+        # Of a body of average size: what people have in common does not matter here.
         pelvis = bodies.trans[j] + np.array([0.0, -0.2, 0.0])
         pixel = project_points(intrinsics, pelvis)
         for i in range(num_k):
@@ -31,9 +35,9 @@ def pair(
                 away = np.linalg.norm(
                     keypoints.uv[i, both, _MID_HIP] - pixel[both], axis=-1
                 )
-                # Of the keypoints that are seen: what is missing lies at 0.
-                seen = keypoints.confidence[i, both] > 0
-                v = np.where(seen, keypoints.uv[i, both][..., 1], np.nan)
+                # Missing keypoints lie at 0 and do not count.
+                present = keypoints.confidence[i, both] > 0
+                v = np.where(present, keypoints.uv[i, both][..., 1], np.nan)
                 size = (np.nanmax(v, axis=-1) - np.nanmin(v, axis=-1)).clip(20)
                 cost[i, j] = np.median(away / size) - 1e-3 * np.sqrt(both.sum())
     rows, columns = linear_sum_assignment(cost)

@@ -1,10 +1,9 @@
 """Frames that only repeat the one before: conversions of the frame rate, and freezes.
 
-A film of 24 frames/s in a file of 30, or of 30 in one of 60, holds frames twice: to a
-motion model they are people who stop and start again many times a second. A repeated
-frame is one that hardly differs from the last in a video in which, just before and
-after, much more changes. A still scene before a still camera has none, and one where
-encoding drops what changes little does not either.
+A film of 24 frames/s in a file of 30, or of 30 in one of 60, holds frames twice; to a
+motion model people then stop and start many times a second. A frame is a repeat if it
+hardly differs from the one before while neighbouring frames differ much more. Videos of
+a still scene, and videos whose encoder drops small changes, therefore have no repeats.
 """
 
 import cv2
@@ -12,24 +11,26 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 _SAMPLES = 320
-"""Along the longer side of what is compared."""
+"""Samples along the longer side of the images that are compared."""
 _BLOCK = 16
+"""Samples along a side of the blocks whose mean change is taken."""
 _MOVING = 2.0
 """Mean change of grey levels in the blocks that change most, from which there is
 motion."""
 _SAME = 0.15
-"""Change of a repeated frame, of that of others around it, at most."""
+"""Change of a repeated frame relative to that of its neighbours, at most."""
 _AROUND = 10
-"""Frames on each side that are compared with."""
+"""Neighbours on each side."""
 _SHORT = 4
 """Repeats in a row that a conversion makes; more are a freeze, or people who stand."""
-_FEWEST = 2
+_MIN_REPEATS = 2
+"""Repeats in a video; a single one may be chance."""
 _REGULAR = 0.8
-"""Frames that a regular conversion may be off a clock by."""
+"""Frames by which a regular conversion may deviate from an even clock."""
 
 
 class Repeats:
-    """Looks at one image after the other, and keeps only how much it changed."""
+    """Collects the change from each image to the next, of a video read once."""
 
     def __init__(self) -> None:
         self.last: np.ndarray | None = None
@@ -37,7 +38,7 @@ class Repeats:
         self.typical: list[float] = []
 
     def look(self, image: UInt8[np.ndarray, "y x *c"] | None) -> None:
-        """Takes the next image into account; None is one that says nothing."""
+        """Adds the next image, or `None` for one that cannot be decoded."""
         now = None
         if image is not None:
             step = max(1, max(image.shape[:2]) // _SAMPLES)
@@ -82,7 +83,7 @@ def repeated(
         moves = typical if last - first + 1 > _SHORT else most
         if not sides or min(moves[k] for k in sides) < _MOVING:
             found[first : last + 1] = False
-    if found.sum() < _FEWEST:
+    if found.sum() < _MIN_REPEATS:
         found[:] = False
     return found
 

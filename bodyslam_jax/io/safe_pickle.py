@@ -130,7 +130,7 @@ def _load_array(file: io.BufferedIOBase, allowed: _Names) -> Any:
     return found.item() if is_lone else found
 
 
-# The one written in Python: joblib's arrays need its loop.
+# The implementation in Python: joblib's arrays are read within its loop.
 _Base: Any = getattr(pickle, "_Unpickler")
 
 

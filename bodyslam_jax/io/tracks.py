@@ -1,4 +1,4 @@
-"""Point tracks made elsewhere -> one checked table."""
+"""Point tracks of another tool -> one checked table."""
 
 import logging
 from pathlib import Path
@@ -10,8 +10,8 @@ from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.types import Tracks
 
 _log = logging.getLogger(__name__)
-_FEWEST_FINITE = 0.5
-"""Share of the observations that must be numbers."""
+_MIN_FINITE = 0.5
+"""Share of the observations that must be finite."""
 
 
 def read_tracks(
@@ -21,7 +21,7 @@ def read_tracks(
     size: tuple[int, int],
     warn: Warn = _log.warning,
 ) -> Tracks:
-    """Reads `frame`, `landmark` and `uv` (px) of point tracks made elsewhere.
+    """Reads the arrays `frame` (m,), `landmark` (m,) and `uv` (m, 2; px).
 
     Observations that are not finite are left out, with a warning.
 
@@ -46,7 +46,7 @@ def read_tracks(
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(frame) & np.isfinite(landmark)
     if not finite.all():
         text = f"{int((~finite).sum())} of {len(uv)} observations not finite"
-        if finite.mean() < _FEWEST_FINITE:
+        if finite.mean() < _MIN_FINITE:
             raise ValueError(f"{path}: {text}.")
         warn(f"tracks: {text}: left out.")
         frame, landmark, uv = frame[finite], landmark[finite], uv[finite]

@@ -23,11 +23,11 @@ mp4 mov m4v qt avi mkv webm mpg mpeg mpe m1v m2v mpv mts m2ts m2t ts mod tod vob
 insv lrv h264 264 avc h265 265 hevc av1 ivf amv dav"""
 VIDEO_SUFFIXES = tuple(f".{name}" for name in _VIDEO_SUFFIXES.split())
 """Of files that FFmpeg, by which OpenCV reads, takes for videos; in either case."""
-_LEAST_SIDE = 16
-"""px; BRISK's pyramid fails below 6; so small images have nothing to follow."""
-_ODD = 0.2
-"""Width of a pixel over its height below which, or above whose inverse, it is a
-mistake."""
+_MIN_SIDE = 16
+"""px; smaller images have no features to track, and BRISK's pyramid fails below 6."""
+_MIN_PIXEL_ASPECT = 0.2
+"""Width of a pixel over its height; below it, or above its inverse, the container's
+value is taken for a mistake."""
 _QUARTER, _LARGE = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
 _MAX_JITTER = 0.25
 """Spread of frame intervals, relative to their median, that is still a fixed rate."""
@@ -35,7 +35,7 @@ _MAX_JITTER = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Footage:
-    """What a video says of itself, after looking at all of it."""
+    """Size and frame times of a video, found by decoding all of it."""
 
     path: Path
     timestamps: Float[np.ndarray, " t"]
@@ -44,11 +44,11 @@ class Footage:
     height: int
     warnings: tuple[str, ...] = ()
     num_read: int = 0
-    """Frames in the file, of which some may be left out."""
+    """All frames in the file, also those that are left out."""
     picks: Int[np.ndarray, " t"] | None = None
-    """Which of them are used, in order; all without it."""
+    """Indices of the frames that are used; `None` for all."""
     pixel_aspect: float = 1.0
-    """Width of a pixel over its height, as the file says; 1 if it does not."""
+    """Width of a pixel over its height, from the container; 1 if that has none."""
 
 
 def look_at(path: Path, fps: float | None = None) -> Footage:
@@ -63,10 +63,10 @@ def look_at(path: Path, fps: float | None = None) -> Footage:
     **Raises:** `ValueError`, naming the file, if it is not a readable video.
     """
     footage = _look_at_images(path, fps) if path.is_dir() else _look_at_video(path)
-    if min(footage.width, footage.height) < _LEAST_SIDE:
+    if min(footage.width, footage.height) < _MIN_SIDE:
         raise ValueError(
             f"{path}: images of {footage.width}x{footage.height} px are too small; "
-            f"expected at least {_LEAST_SIDE}x{_LEAST_SIDE}."
+            f"expected at least {_MIN_SIDE}x{_MIN_SIDE}."
         )
     return footage
 
@@ -92,7 +92,7 @@ T = TypeVar("T")
 
 
 def picked(items: Iterable[T], picks: Int[np.ndarray, " t"]) -> Iterator[T]:
-    """Those of `items` whose places are in `picks`, which increases."""
+    """The `items` at the indices `picks`, which increase."""
     wanted = set(picks.tolist())
     return (item for k, item in enumerate(items) if k in wanted)
 
@@ -150,7 +150,7 @@ def _look_at_video(path: Path) -> Footage:
     finally:
         capture.release()
     stamps, picks, warnings = _timed(path, np.asarray(times), nominal, repeats)
-    # One frame more or less is what containers get wrong; more is a damaged file.
+    # Containers are often wrong by a frame or two; by more, the file is damaged.
     if announced > len(times) + max(2, 0.02 * announced):
         warnings += (f"{path.name}: {announced} frames announced, {len(times)} read.",)
     size = (image.shape[1], image.shape[0])
@@ -162,7 +162,11 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
     across, along = (
         capture.get(p) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)
     )
-    if not (across > 0 and along > 0 and _ODD < across / along < 1 / _ODD):
+    if not (
+        across > 0
+        and along > 0
+        and _MIN_PIXEL_ASPECT < across / along < 1 / _MIN_PIXEL_ASPECT
+    ):
         return 1.0
     turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
     return along / across if turned else across / along
@@ -171,7 +175,7 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
 def _timed(
     path: Path, times: Float[np.ndarray, " n"], nominal: float, repeats: Repeats
 ) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
-    """`resampled`, of the frames alone that do not repeat the one before."""
+    """`resampled`, without the frames that only repeat the one before."""
     again = repeats.repeated()
     if not again.any():
         return resampled(path, times, nominal)
@@ -188,11 +192,11 @@ def _timed(
 def resampled(
     path: Path, times: Float[np.ndarray, " n"], nominal: float
 ) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
-    """Times from 0 (s), which frames they are of, and what there is to be said.
+    """Times of the frames that are used (s, from 0), their indices, and warnings.
 
     Where the rate varies, the frames nearest to the ticks of a clock of the median rate
-    are used: what is denser is thinned out. Frames are not repeated, so gaps stay, with
-    their true times. Unusable times are made up from the nominal rate (1/s).
+    are used, which thins out denser parts. No frame is repeated: gaps stay, with their
+    true times. Times that do not increase are replaced by the nominal rate (1/s).
     """
     step = np.diff(times)
     if len(times) == 1:

@@ -1,4 +1,4 @@
-"""What a data set's files must hold; every refusal names the file."""
+"""Checks of a data set's files; every error names the file."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
 def not_there(path: Path, dataset: str) -> FileNotFoundError:
-    """The error that says where a data set is given out."""
+    """The error for a missing file, with the address where to register."""
     return FileNotFoundError(
         f"{path}: not there; {dataset} is given to researchers who register at "
         f"{_HOME[dataset]}."
@@ -31,7 +31,7 @@ def dictionary(file: Path, needed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[str, Any]:
-    """`data`, which is `name` in `file`, if it is a dictionary with all in `needed`."""
+    """`data`, called `name` in `file`, if it is a dictionary with the keys `needed`."""
     where = f"{file}: {name + ' is ' if name else ''}"
     if not isinstance(data, dict):
         raise ValueError(f"{where}a {type(data).__name__}, not a dictionary.")
@@ -42,7 +42,7 @@ def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[st
 
 
 def entries(file: Path, name: str, data: Any, count: int | None = None) -> list[Any]:
-    """What `name` holds for each of `count` people, or for at least one."""
+    """The entries of `name`, one for each of `count` people; at least one."""
     is_list = isinstance(data, list | tuple)
     if not is_list and not (isinstance(data, np.ndarray) and data.ndim):
         raise ValueError(f"{file}: {name}: a {type(data).__name__}, not a list.")
@@ -103,8 +103,8 @@ def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarra
 def images(folder: Path, num: int = 1) -> list[Path]:
     """The images of a folder, by name; at least `num`.
 
-    Fewer than the truth has frames are those of a download that broke off: they would
-    go to the wrong frames.
+    Fewer images than frames are an incomplete download, whose images would be assigned
+    to wrong frames.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of images.")

@@ -16,18 +16,18 @@ from bodyslam_jax.io import atomic, write_body, write_tum
 FPS = 30.0
 """Of all three data sets."""
 _MARK = "conversion.json"
-"""Where a sequence came from; what a folder with it has may be written again."""
+"""Source of a converted sequence; a folder with this file may be overwritten."""
 
 
 @contextlib.contextmanager
 def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
     """A hidden folder whose content appears in `out` when the block ends well.
 
-    It takes the place of what an earlier conversion wrote; what else lies in `out`
-    stays. If the block raises, `out` is as it was.
+    It replaces what an earlier conversion wrote; other files in `out` stay. If the
+    block raises, `out` is unchanged.
 
-    **Raises:** `ValueError` if `out` cannot be written, or has of its own what would be
-    written.
+    **Raises:** `ValueError` if `out` cannot be written, or has files of the same names
+    that no conversion wrote.
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: a file; expected a folder to write.")
@@ -91,7 +91,7 @@ def write_camera(
 
 
 def link_images(folder: Path, images: Path) -> None:
-    """A link, as data sets are large."""
+    """Links the images, as data sets are large."""
     link = folder / "images"
     link.symlink_to(images.resolve(), target_is_directory=True)
 

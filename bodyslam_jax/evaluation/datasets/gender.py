@@ -1,7 +1,7 @@
-"""The body that true parameters belong to: its kind and its gender.
+"""The body model that true parameters belong to, by kind and gender.
 
-Shape parameters mean another person in another body: ground truths are posed with the
-gendered SMPL that they were made with, as their own evaluations do (EMDB, WHAM, TRAM).
+The same β are another shape in another model: ground truths are posed with the gendered
+SMPL that they were made with, as in the evaluations of EMDB, WHAM and TRAM.
 """
 
 import dataclasses
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
-from bodyslam_jax.body.files import VARIABLE, _candidates, named_gender
-from bodyslam_jax.evaluation.readers import _load_npz, read_groundtruth
+from bodyslam_jax.body.files import VARIABLE, candidates, named_gender
+from bodyslam_jax.evaluation.readers import load_npz, read_groundtruth
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
@@ -24,10 +24,10 @@ _GENDERS |= {gender: gender for gender in _GENDERS.values()}
 _NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 _NAMES["default"] = "the free body that ships with the package"
 _KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
-"""Numbers in a posture, and the bodies that it and its shape fit, best first."""
+"""By the number of pose parameters: kinds of body that they fit, best first."""
 _STEMS = {"smpl": ("smpl_", "basicmodel"), "smplh": ("smplh_", "model")}
 _STEMS["smplx"] = ("smplx_",)
-"""How names of files begin, where they are usual."""
+"""Beginnings of the usual names of files."""
 
 
 def gender_of(value: Any) -> str | None:
@@ -59,9 +59,9 @@ def body_for(
 
 
 def read_truth(path: Path, body_model: Path | None = None) -> Result:
-    """`read_groundtruth`, where each body without joints is posed with its own gender.
+    """`read_groundtruth`, posing each body without joints with a body of its gender.
 
-    Says so where the body at hand is not the one that the parameters are of.
+    Warns if the body that is used is not the one that the parameters belong to.
 
     **Raises:** as `read_groundtruth` and `load_body_model`.
     """
@@ -96,7 +96,7 @@ def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
     else:
         folder = path / "groundtruth" if (path / "groundtruth").is_dir() else path
         files = sorted(folder.glob("body.npz")) or sorted(folder.glob("body_*.npz"))
-    return {file: _load_npz(file) for file in files}
+    return {file: load_npz(file) for file in files}
 
 
 def _needed(person: dict[str, np.ndarray]) -> tuple[str, tuple[str, ...]]:
@@ -113,20 +113,20 @@ def _is_installed(gender: str) -> bool:
 def _body_at_hand(
     body_model: Path | None, gender: str, kinds: tuple[str, ...]
 ) -> tuple[BodyModel, str | None]:
-    """That of the gender; if none is named and none is there, the neutral one."""
-    there = gender if body_model or _is_installed(gender) else "neutral"
-    return _load(body_model, there, gender, kinds)
+    """The body of the gender; the neutral one if none is named or installed."""
+    available = gender if body_model or _is_installed(gender) else "neutral"
+    return _load(body_model, available, gender, kinds)
 
 
 def _load(
-    place: Path | None, there: str, gender: str, kinds: tuple[str, ...]
+    place: Path | None, available: str, gender: str, kinds: tuple[str, ...]
 ) -> tuple[BodyModel, str | None]:
-    """The body of one of `kinds`, best first, among those called `there`.
+    """A body of one of `kinds`, best first, among the files of gender `available`.
 
-    If there is none, it is another, and what that is instead is said.
+    Falls back to another body, and returns what that is, for a warning.
     """
     named = place or os.environ.get(VARIABLE) or Path()
-    files = _candidates(place, there) if place else search_paths(there)
+    files = candidates(place, available) if place else search_paths(available)
     order = lambda file: (not file.is_relative_to(named), _rank(file, kinds))
     files = sorted(filter(Path.is_file, files), key=order)
     found = []
@@ -138,12 +138,12 @@ def _load(
         found.append((body, wrong))
     if found:
         return found[0]
-    body = load_body_model(place, there)  # the free one, or says where none is
+    body = load_body_model(place, available)  # the free one, or an error
     return body, _mismatch(body, DEFAULT, gender, kinds)
 
 
 def _rank(file: Path, kinds: tuple[str, ...]) -> int:
-    """Place of a file among `kinds` by its name, which need not be true."""
+    """Index among `kinds` of a file's kind, by its name; it may be wrong."""
     fits = [file.stem.lower().startswith(_STEMS[kind]) for kind in kinds]
     return [*fits, True].index(True)
 
@@ -151,7 +151,7 @@ def _rank(file: Path, kinds: tuple[str, ...]) -> int:
 def _mismatch(
     body: BodyModel, file: Path, gender: str, kinds: tuple[str, ...]
 ) -> str | None:
-    """What a body is if it is not what was wanted; its gender goes by its name."""
+    """What a body is, if it is not of the kinds and gender wanted; gender by name."""
     name = _NAMES[body.kind]
     if body.kind == "default":
         return name

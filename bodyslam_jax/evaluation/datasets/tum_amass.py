@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bodyslam_jax.body import DEFAULT, load_body_model
 from bodyslam_jax.evaluation.datasets import checks, folder
-from bodyslam_jax.evaluation.readers import _read_body, read_tum
+from bodyslam_jax.evaluation.readers import read_body, read_tum
 
 
 def convert_tum_amass(
@@ -21,7 +21,7 @@ def convert_tum_amass(
     if not motion.is_file():
         raise checks.not_there(motion, "AMASS")
     # Whether it can be read, which does not depend on whose joints it is posed with.
-    _read_body(motion, load_body_model(DEFAULT))
+    read_body(motion, load_body_model(DEFAULT))
     if images is not None:
         checks.images(images)
     with folder.sequence_folder(out, "TUM and AMASS", motion) as partial:

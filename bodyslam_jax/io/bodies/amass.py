@@ -12,13 +12,14 @@ from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
 from bodyslam_jax.io.frame_index import InvalidContent
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
-"""What AMASS calls its rate: with SMPL-H, and since it has SMPL-X."""
+"""AMASS's names of the frame rate: in releases with SMPL-H, and with SMPL-X."""
 _SMPLX = 165
-"""Numbers of a pose of SMPL-X: 55 joints."""
+"""Numbers in a pose of SMPL-X: 3 for each of 55 joints."""
 _SAME_RATE = 0.01
-"""Relative difference of rates that is still the same rate, rounded."""
+"""Relative difference of rates that counts as rounding."""
 _MAX_RATIO = 2.5
-"""Motion and video of durations further apart do not belong together."""
+"""Ratio of the durations of motion and video above which they do not belong
+together."""
 
 
 def is_amass(data: dict) -> bool:
@@ -29,18 +30,18 @@ def is_amass(data: dict) -> bool:
 
 
 def is_smplx(data: dict, width: int) -> bool:
-    """Whether poses of that width, or what the file says, are SMPL-X's."""
+    """Whether the poses are SMPL-X's, by their width or by `surface_model_type`."""
     named = str(np.asarray(data.get("surface_model_type", "")).reshape(-1)[:1])
     return width == _SMPLX or "smplx" in named
 
 
 def from_amass(data: dict, video: Video) -> Rows:
-    """AMASS style, one body for the whole video, taken to be in the camera frame.
+    """AMASS style: the motion of one person, taken to be in the camera frame.
 
-    SMPL's poses (t, 72), SMPL-H's (t, 156) or SMPL-X's (t, 165), whose first 22 joints
-    are the same; `betas` (b,) or (t, b), of which SMPL-X's mean something else and are
-    left out. Both begin together. Another rate is resampled to the times of the video's
-    frames.
+    Poses of SMPL (t, 72), SMPL-H (t, 156) or SMPL-X (t, 165), whose first 22 joints are
+    the same; `betas` (b,) or (t, b), except that SMPL-X's have another meaning and are
+    left out. Motion and video begin together; another frame rate is resampled to the
+    times of the video's frames.
     """
     if "poses" in data:
         poses = numbers_of(data, "poses", None)
@@ -60,7 +61,7 @@ def from_amass(data: dict, video: Video) -> Rows:
     rate = np.ravel(numbers_of(data, key, None))
     if len(rate) != 1 or not 0 < rate[0] < np.inf:
         raise InvalidContent(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
-    at, slack = _places(n, float(rate[0]), video)
+    at, slack = _positions(n, float(rate[0]), video)
     video.warn("AMASS-style bodies taken as in the camera's frame, not in a world.")
     frame = np.flatnonzero(at <= n - 1 + slack)
     at = np.minimum(at[frame], n - 1)
@@ -93,14 +94,14 @@ def write_body(
 
 
 def body_pose(poses: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "t 72"]:
-    """SMPL's poses of those of SMPL, SMPL-H or SMPL-X; without hands for the latter."""
+    """SMPL's poses from those of SMPL, SMPL-H or SMPL-X; hands are 0 for the latter."""
     width = 72 if poses.shape[1] == 72 else 66
     return np.pad(poses[:, :width], [(0, 0), (0, 72 - width)])
 
 
-def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
-    """Where in a motion of `n` frames each frame of the video is, and how far beyond
-    its end is still its last frame."""
+def _positions(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
+    """The (fractional) frame of a motion of `n` frames at the time of each frame of the
+    video; and by how many frames its last one may be exceeded."""
     t, fps = video.num_frames, video.fps
     if t is None:
         t = n if fps is None else round((n - 1) / rate * fps) + 1
@@ -109,7 +110,7 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
         return np.arange(float(n)), 0.5
     if fps is None:
         raise InvalidContent(f"{n} frames at {rate:g}/s, but the video has {t} frames")
-    # Its rate may vary, and that of the frames that are used is another one.
+    # The video's rate may vary, so that its times count and not its mean rate.
     times = np.arange(t) / fps if video.times is None else video.times - video.times[0]
     filmed = float(times[-1]) * t / (t - 1) if t > 1 else 1 / fps
     moved = n / rate
@@ -133,7 +134,7 @@ def _places(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
 def _between(
     poses: np.ndarray, trans: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (t, 72) and positions between frames; joints turn by the shortest way."""
+    """Poses (t, 72) and positions (t, 3) between frames; rotations on the geodesic."""
     low = np.floor(at).astype(np.int64)
     high = np.minimum(low + 1, len(poses) - 1)
     part = (at - low)[:, None]

@@ -1,5 +1,4 @@
-"""Bodies as the readers give them, one row each, in no order; and what they know of
-the video that the bodies are in."""
+"""The table of bodies that readers make, and what they need to know of the video."""
 
 import dataclasses
 import logging
@@ -16,14 +15,15 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """`m` bodies in the camera frame."""
+    """`m` bodies in the camera frame, in any order."""
 
     frame: Int[np.ndarray, " m"]
     person: Int[np.ndarray, " m"]
-    """Any number that is the same for the same person."""
+    """A number for each person, in any order."""
     poses: Float[np.ndarray, "m 72"]
-    """Axis-angle, rad, root first."""
+    """SMPL's joint rotations, axis-angle, rad; the first is `R_CH` of the root."""
     betas: Float[np.ndarray, "m 10"]
+    """SMPL β."""
     trans: Float[np.ndarray, "m 3"]
     """m: the pelvis is at `J_0(β) + trans`."""
     shapes_regressed: bool = True
@@ -32,11 +32,11 @@ class Rows:
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """What readers of bodies are told of the video."""
+    """The video that a file of bodies is read for."""
 
     camera: Intrinsics
     num_frames: int | None = None
-    """None if only the file can say."""
+    """`None` if it is that of the file."""
     fps: float | None = None
     """1/s; None if not known"""
     times: Float[np.ndarray, " t"] | None = None
@@ -47,5 +47,6 @@ class Video:
     warn: Warn = _log.warning
 
     def frames_in(self, seconds: float) -> int:
-        """At least 1; by the common rate of 30/s if the video's is not known."""
+        """The number of frames in so many seconds, at least 1; at 30/s if the video's
+        rate is not known."""
         return max(1, round(seconds * (self.fps or 30.0)))

@@ -20,7 +20,8 @@ from bodyslam_jax.io.frame_index import InvalidContent
 def from_cliff(data: dict, video: Video) -> Rows:
     """CLIFF: full-image translation for its own focal length, image names.
 
-    Its bodies are in no order; who is seen in a few frames only is left out.
+    Its bodies have no identities: people are tracked here, and those detected in a few
+    frames only are left out.
     """
     poses = rotations_of(data, "pose", 24)
     n = len(poses)
@@ -52,8 +53,8 @@ def from_cliff(data: dict, video: Video) -> Rows:
 
 
 def _image_of_each(data: dict, n: int, images: int) -> np.ndarray | None:
-    """CLIFF names each image once, and a detection, a row of `detection_all`, begins
-    with the number of its image; None where each of `n` bodies has its own name."""
+    """The image of each of `n` bodies, if images are named once: the first column of
+    `detection_all`. `None` if each body has an image name of its own."""
     if "detection_all" in data:
         rows = numbers_of(data, "detection_all", None)
         image = rows.reshape(len(rows), -1)[:, 0] if rows.size else np.zeros(0)

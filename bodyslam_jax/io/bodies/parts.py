@@ -1,7 +1,6 @@
-"""Parts that the readers of regressed bodies share: checks, frames, rotations, cameras.
+"""What readers of regressed bodies share: checks, frames, rotations, cameras.
 
-An `InvalidContent` says what is wrong with the content; the caller adds the file's
-name.
+Errors are `InvalidContent`, to which the caller adds the file's name.
 """
 
 import numpy as np
@@ -19,14 +18,15 @@ PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
 _BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
-"""Points in front view of a body's size, about its middle, m."""
+"""Grid of the size of a body about its middle, in the plane of the image, m."""
 
 
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """A float64 array, of the shape given (-1: any length).
+    """A float64 array of the given shape (-1: any length).
 
-    What is not finite in it becomes NaN: the bodies that it is of are left out at the
-    end.
+    Values that are not finite become NaN; the reader leaves out their bodies.
+
+    **Raises:** `InvalidContent` if there is none of numbers, or its shape is another.
     """
     if not isinstance(data, dict) or key not in data:
         raise InvalidContent(f"no `{key}`")
@@ -46,6 +46,7 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
 
 
 def betas_of(data: dict, key: str, n: int) -> np.ndarray:
+    """The first ten β of each of `n` bodies; one row may stand for all."""
     betas = numbers_of(data, key, None)
     betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
     if betas.shape[1] < 10:
@@ -58,7 +59,7 @@ def betas_of(data: dict, key: str, n: int) -> np.ndarray:
 def whole_of(array: np.ndarray, name: str) -> np.ndarray:
     """Numbers of frames or people as integers.
 
-    **Raises:** `InvalidContent` if one is none.
+    **Raises:** `InvalidContent` if one is not a whole number.
     """
     off = array[~np.isfinite(array) | (array != np.round(array))]
     if len(off):
@@ -67,12 +68,14 @@ def whole_of(array: np.ndarray, name: str) -> np.ndarray:
 
 
 def people_of(data: dict, n: int) -> np.ndarray:
+    """The number of each body's person; all 0 if the file has none."""
     if "person" not in data:
         return np.zeros(n, dtype=np.int64)
     return whole_of(numbers_of(data, "person", (n,)), "person")
 
 
 def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarray:
+    """The frame of each of `n` bodies; without `key`, one body per frame."""
     if key in data:
         found = whole_of(np.ravel(numbers_of(data, key, None)), key)
         if len(found) != n:
@@ -86,7 +89,7 @@ def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarra
 
 
 def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
-    """Frames of bodies found in images of these names."""
+    """The frame of each body, from the name of its image."""
     frames = frames_of_names(
         names,
         what="bodies",
@@ -99,8 +102,8 @@ def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.nd
 
 
 def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray:
-    """Numbers people where a tool does not say who is who: by where they are in the
-    image, and how large, from frame to frame. One body a frame is one person."""
+    """Numbers of people, (m,), for a tool that does not track them: by position and
+    size in the image. With at most one body per frame it is one person."""
     if len(np.unique(frame)) == len(frame):
         return np.zeros(len(frame), dtype=np.int64)
     fx, fy, cx, cy = video.camera.params[:4]
@@ -159,13 +162,14 @@ def middle(camera: Intrinsics) -> np.ndarray:
 def refocused(
     trans: np.ndarray, focal: np.ndarray, center: np.ndarray, camera: Intrinsics
 ) -> np.ndarray:
-    """Moves bodies so that they look the same through the true camera.
+    """Positions (m) at which bodies have the same image in the true camera.
 
-    Distance is proportional to focal length for the same size in the image.
+    For the same size in the image, distance is proportional to the focal length.
 
     Args:
-        focal: of the tool's camera, px: one number a body, or two (x, y).
-        center: its principal point, px: one for all, or one a body.
+        trans: positions in the tool's camera, m.
+        focal: of the tool's camera, px: one number per body, or two (x, y).
+        center: its principal point, px: one for all, or one per body.
     """
     if (trans[:, 2] == 0).any():
         raise InvalidContent("a body at a distance of 0 from the camera (z = 0)")
@@ -179,9 +183,10 @@ def refocused(
 
 
 def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n 3 3"]:
-    """Camera matrices for images of the video's size, which a tool may have resized.
+    """A tool's camera matrices, for images of the video's size.
 
-    Told by a principal point in the middle of images of the same shape.
+    A tool that resized the images has its principal point in the middle of images of
+    another size and the same aspect ratio.
     """
     whole = 2 * np.median(K[:, :2, 2], axis=0)
     size = np.array([video.camera.width, video.camera.height])
@@ -197,6 +202,7 @@ def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n
 
 
 def focals(K: np.ndarray) -> np.ndarray:
+    """fx and fy of each camera matrix, (n, 2), px."""
     return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
 
 
@@ -209,6 +215,8 @@ def from_crops(
     box: np.ndarray,
     camera: Intrinsics,
 ) -> Rows:
+    """Bodies given in weak perspective (s, tx, ty) of square boxes (cx, cy, side px),
+    with root rotations relative to the crop's ray."""
     if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
         raise InvalidContent(
             "a weak-perspective camera or box with a size of 0 or less"
@@ -221,6 +229,7 @@ def from_crops(
 
 
 def join(rows: list[Rows]) -> Rows:
+    """The bodies of several people in one table."""
     if not rows:
         raise InvalidContent("no person in it")
     names = ("frame", "person", "poses", "betas", "trans")

@@ -1,10 +1,9 @@
 """Weak-perspective bodies of cropped images -> bodies in the camera frame.
 
-A network that looks at a crop says how large the body is in it (`s`), where (`tx, ty`),
-and how it is turned relative to the direction in which the crop lies. The full image
-says what that means in metres. Formulas: `cam_crop2full` of CLIFF (Li et al., ECCV
-2022) with the true principal point; the rotation by the crop's ray is what Henning et
-al. (ECCV 2022, Section 3.3) refer to.
+A network that sees a crop regresses the body's size (`s`) and position (`tx, ty`) in
+the crop, and its rotation relative to the crop's viewing direction. Formulas:
+`cam_crop2full` of CLIFF (Li et al., ECCV 2022) with the true principal point; the
+rotation by the crop's ray is that of Henning et al. (ECCV 2022, Section 3.3).
 """
 
 import numpy as np
@@ -13,8 +12,8 @@ from jaxtyping import Float
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Intrinsics
 
-# Crops hold a person, and SPIN's smallest person is far larger than this.
 _SMALLEST = 1e-9
+"""px; avoids a division by 0, and is far below the size of any person."""
 
 
 def full_translation(
@@ -42,7 +41,7 @@ def crop_camera(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """Inverse of `full_translation`: what a network would have said."""
+    """Inverse of `full_translation`: the network's `(s, tx, ty)`."""
     fx, fy, px, py = intrinsics.params[:4]
     x, y, z = trans.T
     cx, cy, side = box.T
@@ -55,10 +54,10 @@ def turn_to_camera(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """Root rotations (axis-angle, rad) seen along each crop's ray -> in the camera; NaN
-    where one of the two is not finite.
+    """Root rotations (axis-angle, rad) in the camera, of those relative to each crop's
+    ray; NaN where a rotation or box is not finite.
 
-    The pelvis stays where it is: rotations pivot at `J_0(β) + trans`.
+    The pelvis does not move: rotations pivot at `J_0(β) + trans`.
     """
     fx, fy, px, py = intrinsics.params[:4]
     ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)

@@ -1,6 +1,7 @@
-"""Regressed bodies -> one checked `Bodies`, whatever tool they came from.
+"""Regressed bodies of any tool -> one checked `Bodies`.
 
-The contract's `bodies.npz` is read here; `bodies/tools.py` reads the files of others.
+`bodies.npz`, the format of this package, is read here, result files of other tools by
+`tools`.
 """
 
 import dataclasses
@@ -25,9 +26,9 @@ from bodyslam_jax.types import Bodies, Intrinsics
 _log = logging.getLogger(__name__)
 
 _MAX_DISTANCE = 200.0
-"""A person further away than this is not a person, m."""
-_FEWEST_FINITE = 0.5
-"""Share of the bodies that must be numbers."""
+"""Of a body from the camera, m; further away, `trans` is in another unit."""
+_MIN_FINITE = 0.5
+"""Share of the bodies that must be finite."""
 
 
 def read_bodies(
@@ -41,18 +42,16 @@ def read_bodies(
     config: Association = Association(),
     warn: Warn = _log.warning,
 ) -> Bodies:
-    """Reads regressed bodies, recognised by content; a folder of TRAM's tracks too.
+    """Reads regressed bodies, recognised by content; or a folder of TRAM's tracks.
 
-    `bodies.npz` does not name its source: its shapes count as regressed, unless an
-    array `shapes_regressed` () in it is false, as it is to be where they were measured
-    or optimised.
-
-    Nothing in the file is run: see `safe_pickle.py`.
+    Shapes in `bodies.npz` count as regressed by a network, unless its array
+    `shapes_regressed` () is false, for shapes that were measured or optimised.
+    Pickles are read by `safe_pickle`, which runs nothing in them.
 
     Args:
-        num_frames: of the video; None for as many as the file has.
-        fps, times: of the video, 1/s, and of each of its frames, s; without them a
-            motion of another rate is refused.
+        num_frames: of the video; `None` for as many as the file has.
+        fps: of the video, 1/s. Without it a motion of another rate is refused.
+        times: of each of the video's frames, s.
         images: names of the video's frames, if it is a folder of images.
 
     **Raises:** `ValueError`, naming the file, if it is none of the known kinds, has NaN
@@ -118,7 +117,7 @@ def _from_contract(data: dict, video: Video) -> Rows:
 
 
 def _as_smpl(data: dict) -> dict:
-    """The same of SMPL, where poses are as long as SMPL-H's or SMPL-X's."""
+    """The data with SMPL's poses, if they are as wide as SMPL-H's or SMPL-X's."""
     poses, betas = np.asarray(data["poses"]), np.asarray(data["betas"])
     if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
         poses72 = poses
@@ -166,9 +165,9 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
 
 
 def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
-    """The bodies of which all is a number; the others are absent in those frames.
+    """The bodies that are finite; others are absent in their frames, with a warning.
 
-    **Raises:** `ValueError` if most are not.
+    **Raises:** `ValueError` if most are not finite.
     """
     names = ("poses", "betas", "trans")
     fine = {name: np.isfinite(getattr(rows, name)).all(axis=1) for name in names}
@@ -177,7 +176,7 @@ def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
         return rows
     broken = " and ".join(f"`{name}`" for name in names if not fine[name].all())
     text = f"{broken} has NaN or infinity in {(~kept).sum()} of {len(kept)} bodies"
-    if kept.mean() < _FEWEST_FINITE:
+    if kept.mean() < _MIN_FINITE:
         raise ValueError(f"{path}: {text}.")
     warn(f"{text}: taken as absent in those frames.")
     arrays = {n: getattr(rows, n)[kept] for n in ("frame", "person", *names)}
@@ -187,7 +186,7 @@ def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
 def _gather(
     path: Path, rows: Rows, num_frames: int | None, warn: Warn = _log.warning
 ) -> Bodies:
-    """Sorts rows by person and frame, after a last look at all of them."""
+    """Checks the rows and sorts them by person and frame."""
     if not len(rows.frame):
         raise ValueError(f"{path}: no body in any frame.")
     for name in ("person", "poses", "betas", "trans"):

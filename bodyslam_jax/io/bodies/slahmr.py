@@ -1,7 +1,7 @@
 """SLAHMR's results -> rows for the frames of a video.
 
-It writes `NAME_ITERATION_world_results.npz` for each phase, and beside them, or one
-folder up, `track_info.json`: which part of the video they are of, and who is seen when.
+SLAHMR writes `NAME_ITERATION_world_results.npz` for each phase, and beside it, or one
+folder up, `track_info.json`: the part of the video, and when each person is visible.
 """
 
 import dataclasses
@@ -25,12 +25,13 @@ _INFO = "track_info"
 
 
 def is_slahmr(data: dict) -> bool:
+    """Whether the arrays have SLAHMR's names and axes."""
     body = {"trans", "root_orient", "pose_body"} <= set(data)
     return body and np.ndim(data["trans"]) == 3
 
 
 def with_track_info(path: Path, data: Any) -> Any:
-    """The same with what `track_info.json` says, where there is one for it."""
+    """The data with the content of its `track_info.json`, if there is one."""
     if not isinstance(data, dict) or not is_slahmr(data):
         return data
     for folder in (path.parent, path.parent.parent):
@@ -45,11 +46,12 @@ def with_track_info(path: Path, data: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _Info:
-    """Which frames of the video results are of."""
+    """The frames of the video that the results are of."""
 
     first: int
+    """Index of the first one."""
     masks: dict[int, np.ndarray]
-    """By the index of a person: in which frames, from `first` on, they are seen."""
+    """By index of a person: whether they are visible in each frame from `first` on."""
 
     @classmethod
     def of(cls, data: Any) -> "_Info | None":
@@ -63,7 +65,8 @@ class _Info:
         }
         return cls(before + start, masks)
 
-    def seen(self, people: int, frames: int) -> np.ndarray:
+    def visible(self, people: int, frames: int) -> np.ndarray:
+        """Whether each person is visible in each frame, (people, frames)."""
         found = np.ones((people, frames), dtype=bool)
         for index, mask in self.masks.items():
             if index < people:
@@ -75,7 +78,7 @@ def from_slahmr(data: dict, video: Video) -> Rows:
     """SLAHMR: SMPL-H in a world, seen by cameras whose translation lacks the scale."""
     if "cam_R" not in data or "cam_t" not in data:
         raise InvalidContent(
-            "what SLAHMR starts from, without cameras; give *_world_results.npz"
+            "SLAHMR's initialisation, without cameras; give *_world_results.npz"
         )
     trans = numbers_of(data, "trans", (-1, -1, 3))
     p, t = trans.shape[:2]
@@ -102,22 +105,22 @@ def from_slahmr(data: dict, video: Video) -> Rows:
         K = at_size(np.array([[[fx, 0.0, cx], [0.0, fx, cy], [0.0, 0.0, 1.0]]]), video)
         focal = np.full(p * t, K[0, 0, 0])
         moved = refocused(moved.reshape(-1, 3), focal, K[0, :2, 2], video.camera)
-    seen = np.ones((p, t), dtype=bool)
+    visible = np.ones((p, t), dtype=bool)
     if "track_mask" in data:
-        seen = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
+        visible = np.broadcast_to(np.asarray(data["track_mask"]).astype(bool), (p, t))
     poses = np.concatenate([turned.reshape(p, t, 3), body, np.zeros((p, t, 6))], -1)
     if info is not None:
-        seen = seen & info.seen(p, t)
-    person, frame = np.nonzero(seen)
+        visible = visible & info.visible(p, t)
+    person, frame = np.nonzero(visible)
     if info is not None:
         frame = frame + info.first
     moved = moved.reshape(p, t, 3)
-    parts = (poses[seen], betas[seen], moved[seen])
+    parts = (poses[visible], betas[visible], moved[visible])
     return Rows(frame, person, *parts, shapes_regressed=False)
 
 
 def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
-    """Axis-angle of R exp(rotvec); NaN where one of the two is not finite."""
+    """Axis-angle of `R exp(rotvec)`; NaN where either is not finite."""
     both = np.hstack([R.reshape(-1, 9), rotvec])
     known = np.asarray(np.isfinite(both).all(axis=1))[:, None]
     safe = np.where(known[..., None], R, np.eye(3)), np.where(known, rotvec, 0.0)

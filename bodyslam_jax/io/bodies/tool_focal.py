@@ -1,8 +1,8 @@
-"""The focal length of the camera that each tool puts its bodies in.
+"""The focal length that each tool assumes for its bodies' camera.
 
-A regressor sees a crop, and turns the body's size in it into a distance with a focal
-length of its own. Bodies through another camera need another distance, so whoever reads
-a tool's file has to know it. Where the file says it, the file counts; the others:
+A regressor sees a crop, and converts the body's size in it to a distance with a focal
+length of its own. For the true camera the distance has to be converted by the ratio of
+focal lengths. The file's value is used if it has one; otherwise the tool's default:
 
 | tool | focal length, px | where it is set in the tool's public code |
 |---|---|---|
@@ -22,10 +22,11 @@ from bodyslam_jax.io.bodies.body_records import Video
 from bodyslam_jax.types import Intrinsics
 
 _NOTABLE = 0.02
-"""Relative difference of focal lengths from which it is said what was assumed."""
+"""Relative difference of focal lengths from which there is a warning."""
 
 
 def diagonal(camera: Intrinsics) -> float:
+    """Of the image, px."""
     return math.hypot(camera.width, camera.height)
 
 
@@ -40,9 +41,9 @@ DEFAULT_FOCAL: dict[str, Callable[[Intrinsics], float]] = {
 
 
 def default_focal(tool: str, video: Video) -> float:
-    """What `tool` assumes, px; where the camera has another, with a line that says it.
+    """The focal length that `tool` assumes, px, with a warning if the camera's differs.
 
-    Bodies are then moved to where they look the same through the camera.
+    `parts.refocused` moves the bodies to where they have the same image in the camera.
     """
     focal, actual = DEFAULT_FOCAL[tool](video.camera), float(video.camera.params[0])
     if abs(focal / actual - 1) > _NOTABLE:

@@ -1,12 +1,12 @@
 """Result files of the tools that regress bodies -> rows in the camera frame.
 
-One function per tool, chosen by the keys that a file holds; the layouts are those of
-the tools' own code. All positions follow one convention, `pelvis = J_0(β) + trans`;
-where a tool means something else, the pelvis of the average body (SMPL's or SMPL-X's)
-stands for J_0. SMPL-X's shapes mean other things than SMPL's and are left out.
+One function per tool, chosen by the keys in the file; the layouts are those of the
+tools' own code. All positions follow one convention, `pelvis = J_0(β) + trans`; for
+tools with another one, J_0 is approximated by the pelvis of the mean body (SMPL's or
+SMPL-X's). SMPL-X's β have another basis than SMPL's and are left out.
 
-SLAHMR fits shapes to a video and AMASS to markers; the others have what a network
-guessed, GLAMR too, which optimises paths only.
+SLAHMR fits shapes to a video, AMASS to markers; those of the other tools are regressed
+by a network, also GLAMR's, which optimises trajectories only.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from bodyslam_jax.io.declared_size import factor_to
 
 
 def from_spin(data: dict, video: Video) -> Rows:
-    """SPIN: a row per frame; weak perspective in boxes that SPIN itself leaves out."""
+    """SPIN: a row per frame; weak perspective in boxes, which SPIN does not write."""
     poses = numbers_of(data, "pose", (-1, 72))
     frame = frames_of(data, "frame", len(poses), video.num_frames)
     if "bbox" not in data:
@@ -82,8 +82,8 @@ def from_vibe(data: dict, video: Video) -> Rows:
 
 
 def from_wham(data: dict, video: Video) -> Rows:
-    """WHAM: `{person: {...}}`; `pose`, `trans` are in the camera (`_world` is not), of
-    which the file does not say the focal length."""
+    """WHAM: `{person: {...}}`; `pose` and `trans` are in the camera, whose focal length
+    is not in the file; those in a world are named `_world`."""
     rows = []
     focal = default_focal("WHAM", video)
     for number, (_, one) in enumerate(sorted(data.items(), key=lambda kv: str(kv[0]))):
@@ -102,7 +102,8 @@ def from_wham(data: dict, video: Video) -> Rows:
 
 
 def _of_default(trans: np.ndarray, focal: float, video: Video) -> np.ndarray:
-    """Bodies of a camera of that focal length (px) about the image's middle."""
+    """Positions of bodies that a tool put in a camera of focal length `focal` (px) with
+    its principal point in the middle of the image."""
     return refocused(
         trans, np.full(len(trans), focal), middle(video.camera), video.camera
     )
@@ -115,7 +116,7 @@ def from_phalp(data: dict, video: Video) -> Rows:
     relative to the crop's ray.
     """
     names = sorted(data)
-    # Where it reads a video itself, a frame is called by the video and a time.
+    # If PHALP decoded a video itself, frames are named by the video and a time.
     called = [
         str(data[n].get("time", n[-1]) if isinstance(n, tuple) else n) for n in names
     ]
@@ -124,10 +125,10 @@ def from_phalp(data: dict, video: Video) -> Rows:
     frame, person, poses, betas, trans, box = [], [], [], [], [], []
     for number, name in zip(numbered, names, strict=True):
         found = data[name]
-        seen = found.get("tracked_time", [])
+        since_detection = found.get("tracked_time", [])
         for i, body in enumerate(found["smpl"]):
-            if i < len(seen) and np.ravel(seen[i])[0] != 0:
-                continue  # predicted, not seen
+            if i < len(since_detection) and np.ravel(since_detection[i])[0] != 0:
+                continue  # predicted, not detected
             x, y, w, h = factor * np.ravel(found["bbox"][i])[:4]
             parts = [
                 as_rotvec(np.asarray(body[key]), joints).ravel()
@@ -150,7 +151,7 @@ def from_phalp(data: dict, video: Video) -> Rows:
 
 
 def _phalp_factor(data: dict, video: Video) -> float:
-    """Pixels of the video, per pixel of the images that PHALP saw: `size`, (h, w)."""
+    """Pixels of the video per pixel of PHALP's images, whose `size` is (h, w)."""
     sizes = {
         tuple(np.ravel(size)[:2].tolist())
         for found in data.values()
@@ -260,15 +261,15 @@ def from_glamr(data: dict, video: Video) -> Rows:
             )
             trans = pelvis - PELVIS_SMPL
         poses = np.concatenate([root, numbers_of(one, "smpl_pose", (n, 69))], axis=-1)
-        seen = np.asarray(one.get("visible", np.ones(n))).astype(bool)
+        visible = np.asarray(one.get("visible", np.ones(n))).astype(bool)
         frame = frames_of(one, "frames", n, video.num_frames)
         rows.append(
             Rows(
-                frame[seen],
-                np.full(int(seen.sum()), number),
-                poses[seen],
-                betas_of(one, "smpl_beta", n)[seen],
-                trans[seen],
+                frame[visible],
+                np.full(int(visible.sum()), number),
+                poses[visible],
+                betas_of(one, "smpl_beta", n)[visible],
+                trans[visible],
             )
         )
     return join(rows)
@@ -303,4 +304,4 @@ READERS: list[tuple[str, Callable[[dict], bool], Reader]] = [
     ("4D-Humans", _each("smpl", "camera", "bbox", "tid"), from_phalp),
     ("AMASS", is_amass, from_amass),
 ]
-"""Name, whether a file's content is that tool's, and how it is read."""
+"""Name of the tool, test of a file's content, reader."""

@@ -1,4 +1,4 @@
-"""A camera file, or a guess, -> intrinsics."""
+"""Intrinsics from a camera file, or a guess; projection with them."""
 
 import dataclasses
 import json
@@ -16,20 +16,24 @@ from bodyslam_jax.types import Intrinsics
 _log = logging.getLogger(__name__)
 
 _GUESSED_FOCAL = 1.2
-"""Focal length over the longer side: COLMAP's default, a view of 45 degrees."""
+"""Focal length over the longer side: COLMAP's default, a field of view of 45
+degrees."""
 
 _NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
+"""Models of `camera.json` and the number of their parameters."""
 
 
 def read_camera(
     path: Path, size: tuple[int, int] | None = None
 ) -> tuple[Intrinsics, float | None]:
-    """Reads `camera.json` (model, size and parameters in COLMAP's order, pixel centres
-    at whole numbers; and the frame rate, 1/s, if the file has one), COLMAP's
-    `cameras.txt` or `cameras.bin`, or nerfstudio's `transforms.json`.
+    """Reads intrinsics, and the frame rate (1/s) if the file has one.
+
+    The file is a `camera.json` (parameters in COLMAP's order, pixel centres at whole
+    numbers), COLMAP's `cameras.txt` or `cameras.bin`, or nerfstudio's
+    `transforms.json`; or a folder with one of these.
 
     Args:
-        size: of the video, px: which camera is meant, where a file holds several.
+        size: of the video, px; it selects the camera of a file that holds several.
 
     **Raises:** `ValueError`, naming the file, if something is missing or impossible.
     """
@@ -81,7 +85,7 @@ def read_camera(
 def _from_cameras(
     path: Path, cameras: list[FoundCamera], size: tuple[int, int] | None
 ) -> Intrinsics:
-    """The camera of a file that the video was taken with."""
+    """The video's camera, by its size (px), among those of a file."""
     fitting = [c for c in cameras if size in (None, (c.width, c.height))]
     chosen = fitting or cameras
     same = {(c.model, c.width, c.height, tuple(c.params)) for c in chosen}
@@ -102,9 +106,9 @@ def _from_cameras(
 def _intrinsics(
     path: Path, model: str, params: np.ndarray, width: int, height: int
 ) -> Intrinsics:
-    """Checked, as OpenCV has them.
+    """Checked intrinsics in OpenCV's model.
 
-    **Raises:** `ValueError`, naming the file, if they are those of no camera.
+    **Raises:** `ValueError`, naming the file, if no camera has such parameters.
     """
     params = _from_colmap(model, params)
     if not np.isfinite(params).all() or (params[:2] <= 0).any():
@@ -142,8 +146,8 @@ def guess_camera(
 
 
 def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics:
-    """The camera with a focal length fx that somebody knows, px, to within `sigma`;
-    the shape of its pixels stays."""
+    """The camera with the focal length fx given by the user (px, standard deviation
+    `sigma`); fy keeps its ratio to fx."""
     params = intrinsics.params.copy()
     params[:2] *= focal / params[0]
     return dataclasses.replace(
@@ -152,7 +156,8 @@ def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics
 
 
 def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
-    """Pixels of points (m, 3) in the camera frame; far away if behind the camera."""
+    """Pixels (m, 2) of points (m, 3) in the camera frame, m; points behind the camera
+    are projected far outside the image."""
     front = p_C[:, 2] > 0.05
     safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
     K, distortion = as_opencv(intrinsics.params)
@@ -165,8 +170,8 @@ def rays(
 ) -> Float[np.ndarray, "m 2"]:
     """x/z and y/z of pixels (m, 2), distortion undone.
 
-    Not as often as OpenCV does by default, five times, which leaves up to 25 px at the
-    edge of a wide lens.
+    With up to 100 iterations: OpenCV's default of five leaves errors of up to 25 px at
+    the edge of a wide lens.
     """
     if not len(uv):
         return np.zeros((0, 2))
@@ -196,7 +201,7 @@ def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
 
 
 def _focal_from_exif(image: Path, longer_side: float) -> float | None:
-    """px, from the 35 mm equivalent that phones write; None where there is none."""
+    """px, from the 35 mm equivalent in EXIF data; `None` if there is none."""
     from PIL import Image  # comes with matplotlib
 
     try:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from bodyslam_jax.geometry import so3_numpy as so3
 
 _HALF = 0.5
-"""px between COLMAP's pixel coordinates and those of pixel centres."""
+"""px that COLMAP's pixel coordinates exceed those with centres at whole numbers."""
 _MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -33,18 +33,18 @@ _MODELS = (
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
 )
-"""By COLMAP's model number: name, and how many parameters."""
+"""By COLMAP's model number: name, and number of parameters."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FoundCamera:
-    """One camera of a file, pixel centres at whole numbers."""
+    """One camera of a file; pixel centres at whole numbers."""
 
     model: str
     width: int
     height: int
     params: list[float]
-    """In COLMAP's order."""
+    """In COLMAP's order; px, and distortion coefficients."""
 
 
 def read_cameras(path: Path) -> list[FoundCamera]:
@@ -112,7 +112,7 @@ def _text(path: Path) -> Iterator[FoundCamera]:
 
 
 def _images(path: Path) -> Iterator[tuple[str, list[float]]]:
-    """Every second line is of an image, the other, perhaps empty, its points."""
+    """Lines alternate between an image and its points, which may be empty."""
     for line in list(_lines(path))[::2]:
         if line:
             words = line.split(maxsplit=9)

@@ -1,4 +1,4 @@
-"""Camera poses that came with the video -> a pose for each of its frames."""
+"""Given camera poses -> a pose for each frame of the video."""
 
 from pathlib import Path
 
@@ -12,8 +12,9 @@ from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.types import CameraPath
 
 _FEWEST = 2
+"""Frames with a pose, at least."""
 _LONGEST_GAP = 0.5
-"""s between poses of a trajectory within which frames are interpolated."""
+"""Time between poses across which frames are interpolated, s."""
 
 
 def read_camera_path(
@@ -26,8 +27,13 @@ def read_camera_path(
 ) -> CameraPath:
     """Reads a TUM trajectory, COLMAP's images or nerfstudio's transforms.json.
 
-    A trajectory with as many poses as the video has frames is taken frame by frame,
-    any other by its times; images are matched to frames by the numbers in their names.
+    A trajectory with as many poses as the video has frames is taken frame by frame, any
+    other is interpolated at the frames' `timestamps` (s). Images are matched to frames
+    by the numbers in their names.
+
+    Args:
+        metric: whether the poses are in metres.
+        images: names of the video's frames, if it is a folder of images.
 
     **Raises:** `ValueError`, naming the file, if it is none of these or belongs to
     another video.
@@ -78,11 +84,11 @@ def _at_times(
     poses: Float[np.ndarray, "n 4 4"],
     timestamps: Float[np.ndarray, " t"],
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
-    """Poses at the frames' times, and where there are any."""
+    """Interpolated poses at the frames' times, and the frames that have one."""
     if len(times) == len(timestamps):
         return poses, np.ones(len(timestamps), bool)
     if times[0] > timestamps[-1]:
-        times = times - times[0]  # the recorder's own clock, which began with the video
+        times = times - times[0]  # of another clock, taken to start with the video
     after = np.clip(np.searchsorted(times, timestamps), 1, len(times) - 1)
     gap = times[after] - times[after - 1]
     inside = (timestamps >= times[0] - 1e-6) & (timestamps <= times[-1] + 1e-6)

@@ -1,4 +1,4 @@
-"""Points as a file lists them -> BODY_25: broken values, the order, x and y."""
+"""Points as a file lists them -> BODY_25: invalid values, the order, x and y."""
 
 from pathlib import Path
 
@@ -13,25 +13,27 @@ from bodyslam_jax.io.keypoints.layouts import LAYOUTS, VITPOSE, from_layout, to_
 from bodyslam_jax.io.keypoints.lying import lying
 from bodyslam_jax.io.keypoints.names import layout_of
 
-_MOST = 0.5
-"""Share of the people and frames without a usable point from which a file is broken."""
+_MAX_LOST = 0.5
+"""Share of the detections without a usable person from which a file is refused."""
 _USABLE = 4
-"""Points that are enough for a person."""
+"""Valid points that make a person usable."""
 _ALL_LIE = 0.85
-"""Share of the people and frames who lie on their side from which it is no posture."""
-_AGREED = 0.7
-_FEWEST = 10
+"""Share of the detections that lie on their side from which it is no posture."""
+_MIN_MIRRORED = 0.7
+"""Share of the detections that are mirror images from which x and y are exchanged."""
+_MIN_DETECTIONS = 10
+"""For a decision whether x and y are exchanged."""
 
 
 def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "25 3"]]:
     """For each row of a file its points in BODY_25's order, (u px, v px, confidence).
 
-    Which order they are in is told by the names that the file gives them, else by their
-    number, unless geometry says clearly that it is another of as many points. A value
-    that is no number makes its point a missing one.
+    The file's order is known from the names that it gives its points, else from their
+    number, unless the distances between them clearly favour another known order of as
+    many points (`layout_evidence`). Points with a value that is not finite are missing.
 
-    **Raises:** `ValueError`, naming the file, if most is broken, or no known order of
-    so many points is that of a body.
+    **Raises:** `ValueError`, naming the file, if most detections are lost to such
+    values, or no known order of as many points fits a body.
     """
     raw = [points for _, points, _ in listed.rows]
     found: list[np.ndarray] = [np.zeros((25, 3))] * len(raw)
@@ -56,17 +58,17 @@ def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "
 
 
 def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
-    """The same with points of confidence 0 where a number is missing or infinite."""
+    """The same, with points of confidence 0 in place of those that are not finite."""
     broken, total, lost = 0, 0, 0
     whole = []
     for points in raw:
         finite = np.asarray(np.isfinite(points).all(axis=-1))
-        # Without confidence it is no error that there is no place.
+        # A missing point (confidence 0) may have no coordinates.
         bad = ~finite & ~(points[:, 2] <= 0)
         broken, total = broken + int(bad.sum()), total + len(points)
         lost += bool(bad.any()) and int((finite & (points[:, 2] > 0)).sum()) < _USABLE
         whole.append(np.where(finite[:, None], points, 0.0))
-    if lost > _MOST * len(raw):
+    if lost > _MAX_LOST * len(raw):
         raise ValueError(
             f"{path}: {broken} of {total} keypoints with NaN or infinity, so that "
             f"{lost} of {len(raw)} people have fewer than {_USABLE} left."
@@ -86,7 +88,7 @@ def _in_order(
     listed: Listed,
     warn: Warn,
 ) -> tuple[np.ndarray, list[int]]:
-    """BODY_25, and the layout that it was in."""
+    """The points in BODY_25's order, and the layout they were in."""
     num = points.shape[1]
     if layout is not None and listed.parts is not None:
         if len(layout) != num:
@@ -122,16 +124,18 @@ def _in_order(
 def _right_way_round(
     points: np.ndarray, has_face: bool, from_rows: bool, warn: Warn
 ) -> np.ndarray:
-    """The same with x and y exchanged if that, and no turn, puts people upright.
+    """The same, with x and y exchanged if that, and not a rotation of the image, puts
+    people upright.
 
     Args:
-        from_rows: whether the layout is of a tool that writes (y, x).
+        has_face: whether the layout has nose and eyes.
+        from_rows: whether the layout is that of a tool that writes (y, x).
     """
     found = lying(points, has_face)
-    if len(points) < _FEWEST or found.share < _ALL_LIE:
+    if len(points) < _MIN_DETECTIONS or found.share < _ALL_LIE:
         return points
     share = f"people lie on their side, head to the left, {100 * found.share:.0f} %"
-    if from_rows or found.mirrored >= _AGREED:
+    if from_rows or found.mirrored >= _MIN_MIRRORED:
         why = "and easy_ViTPose, whose order this is, writes (y, x)"
         if not from_rows:
             why = "and their faces and feet are those of a mirror image"

@@ -1,7 +1,7 @@
-"""Detections in no order -> people: who is who from frame to frame.
+"""Unordered detections in each frame -> people tracked through the video.
 
-Hungarian assignment on a mix of keypoint distance and box overlap, both relative to the
-person's size, against positions predicted at constant velocity.
+Hungarian assignment, with costs from keypoint distances (relative to the person's size)
+and box overlap, to positions predicted at constant velocity.
 """
 
 import dataclasses
@@ -15,26 +15,28 @@ from bodyslam_jax.io.keypoints.reader import Detections
 from bodyslam_jax.types import Keypoints
 
 _FEWEST, _MANY = 3, 8
-"""Keypoints from which sizes are compared, and are comparable."""
+"""Common keypoints from which sizes are compared, and from which they are reliable."""
 _GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
-"""Ratio of sizes from which it is somebody else."""
+"""Ratio of sizes, by few and by many keypoints, from which it is another person."""
 _SEEN = 0.05
-"""Confidence from which a keypoint counts in comparing people."""
+"""Confidence from which a keypoint counts as detected."""
 
 
 @dataclasses.dataclass
 class _Person:
     number: int
     frame: int
-    """When they were last seen."""
+    """The last one in which they were detected."""
     points: np.ndarray
-    """(25, 3): u px, v px, confidence; what is hidden has gone along with the rest."""
+    """(25, 3): u px, v px, confidence; hidden keypoints are moved along with the
+    others."""
     velocity: np.ndarray
+    """(2,): px per frame."""
     hidden: np.ndarray
-    """(25,): frames since each keypoint was last seen."""
+    """(25,): frames since each keypoint was last detected."""
 
     def predict(self, frame: int) -> np.ndarray:
-        """Keypoints (25, 3) expected in `frame`; motion fades while unseen."""
+        """Keypoints (25, 3) predicted for `frame`; at most five frames of motion."""
         gap = min(frame - self.frame, 5)
         last = self.points.copy()
         last[:, :2] += gap * self.velocity
@@ -48,7 +50,7 @@ class _Person:
         if both.sum() >= _FEWEST:
             moved = np.median((points - self.points)[both, :2], axis=0) / gap
             self.velocity = 0.7 * self.velocity + 0.3 * moved
-        # Whoever is half hidden is still as large as before.
+        # Hidden keypoints are kept, so that a half hidden person keeps their size.
         self.hidden = np.where(seen, 0, self.hidden + gap)
         kept = ~seen & (self.points[:, 2] > _SEEN) & (self.hidden <= max_gap)
         points = points.copy()
@@ -59,13 +61,13 @@ class _Person:
 
 @dataclasses.dataclass(frozen=True)
 class _Track:
-    """All that was seen of one person."""
+    """All detections of one person."""
 
     frames: list[int]
     points: list[np.ndarray]
 
     def presence(self) -> float:
-        """How much there is to see: confidence times size, over time."""
+        """Sum over frames of confidence times size; it ranks people."""
         return sum(float(p[:, 2].sum()) * _size(p) for p in self.points)
 
 
@@ -75,14 +77,16 @@ def associate(
     fps: float,
     given: list[np.ndarray] | None = None,
 ) -> tuple[Keypoints, tuple[str, ...]]:
-    """People found in the detections of `t` frames, the best seen first.
+    """People in the detections of `t` frames, in the order of their presence, and
+    warnings.
 
-    Whoever is seen for less than `config.min_duration` is dropped, unless that is
-    everybody, and so is who is beyond `config.max_people`.
+    People detected for less than `config.min_duration` are dropped, unless everybody
+    is; and so are those with the least presence beyond `config.max_people`.
 
     Args:
-        given: for each frame who each detection is, where that is known: the same
-            number is the same person, and people keep the order of their numbers.
+        fps: frame rate, 1/s.
+        given: for each frame the number of the person that each detection is of, if a
+            detector tracks people; they keep the order of their numbers then.
     """
     found = given
     if found is None:
@@ -113,10 +117,11 @@ def associate(
 
 
 def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
-    """For each frame who its `n` detections are, (n,): people numbered from 0.
+    """For each frame the number of the person that each of its `n` detections is of,
+    (n,), from 0.
 
     Args:
-        max_gap: frames that a person may be unseen and still be recognised.
+        max_gap: frames without a detection after which a person is not recognised.
     """
     people: list[_Person] = []
     found = []
@@ -149,7 +154,7 @@ def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
 
 
 def _returns(people: list[_Track]) -> list[str]:
-    """Whoever appears after another has left may be that other, and is said to be."""
+    """Warnings about people who appear after another has left: both may be one."""
     warnings = []
     for j, person in enumerate(people):
         begin = person.frames[0]
@@ -164,14 +169,14 @@ def _returns(people: list[_Track]) -> list[str]:
 
 
 def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
-    """0 for the same place, 1 where it may no longer be the same person."""
+    """0 for a detection at the predicted place; from 1 it is another person."""
     expected = person.predict(frame)
     both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
     if not both.any():
         return np.inf
     size = max(_size(points), _size(expected), 1.0)
-    # The median forgives a swapped or lost limb, which a mean would not; whoever is
-    # named left for right in all of them is the same person, too.
+    # The median tolerates a swapped or lost limb. A detection whose left and right are
+    # exchanged altogether is of the same person, too.
     other = points[list(BODY25_MIRRORED)]
     crossed = (other[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
     away = lambda p, seen: np.median(np.linalg.norm((p - expected)[seen, :2], axis=-1))
@@ -187,7 +192,7 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
 
 
 def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
-    """Whether somebody may be as large as another, by the keypoints that both show."""
+    """Whether the sizes, by common keypoints, can be those of one person."""
     both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
     if both.sum() < _FEWEST:
         return True

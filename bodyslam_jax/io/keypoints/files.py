@@ -1,6 +1,6 @@
-"""Keypoint files of any common detector, as they are: names of images, and who is seen.
+"""Keypoint files of common detectors -> names of images, and detections in them.
 
-Which frame a name means is for `frame_index.py` to say.
+`frame_index` maps the names to frames, `arrange` the points to BODY_25.
 """
 
 import dataclasses
@@ -17,30 +17,33 @@ from bodyslam_jax.io.keypoints.names import names_in
 
 _JSON_SUFFIX = "_keypoints.json"
 _SMALL = 300
-"""Numbers or names of an array that may say something of all the others."""
+"""Entries of an array that may be metadata."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Listed:
-    """The content of a file, before it is known which frames its names mean, and which
-    parts of the body its points are."""
+    """The content of a file, before frames and parts of the body are known."""
 
     rows: list[tuple[str, np.ndarray, int]]
-    """Name of the image, keypoints (j, 3), which may not be finite, and who it is, or
-    -1."""
+    """Name of the image, keypoints (j, 3: u px, v px, confidence; perhaps not finite),
+    and number of the person, or -1."""
     names: list[str]
-    """All images that are listed, with somebody in them or not."""
+    """All images that are listed, with people or without."""
     complete: bool = True
-    """Whether images with nobody in them are listed, too."""
+    """Whether images without people are listed, too."""
     parts: tuple[str, ...] | None = None
     """Names of the `j` points, if the file has them."""
     row_first: bool = False
     """Whether the tool writes (y, x)."""
     size: Size | None = None
-    """Of the images that the points are in, px, if the file says so."""
+    """Of the images that the points are in, px, if the file declares it."""
 
 
 def read_openpose(folder: Path) -> Listed:
+    """OpenPose's folder of `*_keypoints.json`, one file per frame.
+
+    **Raises:** `ValueError`, naming the file, if it is not OpenPose's.
+    """
     files = sorted(folder.glob(f"*{_JSON_SUFFIX}")) or sorted(folder.glob("*.json"))
     if not files:
         raise ValueError(f"{folder}: no *{_JSON_SUFFIX} in this folder.")
@@ -67,6 +70,10 @@ def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
 
 
 def read_json(path: Path) -> Listed:
+    """A JSON file of AlphaPose, MMPose, COCO or easy_ViTPose, recognised by content.
+
+    **Raises:** `ValueError`, naming the file, if it is none of these or incomplete.
+    """
     data = _load_json(path)
     for recognise, read in _JSON_READERS:
         if recognise(data):
@@ -99,7 +106,7 @@ def _read_flat_list(path: Path, data: Any) -> Listed:
         for e in data
     ]
     if all(who == 0 for _, _, who in rows):
-        # What AlphaPose writes for everybody where it does not track.
+        # AlphaPose numbers everybody 0 if it does not track.
         rows = [(name, points, -1) for name, points, _ in rows]
     return Listed(rows, [name for name, _, _ in rows], complete=False)
 
@@ -186,7 +193,7 @@ _JSON_READERS: list[tuple[Callable[[Any], bool], Callable[[Path, Any], Listed]]]
 def read_npz(path: Path, num_frames: int | None) -> Listed:
     """Generic: `keypoints` (t, j, 3) or (h, t, j, 3), or `uv` and `confidence`.
 
-    Without an axis of people it is one person; with one, each is who it is.
+    Without an axis of people it is one person; along the axis, people are tracked.
     """
     with open_npz(path) as archive:
         if "keypoints" in archive.files:
@@ -250,7 +257,7 @@ def _triples(path: Path, flat: Any) -> np.ndarray:
 
 
 def _who(path: Path, entry: dict, *keys: str) -> int:
-    """The number that a tool gave a person it followed, alone or in a list; or -1."""
+    """The number of a tracked person, alone or in a list; -1 if there is none."""
     value = next((entry[k] for k in keys if k in entry), None)
     while isinstance(value, list):
         value = value[0] if value else None
@@ -259,4 +266,4 @@ def _who(path: Path, entry: dict, *keys: str) -> int:
     try:
         return int(value)
     except (TypeError, ValueError, OverflowError):
-        return -1  # a name, say; people are then told apart by where they are
+        return -1  # not a number, such as a name: people are tracked by position

@@ -1,12 +1,11 @@
-"""Which order keypoints are in, told by geometry.
+"""The likelihood of keypoints under each known order, from distances in the image.
 
-Points that are neighbours on a body are near each other in the image, as near as bones
-are long at most. Under each layout every point has neighbours; how likely the distances
-to them are, of a heavy-tailed density as wide as the bone is long, tells layouts apart.
-A point that a layout has no name for is somewhere about the body. No posture, direction
-of view or orientation in the image goes into it, and neither does the number of points
-that are seen. Of real and simulated people the right order is 1.3 nats a point or more,
-a random one 0 ± 0.4 and at most 1.0; two known orders are 0.6 or more apart.
+Points that are neighbours on a body are at most as far apart in the image as their bone
+is long. Under each layout, distances between neighbours have a heavy-tailed density as
+wide as the bone is long; a point that the layout does not name is anywhere about the
+body. Posture, view and orientation in the image do not matter, nor does the number of
+detected points. For real and simulated people the right order has 1.3 nats per point or
+more, a random one 0 ± 0.4 and at most 1.0; two known orders differ by 0.6 or more.
 """
 
 import dataclasses
@@ -20,25 +19,26 @@ from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, NUM_PARTS, SPINE
 _SEEN = 0.05
 _SURE = 0.3
 _FEWEST_POINTS = 6
-"""Of a person, in a frame, to say anything."""
+"""Of a detection that is used."""
 _FEWEST_PEOPLE = 5
 _MANY_POINTS = 12
-"""From which an order that fits nobody is no half of a body."""
+"""Points of a detection from which a bad fit is not explained by a half hidden body."""
 _PLAUSIBLE = 1.1
-"""Nats a point: less may be chance."""
+"""Nats per point of a layout that is not chance."""
 _MARGIN = 0.3
-"""Nats a point by which another order must be better."""
+"""Nats per point by which another order must be better than the usual one."""
 _AGREED = 0.8
-"""Share of the people and frames that must say the same."""
+"""Share of the detections for which it must be better."""
 _NOBODY, _ODD = 0.1, 0.7
-"""Nats a point, below which a layout explains nothing, no layout at all having 0.4; and
-below which it hardly does."""
+"""Nats per point below which a layout explains nothing (points without any layout have
+0.4), and below which it explains the points badly."""
 _ALIVE = 0.02
-"""Change of posture, of a person's size, without which it is no person's."""
+"""Change of posture, relative to the person's size, of a living person."""
 _SCALES = (0.15, 0.25, 0.35, 0.5, 0.7)
-"""m, that the seen points of a person are about their middle: half a body is less."""
+"""Candidates for the RMS distance of the detected points from their mean, m; a half
+hidden body has less."""
 _BREADTH = 0.6
-"""m, of what no neighbour tells."""
+"""Width of the density of points without neighbours, m."""
 
 _BONES = (  # parts of the right side, of the left side, m
     ((2, 3), (5, 6), 0.28),
@@ -76,26 +76,26 @@ _NEIGHBOURS = [(a, m) for r, l, m in _BONES for a in (r, l)] + list(_BETWEEN)
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Which layout keypoints are in."""
+    """The layout that keypoints are in."""
 
     layout: str
     changed: bool
-    """Whether it is another one than is assumed by their number."""
+    """Whether it is not the usual one of as many keypoints."""
     known: bool
-    """Whether any layout explains them."""
+    """Whether any layout explains the keypoints."""
     odd: bool
-    """Whether the layout hardly explains them, better than chance though."""
+    """Whether the layout explains them badly, if better than chance."""
     nats: dict[str, float]
-    """How well each explains them: nats a point."""
+    """Log-likelihood of each layout, nats per point."""
 
 
 def choose_layout(
     points: Float[np.ndarray, "n j 3"], layouts: Mapping[str, list[int]]
 ) -> Choice:
-    """The layout of `n` people in frames, of those given, the first the usual one.
+    """The layout of `n` detections among `layouts`, the first being the usual one.
 
-    Another than the first is chosen only where it is plausible, much better, and better
-    for nearly everybody, and where postures change.
+    Another is chosen only if it is plausible, much better, better for nearly all
+    detections, and postures change.
     """
     first = next(iter(layouts))
     seen = points[..., 2] > _SEEN
@@ -125,8 +125,8 @@ def choose_layout(
 def likelihood(
     points: Float[np.ndarray, "n j 3"], seen: Bool[np.ndarray, "n j"], layout: list[int]
 ) -> Float[np.ndarray, " n"]:
-    """How well a layout explains each of `n` people: nats a point seen, of a density
-    over the plane in which the root mean square from the middle is 0.5."""
+    """Log-likelihood of each of `n` detections under a layout, nats per detected point,
+    in units in which the RMS distance from the mean is 0.5."""
     uv = _normalised(points, seen)
     num = len(points)
     place, there = np.zeros((num, NUM_PARTS, 2)), np.zeros((num, NUM_PARTS), dtype=bool)
@@ -161,12 +161,13 @@ def likelihood(
 
 
 def _density(square: np.ndarray, width: float) -> np.ndarray:
-    """Logarithm of Student's t of two degrees of freedom in the plane, up to 1/2π."""
+    """Log density, up to 1/2π, of Student's t with two degrees of freedom in the
+    plane."""
     return -2 * np.log(width) - 2 * np.log1p(square / (2 * width**2))
 
 
 def _normalised(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Places about the middle of the points seen, of which the RMS is 1."""
+    """Positions relative to the mean of the detected points, scaled to an RMS of 1."""
     count = np.maximum(seen.sum(axis=1), 1)[:, None]
     uv = (
         points[..., :2]
@@ -177,7 +178,7 @@ def _normalised(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _changes(points: np.ndarray, seen: np.ndarray) -> bool:
-    """Whether postures differ: points that always lie alike are no moving person."""
+    """Whether postures differ, as those of a moving person do."""
     often = seen.mean(axis=0) > 0.5
     if not often.any():
         return True

@@ -1,7 +1,7 @@
 """Keypoints of any common layout -> BODY_25.
 
-A layout says for each of a detector's points which part of the body it is; the parts
-are BODY_25's, and two more that other detectors have. Sources: OpenPose's documentation
+A layout lists the part of the body that each of a detector's points is; the parts are
+BODY_25's, and two more that other detectors have. Sources: OpenPose's documentation
 (BODY_25, BODY_25B, COCO-18), COCO, COCO-WholeBody, Halpe (AlphaPose), ViTPose+ with
 feet (easy_ViTPose's `coco_25`), Human3.6M as in MMPose, Kinect v2 (NTU RGB+D).
 """
@@ -55,8 +55,8 @@ LAYOUTS: dict[int, dict[str, list[int]]] = {
         ],
     },
 }
-"""By the number of keypoints: layouts that have as many, the one that is assumed first.
-For each of their points its part, or -1."""
+"""By the number of keypoints: layouts of as many, the usual one first. A layout has the
+part of each of its points, or -1."""
 
 _MIDPOINTS = (
     (BODY25["neck"], BODY25["right_shoulder"], BODY25["left_shoulder"]),

@@ -1,8 +1,8 @@
 """Whether people lie on their side because x and y were exchanged.
 
 (y, x) in place of (x, y) lays everybody down, with the head to the left. So does a
-quarter turn of the image, but it does not mirror: whoever faces the camera has the
-right side of the body on the left of an upright image.
+rotation of the image by 90 degrees, but without mirroring: in an upright image, a
+person who faces the camera has the right side of the body on the left.
 """
 
 import dataclasses
@@ -21,36 +21,36 @@ _RIGHT, _LEFT = (
 _FEET = (BODY25_TOES_AND_HEELS[:2], BODY25_TOES_AND_HEELS[2:])
 """Toe and heel of either foot."""
 _STEEP = 35.0
-"""degrees from the image's rows, that the trunk of who lies is at most."""
+"""degrees between the trunk of a lying person and the image's rows, at most."""
 _ASIDE = 0.2
-"""Of the trunk: less of breadth is a side view, which tells nothing."""
+"""Breadth over the trunk's length below which it is a side view, without evidence."""
 _ALWAYS = 0.99
-"""Share of the people and frames with a face above which the detector says so of
-everybody, also of who is seen from behind."""
+"""Share of the detections with a face above which the detector gives everybody one,
+also people seen from behind."""
 _FEWEST = 5
+"""Detections with evidence."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Lying:
-    """People who lie on their side with their heads to the left of the image."""
+    """Detections that lie on their side with the head to the left of the image."""
 
     share: float
-    """Of all people in frames, those who do."""
+    """Of all detections."""
     mirrored: float
-    """Of those of whom it can be told, the share for whom exchanging x and y fits what
-    is seen of face and feet; for the others turning the image does. NaN where it cannot
-    be told."""
+    """Of the lying detections with evidence, the share whose face and feet fit an
+    exchange of x and y; those of the others fit a rotation. NaN without evidence."""
 
 
 def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
-    """How `n` people in frames lie, given as (u px, v px, confidence) in BODY_25 order.
+    """How `n` detections lie, given as (u px, v px, confidence) in BODY_25 order.
 
     Args:
-        has_face: whether the detector's layout has nose and eyes, so that none means
-            that none is seen.
+        has_face: whether the detector's layout has nose and eyes, so that their absence
+            means a person seen from behind.
     """
-    known = (points[:, [_NECK, _MID_HIP], 2] > _SEEN).all(axis=1)
-    points = points[known]
+    has_trunk = (points[:, [_NECK, _MID_HIP], 2] > _SEEN).all(axis=1)
+    points = points[has_trunk]
     if not len(points):
         return Lying(0.0, np.nan)
     trunk = points[:, _MID_HIP, :2] - points[:, _NECK, :2]
@@ -74,11 +74,12 @@ def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
 def _facing(
     points: np.ndarray, sure: np.ndarray, length: np.ndarray, has_face: bool
 ) -> np.ndarray:
-    """Positive for who faces the camera, negative for who turns away, 0 for unknown.
+    """Positive for people who face the camera, negative for those seen from behind, 0
+    for unknown.
 
-    By whether a face is seen; if one is of everybody, by the feet: toes of who comes
-    are lower in an upright image than the heels, as the camera is above the ground. Of
-    who lies with the head to the left, lower is further to the right.
+    By whether a face is detected; if everybody has one, by the feet: toes of a person
+    who faces the camera are lower in an upright image than the heels, as the camera is
+    above the ground. With the head to the left, lower is further to the right.
     """
     face = sure[:, list(BODY25_FACE)].sum(axis=1) >= 2
     if has_face and face.mean() <= _ALWAYS:

@@ -1,4 +1,4 @@
-"""Names that files give their keypoints -> parts of the body."""
+"""Names that files give their keypoints -> parts of the body (indices of BODY_25)."""
 
 import re
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ _SIDED = _sided(
     heel="heel",
 )
 _ELSE = _sided(wrist="hand", ankle="foot")
-"""What some call wrist and ankle, where nothing else is called so."""
+"""Names that some files give wrist and ankle; they count if nothing else has them."""
 _RIGHT, _LEFT = {"right", "r"}, {"left", "l"}
 _LIMBS = {
     BODY25[f"{side}_{part}"]
@@ -51,11 +51,11 @@ _LIMBS = {
     for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 }
 _FEWEST = 8
-"""Of the twelve joints of the limbs: as many must be named."""
+"""Of the twelve joints of the limbs, so many must be named."""
 
 
 def layout_of(names: Sequence[Any]) -> list[int] | None:
-    """For each name its part, as in `LAYOUTS`; None if these are no body's names."""
+    """The part of each name, as in `LAYOUTS`; `None` if too few are a body's."""
     words = [_words(str(name)) for name in names]
     layout = [_part(side, rest, _SIDED) for side, rest in words]
     for place, (side, rest) in enumerate(words):
@@ -64,7 +64,7 @@ def layout_of(names: Sequence[Any]) -> list[int] | None:
             layout[place] = part
     taken: set[int] = set()
     for place, part in enumerate(layout):
-        # The first counts: `head` before `head_top`, say.
+        # Of two names of one part, such as `head` and `head_top`, the first counts.
         if part in taken:
             layout[place] = -1
         taken.add(part)
@@ -115,7 +115,7 @@ def _listed(value: Any) -> list[str] | None:
 
 
 def _words(name: str) -> tuple[str, str]:
-    """Which side a name says, `r`, `l` or nothing, and the rest of it, joined."""
+    """The side in a name, `r`, `l` or nothing, and the rest of the name, joined."""
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name)
     words = [w for w in re.split(r"[^a-z0-9]+", name.lower()) if w]
     side = next((w for w in words if w in _RIGHT | _LEFT), "")

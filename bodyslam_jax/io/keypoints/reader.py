@@ -1,7 +1,7 @@
-"""Keypoint files of any common detector -> people in BODY_25 order, in pixels.
+"""Keypoint files of common detectors -> detections in each frame, BODY_25, pixels.
 
-A reader gives what each frame holds, in no order, and who is who if the file says so;
-`keypoints/associate.py` makes people of it.
+Detections of a frame have no order, but numbers of people if the file has them;
+`associate` tracks people through them.
 """
 
 import dataclasses
@@ -22,17 +22,17 @@ Detections = list[np.ndarray]
 """For each frame the keypoints (n, 25, 3) of `n` people: u px, v px, confidence."""
 
 _SURE = 0.3
-"""Confidence from which a keypoint is where it is said to be."""
+"""Confidence from which a keypoint's position is trusted."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Detected:
-    """What a file of keypoints holds for each frame."""
+    """The detections in each frame."""
 
     points: Detections
     person: list[np.ndarray] | None = None
-    """For each frame who its `n` people are, (n,): the same number is the same person;
-    None if the file does not say."""
+    """For each frame the numbers (n,) of its `n` people, the same for the same person;
+    `None` if the file does not track people."""
 
 
 def read_detections(
@@ -47,8 +47,8 @@ def read_detections(
     """Reads whatever `path` is: a folder of OpenPose JSON files, a JSON file of
     AlphaPose, MMPose, COCO or easy_ViTPose, or a generic `.npz`.
 
-    Broken values are missing points; points in another order than usual, in (y, x), or
-    in images of another size that the file names, are put right. All is said.
+    Points that are not finite are missing; points in another order than usual, in
+    (y, x), or in images of another declared size are converted, with warnings.
 
     Args:
         num_frames: of the video; None for as many as the file has.
@@ -91,11 +91,11 @@ def read_detections(
 
 
 def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:
-    """Who is who, if the file says it of everybody and without contradiction."""
-    said = np.concatenate(person) if person else np.zeros(0)
-    if not (said >= 0).any():
+    """The numbers of people, if everybody has one and nobody two in a frame."""
+    numbers = np.concatenate(person) if person else np.zeros(0)
+    if not (numbers >= 0).any():
         return None
-    wrong = "given for some only" if (said < 0).any() else ""
+    wrong = "given for some only" if (numbers < 0).any() else ""
     for frame, who in enumerate(person):
         if not wrong and len(np.unique(who)) < len(who):
             wrong = f"given twice in frame {frame}"
@@ -113,8 +113,8 @@ def _to_pixels(
     declared: Size | None,
     warn: Warn,
 ) -> Detected:
-    """Undoes OpenPose's `--keypoint_scale` and another size that the file declares, and
-    clears what is missing."""
+    """Undoes OpenPose's `--keypoint_scale`, another declared size and the rotation of a
+    phone's video; sets missing points to 0."""
     counts = [len(d) for d in detections]
     if not sum(counts):
         raise ValueError(f"{path}: no person in any frame.")
@@ -152,16 +152,16 @@ def _to_pixels(
 def _relative(
     points: np.ndarray, sure: np.ndarray, size: tuple[int, int], warn: Warn
 ) -> np.ndarray | None:
-    """Pixels of points that are relative to the image, in [0, 1] or [-1, 1]; None of
-    those that are not.
+    """Pixels of points that are relative to the image, in [0, 1] or [-1, 1]; `None` if
+    they are pixels already.
 
-    Told by most of the sure points: single ones may be well outside the image.
+    Decided by quantiles: single points may be well outside the image.
     """
     uv = points[..., :2]
     low, high = np.quantile(uv[sure], [0.05, 0.95], axis=0)
     if high.max() > 1.5 or low.min() < -1.5:
         return None
-    # Half a person beyond the left or top side is rarer than [-1, 1].
+    # In [0, 1] a twentieth of the points is rarely as far beyond the left or top side.
     zero = -1.0 if low.min() < -0.1 else 0.0
     warn(f"keypoints in [{zero:g}, 1]: taken as relative to the size of the image.")
     return (uv - zero) / (1 - zero) * (np.asarray(size, dtype=np.float64) - 1)

@@ -1,15 +1,16 @@
-"""Keypoints of a phone's video as it is stored, on its side, not as it is shown."""
+"""Keypoints in the frames of a phone's video as stored, before its rotation tag."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax.body.skeleton import BODY25
 from bodyslam_jax.io.frame_index import Warn
 
 _BEYOND, _WITHIN = 0.02, 0.995
-"""Share of points beyond the edge of the video, and within that of the turned one."""
+"""Share of points outside the video, and within the rotated one, at least."""
 _LYING = 0.8
-"""Share of people whose trunk is across."""
-_NECK, _MID_HIP = 1, 8
+"""Share of people whose trunk is horizontal, at least."""
+_NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
 
 
 def turned_back(
@@ -18,12 +19,14 @@ def turned_back(
     size: tuple[int, int],
     warn: Warn,
 ) -> Float[np.ndarray, "m 25 2"] | None:
-    """Pixels of the video (width, height), if the points are those of a video of height
-    x width in which people lie; None if not. Heads are up then.
+    """Pixels of the video of `size` (width, height), if the points fit a video of
+    height x width in which people lie; `None` if they do not.
+
+    The rotation is the one that turns heads up.
 
     Args:
         points: u px, v px, confidence.
-        sure: which of them are where they are said to be.
+        sure: points whose position is trusted.
     """
     width, height = size
     uv = points[..., :2]
@@ -41,9 +44,8 @@ def turned_back(
         return None
     warn(
         f"keypoints are of a video of {height}x{width} px in which people lie, this "
-        "one "
-        f"has {width}x{height} px: taken as detected before the video's rotation was "
-        "applied, and turned."
+        f"one has {width}x{height} px: taken as detected before the video's rotation "
+        "was applied, and turned."
     )
     u, v = uv[..., 0], uv[..., 1]
     if right > left:  # the stored image is the shown one turned clockwise
