@@ -67,7 +67,7 @@ def search_paths(gender: str = "neutral") -> list[Path]:
     The file or folder in the environment variable `BODYSLAM_BODY_MODEL`, then the
     user's folder for data. The body that ships with the package comes after these.
     """
-    return [path for folder in _folders() for path in candidates(folder, gender)]
+    return [path for location in _locations() for path in candidates(location, gender)]
 
 
 def load_body_model(
@@ -169,29 +169,31 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
     return read_pickle(file)
 
 
-def _folders() -> list[Path]:
-    folders = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
+def _locations() -> list[Path]:
+    locations = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
     home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return [*folders, Path(home) / "bodyslam" / "body_models"]
+    return [*locations, Path(home) / "bodyslam" / "body_models"]
 
 
-def candidates(place: Path, gender: str) -> list[Path]:
-    """The files of one gender that `place`, a file or folder, may stand for."""
+def candidates(location: Path, gender: str) -> list[Path]:
+    """The files of one gender that `location`, a file or folder, may stand for."""
     if gender not in _GENDERS:
         raise ValueError(f"gender {gender!r}, expected neutral, female or male.")
-    if place.suffix in (".npz", ".pkl") or place.is_file():
-        return [place]
+    if location.suffix in (".npz", ".pkl") or location.is_file():
+        return [location]
     short = gender if gender == "neutral" else gender[0]
     names = [n.format(G=gender.upper(), g=short, gender=gender) for n in _NAMES]
-    return [place / name for name in names]
+    return [location / name for name in names]
 
 
 def _find(path: str | Path | None, gender: str | None) -> Path:
     wanted = gender or "neutral"
-    places = _folders() if path is None else [Path(path)]
+    locations = _locations() if path is None else [Path(path)]
     is_set = path is None and bool(os.environ.get(VARIABLE))
     note = f" ({VARIABLE} is set)" if is_set else ""
-    for candidate in (file for place in places for file in candidates(place, wanted)):
+    for candidate in (
+        file for location in locations for file in candidates(location, wanted)
+    ):
         if candidate.is_file():
             of = named_gender(candidate)
             if gender and of not in (gender, None):
@@ -201,7 +203,7 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
             return candidate
     if path is None and wanted == "neutral" and not is_set:
         return DEFAULT
-    tried = ", ".join(_tried(place, wanted) for place in places)
+    tried = ", ".join(_tried(location, wanted) for location in locations)
     raise ValueError(f"No {wanted} body model found{note}; tried {tried}.")
 
 
@@ -216,12 +218,12 @@ def named_gender(file: Path) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _tried(place: Path, gender: str) -> str:
-    files = candidates(place, gender)
-    if files == [place]:
-        return str(place)
-    names = ", ".join(str(file.relative_to(place)) for file in files[:2])
-    return f"{place} ({names}, ...)"
+def _tried(location: Path, gender: str) -> str:
+    files = candidates(location, gender)
+    if files == [location]:
+        return str(location)
+    names = ", ".join(str(file.relative_to(location)) for file in files[:2])
+    return f"{location} ({names}, ...)"
 
 
 def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:

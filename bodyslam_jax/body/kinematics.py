@@ -198,8 +198,8 @@ def _placed(model, pose, shape, trans, points):
 def _detected(model, posed, shape, layout, bias):
     """Keypoints (k, 3, n) about the pelvis."""
     if layout not in KEYPOINT_NAMES:
-        known = ", ".join(KEYPOINT_NAMES)
-        raise ValueError(f"keypoint layout {layout!r}, expected one of {known}.")
+        layouts = ", ".join(KEYPOINT_NAMES)
+        raise ValueError(f"keypoint layout {layout!r}, expected one of {layouts}.")
     names = KEYPOINT_NAMES[layout]
     surface = [n for n in names if n in SURFACE_POINTS]
     inner = [n for n in names if n not in SURFACE_POINTS]

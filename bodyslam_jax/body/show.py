@@ -58,9 +58,9 @@ def save_picture(model: BodyModel, path: str | Path) -> None:
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
-    suffix, known = Path(path).suffix, sorted(figure.canvas.get_supported_filetypes())
-    if suffix[1:].lower() not in known:
-        expected = ", ".join(f".{kind}" for kind in known)
+    suffix, formats = Path(path).suffix, sorted(figure.canvas.get_supported_filetypes())
+    if suffix[1:].lower() not in formats:
+        expected = ", ".join(f".{kind}" for kind in formats)
         raise ValueError(f"{path}: suffix {suffix!r}, expected one of {expected}.")
     rows = figure.subplots(2, 1)
     trans, zero = jnp.zeros(3, model.dtype), jnp.zeros(10, model.dtype)
@@ -109,8 +109,8 @@ def draw_body(
         u, depth = -points[:, 2], points[:, 0]
     else:  # from +z: the subject's left is to the right
         u, depth = points[:, 0], points[:, 2]
-    seen = np.stack([u + at[0], points[:, 1] + at[1], depth], -1)
-    corner = seen[faces]
+    view = np.stack([u + at[0], points[:, 1] + at[1], depth], -1)
+    corner = view[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     front = normal[:, 2] > 0

@@ -119,9 +119,9 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
-    true_up, known = plausibility.up_axis(truth.joints, truth.present)
+    true_up, has_up = plausibility.up_axis(truth.joints, truth.present)
     tilt = plausibility.gravity_error(estimate.T_WC, truth.T_WC, camera_valid, true_up)
-    values["gravity_error"] = jnp.where(known, tilt, jnp.nan)
+    values["gravity_error"] = jnp.where(has_up, tilt, jnp.nan)
     people: dict[str, Array] = {}
     if truth.present.shape[0]:
         per_person = jax.vmap(_person_errors, (0,) * 6 + (None,) * 4)
@@ -206,11 +206,11 @@ def _camera_errors(
         values |= _both(f"c_ate_{group}", error)
         scale = found.scale
     values["ate_s"] = values["c_ate_se3"]
-    known = _moves(truth.T_WC, valid) & ~_stands(estimate.T_WC, valid)
+    has_scale = _moves(truth.T_WC, valid) & ~_stands(estimate.T_WC, valid)
     for name in ("c_ate_sim3", "c_ate_sim3_rmse"):
-        values[name] = jnp.where(known, values[name], jnp.nan)
-    values["scale"] = jnp.where(known, scale, jnp.nan)
-    values["scale_error"] = jnp.where(known, jnp.abs(1 - scale), jnp.nan)
+        values[name] = jnp.where(has_scale, values[name], jnp.nan)
+    values["scale"] = jnp.where(has_scale, scale, jnp.nan)
+    values["scale_error"] = jnp.where(has_scale, jnp.abs(1 - scale), jnp.nan)
     moved, turned = metrics.relative_pose_errors(estimate.T_WC, truth.T_WC, valid)
     return values | _both("rpe_translation", moved) | _both("rpe_rotation", turned)
 

@@ -139,8 +139,8 @@ def resample(
         return (1 - w) * x[:, before] + w * x[:, after]
 
     def flags(x: np.ndarray) -> np.ndarray:
-        known = (x[..., before] | (weight == 1)) & (x[..., after] | (weight == 0))
-        return known & between.available
+        both = (x[..., before] | (weight == 1)) & (x[..., after] | (weight == 0))
+        return both & between.available
 
     return Samples(
         interpolate_poses(samples.T_WC, between),

@@ -162,8 +162,8 @@ def _points(
     """Image points of each person in each frame: u px, v px, 1 or 0 if missing."""
     if people is not None:
         sure = people.confidence > _SURE
-        seen = sure if sure.any() else people.confidence > 0
-        return np.concatenate([people.uv, seen[..., None].astype(float)], axis=-1)
+        present = sure if sure.any() else people.confidence > 0
+        return np.concatenate([people.uv, present[..., None].astype(float)], axis=-1)
     if bodies is None:
         return None
     place = bodies.trans[:, :, None] + _ABOUT_PELVIS

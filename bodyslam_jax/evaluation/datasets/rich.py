@@ -70,12 +70,12 @@ def convert_rich(
 def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, str]:
     """Gender by subject, from a table `{"3": "male", ...}`."""
     root = root.resolve()
-    places = [root, root / "resource", root.parent / "resource"]
-    places = [place / "gender.json" for place in places] if file is None else [file]
-    file = next((place for place in places if place.is_file()), None)
+    folders = [root, root / "resource", root.parent / "resource"]
+    paths = [folder / "gender.json" for folder in folders] if file is None else [file]
+    file = next((path for path in paths if path.is_file()), None)
     if file is None:
         raise FileNotFoundError(
-            f"{places[0]}: not there, and RICH's own files do not name genders; it is "
+            f"{paths[0]}: not there, and RICH's own files do not name genders; it is "
             f"in {_GENDERS_FROM}, and can be named with --genders."
         )
     try:

@@ -138,11 +138,11 @@ def _between(
     low = np.floor(at).astype(np.int64)
     high = np.minimum(low + 1, len(poses) - 1)
     part = (at - low)[:, None]
-    known = np.asarray(np.isfinite(poses).all(axis=1))[:, None]
-    safe = np.where(known, poses, 0.0)
+    finite = np.asarray(np.isfinite(poses).all(axis=1))[:, None]
+    safe = np.where(finite, poses, 0.0)
     a, b = (safe[k].reshape(-1, 24, 3) for k in (low, high))
     turn = part[:, :, None] * so3.between(a, b)
     between = so3.compose(a, turn).reshape(-1, 72)
     between = np.where(part > 0, between, poses[low])
-    between = np.where(known[low] & (known[high] | (part == 0)), between, np.nan)
+    between = np.where(finite[low] & (finite[high] | (part == 0)), between, np.nan)
     return between, (1 - part) * trans[low] + part * trans[high]

@@ -61,7 +61,7 @@ def turn_to_camera(
     """
     fx, fy, px, py = intrinsics.params[:4]
     ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
-    known = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
-    ray, turn = np.where(known, ray, 0.0), np.where(known, orientation, 0.0)
+    finite = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
+    ray, turn = np.where(finite, ray, 0.0), np.where(finite, orientation, 0.0)
     turned = so3.compose(so3.optical_axis_to_ray(ray), turn)
-    return np.where(known, turned, np.nan)
+    return np.where(finite, turned, np.nan)

@@ -83,9 +83,11 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
         raise ValueError(f"{path}: incomplete or damaged bodies ({what}).") from None
-    known = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
+    supported = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
     keys = ", ".join(str(k) for k in list(data)[:6])
-    raise ValueError(f"{path}: not bodies of {known} or bodies.npz; it holds {keys}.")
+    raise ValueError(
+        f"{path}: not bodies of {supported} or bodies.npz; it holds {keys}."
+    )
 
 
 def _from_contract(data: dict, video: Video) -> Rows:

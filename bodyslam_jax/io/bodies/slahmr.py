@@ -122,6 +122,6 @@ def from_slahmr(data: dict, video: Video) -> Rows:
 def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     """Axis-angle of `R exp(rotvec)`; NaN where either is not finite."""
     both = np.hstack([R.reshape(-1, 9), rotvec])
-    known = np.asarray(np.isfinite(both).all(axis=1))[:, None]
-    safe = np.where(known[..., None], R, np.eye(3)), np.where(known, rotvec, 0.0)
-    return np.where(known, so3.compose(so3.log(safe[0]), safe[1]), np.nan)
+    finite = np.asarray(np.isfinite(both).all(axis=1))[:, None]
+    safe = np.where(finite[..., None], R, np.eye(3)), np.where(finite, rotvec, 0.0)
+    return np.where(finite, so3.compose(so3.log(safe[0]), safe[1]), np.nan)

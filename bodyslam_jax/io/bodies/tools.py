@@ -163,8 +163,8 @@ def _phalp_factor(data: dict, video: Video) -> float:
         raise InvalidContent(f"images of several sizes: {sorted(sizes)[:3]}")
     height, width = sizes.pop()
     size = (video.camera.width, video.camera.height)
-    seen = (float(width), float(height))
-    return factor_to(seen, size, np.zeros((0, 2)), "bodies", video.warn)
+    declared = (float(width), float(height))
+    return factor_to(declared, size, np.zeros((0, 2)), "bodies", video.warn)
 
 
 def from_tram(data: dict, video: Video) -> Rows:

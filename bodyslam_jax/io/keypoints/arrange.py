@@ -96,15 +96,15 @@ def _in_order(
                 f"{path}: names of {len(layout)} keypoints, but {num} a person."
             )
         return from_layout(points, layout), layout
-    known = LAYOUTS.get(num)
-    if known is None:
+    layouts = LAYOUTS.get(num)
+    if layouts is None:
         return to_body25(path, points), list(range(25))
-    choice = choose_layout(points, known)
-    usual = next(iter(known))
+    choice = choose_layout(points, layouts)
+    usual = next(iter(layouts))
     if not choice.known:
         raise ValueError(
             f"{path}: {num} keypoints a person in no known order: as "
-            f"{', '.join(known)} limbs are longer than anybody's; give them in "
+            f"{', '.join(layouts)} limbs are longer than anybody's; give them in "
             f"{usual}'s order, or in a file that names them (`keypoint_names`)."
         )
     if choice.odd:
@@ -118,7 +118,7 @@ def _in_order(
             "the distances between them, log-likelihoods a point "
             f"{choice.nats[choice.layout]:.1f} and {choice.nats[usual]:.1f}."
         )
-    return from_layout(points, known[choice.layout]), known[choice.layout]
+    return from_layout(points, layouts[choice.layout]), layouts[choice.layout]
 
 
 def _right_way_round(

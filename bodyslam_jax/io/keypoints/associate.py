@@ -18,7 +18,7 @@ _FEWEST, _MANY = 3, 8
 """Common keypoints from which sizes are compared, and from which they are reliable."""
 _GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
 """Ratio of sizes, by few and by many keypoints, from which it is another person."""
-_SEEN = 0.05
+_PRESENT = 0.05
 """Confidence from which a keypoint counts as detected."""
 
 
@@ -44,15 +44,15 @@ class _Person:
 
     def extend(self, frame: int, points: np.ndarray, max_gap: int) -> None:
         gap = frame - self.frame
-        seen = points[:, 2] > _SEEN
-        both = seen & (self.points[:, 2] > _SEEN)
+        present = points[:, 2] > _PRESENT
+        both = present & (self.points[:, 2] > _PRESENT)
         moved = self.velocity
         if both.sum() >= _FEWEST:
             moved = np.median((points - self.points)[both, :2], axis=0) / gap
             self.velocity = 0.7 * self.velocity + 0.3 * moved
         # Hidden keypoints are kept, so that a half hidden person keeps their size.
-        self.hidden = np.where(seen, 0, self.hidden + gap)
-        kept = ~seen & (self.points[:, 2] > _SEEN) & (self.hidden <= max_gap)
+        self.hidden = np.where(present, 0, self.hidden + gap)
+        kept = ~present & (self.points[:, 2] > _PRESENT) & (self.hidden <= max_gap)
         points = points.copy()
         points[kept] = self.points[kept]
         points[kept, :2] += gap * moved
@@ -125,28 +125,28 @@ def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
     """
     people: list[_Person] = []
     found = []
-    for frame, seen in enumerate(detections):
+    for frame, detected in enumerate(detections):
         alive = [p for p in people if frame - p.frame <= max_gap]
-        who = np.full(len(seen), -1)
-        if alive and len(seen):
-            cost = np.array([[_cost(p, frame, d) for d in seen] for p in alive])
+        who = np.full(len(detected), -1)
+        if alive and len(detected):
+            cost = np.array([[_cost(p, frame, d) for d in detected] for p in alive])
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:
-                    alive[i].extend(frame, seen[j], max_gap)
+                    alive[i].extend(frame, detected[j], max_gap)
                     who[j] = alive[i].number
         for j in np.flatnonzero(who < 0):
             who[j] = len(people)
-            unseen = np.zeros(len(seen[j]), int)
-            people.append(_Person(len(people), frame, seen[j], np.zeros(2), unseen))
+            hidden = np.zeros(len(detected[j]), int)
+            people.append(_Person(len(people), frame, detected[j], np.zeros(2), hidden))
         found.append(who)
     return found
 
 
 def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
     people: dict[int, _Track] = {}
-    for frame, (seen, who) in enumerate(zip(detections, found, strict=True)):
-        for points, number in zip(seen, who.tolist(), strict=True):
+    for frame, (detected, who) in enumerate(zip(detections, found, strict=True)):
+        for points, number in zip(detected, who.tolist(), strict=True):
             person = people.setdefault(number, _Track([], []))
             person.frames.append(frame)
             person.points.append(points)
@@ -171,15 +171,15 @@ def _returns(people: list[_Track]) -> list[str]:
 def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
     """0 for a detection at the predicted place; from 1 it is another person."""
     expected = person.predict(frame)
-    both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    both = (points[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
     if not both.any():
         return np.inf
     size = max(_size(points), _size(expected), 1.0)
     # The median tolerates a swapped or lost limb. A detection whose left and right are
     # exchanged altogether is of the same person, too.
     other = points[list(BODY25_MIRRORED)]
-    crossed = (other[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
-    away = lambda p, seen: np.median(np.linalg.norm((p - expected)[seen, :2], axis=-1))
+    crossed = (other[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
+    away = lambda p, both: np.median(np.linalg.norm((p - expected)[both, :2], axis=-1))
     distance = away(points, both)
     if crossed.any():
         distance = min(distance, away(other, crossed))
@@ -193,7 +193,7 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
 
 def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
     """Whether the sizes, by common keypoints, can be those of one person."""
-    both = (points[:, 2] > _SEEN) & (expected[:, 2] > _SEEN)
+    both = (points[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
     if both.sum() < _FEWEST:
         return True
     most = _GROWTH if both.sum() >= _MANY else _GROWTH_OF_FEW
@@ -202,10 +202,10 @@ def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def _box(points: np.ndarray) -> np.ndarray:
-    seen = points[points[:, 2] > _SEEN][:, :2]
-    if not len(seen):
+    uv = points[points[:, 2] > _PRESENT][:, :2]
+    if not len(uv):
         return np.zeros((2, 2))
-    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+    return np.stack([uv.min(axis=0), uv.max(axis=0)])
 
 
 def _size(points: np.ndarray) -> float:

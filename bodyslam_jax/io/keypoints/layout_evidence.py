@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, NUM_PARTS, SPINE
 
-_SEEN = 0.05
+_PRESENT = 0.05
 _SURE = 0.3
 _FEWEST_POINTS = 6
 """Of a detection that is used."""
@@ -98,12 +98,12 @@ def choose_layout(
     detections, and postures change.
     """
     first = next(iter(layouts))
-    seen = points[..., 2] > _SEEN
-    enough = seen.sum(axis=1) >= _FEWEST_POINTS
-    points, seen = points[enough], seen[enough]
+    present = points[..., 2] > _PRESENT
+    enough = present.sum(axis=1) >= _FEWEST_POINTS
+    points, present = points[enough], present[enough]
     if not len(points):
         return Choice(first, False, True, False, {})
-    nats = {name: likelihood(points, seen, la) for name, la in layouts.items()}
+    nats = {name: likelihood(points, present, la) for name, la in layouts.items()}
     mean = {name: float(value.mean()) for name, value in nats.items()}
     best = max(mean, key=lambda name: mean[name])
     better = nats[best] > nats[first]
@@ -112,36 +112,41 @@ def choose_layout(
         and mean[best] >= _PLAUSIBLE
         and mean[best] - mean[first] >= _MARGIN
         and better.mean() >= _AGREED
-        and _changes(points, seen)
+        and _changes(points, present)
     ):
         return Choice(best, True, True, False, mean)
-    many = seen.sum(axis=1) >= _MANY_POINTS
+    many = present.sum(axis=1) >= _MANY_POINTS
     least = float(nats[first][many].mean()) if many.sum() >= _FEWEST_PEOPLE else np.inf
-    doubtful = least < _ODD and _changes(points[many], seen[many])
+    doubtful = least < _ODD and _changes(points[many], present[many])
     none = doubtful and least < _NOBODY and max(mean.values()) < _PLAUSIBLE
     return Choice(first, False, not none, doubtful and not none, mean)
 
 
 def likelihood(
-    points: Float[np.ndarray, "n j 3"], seen: Bool[np.ndarray, "n j"], layout: list[int]
+    points: Float[np.ndarray, "n j 3"],
+    present: Bool[np.ndarray, "n j"],
+    layout: list[int],
 ) -> Float[np.ndarray, " n"]:
     """Log-likelihood of each of `n` detections under a layout, nats per detected point,
     in units in which the RMS distance from the mean is 0.5."""
-    uv = _normalised(points, seen)
+    uv = _normalised(points, present)
     num = len(points)
-    place, there = np.zeros((num, NUM_PARTS, 2)), np.zeros((num, NUM_PARTS), dtype=bool)
+    position, has_part = (
+        np.zeros((num, NUM_PARTS, 2)),
+        np.zeros((num, NUM_PARTS), dtype=bool),
+    )
     for k, part in enumerate(layout):
         if part >= 0:
-            place[:, part], there[:, part] = uv[:, k], seen[:, k]
+            position[:, part], has_part[:, part] = uv[:, k], present[:, k]
     pairs = [
-        (a, b, length, ((place[:, a] - place[:, b]) ** 2).sum(axis=-1))
+        (a, b, length, ((position[:, a] - position[:, b]) ** 2).sum(axis=-1))
         for (a, b), length in _NEIGHBOURS
     ]
     found = np.full(num, -np.inf)
     for size in _SCALES:
         total, count = np.zeros((num, NUM_PARTS)), np.zeros((num, NUM_PARTS))
         for a, b, length, square in pairs:
-            both = there[:, a] & there[:, b]
+            both = has_part[:, a] & has_part[:, b]
             value = both * _density(square * size**2, 0.8 * length)
             for part in (a, b):
                 total[:, part] += value
@@ -154,8 +159,8 @@ def likelihood(
                 value = np.where(count[:, part] > 0, near, alone[:, k])
             else:
                 value = alone[:, k]
-            sums += seen[:, k] * value
-        mean = sums / np.maximum(seen.sum(axis=1), 1)
+            sums += present[:, k] * value
+        mean = sums / np.maximum(present.sum(axis=1), 1)
         found = np.maximum(found, mean + 2 * np.log(size / 0.5))
     return found
 
@@ -166,22 +171,22 @@ def _density(square: np.ndarray, width: float) -> np.ndarray:
     return -2 * np.log(width) - 2 * np.log1p(square / (2 * width**2))
 
 
-def _normalised(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _normalised(points: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Positions relative to the mean of the detected points, scaled to an RMS of 1."""
-    count = np.maximum(seen.sum(axis=1), 1)[:, None]
+    count = np.maximum(present.sum(axis=1), 1)[:, None]
     uv = (
         points[..., :2]
-        - ((points[..., :2] * seen[..., None]).sum(axis=1) / count)[:, None]
+        - ((points[..., :2] * present[..., None]).sum(axis=1) / count)[:, None]
     )
-    square = ((uv**2).sum(axis=-1) * seen).sum(axis=1, keepdims=True) / count
+    square = ((uv**2).sum(axis=-1) * present).sum(axis=1, keepdims=True) / count
     return uv / np.sqrt(np.maximum(square, 1e-12))[..., None]
 
 
-def _changes(points: np.ndarray, seen: np.ndarray) -> bool:
+def _changes(points: np.ndarray, present: np.ndarray) -> bool:
     """Whether postures differ, as those of a moving person do."""
-    often = seen.mean(axis=0) > 0.5
+    often = present.mean(axis=0) > 0.5
     if not often.any():
         return True
-    uv = np.where(seen[..., None], _normalised(points, seen), np.nan)[:, often]
+    uv = np.where(present[..., None], _normalised(points, present), np.nan)[:, often]
     away = uv - np.nanmedian(uv, axis=0)
     return bool(np.nanmedian(np.linalg.norm(away, axis=-1)) > _ALIVE)

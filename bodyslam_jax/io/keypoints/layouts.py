@@ -73,8 +73,8 @@ def to_body25(path: Path, points: np.ndarray) -> np.ndarray:
     num = points.shape[-2]
     if num not in BODY25_FROM:
         *others, last = BODY25_FROM
-        known = f"{', '.join(map(str, others))} or {last}"
-        raise ValueError(f"{path}: {num} keypoints a person, not {known}.")
+        expected = f"{', '.join(map(str, others))} or {last}"
+        raise ValueError(f"{path}: {num} keypoints a person, not {expected}.")
     return _gathered(points, np.asarray(BODY25_FROM[num]))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import BODY25, BODY25_FACE, BODY25_TOES_AND_HEELS
 
-_SEEN = 0.05
+_PRESENT = 0.05
 _SURE = 0.3
 _NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
 _RIGHT, _LEFT = (
@@ -49,7 +49,7 @@ def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
         has_face: whether the detector's layout has nose and eyes, so that their absence
             means a person seen from behind.
     """
-    has_trunk = (points[:, [_NECK, _MID_HIP], 2] > _SEEN).all(axis=1)
+    has_trunk = (points[:, [_NECK, _MID_HIP], 2] > _PRESENT).all(axis=1)
     points = points[has_trunk]
     if not len(points):
         return Lying(0.0, np.nan)
@@ -83,7 +83,7 @@ def _facing(
     """
     face = sure[:, list(BODY25_FACE)].sum(axis=1) >= 2
     if has_face and face.mean() <= _ALWAYS:
-        none = (points[:, list(BODY25_FACE), 2] <= _SEEN).all(axis=1)
+        none = (points[:, list(BODY25_FACE), 2] <= _PRESENT).all(axis=1)
         return np.where(face, 1.0, np.where(none, -1.0, 0.0))
     lower = np.zeros((len(_FEET), len(points)))
     for row, (toe, heel) in zip(lower, _FEET, strict=True):

@@ -119,11 +119,11 @@ def _to_pixels(
     if not sum(counts):
         raise ValueError(f"{path}: no person in any frame.")
     points = np.concatenate(detections)
-    seen = points[..., 2] > 0
-    if not seen.any():
+    present = points[..., 2] > 0
+    if not present.any():
         raise ValueError(f"{path}: all confidences are zero.")
     sure = points[..., 2] > _SURE
-    sure = sure if sure.any() else seen
+    sure = sure if sure.any() else present
     if (uv := _relative(points, sure, size, warn)) is not None:
         points[..., :2] = uv
     elif declared is not None:
@@ -141,7 +141,7 @@ def _to_pixels(
             f"{path}: {100 * outside.mean():.0f} % of the keypoints outside the image "
             f"of {size[0]}x{size[1]} px: of another video?"
         )
-    points[~seen] = 0.0
+    points[~present] = 0.0
     split = np.split(points, np.cumsum(counts)[:-1])
     kept = [(d[..., 2] > 0).any(axis=-1) for d in split]
     if person is not None:
