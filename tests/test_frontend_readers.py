@@ -265,7 +265,7 @@ def test_drops_who_is_seen_too_briefly_and_who_is_too_many():
     frames[5] = np.concatenate([frames[5], person(30.0, 42.0, 5.0)[None]])
     people, warnings = associate(frames, Association(max_people=2), fps=30.0)
     assert len(people.uv) == 2 and "1 less visible" in warnings[0]
-    assert "1 person seen for less than 0.4 s dropped" in warnings[1]
+    assert "1 person detected for less than 0.4 s dropped" in warnings[1]
 
 
 def test_a_jump_makes_another_person():
@@ -277,7 +277,7 @@ def test_a_jump_makes_another_person():
     first, second = np.argsort(people.confidence[:, 0].max(axis=-1))[::-1]
     assert len(warnings) == 1
     assert f"person {second} may be person {first}" in warnings[0]
-    assert "begins in frame 20, the other was last seen in frame 19" in warnings[0]
+    assert "begins in frame 20, the other ends in frame 19" in warnings[0]
 
 
 # Cameras
@@ -609,7 +609,7 @@ def test_people_of_cliff_are_told_apart_by_where_they_are(tmp_path):
     )
     assert found.present.all() and len(found.present) == 2
     assert (np.ptp(found.trans[..., 0], axis=1) == 0).all()
-    assert len(said) == 1 and "2 people told apart" in said[0]
+    assert len(said) == 1 and "2 people tracked by position" in said[0]
     assert "1 bodies left out" in said[0]
 
 
@@ -1080,7 +1080,7 @@ BAD_SEQUENCES = {
                 p / "tracks.npz", frame=[1, 1], landmark=[0, 0], uv=np.ones((2, 2))
             )
         ),
-        "seen twice",
+        "observed twice",
     ),
     "tracks with NaN": (
         _broken(

@@ -188,7 +188,7 @@ def _at(
 def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
     """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10.
 
-    An optional `present` (t,) says in which frames the person is known.
+    An optional `present` (t,) marks the frames in which the person is known.
     """
     arrays = load_npz(path)
     missing = [name for name in ("poses", "trans", "betas") if name not in arrays]

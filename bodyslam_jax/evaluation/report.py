@@ -124,11 +124,11 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
     if 0 < scope.cameras < _FEW:
         found.append(
             f"cameras are compared in {scope.cameras} frames only, which alignment "
-            "brings together: their errors say nothing."
+            "brings together: their errors are meaningless."
         )
     found += [
-        f"person {pair.truth} goes along a line, to {100 * STRAIGHT:.0f} cm: how far "
-        "they are turned about it alignment A1 leaves open, and J-ATE may be of that."
+        f"person {pair.truth} goes along a line, to {100 * STRAIGHT:.0f} cm: alignment "
+        "A1 does not determine the rotation about it, on which J-ATE depends."
         for pair, straight in zip(scope.people, scope.straight)
         if straight
     ]

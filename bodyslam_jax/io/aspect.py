@@ -38,10 +38,10 @@ def aspect_warnings(intrinsics: Intrinsics, footage: Footage) -> tuple[str, ...]
     name = footage.path.name
     if abs(used / declared - 1) < _SQUARE:
         return (
-            f"{name}: its pixels are {declared:.4g} times as wide as high, as it says "
-            "itself: fx and fy differ by that.",
+            f"{name}: pixels {declared:.4g} times as wide as high, by the container: "
+            "fx and fy differ by that.",
         )
     return (
-        f"{name}: says that its pixels are {declared:.4g} times as wide as high, but "
+        f"{name}: pixels {declared:.4g} times as wide as high, by the container, but "
         f"camera.json has fy/fx = {used:.4g}: camera.json used.",
     )

@@ -114,8 +114,8 @@ def _read_parts(
     rate = _mean_rate(timestamps)
     if rate < _MIN_RATE:
         warn(
-            f"{rate:.3g} frames/s: people do not move as straight between frames as "
-            "the motion model, of 30, has to take them to."
+            f"{rate:.3g} frames/s: the motion model, of 30 frames/s, is inaccurate for "
+            "motion that is interpolated across such intervals."
         )
     people, detected = None, None
     if parts.keypoints:
@@ -260,7 +260,7 @@ def _check_rate(fps: float | None, footage: Footage, warn: Warn) -> None:
         return
     rate = _mean_rate(footage.timestamps)
     if abs(rate - fps) > _RATE_TOLERANCE * fps:
-        warn(f"camera.json says {fps:g} frames/s, the video {rate:.4g}: video used.")
+        warn(f"camera.json has {fps:g} frames/s, the video {rate:.4g}: video used.")
 
 
 def _mean_rate(timestamps: np.ndarray) -> float:

@@ -68,5 +68,5 @@ def read_tracks(
     _, index = np.unique(landmark, return_inverse=True)
     frame = frame.astype(np.int64)
     if len(np.unique(frame * (index.max() + 1) + index)) < len(frame):
-        raise ValueError(f"{path}: a landmark seen twice in one frame.")
+        raise ValueError(f"{path}: a landmark observed twice in one frame.")
     return Tracks(frame, index.astype(np.int64), uv)

@@ -223,7 +223,7 @@ def resampled(
 
 
 def at_rate(footage: Footage, fps: float) -> Footage:
-    """All frames of a video file, one every 1/`fps` s, whatever the file says."""
+    """All frames of a video file, one every 1/`fps` s, in place of the file's times."""
     times = np.arange(footage.num_read) / fps
     kept = tuple(w for w in footage.warnings if "announced" in w)
     return dataclasses.replace(footage, timestamps=times, picks=None, warnings=kept)

@@ -45,8 +45,9 @@ def from_cliff(data: dict, video: Video) -> Rows:
     keep = count[which] >= min(least, count.max(initial=0))
     if len(count) > 1:
         video.warn(
-            f"bodies do not say who is who: {len(np.unique(person[keep]))} people told "
-            f"apart by where they are, {int((~keep).sum())} bodies left out."
+            "bodies without identities: "
+            f"{len(np.unique(person[keep]))} people tracked by position, "
+            f"{int((~keep).sum())} bodies left out."
         )
     betas = betas_of(data, "shape", n)
     return Rows(frame[keep], person[keep], poses[keep], betas[keep], trans[keep])

@@ -86,7 +86,7 @@ def from_slahmr(data: dict, video: Video) -> Rows:
     if info is None and video.num_frames not in (None, t):
         raise InvalidContent(
             f"{t} frames, but the video has {video.num_frames}; SLAHMR's "
-            "track_info.json beside the file says which"
+            "track_info.json, expected beside the file, tells which"
         )
     scale = float(np.ravel(data.get("world_scale", 1.0))[0])
     R = np.broadcast_to(numbers_of(data, "cam_R", None), (p, t, 3, 3))

@@ -104,7 +104,7 @@ def _in_order(
     if not choice.known:
         raise ValueError(
             f"{path}: {num} keypoints a person in no known order: as "
-            f"{', '.join(layouts)} limbs are longer than anybody's; give them in "
+            f"{', '.join(layouts)} limbs are too long for a body; give them in "
             f"{usual}'s order, or in a file that names them (`keypoint_names`)."
         )
     if choice.odd:

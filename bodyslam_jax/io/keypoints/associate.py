@@ -103,7 +103,7 @@ def associate(
     if brief:
         who = "1 person" if brief == 1 else f"{brief} people"
         warnings.append(
-            f"{who} seen for less than {config.min_duration:g} s dropped "
+            f"{who} detected for less than {config.min_duration:g} s dropped "
             "(min_duration)."
         )
     if given is None:
@@ -163,7 +163,7 @@ def _returns(people: list[_Track]) -> list[str]:
             i = max(gone, key=lambda i: people[i].frames[-1])
             warnings.append(
                 f"person {j} may be person {i}: the one begins in frame {begin}, the "
-                f"other was last seen in frame {people[i].frames[-1]}."
+                f"other ends in frame {people[i].frames[-1]}."
             )
     return warnings
 

@@ -79,7 +79,7 @@ def to_body25(path: Path, points: np.ndarray) -> np.ndarray:
 
 
 def from_layout(points: np.ndarray, layout: list[int]) -> np.ndarray:
-    """BODY_25 of keypoints (..., j, 3) of which `layout` says the parts."""
+    """BODY_25 of keypoints (..., j, 3) whose parts are those of `layout`."""
     index = np.full(25, -1)
     for place, part in enumerate(layout):
         if 0 <= part < 25:
@@ -91,7 +91,7 @@ def _gathered(points: np.ndarray, index: np.ndarray) -> np.ndarray:
     found = np.where((index >= 0)[:, None], points[..., index, :], 0.0)
     for missing, a, b in _MIDPOINTS:
         if index[missing] < 0:
-            # As OpenPose was trained: the middle of the pair, if both were seen.
+            # As OpenPose was trained: the middle of the pair, if both are detected.
             found[..., missing, :2] = (found[..., a, :2] + found[..., b, :2]) / 2
             found[..., missing, 2] = np.minimum(found[..., a, 2], found[..., b, 2])
     return found

@@ -100,7 +100,7 @@ def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:
         if not wrong and len(np.unique(who)) < len(who):
             wrong = f"given twice in frame {frame}"
     if wrong:
-        warn(f"keypoints: people's numbers {wrong}, so told apart by where they are.")
+        warn(f"keypoints: people's numbers {wrong}: people are tracked by position.")
         return None
     return person
 
