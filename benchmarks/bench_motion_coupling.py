@@ -24,9 +24,9 @@ import numpy as np
 
 from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.config import Config, GraphWeights, Simulation
-from bodyslam_jax.experiments.scenario import make_case
-from bodyslam_jax.experiments.scoring import trajectories
+from bodyslam_jax.experiments import score_of
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.pipeline.case import simulate_case, trajectories
 
 WAYS = ("frozen", "refreshed")
 WRONG = (0.8, 1.2)
@@ -36,7 +36,7 @@ def cases(names, frames, cache, config):
     for name in names:
         sequence, family = name.split("-")
         settings = Simulation(sequence=sequence, family=family, length=frames)
-        yield name, make_case(settings, config, cache=cache)
+        yield name, simulate_case(settings, config=config, cache=cache)
 
 
 def problem_for(prepared, way):
@@ -73,7 +73,7 @@ def accuracy(args, config):
         for way in args.ways:
             problem = problem_for(prepared, way)
             found, steps, taken = run(problem, prepared.state)
-            score = case.score(found.state, prepared.roots.present)
+            score = score_of(case, found.state, prepared.roots.present)
             seen = trajectories(
                 found.state,
                 case.body,

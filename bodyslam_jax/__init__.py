@@ -1,7 +1,7 @@
 """Cameras, people and map in metres from one moving camera, in JAX.
 
-The names below are imported on first use, so that `bodyslam --help` and tools that
-only read the version do not wait for JAX.
+`docs/toolkit.md` shows these names in use. They are imported on first use, so that
+`bodyslam --help` and tools that only read the version do not wait for JAX.
 """
 
 import importlib
@@ -17,24 +17,50 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if TYPE_CHECKING:
     from bodyslam_jax.body import BodyModel as BodyModel
     from bodyslam_jax.body import load_body_model as load_body_model
+    from bodyslam_jax.config import Config as Config
+    from bodyslam_jax.evaluation import evaluate as evaluate
+    from bodyslam_jax.evaluation import stack_pairs as stack_pairs  # pyright: ignore
+    from bodyslam_jax.graph import FrameFactor as FrameFactor
+    from bodyslam_jax.graph import Problem as Problem
+    from bodyslam_jax.graph import State as State
+    from bodyslam_jax.graph import check_factor as check_factor
+    from bodyslam_jax.graph import rescaled as rescaled
+    from bodyslam_jax.graph import weights as weights
+    from bodyslam_jax.graph import with_weights as with_weights
+    from bodyslam_jax.io import read_sequence as read_sequence
+    from bodyslam_jax.motion import MotionModel as MotionModel
+    from bodyslam_jax.motion import load_motion_model as load_motion_model
+    from bodyslam_jax.pipeline import run as run
+    from bodyslam_jax.pipeline.case import simulate_case as simulate_case
+    from bodyslam_jax.pipeline.problem_builder import build as build
+    from bodyslam_jax.solver import solve as solve
+    from bodyslam_jax.solver import vmap_over_devices as vmap_over_devices
     from bodyslam_jax.types import Result as Result
     from bodyslam_jax.types import Sequence as Sequence
 
 _HOME = {
     "BodyModel": "body",
+    "Config": "config",
+    "FrameFactor": "graph",
     "MotionModel": "motion",
     "Problem": "graph",
     "Result": "types",
     "Sequence": "types",
     "State": "graph",
+    "build": "pipeline.problem_builder",
+    "check_factor": "graph",
     "evaluate": "evaluation",
     "load_body_model": "body",
     "load_motion_model": "motion",
-    "vmap_over_devices": "solver",
     "read_sequence": "io",
+    "rescaled": "graph",
     "run": "pipeline",
+    "simulate_case": "pipeline.case",
     "solve": "solver",
     "stack_pairs": "evaluation",
+    "vmap_over_devices": "solver",
+    "weights": "graph",
+    "with_weights": "graph",
 }
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

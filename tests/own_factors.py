@@ -15,8 +15,6 @@ class CameraSmoothness(g.FrameFactor):
     sigma: Float[Array, "t 2"]
     """Per frame squared: rad, units of the map; `inf` for the first two frames."""
     loss: g.Loss = g.Squared()
-    of_people = False
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
     keys = (("camera", 0), ("camera", 1), ("camera", 2))
 
@@ -39,8 +37,6 @@ class StillFeet(g.FrameFactor):
     """m per frame; `inf` in the first frame."""
     loss: g.Loss = g.Squared()
     points: tuple[int, ...] = eqx.field(static=True, default=(19, 21, 22, 24))
-    of_people = True
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
     keys = (
         *((name, lag) for name in ("camera", "root", "pose") for lag in range(2)),

@@ -198,7 +198,7 @@ class Forgotten(Position):
         (Unknown, r"Unknown.padding: found 'sigma', expected fields among"),
         (
             Forgotten,
-            r"Forgotten.frame_fields: .* expected 'trust', an array over frame",
+            r"Forgotten.time_fields: .* expected 'trust', an array over frame",
         ),
     ],
 )

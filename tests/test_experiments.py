@@ -34,6 +34,7 @@ from bodyslam_jax.experiments.row_cache import Journal, fits
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBLE
 from bodyslam_jax.experiments.structural_landmarks import shake
+from bodyslam_jax.pipeline.case import trajectories
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
 """Postures held: compiled in a few seconds."""
@@ -57,7 +58,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     traced = jax.jit(
         jax.vmap(
             lambda f: solver.trace(
-                held, experiments.rescaled(bare, f), lambda y: y.scale, schedule=SHORT
+                held, g.rescaled(bare, f), lambda y: y.scale, schedule=SHORT
             )
         )
     )
@@ -65,7 +66,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     assert seen.shape == (3, 9)
     np.testing.assert_array_equal(seen[:, 0], bare.scale)
     np.testing.assert_array_equal(seen[:, -1], states.scale)
-    single = solver.solve(held, experiments.rescaled(bare, 3.0), schedule=SHORT)
+    single = solver.solve(held, g.rescaled(bare, 3.0), schedule=SHORT)
     # The same arithmetic in another order, eight steps long.
     np.testing.assert_allclose(states.scale[2], single.state.scale, rtol=1e-6)
     np.testing.assert_allclose(states.roots[2], single.state.roots, atol=1e-6)
@@ -173,7 +174,7 @@ def _steep(calls, last=math.inf):
 def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
     problem, truth, start = scene
     body, there = scenes.body_model(), jnp.ones((1, 12), bool)
-    seen = experiments.trajectories(truth, body, there, there[0], jnp.asarray(30.0))
+    seen = trajectories(truth, body, there, there[0], jnp.asarray(30.0))
     trials = [experiments.Trial(problem, start, seen, body, there[0])] * 2
     names = ("motion", "shape")
     learn = lambda steps, **kw: experiments.learn_weights(

@@ -40,12 +40,7 @@ from bodyslam_jax.solver.triangular import invert_lower
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 TIGHT = (Stage(rtol=1e-13, max_steps=60),)
-STOCK = [
-    "optimistix",
-    "jaxopt_lm",
-    # Its program takes as long to compile as those of both others.
-    pytest.param("jaxopt_gn", marks=pytest.mark.slow),
-]
+STOCK = ["optimistix_lm", "jaxopt_lm"]
 
 
 def unpadded(step, state):
@@ -259,7 +254,7 @@ def test_first_order_steps_end_by_themselves_only_where_the_cost_stays():
 def test_landmarks_known_besides_reach_the_same_optimum_as_in_stock_solvers():
     problem, _, start = make(known=True)
     found = solve(problem, start, schedule=TIGHT)
-    other = solve(problem, start, solver="optimistix", schedule=TIGHT)
+    other = solve(problem, start, solver="optimistix_lm", schedule=TIGHT)
     assert float(found.cost) == pytest.approx(float(other.cost), rel=1e-8)
     without = eqx.tree_at(lambda p: p.factors, problem, problem.factors[1:])
     assert float(without.cost(found.state)) < 0.9 * float(found.cost)

@@ -38,8 +38,9 @@ class Config(Known):
     structure: Structure = Structure()
     people_fit: PeopleFit = PeopleFit()
     weights: GraphWeights = GraphWeights()
-    solver: Literal["structured", "adam"] = "structured"
-    """Second order, or the paper's 200 + 100 first-order steps."""
+    solver: Literal["structured", "adam", "optimistix_lm", "jaxopt_lm"] = "structured"
+    """Second order with the problem's structure; the paper's 200 + 100 first-order
+    steps; or dense Levenberg-Marquardt of optimistix or jaxopt, for small problems."""
     motion_coupling: Literal["frozen", "refreshed"] = "refreshed"
     """When motion is predicted: once, before the joint solve, or again after each
     accepted step. No derivative of the prediction enters the solve."""

@@ -14,16 +14,13 @@ from bodyslam_jax.experiments.comparison import METHODS as METHODS
 from bodyslam_jax.experiments.comparison import compare_methods as compare_methods
 from bodyslam_jax.experiments.comparison import depth_scale as depth_scale
 from bodyslam_jax.experiments.learning import judge as judge
-from bodyslam_jax.experiments.problems import rescaled as rescaled
 from bodyslam_jax.experiments.problems import without_map as without_map
 from bodyslam_jax.experiments.scale import PERTURBATIONS as PERTURBATIONS
 from bodyslam_jax.experiments.scale import ScaleRecovery as ScaleRecovery
 from bodyslam_jax.experiments.scale import scale_recovery as scale_recovery
-from bodyslam_jax.experiments.scenario import Case as Case
-from bodyslam_jax.experiments.scenario import make_case as make_case
+from bodyslam_jax.experiments.scenario import score_of as score_of
 from bodyslam_jax.experiments.scoring import errors as errors
 from bodyslam_jax.experiments.scoring import score as score
-from bodyslam_jax.experiments.scoring import trajectories as trajectories
 from bodyslam_jax.experiments.structural_landmarks import (
     landmark_ablation as landmark_ablation,
 )

@@ -8,10 +8,11 @@ import jax
 
 from bodyslam_jax import graph, motion, solver
 from bodyslam_jax.config import Config, GraphWeights
-from bodyslam_jax.experiments.scenario import Case
+from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.experiments.scoring import NAMES
 from bodyslam_jax.experiments.variants import FULL, VARIANTS
 from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.pipeline.case import Case
 
 INDEPENDENT = {
     "motion_correlation": 0.0,
@@ -146,7 +147,7 @@ def _time_of_gradient(problem: graph.Problem, state: graph.State) -> float:
 
 
 def _row(case, prepared, state, stage, solution=None, seconds=None):
-    found = case.score(state, prepared.roots.present)
+    found = score_of(case, state, prepared.roots.present)
     row = {**found, "radius": case.radius, "scale_ratio": 1 / found["scale"]}
     if solution is not None:
         steps = sum(int(n) for n in solution.num_steps)

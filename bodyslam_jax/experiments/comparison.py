@@ -9,9 +9,10 @@ from bodyslam_jax import evaluation, graph, people
 from bodyslam_jax.body.skeleton import BODY25_ANKLES
 from bodyslam_jax.experiments.ablation import as_published
 from bodyslam_jax.experiments.problems import with_scale, without_map
-from bodyslam_jax.experiments.scenario import Case
-from bodyslam_jax.experiments.scoring import NAMES, trajectories
+from bodyslam_jax.experiments.scenario import score_of
+from bodyslam_jax.experiments.scoring import NAMES
 from bodyslam_jax.initialisation import first_state
+from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.joint_stage import solve_stage
 
 METHODS = {
@@ -70,7 +71,7 @@ def compare_methods(case: Case) -> dict[str, Any]:
         "status": stage["status"],
     }
     for name, state in states.items():
-        found = case.score(state, prepared.roots.present)
+        found = score_of(case, state, prepared.roots.present)
         row |= {f"{name}/{key}": value for key, value in found.items()}
     published = as_published(case)
     row |= {f"published/{name}": published[name] for name in NAMES}

@@ -10,7 +10,8 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import motion
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments.row_cache import Row
-from bodyslam_jax.experiments.scenario import Case, make_case, simulations
+from bodyslam_jax.experiments.scenario import simulations
+from bodyslam_jax.pipeline.case import Case, simulate_case
 from bodyslam_jax.simulation import LENGTH
 
 FRONT, SOLVE, COMPILE = 0.15, 0.08, 25.0
@@ -78,7 +79,7 @@ def cases(config: Config, stages: Path) -> Callable[[Simulation], Case]:
 
     @functools.lru_cache(maxsize=1)
     def case(settings: Simulation) -> Case:
-        return make_case(settings, config, cache=stages)
+        return simulate_case(settings, config=config, cache=stages)
 
     return case
 

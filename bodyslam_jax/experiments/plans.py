@@ -18,12 +18,13 @@ from bodyslam_jax.experiments.paper import STRUCTURE
 from bodyslam_jax.experiments.provenance import about
 from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.scale import PERTURBATIONS, scale_recovery
-from bodyslam_jax.experiments.scenario import Case, simulations
+from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.experiments.structural_landmarks import landmark_ablation
 from bodyslam_jax.experiments.table1 import FORM, write_table1
 from bodyslam_jax.experiments.variants import FULL, VARIANTS
 from bodyslam_jax.experiments.video_table import write_video
 from bodyslam_jax.experiments.weights import Learned, Trial, learn_weights, make_trial
+from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 
 ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")

@@ -40,16 +40,6 @@ def without_map(
     return rebuild(problem, bare, kept, free), bare
 
 
-def rescaled(state: graph.State, factor: Float[Array, ""] | float) -> graph.State:
-    """The map `factor` times as large, with s as it was: s should become smaller."""
-    grow = jnp.asarray(factor, state.scale.dtype)
-    return eqx.tree_at(
-        lambda s: (s.cameras, s.landmarks),
-        state,
-        (state.cameras.at[:, :3, 3].multiply(grow), state.landmarks * grow),
-    )
-
-
 def with_scale(state: graph.State, scale: Float[Array, ""] | float) -> graph.State:
     """The same state with this s."""
     return eqx.tree_at(lambda s: s.scale, state, jnp.asarray(scale, state.scale.dtype))

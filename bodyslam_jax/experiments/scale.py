@@ -8,9 +8,8 @@ from jaxtyping import Float
 
 from bodyslam_jax import graph, solver
 from bodyslam_jax.evaluation import Trajectories, evaluate_trajectories
-from bodyslam_jax.experiments.problems import rescaled, with_scale, without_map
-from bodyslam_jax.experiments.scenario import Case
-from bodyslam_jax.experiments.scoring import trajectories
+from bodyslam_jax.experiments.problems import with_scale, without_map
+from bodyslam_jax.pipeline.case import Case, trajectories
 
 PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
 """The paper's 1/s': what the estimated s should come to."""
@@ -63,7 +62,7 @@ def scale_recovery(
         found = case.prepare()
         prepared = without_map(found.problem, found.state, hold_cameras=True)
     problem, state = prepared
-    true_size = rescaled(with_scale(state, 1.0), case.map_scale)
+    true_size = graph.rescaled(with_scale(state, 1.0), case.map_scale)
     state, seen = _recover(
         jnp.asarray(perturbations),
         problem,
@@ -85,7 +84,7 @@ def scale_recovery(
 def _recover_one(
     perturbation, problem, state, truth, body, present, registered, schedule
 ):
-    start = rescaled(state, 1 / perturbation)
+    start = graph.rescaled(state, 1 / perturbation)
     observe = lambda y: {
         "scale": y.scale,
         "h_ate": _h_ate(y, truth, body, present, registered),

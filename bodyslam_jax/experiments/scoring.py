@@ -6,11 +6,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import evaluation, graph
-from bodyslam_jax.body import BodyModel, local_joints
-from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.pipeline import to_metric
-from bodyslam_jax.types import Result
+from bodyslam_jax.pipeline.case import trajectories
 
 NAMES = (
     "c_ate_se3",
@@ -29,44 +28,6 @@ PLAUSIBLE = (
 """Whether people slide, float or crouch: rad, m, s; without the result's low pass."""
 _FRAMES = 100
 """Numbers of frames are rounded up to this, so that lengths share what is compiled."""
-
-
-def truth_of(result: Result) -> Trajectories:
-    """A simulation's truth as what is compared with."""
-    joints = jnp.asarray(result.joints)
-    t = len(result.timestamps)
-    fps = (t - 1) / (result.timestamps[-1] - result.timestamps[0])
-    return Trajectories(
-        T_WC=jnp.asarray(result.T_WC),
-        camera_valid=jnp.ones(t, bool),
-        joints=joints,
-        present=jnp.asarray(result.present),
-        feet=joints[..., np.array(ANKLES_AND_FEET), :],
-        fps=jnp.asarray(fps),
-    )
-
-
-def trajectories(
-    state: graph.State,
-    body: BodyModel,
-    present: Bool[Array | np.ndarray, "h t"],
-    registered: Bool[Array | np.ndarray, " t"],
-    fps: Float[Array, ""],
-) -> Trajectories:
-    """Cameras, pelvis and joints of a state in metres, in the map's world frame."""
-    cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
-    T_WH = graph.world_from_root(state)
-    p_H = local_joints(body, state.poses, state.shapes[:, None])
-    turn, move = T_WH[..., :3, :3], T_WH[..., None, :3, 3]
-    joints = jnp.einsum("htij,htkj->htki", turn, p_H) + move
-    return Trajectories(
-        T_WC=cameras,
-        camera_valid=jnp.asarray(registered),
-        joints=joints,
-        present=jnp.asarray(present),
-        feet=joints[..., np.array(ANKLES_AND_FEET), :],
-        fps=fps,
-    )
 
 
 def errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:

@@ -6,7 +6,8 @@ from jaxtyping import PRNGKeyArray
 
 from bodyslam_jax import graph
 from bodyslam_jax.experiments.problems import with_scale, without_map
-from bodyslam_jax.experiments.scenario import Case
+from bodyslam_jax.experiments.scenario import score_of
+from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.joint_stage import solve_stage
 
 SHIFT, TURN = 0.1, 0.01
@@ -59,7 +60,7 @@ def landmark_ablation(case: Case, *, seed: int = 0) -> dict[str, float | str]:
         "landmarks": with_map.state,
     }
     for name, one in states.items():
-        found = case.score(one, prepared.roots.present)
+        found = score_of(case, one, prepared.roots.present)
         row[name] = found["c_ate_se3"]
         row[f"{name}/sim3"] = found["c_ate_sim3"]
         row[f"{name}/scale"] = found["scale"]

@@ -21,9 +21,9 @@ from jaxtyping import Array, Float
 from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.experiments.problems import without_map
-from bodyslam_jax.experiments.scenario import Case
-from bodyslam_jax.experiments.scoring import errors, trajectories
+from bodyslam_jax.experiments.scoring import errors
 from bodyslam_jax.pipeline import joint_stage, stage_cache
+from bodyslam_jax.pipeline.case import Case, trajectories
 
 log = logging.getLogger(__name__)
 WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {

@@ -1,6 +1,9 @@
 """What is estimated, and why: state, error terms, problem."""
 
+from bodyslam_jax.graph.check_factor import FactorReport as FactorReport
+from bodyslam_jax.graph.check_factor import check_factor as check_factor
 from bodyslam_jax.graph.edit import disable as disable
+from bodyslam_jax.graph.edit import rescaled as rescaled
 from bodyslam_jax.graph.edit import set_constant as set_constant
 from bodyslam_jax.graph.factor import JOINTS as JOINTS
 from bodyslam_jax.graph.factor import Factor as Factor
@@ -70,5 +73,7 @@ from bodyslam_jax.graph.state import retract_pose as retract_pose
 from bodyslam_jax.graph.state import retract_rotation as retract_rotation
 from bodyslam_jax.graph.state import world_from_root as world_from_root
 from bodyslam_jax.graph.validation import check_state as check_state
+from bodyslam_jax.graph.weights import weights as weights
+from bodyslam_jax.graph.weights import with_weights as with_weights
 from bodyslam_jax.graph.whitening import ar1_correlation as ar1_correlation
 from bodyslam_jax.graph.whitening import whitening_of as whitening_of

@@ -1,9 +1,12 @@
-"""Other problems with the shapes of a given one, so that nothing is compiled anew."""
+"""Problems and states edited with their shapes kept, so that nothing is recompiled."""
 
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.intrinsics_prior import AbstractIntrinsicsFactor
@@ -11,7 +14,7 @@ from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
-from bodyslam_jax.graph.state import Step
+from bodyslam_jax.graph.state import State, Step
 
 
 def disable(problem: Problem, *kinds: type[Factor]) -> Problem:
@@ -48,3 +51,20 @@ def set_constant(free: Step, *names: str) -> Step:
     """The same mask with groups of variables held, by their names in `State`."""
     held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
     return dataclasses.replace(free, **held)
+
+
+def rescaled(state: State, factor: Float[Array | np.ndarray, "*f"] | float) -> State:
+    """The map `factor` times as large, with the scale s as it was.
+
+    Camera centres and landmarks are multiplied, so that the solution's s is divided by
+    `factor`. Of an array of factors, the states have its axes as leading axes.
+    """
+    by = jnp.asarray(factor, state.scale.dtype)
+    one = lambda f: eqx.tree_at(
+        lambda s: (s.cameras, s.landmarks),
+        state,
+        (state.cameras.at[:, :3, 3].multiply(f), state.landmarks * f),
+    )
+    for _ in range(by.ndim):
+        one = jax.vmap(one)
+    return one(by)

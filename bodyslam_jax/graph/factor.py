@@ -1,22 +1,23 @@
 """What a factor of the graph is: measurements, and one `residual` method.
 
 A residual is prediction minus measurement in standard deviations, so that
-`0.5 * sum(rho(|residual|^2))` is a negative log-likelihood. Missing is `sigma = inf` on
-a finite value. A factor over frames is written once, for one frame of one person
-(`local`), with the variables it touches; the rest (all frames at once, blocks of the
-Jacobian) follows from that.
+`0.5 * sum(rho(|residual|^2))` is a negative log-likelihood. Missing measurements have
+`sigma = inf` and a finite value. A factor over frames is written for one frame of one
+person (`frame_residual`), with the variables it depends on (`keys`); the residuals of
+all frames and the blocks of the Jacobian follow from that.
 """
 
 import abc
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph.losses import Loss, squared_norm
+from bodyslam_jax.graph.annotations import fields_with_axes
+from bodyslam_jax.graph.losses import Loss, Squared, squared_norm
 from bodyslam_jax.graph.state import State
 
 JOINTS = tuple(range(23))
@@ -27,6 +28,9 @@ Limbs = tuple[tuple[int, ...], ...]
 
 Key = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
+
+_OF_PEOPLE = ("root", "pose", "shape")
+_SHARED = ("scale", "shape", "intrinsics")
 
 
 class Frame(eqx.Module):
@@ -67,34 +71,83 @@ def residual_of(factor: Factor, state: State) -> Array:
 
 
 class FrameFactor(Factor):
-    """A factor for each frame of each person, or of the camera."""
+    """A factor with one residual for each frame, of each person or of the camera.
 
-    of_people: eqx.AbstractClassVar[bool]
-    time_fields: eqx.AbstractClassVar[tuple[str, ...]]
-    """Fields with leading axes `h t` (or `t`): what is padded to a common length."""
+    A subclass declares its measurements as annotated arrays, the variables that its
+    residual depends on (`keys`), and `frame_residual`; everything else has a default:
+
+        class CameraPosition(FrameFactor):
+            position: Float[Array, "t 3"]
+            sigma: Float[Array, " t"]
+            keys = (("camera", 0), ("scale", 0))
+
+            def frame_residual(self, data, window, shared):
+                position, sigma = data
+                return (shared.scale * window[0].camera[:3, 3] - position) / sigma
+
+    Axes are `h` people and `t` frames: arrays of a person's factor begin with `h t`,
+    those of the camera's with `t`. Measurements that depend on no frame, such as a
+    known stature, have no `t` axis and keys among `scale`, `shape` and `intrinsics`;
+    they are counted once (`once`). Missing measurements have `sigma = inf`.
+    """
+
+    loss = Squared()
+    """The robust loss; a subclass makes it a field with `loss: Loss = Squared()`."""
     padding: ClassVar[Mapping[str, float] | None] = None
-    """The value of a field of `time_fields` with which a frame weighs nothing, such as
-    `{"sigma": jnp.inf}`; other fields repeat their last frame. The solver adds frames,
-    so that videos of about the same length share a program. Without it, residuals of
-    added frames are masked, whatever fields are called (`Masked`)."""
+    """The value of each of `time_fields` with which a frame has no weight, such as
+    `{"sigma": jnp.inf}`; other fields repeat their last frame. The solver appends
+    frames, so that videos of about the same length share a program. Without `padding`
+    the residuals of appended frames are masked (`Masked`), which is always right and
+    slightly slower."""
     per_joint = False
     """Whether row j of the residual depends on joint j of the touched poses alone."""
 
-    @property
-    @abc.abstractmethod
-    def keys(self) -> tuple[Key, ...]:
-        """Among `camera`, `root`, `pose` with a lag, and `scale`, `shape`,
-        `intrinsics` with lag 0."""
+    if TYPE_CHECKING:
+        keys: ClassVar[Any]
+        """The variables: among `camera`, `root`, `pose` with a lag, and `scale`,
+        `shape`, `intrinsics` with lag 0. A class attribute, or a property where they
+        depend on the factor's settings."""
+    else:
 
-    @abc.abstractmethod
+        @property
+        @abc.abstractmethod
+        def keys(self) -> tuple[Key, ...]:
+            """See above."""
+
+    @property
+    def of_people(self) -> bool:
+        """Whether there is one residual for each person, or for the camera only."""
+        return any(name in _OF_PEOPLE for name, _ in self.keys)
+
+    @property
+    def time_fields(self) -> tuple[str, ...]:
+        """Array fields with leading axes `h t` (or `t`), which padding extends."""
+        axes = ("h", "t") if self.of_people else ("t",)
+        return fields_with_axes(type(self), axes)
+
+    @property
+    def once(self) -> bool:
+        """Whether its measurements depend on no frame, and are counted once."""
+        return not self.time_fields and all(name in _SHARED for name, _ in self.keys)
+
     def data(self) -> Any:
-        """Measurements, leading axes `h t` (or `t`, for a factor of the camera)."""
+        """Measurements, leading axes `h t` (or `t`): by default a tuple of
+        `time_fields`, or of all arrays of a factor that is counted once."""
+        if not self.once:
+            return tuple(getattr(self, name) for name in self.time_fields)
+        axes = ("h",) if self.of_people else ()
+        names = fields_with_axes(type(self), axes)
+        return tuple(jnp.expand_dims(getattr(self, n), len(axes)) for n in names)
 
     @abc.abstractmethod
     def frame_residual(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
     ) -> Float[Array, "*m d"]:
-        """The residual of one frame; `window[lag]` is the frame that far back."""
+        """The residual of one frame, one axis or more.
+
+        `data` is `self.data()` of this frame; `window[lag]` has the variables of the
+        frame that far back, `shared` those that all frames have in common.
+        """
 
     def jacobian(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
@@ -125,8 +178,14 @@ class FrameFactor(Factor):
         """`function(data, window, shared, extra)` over frames, and people if any.
 
         A window repeats the first frame where there is none before; factors carry no
-        weight there.
+        weight there. A factor that is counted once is evaluated in the first frame.
         """
+        if self.once:
+            state = eqx.tree_at(
+                lambda s: (s.cameras, s.roots, s.poses),
+                state,
+                (state.cameras[:1], state.roots[:, :1], state.poses[:, :1]),
+            )
 
         def back(x, lag):
             return x[jnp.maximum(self.frame_of_row(x.shape[0]) - lag, 0)]

@@ -13,8 +13,9 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import AbstractArray, Array, Bool
+from jaxtyping import Array, Bool
 
+from bodyslam_jax.graph.annotations import array_annotations
 from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State
@@ -39,11 +40,14 @@ class Masked(FrameFactor):
     present: Bool[Array, "*h t"]
     """Which frames count, of each person if it is of people; those that do not are the
     last."""
-    time_fields = ("present",)
     padding = {"present": False}
 
     @property
-    def of_people(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def time_fields(self) -> tuple[str, ...]:
+        return ("present",)
+
+    @property
+    def of_people(self) -> bool:
         return self.factor.of_people
 
     @property
@@ -115,8 +119,9 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
 
 
 def _is_over_frames(factor: FrameFactor) -> bool:
-    """Whether its rows are the frames: not, if it maps them in a way of its own."""
-    return type(factor).map_frames is FrameFactor.map_frames
+    """Whether its rows are the frames: not if they are counted once, or if it maps
+    frames in a way of its own."""
+    return not factor.once and type(factor).map_frames is FrameFactor.map_frames
 
 
 def extend_state(state: State, frames: int) -> State:
@@ -160,16 +165,20 @@ def check_padding(factor: FrameFactor, state: State) -> None:
                 f"{name}.padding: found {field!r}, expected fields among "
                 f"`time_fields`, {list(fields)}."
             )
-    axes = ["h", "t"] if factor.of_people else ["t"]
-    for field in dataclasses.fields(factor):
-        kind = field.type
-        if not (isinstance(kind, type) and issubclass(kind, AbstractArray)):
-            continue
-        leading = kind.dim_str.split()[: len(axes)]
-        if leading == axes and field.name not in fields:
+    axes = "h t" if factor.of_people else "t"
+    for field, array in array_annotations(type(factor)).items():
+        dims = array.dim_str.split()
+        if "t" in dims and field not in fields:
+            leads = dims[: len(axes.split())] == axes.split()
+            where = f"{name}.time_fields" if leads else f"{name}.{field}"
+            found = list(fields) if leads else f"axes `{array.dim_str}`"
             raise ValueError(
-                f"{name}.frame_fields: found {list(fields)}, expected {field.name!r}, "
-                "an array over frames, among them."
+                f"{where}: found {found}, expected "
+                + (
+                    f"{field!r}, an array over frames, among them."
+                    if leads
+                    else f"`{axes}` to be the first."
+                )
             )
     if is_traced((factor, state)):
         return

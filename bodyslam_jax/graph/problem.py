@@ -3,6 +3,7 @@
 `make_problem` is the door: it checks everything that the solver relies on.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,7 +25,8 @@ from bodyslam_jax.graph.padding import Masked, check_padding
 from bodyslam_jax.graph.state import State, Step, gauge
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
-    check_factor,
+    Sizes,
+    check_measurements,
     check_prior,
     check_shapes,
     check_state,
@@ -110,6 +112,58 @@ class Problem(eqx.Module):
         """The same problem with the motion predicted anew."""
         return self.with_prediction(self.predict(state))
 
+    def with_motion_model(
+        self, predict: Callable[..., Any], parameters: Any
+    ) -> "Problem":
+        """The same problem with another motion model, which `solve` predicts with.
+
+        `predict(parameters, body, orientation, body_pose, shape, present)` is called
+        for one person: root rotations (t, 3, 3) to the world, joint rotations
+        (t, 23, 3) in rad, SMPL β (10,), presence (t,). It returns a
+        `motion.Prediction`: row k is the step from frame k-1 to k. The weight of each
+        step stays that of the model with which the problem was built (`with_weights`
+        changes it).
+
+        **Raises:** `ValueError` if the problem has no motion model: no people, or
+        `motion_coupling="frozen"`.
+        """
+        if self.motion is None:
+            raise ValueError(
+                "problem.motion: found none, expected a problem with people and "
+                "`motion_coupling` other than `frozen`."
+            )
+        other = dataclasses.replace(self.motion, predict=predict, model=parameters)
+        return dataclasses.replace(self, motion=other)
+
+    def with_factors(self, *factors: Factor) -> "Problem":
+        """The same problem with more factors; states of this problem fit it as before.
+
+        Checks and layout are those of `make_problem`. What is held stays held, except
+        a scale that no factor depended on so far and one of `factors` does: it is free
+        in what this returns. A custom factor is best checked first (`check_factor`).
+
+        **Raises:** `ValueError` naming the factor and its field where shapes, kinds or
+        values do not fit, or if there would be two `Reprojection`.
+        """
+        sizes = dict[str, int]()
+        check_shapes(self.free, "problem.free", sizes)
+        sample = _sample_state(self.free)
+        for factor in factors:
+            check_measurements(factor, sizes)
+            check_precision(factor, sample)
+            if isinstance(factor, FrameFactor):
+                check_padding(factor, sample)
+        everything = (*self.factors, *factors)
+        layout = dataclasses.replace(self.layout, limbs=limbs_of(everything))
+        if any(isinstance(f, Reprojection | LandmarkPrior) for f in factors):
+            layout = _layout_of(everything, sizes)
+            check_memory(layout, sample)
+        free, variables = self.free, self.variables
+        if "scale" in _touched(factors) - _touched(self.factors):
+            free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
+            variables = tuple(v for v in VARIABLES if v in (*variables, "scale"))
+        return Problem(everything, free, self.motion, layout, variables)
+
 
 def _with_prediction(factor, seen):
     if isinstance(factor, HumanMotion) and "translation" in seen:
@@ -161,7 +215,7 @@ def make_problem(
     factors = tuple(factors)
     sizes = check_state(state)
     for factor in factors:
-        check_factor(factor, sizes)
+        check_measurements(factor, sizes)
         check_precision(factor, state)
         if isinstance(factor, FrameFactor):
             check_padding(factor, state)
@@ -170,29 +224,12 @@ def make_problem(
     if free is not None:
         check_shapes(free, "free", dict(sizes))
         check_mask(free)
-    tracks = [f for f in factors if isinstance(f, Reprojection)]
-    if len(tracks) > 1:
-        raise ValueError(
-            f"factors: {len(tracks)} `Reprojection`, expected one with all landmarks."
-        )
-    frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
-    landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
-    for factor in factors:
-        if isinstance(factor, LandmarkPrior):
-            check_prior(factor, landmark)
-    limbs = limbs_of(factors)
-    layout = make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"], limbs)
+    layout = _layout_of(factors, sizes)
     check_memory(layout, state)
     if free is None:
-        touched = {
-            name
-            for factor in factors
-            if isinstance(factor, FrameFactor)
-            for name, _ in factor.keys
-        }
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
         free = Step(
-            scale=ones.scale * float("scale" in touched),
+            scale=ones.scale * float("scale" in _touched(factors)),
             cameras=gauge(state.cameras),
             roots=ones.roots,
             poses=ones.poses,
@@ -207,3 +244,46 @@ def make_problem(
     movable = jax.tree.map(moves, free)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
     return Problem(factors, free, motion, layout, variables)
+
+
+def _touched(factors: Sequence[Factor]) -> set[str]:
+    """Variables, as factors name them, that factors over frames depend on."""
+    over_frames = [f for f in factors if isinstance(f, FrameFactor)]
+    return {name for factor in over_frames for name, _ in factor.keys}
+
+
+def _layout_of(factors: Sequence[Factor], sizes: Sizes) -> Layout:
+    """Where the observations of landmarks lie in dense blocks.
+
+    **Raises:** `ValueError` for two `Reprojection`, and for priors of landmarks without
+    an observation.
+    """
+    tracks = [f for f in factors if isinstance(f, Reprojection)]
+    if len(tracks) > 1:
+        raise ValueError(
+            f"factors: {len(tracks)} `Reprojection`, expected one with all landmarks."
+        )
+    frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
+    landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            check_prior(factor, landmark)
+    limbs = limbs_of(factors)
+    return make_layout(sizes["t"], sizes["l"], frame, landmark, sizes["h"], limbs)
+
+
+def _sample_state(free: Step) -> State:
+    """Some state of a problem's sizes: people stand 3 m in front of the cameras."""
+    eye = lambda x: (
+        jnp.zeros((*x.shape[:-1], 4, 4), x.dtype) + jnp.eye(4, dtype=x.dtype)
+    )
+    intrinsics = jnp.zeros_like(free.intrinsics)
+    return State(
+        scale=jnp.ones_like(free.scale),
+        cameras=eye(free.cameras),
+        roots=eye(free.roots).at[..., 2, 3].set(3.0),
+        poses=jnp.zeros_like(free.poses),
+        shapes=jnp.zeros_like(free.shapes),
+        landmarks=jnp.zeros_like(free.landmarks).at[:, 2].set(3.0),
+        intrinsics=intrinsics.at[:4].set(jnp.array([500.0, 500.0, 320.0, 240.0])),
+    )

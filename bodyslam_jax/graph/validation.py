@@ -5,15 +5,14 @@ Shapes are those of the fields' annotations: `t` frames, `h` people, `l` landmar
 too; values are looked at where there are any.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import AbstractArray, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
+from bodyslam_jax.graph.annotations import array_annotations
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.camera_prior import CameraPrior
 from bodyslam_jax.graph.factors.ground_contact import GroundContact
@@ -62,7 +61,7 @@ def check_state(state: State, free: Step | None = None) -> Sizes:
     return sizes
 
 
-def check_factor(factor: Factor, sizes: Sizes) -> None:
+def check_measurements(factor: Factor, sizes: Sizes) -> None:
     """Refuses measurements that do not fit a state with axes of these `sizes`.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
@@ -118,11 +117,9 @@ def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
-    for field in dataclasses.fields(module):
-        kind, found = field.type, getattr(module, field.name)
-        if not (isinstance(kind, type) and issubclass(kind, AbstractArray)):
-            continue
-        where = f"{name}.{field.name}"
+    for field, kind in array_annotations(type(module)).items():
+        found = getattr(module, field)
+        where = f"{name}.{field}"
         if not isinstance(found, jax.Array | np.ndarray):
             raise ValueError(f"{where}: found {found!r:.40}, expected an array.")
         numbers, word = _KINDS.get(kind.dtype, (jnp.generic, "numbers"))

@@ -46,8 +46,12 @@ def prepare(
     bodies: Bodies,
     body: body_.BodyModel,
     config: Config,
+    *,
+    body_only_solve: bool = True,
 ) -> Prepared:
     """People by themselves, the first scale in closed form, then the whole graph.
+
+    Without `body_only_solve` nothing is solved: people start as their bodies are given.
 
     Postures are settled from keypoints before the motion model reads them: errors of a
     regressor's orientations bias the displacements that it predicts.
@@ -139,10 +143,11 @@ def prepare(
         upright = initialisation.upright_factor(state, there, sequence.fps, weights)
         if upright is not None:
             factors.append(upright)
-        problem = make([*factors, *walked(seen, state)], state)
-        state, stage = _settle_people(problem, state, config)
-        stages.append(stage)
-        seen = predict(predictor, state)
+        if body_only_solve:
+            problem = make([*factors, *walked(seen, state)], state)
+            state, stage = _settle_people(problem, state, config)
+            stages.append(stage)
+            seen = predict(predictor, state)
         if moving:
             start_of = lambda without: initialisation.scale_start(
                 state,

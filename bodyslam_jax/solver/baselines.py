@@ -6,6 +6,7 @@ In the others it stays as it is at the start of a stage. Each is one program wit
 that it needs.
 """
 
+import math
 import warnings
 
 import equinox as eqx
@@ -22,6 +23,9 @@ from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.solution import is_finite
 
 ADAM_RATE = 1e-2
+DENSE_LIMIT = 20_000_000
+"""Entries of a dense Jacobian, 160 MB in double precision: above, `optimistix_lm` and
+`jaxopt_lm` are refused."""
 SETTLED = 10
 """First-order steps over which the cost must stay as it is."""
 
@@ -40,6 +44,25 @@ def run(name, problem, state, stage):
     state = jax.tree.map(lambda new, old: jnp.where(good, new, old), found, state)
     result = optx.RESULTS.where(good, result, optx.RESULTS.nonfinite)
     return state, jnp.where(good, cost, before), count, result
+
+
+def check_size(name: str, problem: Problem, state: State) -> None:
+    """Refuses a problem whose dense Jacobian would be too large.
+
+    **Raises:** `ValueError` with the size of the Jacobian and the largest allowed.
+    """
+    if name == "adam":
+        return
+    rows = jax.eval_shape(lambda s: lifted(s, problem), state)
+    count = sum(math.prod(row.shape) for row in rows)
+    unknowns = sum(x.size for x in jax.tree.leaves(problem.free))
+    if count * unknowns > DENSE_LIMIT:
+        raise ValueError(
+            f"solver: {name} is for small problems, as its Jacobian is dense: found "
+            f"{count:,} residuals by {unknowns:,} unknowns ({len(state.cameras)} "
+            f"frames, {len(state.landmarks)} landmarks), expected a product below "
+            f"{DENSE_LIMIT:,}; use `structured` or `adam`."
+        )
 
 
 class _Flat(eqx.Module):
@@ -80,7 +103,7 @@ def _held_rows(step, flat):
     return flat.residual(step), held
 
 
-def optimistix(problem, state, stage):
+def optimistix_lm(problem, state, stage):
     """Stock Levenberg-Marquardt of optimistix, dense, by QR."""
     flat, zero = _flat(problem, state)
     method = optx.LevenbergMarquardt(
@@ -132,15 +155,6 @@ def _units(flat, zero):
 
 def jaxopt_lm(problem, state, stage):
     """Levenberg-Marquardt of jaxopt, dense."""
-    return _jaxopt("LevenbergMarquardt", problem, state, stage)
-
-
-def jaxopt_gn(problem, state, stage):
-    """Gauss-Newton of jaxopt."""
-    return _jaxopt("GaussNewton", problem, state, stage)
-
-
-def _jaxopt(name, problem, state, stage):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
@@ -155,21 +169,24 @@ def _jaxopt(name, problem, state, stage):
     # Of the largest slope at the start: by itself it depends on what costs are of.
     slope = jax.lax.stop_gradient(jax.grad(flat.cost)(zero))
     slope = jnp.abs(ravel_pytree(slope)[0]).max()
-    options = {"maxiter": 4 * stage.max_steps, "tol": stage.rtol * slope}
-    if name == "LevenbergMarquardt":
-        options |= {"solver": "cholesky", "materialize_jac": True, "xtol": 1e-14}
-    method = getattr(jaxopt, name)(residual, **options)
+    method = jaxopt.LevenbergMarquardt(
+        residual,
+        maxiter=4 * stage.max_steps,
+        tol=stage.rtol * slope,
+        xtol=1e-14,
+        solver="cholesky",
+        materialize_jac=True,
+    )
     # jaxopt multiplies truth values and numbers.
     with jax.numpy_dtype_promotion("standard"):
         found = method.run(start, arrays)
-    converged = found.state.error <= options["tol"]
-    if name == "LevenbergMarquardt":
-        # Where rounding lets no step lower the cost, it tries ever shorter ones.
-        last = found.state
-        least = 1e-12 * jnp.diag(jnp.max(jnp.diag(last.jtj)) * jnp.ones_like(start))
-        step = jnp.linalg.solve(last.jtj + least, last.gradient)
-        gain = 0.5 * last.gradient @ step
-        converged |= gain <= jnp.maximum(stage.rtol * last.value, stage.atol)
+    # Where rounding lets no step lower the cost, it tries ever shorter ones.
+    last = found.state
+    least = 1e-12 * jnp.diag(jnp.max(jnp.diag(last.jtj)) * jnp.ones_like(start))
+    step = jnp.linalg.solve(last.jtj + least, last.gradient)
+    gain = 0.5 * last.gradient @ step
+    converged = last.error <= stage.rtol * slope
+    converged |= gain <= jnp.maximum(stage.rtol * last.value, stage.atol)
     return flat.retract(unravel(found.params)), found.state.iter_num, _result(converged)
 
 
@@ -231,8 +248,7 @@ def _adam(flat, start, rate, count, decays):
 
 
 _METHODS = {
-    "optimistix": optimistix,
+    "optimistix_lm": optimistix_lm,
     "jaxopt_lm": jaxopt_lm,
-    "jaxopt_gn": jaxopt_gn,
     "adam": adam,
 }

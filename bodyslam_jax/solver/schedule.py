@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 from bodyslam_jax.graph import VARIABLES
 
-Solver = Literal["structured", "optimistix", "jaxopt_lm", "jaxopt_gn", "adam"]
+Solver = Literal["structured", "adam", "optimistix_lm", "jaxopt_lm"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -41,9 +41,9 @@ def solve(
 ) -> Solution:
     """Minimises the cost of a problem from a first state.
 
-    - `solver`: `structured` is the one for real videos. The others are baselines for
-      small problems: `optimistix` and `jaxopt_lm` (Levenberg-Marquardt), `jaxopt_gn`
-      (Gauss-Newton) and `adam` (first-order steps, as many as a stage has).
+    - `solver`: `structured` is the one for real videos. `adam` takes first-order steps,
+      as many as a stage has. `optimistix_lm` and `jaxopt_lm` are dense
+      Levenberg-Marquardt, for small problems: larger ones are refused.
     - `schedule`: stages one after another, each with its free variables, most steps
       and tolerances; `PAPER_SCHEDULE` is the paper's.
     - `damping`: of the first step of each stage, as a share of each variable's own
@@ -75,6 +75,7 @@ def solve(
     if solver != "structured":
         if mixed_precision:
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
+        baselines.check_size(solver, problem, state)
         return _solve_baseline(problem, state, solver, schedule)
     check_limbs(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))

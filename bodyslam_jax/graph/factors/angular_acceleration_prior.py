@@ -19,8 +19,6 @@ class AngularAccelerationPrior(FrameFactor):
     sigma: Float[Array, "h t"]
     """rad per frame squared; `inf` where one of the three frames is missing."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property

@@ -34,8 +34,6 @@ class BodyPosePrior(FrameFactor):
     correlated: bool = eqx.field(static=True, default=True)
     predicted: bool = eqx.field(static=True, default=False)
     """Whether θ̃ is the motion model's prediction (the paper), not a regressor's."""
-    of_people = True
-    time_fields = ("rotation", "sigma", "correlation")
     padding = {"sigma": jnp.inf, "correlation": 0.0}
     per_joint = True
 

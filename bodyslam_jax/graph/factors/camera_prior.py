@@ -22,8 +22,6 @@ class CameraPrior(FrameFactor):
     sigma: Float[Array, "t 6"]
     """Of rotation (rad) and of centre (units of the map); `inf` where unknown."""
     loss: Loss = Squared()
-    of_people = False
-    time_fields = ("cameras", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

@@ -41,8 +41,6 @@ class GroundContact(FrameFactor):
     """m; `inf` where feet are not visible. The plane has one error in all frames, so
     this is its standard deviation times the root of their number."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property

@@ -43,8 +43,6 @@ class HumanMotion(FrameFactor):
     correlated: bool = eqx.field(static=True, default=True)
     """Whether the errors are correlated; if not, `keys` span two frames, not three."""
     body: BodyModel | None = None
-    of_people = True
-    time_fields = ("translation", "whitening", "correlation")
     padding = {"whitening": 0.0, "correlation": 0.0}
 
     @property

@@ -17,8 +17,6 @@ from bodyslam_jax.graph.losses import Loss, Squared
 class AbstractIntrinsicsFactor(FrameFactor):
     """A factor of the intrinsics alone: one row for the whole video."""
 
-    of_people = False
-    time_fields = ()
     padding = {}  # its one row is no frame
 
     @property

@@ -41,8 +41,6 @@ class KeypointReprojection(FrameFactor):
     """Share of the offset between a detector's hips, neck and shoulders and the joints
     of the body model (`body.DETECTOR_BIAS`)."""
     layout: str = eqx.field(static=True, default="body25")
-    of_people = True
-    time_fields = ("pixel", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

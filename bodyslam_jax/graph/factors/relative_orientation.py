@@ -22,8 +22,6 @@ class RelativeOrientation(FrameFactor):
     sigma: Float[Array, "h t"]
     """Per axis, rad; `inf` where not predicted."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("rotation", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

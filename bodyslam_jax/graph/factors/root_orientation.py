@@ -26,8 +26,6 @@ class RootOrientation(FrameFactor):
     correlation: Float[Array, "h t"]
     """ρ between the errors of k-1 and k; 0 at the start of a run."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("orientation", "sigma", "correlation")
     padding = {"sigma": jnp.inf, "correlation": 0.0}
 
     @property

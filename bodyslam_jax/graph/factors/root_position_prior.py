@@ -29,8 +29,6 @@ class RootPositionPrior(FrameFactor):
     correlation: Float[Array, "h t"]
     """ρ between the errors of k-1 and k; 0 at the start of a run."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("place", "sigma", "correlation")
     padding = {"sigma": jnp.inf, "correlation": 0.0}
 
     @property

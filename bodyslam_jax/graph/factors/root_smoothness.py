@@ -25,8 +25,6 @@ class RootSmoothness(FrameFactor):
     missing."""
     loss: Loss = Squared()
     body: BodyModel | None = None
-    of_people = True
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property

@@ -21,8 +21,6 @@ class ScalePrior(FrameFactor):
     sigma: Float[Array, " t"]
     """m per unit of the map; finite in one frame, `inf` in all others."""
     loss: Loss = Squared()
-    of_people = False
-    time_fields = ("scale", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

@@ -22,8 +22,6 @@ class ShapePrior(FrameFactor):
     sigma: Float[Array, "h t 10"]
     """`inf` where not measured."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("shape", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

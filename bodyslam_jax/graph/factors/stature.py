@@ -26,8 +26,6 @@ class Stature(FrameFactor):
     sigma: Float[Array, "h t"]
     """m; finite in one frame of each person who was measured, `inf` elsewhere."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("height", "sigma")
     padding = {"sigma": jnp.inf}
 
     @property

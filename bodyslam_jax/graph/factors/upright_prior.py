@@ -23,8 +23,6 @@ class UprightPrior(FrameFactor):
     sigma: Float[Array, "h t"]
     """rad; `inf` where the person is absent."""
     loss: Loss = Squared()
-    of_people = True
-    time_fields = ("sigma",)
     padding = {"sigma": jnp.inf}
 
     @property

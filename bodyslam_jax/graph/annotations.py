@@ -1,0 +1,36 @@
+"""The array fields of a module and the axes that their jaxtyping annotations name."""
+
+import dataclasses
+import functools
+import typing
+
+import equinox as eqx
+from jaxtyping import AbstractArray
+
+
+@functools.cache
+def array_annotations(kind: type[eqx.Module]) -> dict[str, type[AbstractArray]]:
+    """Fields annotated with a jaxtyping array, in the order of their declaration.
+
+    Annotations that are strings (`from __future__ import annotations`) are evaluated.
+    """
+    fields = dataclasses.fields(kind)
+    if any(isinstance(field.type, str) for field in fields):
+        types = typing.get_type_hints(kind)
+    else:
+        types = {field.name: field.type for field in fields}
+    return {
+        field.name: types[field.name]
+        for field in fields
+        if isinstance(types[field.name], type)
+        and issubclass(types[field.name], AbstractArray)
+    }
+
+
+def fields_with_axes(kind: type[eqx.Module], axes: tuple[str, ...]) -> tuple[str, ...]:
+    """Array fields whose leading axes are these, such as `("h", "t")`."""
+    return tuple(
+        name
+        for name, array in array_annotations(kind).items()
+        if tuple(array.dim_str.split()[: len(axes)]) == axes
+    )

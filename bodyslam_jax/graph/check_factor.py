@@ -1,0 +1,184 @@
+"""`check_factor`: whether a custom factor is one that the solver can rely on."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from bodyslam_jax.graph.factor import Factor, FrameFactor
+from bodyslam_jax.graph.padding import check_padding
+from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.validation import check_measurements, check_state
+from bodyslam_jax.graph.validation_weights import check_precision
+
+_MOVED = 0.01
+"""rad, m and so on: how far from the given state derivatives are looked at, where a
+residual is not 0 by chance."""
+_SAME = {"float64": 1e-9, "float32": 1e-4}
+"""Relative difference that rounding may make between two ways of computing a cost."""
+_VARIABLE = {
+    "scale": "scale",
+    "cameras": "camera",
+    "roots": "root",
+    "poses": "pose",
+    "shapes": "shape",
+    "intrinsics": "intrinsics",
+}
+"""Fields of a state, and the names that `keys` has for them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FactorReport:
+    """What `check_factor` found of a factor that passed."""
+
+    name: str
+    keys: tuple[tuple[str, int], ...]
+    """Variables and lags that the residual depends on."""
+    residual_shape: tuple[int, ...]
+    cost: float
+    """Negative log-likelihood at the given state, up to a constant."""
+    gradient: dict[str, float]
+    """Largest derivative of the cost by each group of variables in `keys`, close to the
+    given state."""
+
+
+def check_factor(factor: Factor, state: State) -> FactorReport:
+    """Refuses a factor that does not fit a state, or that the solver cannot use.
+
+    Shapes, kinds and values must fit; a residual may depend on the variables in `keys`
+    only; values and derivatives must be finite, close to `state` and with respect to
+    the measurements; appended frames must not change the cost; `jit` and `vmap` must
+    give the same cost.
+
+    **Raises:** `ValueError` in one line: where, what was found, what was expected.
+    """
+    sizes = check_state(state)
+    check_measurements(factor, sizes)
+    check_precision(factor, state)
+    name = type(factor).__name__
+    residual = _residual(factor, state, name)
+    moved = _away_from(state)
+    cost = _finite_cost(factor, state, name)
+    gradient = _gradient_by_state(factor, moved, name)
+    _check_gradient_by_measurements(factor, moved, name)
+    if isinstance(factor, FrameFactor):
+        check_padding(factor, state)
+    _check_transformed(factor, moved, name)
+    keys = tuple(factor.keys) if isinstance(factor, FrameFactor) else ()
+    return FactorReport(name, keys, residual.shape, cost, gradient)
+
+
+def _residual(factor: Factor, state: State, name: str) -> Array:
+    residual = factor.residual(state)
+    if not isinstance(residual, jax.Array) or residual.ndim < 1:
+        raise ValueError(
+            f"{name}.frame_residual: found {type(residual).__name__} of shape "
+            f"{np.shape(residual)}, expected an array with one axis or more."
+        )
+    if not isinstance(factor, FrameFactor):
+        return residual
+    lead = (state.roots.shape[0],) if factor.of_people else ()
+    lead += (1,) if factor.once else (len(state.cameras),)
+    if type(factor).map_frames is not FrameFactor.map_frames:
+        return residual
+    if residual.shape[: len(lead)] != lead or residual.ndim == len(lead):
+        raise ValueError(
+            f"{name}.frame_residual: shape {residual.shape[len(lead) :]} for each "
+            "frame, expected one axis or more, such as (3,) or (1,)."
+        )
+    return residual
+
+
+def _finite_cost(factor: Factor, state: State, name: str) -> float:
+    cost = float(factor.cost(state))
+    if not np.isfinite(cost):
+        raise ValueError(
+            f"{name}.frame_residual: the cost at the given state is {cost}, expected a "
+            "finite number; missing measurements have sigma = inf and a finite value."
+        )
+    return cost
+
+
+def _gradient_by_state(factor: Factor, state: State, name: str) -> dict[str, float]:
+    """Largest derivative by each group; refuses those that `keys` leaves out."""
+    slope = _slope(factor, state)
+    largest = {}
+    for field, values in vars(slope).items():
+        values = np.asarray(values)
+        variable = _VARIABLE.get(field)
+        if not np.isfinite(values).all():
+            bad = int(np.sum(~np.isfinite(values)))
+            raise ValueError(
+                f"{name}.frame_residual: {bad} of {values.size} derivatives by "
+                f"{field} are not finite, expected all to be; guard roots, norms and "
+                "angles where they are not differentiable (`jnp.where` on the input)."
+            )
+        size = float(abs(values).max(initial=0.0))
+        if not isinstance(factor, FrameFactor):
+            largest[field] = size
+        elif variable in {key for key, _ in factor.keys}:
+            largest[field] = size
+        elif size > 0:
+            expected = f"({variable!r}, 0)" if variable else "no landmarks"
+            raise ValueError(
+                f"{name}.keys: found {list(factor.keys)}, but the residual depends on "
+                f"{field}; expected {expected} among them."
+            )
+    return largest
+
+
+def _check_gradient_by_measurements(factor: Factor, state: State, name: str) -> None:
+    slope = eqx.filter_grad(lambda f: f.cost(state))(factor)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(slope):
+        if not np.isfinite(np.asarray(leaf)).all():
+            bad = int(np.sum(~np.isfinite(np.asarray(leaf))))
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)}: {bad} of {np.size(leaf)} "
+                "derivatives of the cost by it are not finite, expected all to be."
+            )
+
+
+def _check_transformed(factor: Factor, state: State, name: str) -> None:
+    """`jit` and `vmap` over two states give the cost that plain evaluation gives."""
+    plain = lambda f, s: f.cost(s)
+    with jax.disable_jit():
+        expected = np.asarray(plain(factor, state))
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    ways: dict[str, Any] = {
+        "jax.jit": lambda: eqx.filter_jit(plain)(factor, state),
+        "jax.vmap": lambda: eqx.filter_vmap(plain, in_axes=(None, 0))(factor, both),
+    }
+    for way, cost in ways.items():
+        try:
+            found = np.asarray(cost())
+        except (jax.errors.JAXTypeError, TypeError) as error:
+            line = str(error).splitlines()[0]
+            raise ValueError(
+                f"{name}.frame_residual: cannot be traced by {way} ({line:.120}); "
+                "expected jax.numpy and no `if` on values."
+            ) from error
+        if not np.allclose(found, expected, rtol=_SAME[str(state.scale.dtype)]):
+            raise ValueError(
+                f"{name}.frame_residual: the cost is {found.ravel()[0]:.9g} under "
+                f"{way}, expected {expected:.9g} as without it."
+            )
+
+
+@eqx.filter_jit
+def _slope(factor: Factor, state: State) -> Step:
+    cost = lambda step: factor.cost(state.retract(step))
+    return jax.grad(cost)(state.zero_step())
+
+
+@jax.jit
+def _away_from(state: State) -> State:
+    """Another state close by, drawn with a fixed key."""
+    leaves, treedef = jax.tree.flatten(state.zero_step())
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
+    step = [draw(k, x) for k, x in zip(keys, leaves, strict=True)]
+    return state.retract(treedef.unflatten(step))

@@ -1,0 +1,143 @@
+"""The weights λ of a problem's terms: read, and replaced without a new compilation.
+
+The paper writes its cost as `Σ λ ρ(e²)` (section 3.6). A factor holds the standard
+deviation of each measurement instead, so `λ = σ⁻²`, averaged over the measurements of
+the term that are not missing.
+"""
+
+import re
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bodyslam_jax.graph.factor import Factor
+from bodyslam_jax.graph.padding import Masked
+from bodyslam_jax.graph.problem import Problem
+from bodyslam_jax.graph.tracing import is_traced
+
+_NAMES = {
+    "Reprojection": "landmarks",
+    "KeypointReprojection": "keypoints",
+    "GroundContact": "ground",
+    "LandmarkPrior": "landmark_prior",
+}
+"""Names of terms that do not follow from the name of the factor's class."""
+
+
+def weights(problem: Problem) -> dict[str, Float[Array, ""]]:
+    """λ of each term, the mean inverse variance of its measurements.
+
+    Terms are named after the factor's class without `Prior`, in lower case:
+    `human_motion`, `body_pose`, `shape`, `stature`, ...; `landmarks` and `keypoints`
+    are the two reprojection terms. Units are those of σ⁻²: px⁻², rad⁻², m⁻² or leg
+    lengths⁻². Factors without a field `sigma` or `whitening` have no λ here.
+    """
+    found = {}
+    for name, factor in zip(term_names(problem), problem.factors, strict=True):
+        inner = factor.factor if isinstance(factor, Masked) else factor
+        value = _mean_inverse_variance(inner)
+        if value is not None:
+            found[name] = value
+    return found
+
+
+def with_weights(
+    problem: Problem, **weights: float | Float[Array, ""] | np.ndarray
+) -> Problem:
+    """The same problem with other λ: the cost of a term is λ times its robust loss.
+
+    Standard deviations of a term are multiplied by one factor, and the scale of its
+    robust loss with them, so that the same pixels or metres are an outlier. Shapes and
+    compiled programs stay the same for all values. Differentiates by, and maps over, λ;
+    λ = 0 is not allowed (`graph.disable` leaves a term out).
+
+    **Raises:** `ValueError` for a term that the problem does not have, or a λ that is
+    not positive and finite.
+    """
+    names = term_names(problem)
+    factors = list(problem.factors)
+    for name, value in weights.items():
+        if name not in names:
+            raise ValueError(f"weights: no term {name!r}, expected among {names}.")
+        _check(name, value)
+        i = names.index(name)
+        factors[i] = _weighted(name, factors[i], value)
+    return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
+
+
+def term_names(problem: Problem) -> list[str]:
+    """The name of each factor's term, numbered where a class repeats."""
+    return [_snake_case(name) for name in problem.names]
+
+
+def _snake_case(name: str) -> str:
+    kind, _, number = name.partition("_")
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.removesuffix("Prior")).lower()
+    words = _NAMES.get(kind, words)
+    return f"{words}_{number}" if number else words
+
+
+def _mean_inverse_variance(factor: Factor) -> Float[Array, ""] | None:
+    """`None` where the factor has no standard deviation; 0 where all are missing."""
+    sigma, whitening = _field(factor, "sigma"), _field(factor, "whitening")
+    if whitening is not None:
+        variances = jnp.sum(whitening**2, axis=(-1, -2)) / whitening.shape[-1]
+        present = variances > 0
+    elif sigma is not None:
+        present = jnp.isfinite(sigma)
+        # Infinite means missing; its derivative is not a number.
+        variances = jnp.where(present, 1 / jnp.where(present, sigma, 1.0) ** 2, 0.0)
+    else:
+        return None
+    count = jnp.maximum(present.sum(dtype=variances.dtype), 1)
+    return jnp.sum(variances) / count
+
+
+def _weighted(name: str, factor: Factor, value: Any) -> Factor:
+    if isinstance(factor, Masked):
+        inner = _weighted(name, factor.factor, value)
+        return eqx.tree_at(lambda f: f.factor, factor, inner)
+    before = _mean_inverse_variance(factor)
+    if before is None:
+        raise ValueError(
+            f"weights.{name}: {type(factor).__name__} has no field `sigma` or "
+            "`whitening`, expected one of them."
+        )
+    # Where nothing is measured, nothing changes.
+    empty = before == 0
+    ratio = jnp.asarray(value, before.dtype) / jnp.where(empty, 1.0, before)
+    root = jnp.sqrt(jnp.where(empty, 1.0, ratio))
+    if (whitening := _field(factor, "whitening")) is not None:
+        factor = eqx.tree_at(lambda f: f.whitening, factor, whitening * root)
+    else:
+        sigma = _field(factor, "sigma")
+        missing = jnp.isinf(sigma)
+        sigma = jnp.where(missing, jnp.inf, jnp.where(missing, 1.0, sigma) / root)
+        factor = eqx.tree_at(lambda f: f.sigma, factor, sigma)
+    scale = getattr(factor.loss, "scale", None)
+    if scale is None:
+        return factor
+    return eqx.tree_at(
+        lambda f: f.loss.scale, factor, jnp.asarray(scale, before.dtype) * root
+    )
+
+
+def _field(factor: Factor, name: str) -> Any:
+    """An array of a factor, `None` if it has none of this name."""
+    value = getattr(factor, name, None)
+    return value if eqx.is_array(value) else None
+
+
+def _check(name: str, value: Any) -> None:
+    if is_traced(value):
+        return
+    if np.ndim(value):
+        raise ValueError(
+            f"weights.{name}: shape {np.shape(value)}, expected one number; map over "
+            "several with `jax.vmap`."
+        )
+    if not 0 < float(value) < np.inf:
+        raise ValueError(f"weights.{name}: found {value}, expected above 0 and finite.")

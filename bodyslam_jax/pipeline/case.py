@@ -1,0 +1,159 @@
+"""A simulated sequence with its truth, taken to where the joint estimate begins."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax import evaluation, graph, simulation
+from bodyslam_jax.body import BodyModel, load_body_model, local_joints
+from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
+from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.evaluation import Trajectories
+from bodyslam_jax.pipeline import before_joint
+from bodyslam_jax.pipeline.joint_stage import Prepared, prepare
+from bodyslam_jax.pipeline.sfm_stage import with_intrinsics
+from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
+from bodyslam_jax.types import Bodies, Result, Sequence, SfmResult
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One simulated sequence: measurements, truth, and what the front end made."""
+
+    name: str
+    """Such as `M2-room`."""
+    sequence: Sequence
+    """The measurements: tracks, keypoints, regressed bodies, intrinsics."""
+    truth: Trajectories
+    """True cameras and people, m, in the simulation's world."""
+    body: BodyModel
+    cameras: SfmResult
+    """Cameras and map up to scale, from the tracks."""
+    bodies: Bodies
+    """Bodies in the camera frame, cleaned."""
+    config: Config
+
+    @property
+    def map_scale(self) -> float:
+        """Metres per unit of the map: what s should be, by Sim(3) on the cameras."""
+        found = evaluation.umeyama(
+            self.truth.T_WC[:, :3, 3],
+            jnp.asarray(self.cameras.T_WC[:, :3, 3]),
+            jnp.asarray(self.cameras.registered, float),
+            with_scale=True,
+        )
+        return float(found.scale)
+
+    @property
+    def radius(self) -> float:
+        """RMS distance of the true camera from its mean place, m."""
+        centre = np.asarray(self.truth.T_WC[:, :3, 3])
+        return float(np.sqrt(((centre - centre.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+    def prepare(self, config: Config | None = None) -> Prepared:
+        """The joint problem and its start after the body-only solve, as in `run`, with
+        other settings than the case's if they are given."""
+        return prepare(
+            self.sequence, self.cameras, self.bodies, self.body, config or self.config
+        )
+
+    def trajectories(self, state: graph.State) -> Trajectories:
+        """Cameras and people of a state, to be compared with `truth` by `evaluate`.
+
+        Differentiates and maps over states. People are present where they are in the
+        truth; the world is the map's, in metres.
+        """
+        return trajectories(
+            state,
+            self.body,
+            self.truth.present,
+            self.cameras.registered,
+            self.truth.fps,
+        )
+
+
+def simulate_case(
+    sequence: str | Simulation = "M2",
+    *,
+    frames: int | None = None,
+    config: Config = Config(),
+    cache: Path | None = None,
+    **settings: Any,
+) -> Case:
+    """Simulates a sequence and runs the stages before the joint estimate on it.
+
+    These are structure from motion with bundle adjustment on the simulated tracks, and
+    the cleaning of the regressed bodies: what `build` needs, as in `run`.
+
+    Args:
+        sequence: a name from `E1` to `D3`, or all settings.
+        frames: at 30 fps; without it the sequence's own number, 600 to 1000.
+        cache: a folder in which finished stages are kept, one folder of it a sequence.
+        settings: other fields of `config.Simulation`, such as `family="follow"`,
+            `seed`, `noise`.
+
+    **Raises:** as `simulation.simulate` and `pipeline.run`.
+    """
+    if not isinstance(sequence, Simulation):
+        sequence = Simulation(sequence=sequence, length=frames, **settings)  # pyright: ignore
+    elif frames is not None or settings:
+        sequence = dataclasses.replace(
+            sequence, length=frames or sequence.length, **settings
+        )
+    body = load_body_model(config.body_model)
+    simulated = simulation.simulate(sequence, body)
+    measured = simulation.as_sequence(simulated)
+    name = f"{simulated.name}-{fingerprint(sequence)}"
+    kept = Cache(None if cache is None else cache / name)
+    cameras, bodies = before_joint(measured, body, config, kept)
+    return Case(
+        name=simulated.name,
+        sequence=with_intrinsics(measured, cameras.intrinsics),
+        truth=truth_of(simulation.as_truth(simulated)),
+        body=body,
+        cameras=cameras,
+        bodies=bodies,
+        config=config,
+    )
+
+
+def truth_of(result: Result) -> Trajectories:
+    """A simulation's truth as what is compared with."""
+    joints = jnp.asarray(result.joints)
+    t = len(result.timestamps)
+    fps = (t - 1) / (result.timestamps[-1] - result.timestamps[0])
+    return Trajectories(
+        T_WC=jnp.asarray(result.T_WC),
+        camera_valid=jnp.ones(t, bool),
+        joints=joints,
+        present=jnp.asarray(result.present),
+        feet=joints[..., np.array(ANKLES_AND_FEET), :],
+        fps=jnp.asarray(fps),
+    )
+
+
+def trajectories(
+    state: graph.State,
+    body: BodyModel,
+    present: Bool[Array | np.ndarray, "h t"],
+    registered: Bool[Array | np.ndarray, " t"],
+    fps: Float[Array, ""],
+) -> Trajectories:
+    """Cameras, pelvis and joints of a state in metres, in the map's world frame."""
+    cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
+    T_WH = graph.world_from_root(state)
+    p_H = local_joints(body, state.poses, state.shapes[:, None])
+    turn, move = T_WH[..., :3, :3], T_WH[..., None, :3, 3]
+    joints = jnp.einsum("htij,htkj->htki", turn, p_H) + move
+    return Trajectories(
+        T_WC=cameras,
+        camera_valid=jnp.asarray(registered),
+        joints=joints,
+        present=jnp.asarray(present),
+        feet=joints[..., np.array(ANKLES_AND_FEET), :],
+        fps=fps,
+    )

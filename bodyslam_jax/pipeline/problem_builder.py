@@ -1,0 +1,61 @@
+"""`build`: the joint problem and its start, with nothing of it solved."""
+
+import dataclasses
+
+from bodyslam_jax import diagnostics, graph, people
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config
+from bodyslam_jax.pipeline import before_joint, find_people
+from bodyslam_jax.pipeline.case import Case
+from bodyslam_jax.pipeline.joint_stage import prepare
+from bodyslam_jax.pipeline.sfm_stage import with_intrinsics
+from bodyslam_jax.types import Sequence
+
+
+def build(
+    source: Case | Sequence,
+    config: Config | None = None,
+    hold: tuple[str, ...] = (),
+) -> tuple[graph.Problem, graph.State]:
+    """The joint problem of section 3.6 and a first state for it.
+
+    Cameras and landmarks start where structure from motion put them, people where
+    their bodies are given, and the scale at its closed form from people's motion and
+    the ground. `run` first solves for the bodies alone with cameras held; `build` does
+    not, so that its start is a little farther from the solution. Of a `Sequence` the
+    front end runs here, as in `run`; of a `Case` it has run.
+
+    Args:
+        config: without it that of the case, or the defaults.
+        hold: groups of variables that stay as they are in the first state, among the
+            fields of `State`: `scale`, `cameras`, `roots`, `poses`, `shapes`,
+            `landmarks`, `intrinsics`.
+
+    **Raises:** `ValueError` as `run`, and for a name in `hold` that is none of these.
+    """
+    unknown = sorted(set(hold) - set(graph.VARIABLES))
+    if isinstance(hold, str) or unknown:
+        raise ValueError(
+            f"hold: found {hold!r}, expected a tuple of names among "
+            f"{list(graph.VARIABLES)}."
+        )
+    if isinstance(source, Case):
+        config = config or source.config
+        sequence, body = source.sequence, source.body
+        cameras, bodies = source.cameras, source.bodies
+    else:
+        config = config or Config()
+        body = load_body_model(config.body_model)
+        source = diagnostics.reconcile(find_people(source, config), body)
+        cameras, bodies = before_joint(source, body, config)
+        sequence = people.select_people(source, config.person)
+        sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+    prepared = prepare(sequence, cameras, bodies, body, config, body_only_solve=False)
+    return hold_groups(prepared.problem, hold), prepared.state
+
+
+def hold_groups(problem: graph.Problem, hold: tuple[str, ...]) -> graph.Problem:
+    """The problem with these groups held; their blocks are not even formed."""
+    variables = tuple(name for name in problem.variables if name not in hold)
+    free = graph.set_constant(problem.free, *hold)
+    return dataclasses.replace(problem, free=free, variables=variables)
