@@ -25,7 +25,6 @@ import numpy as np
 
 import bodyslam_jax as bs
 from bodyslam_jax import evaluation, export, io, simulation, view
-from bodyslam_jax.config import Config
 
 # %config InlineBackend.figure_formats = ["jpeg"]
 plt.rcParams["figure.dpi"] = 70
@@ -38,7 +37,7 @@ print(sorted(path.name for path in source.iterdir()))
 
 # %%
 sequence = bs.read_sequence(source)
-result = bs.run(sequence, Config(uncertainty=False))
+result = bs.run(sequence, bs.Config(uncertainty=False))
 print(*result.summary["headline"], sep="\n")
 
 # %% [markdown]

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+import bodyslam_jax as bs
 from bodyslam_jax import experiments, solver
-from bodyslam_jax.config import Simulation
 
 # %config InlineBackend.figure_formats = ["jpeg"]
 plt.rcParams["figure.dpi"] = 70
@@ -39,7 +39,7 @@ plt.rcParams["figure.dpi"] = 70
 # the problem once; with other weights the solution is near.
 
 # %%
-case = experiments.make_case(Simulation(sequence="M2", family="follow", length=80))
+case = bs.simulate_case("M2", family="follow", frames=80)
 trial = experiments.make_trial(case, case.prepare(), hold_cameras=True)
 names = experiments.names_of(trial.problem)
 print(names)

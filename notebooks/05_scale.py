@@ -24,20 +24,20 @@ jax.config.update("jax_enable_x64", True)
 import matplotlib.pyplot as plt
 import numpy as np
 
+import bodyslam_jax as bs
 from bodyslam_jax import experiments
-from bodyslam_jax.config import Simulation
 
 # %config InlineBackend.figure_formats = ["jpeg"]
 plt.rcParams["figure.dpi"] = 70
 
 # %% [markdown]
 # ## One sequence
-# Four seconds of a walker whom a hand-held camera goes along with. `make_case`
+# Four seconds of a walker whom a hand-held camera goes along with. `simulate_case`
 # does what the pipeline does: structure from motion and bundle adjustment of noisy
 # tracks, bodies from a simulated regressor.
 
 # %%
-case = experiments.make_case(Simulation(sequence="M2", family="follow", length=120))
+case = bs.simulate_case("M2", family="follow", frames=120)
 print(
     f"{case.name}: {case.sequence.num_frames} frames, camera within {case.radius:.2f} m,"
     f" one unit of its map is {case.map_scale:.3f} m"

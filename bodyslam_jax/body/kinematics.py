@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.body.arguments import batch_of
 from bodyslam_jax.body.model import BodyModel
 from bodyslam_jax.body.skeleton import (
     DETECTOR_BIAS,
@@ -36,7 +37,11 @@ _PARENT = np.array(PARENTS[1:])
 def rest_joints(
     model: BodyModel, shape: Float[Array, "*b 10"]
 ) -> Float[Array, "*b 24 3"]:
-    """Joints at rest for SMPL β, m, in the model's own frame (pelvis at `J_0(β)`)."""
+    """Joints at rest for SMPL β, m, in the model's own frame (pelvis at `J_0(β)`).
+
+    **Raises:** `ValueError` naming an argument of another shape.
+    """
+    batch_of("rest_joints", shape=shape)
     moved = shape @ model.joint_shape_dirs.reshape(72, 10).T
     return model.joint_template + moved.reshape(*shape.shape[:-1], 24, 3)
 
@@ -51,8 +56,10 @@ def local_joints(
 
     `body_pose` holds the axis-angle rotations of joints 1 to 23, rad, each in its
     parent's frame; `shape` is SMPL β. Leading axes broadcast.
+
+    **Raises:** `ValueError` naming an argument of another shape.
     """
-    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    batch = batch_of("local_joints", body_pose=body_pose, shape=shape)
     R = _under_root(flatten(body_pose, batch, 2))
     return _unflatten(pose_joints(model, R, flatten(shape, batch, 1)).x, batch)
 
@@ -67,7 +74,10 @@ def joints(
     """Posed joints, m, in the frame into which the root rotation `pose[:3]` turns.
 
     The pelvis is at `J_0(β) + trans` whatever the pose. Leading axes broadcast.
+
+    **Raises:** `ValueError` naming an argument of another shape.
     """
+    batch_of("joints", pose=pose, shape=shape, trans=trans)
     return _placed(model, pose, shape, trans, lambda posed, shape: posed.x)
 
 
@@ -87,8 +97,10 @@ def local_keypoints(
     - `bias`: 0 for keypoints at SMPL's joints of the same names, 1 for hips, neck and
         shoulders where detectors trained on COCO put them (`DETECTOR_BIAS`); keypoints
         are linear in it.
+
+    **Raises:** `ValueError` naming an argument of another shape.
     """
-    batch = jnp.broadcast_shapes(body_pose.shape[:-2], shape.shape[:-1])
+    batch = batch_of("local_keypoints", body_pose=body_pose, shape=shape)
     beta = flatten(shape, batch, 1)
     posed = pose_joints(model, _under_root(flatten(body_pose, batch, 2)), beta)
     return _unflatten(_detected(model, posed, beta, layout, bias), batch)
@@ -104,6 +116,7 @@ def keypoints(
     bias: float | Float[Array, ""] = 0.0,
 ) -> Float[Array, "*b keypoints 3"]:
     """`local_keypoints`, placed like `joints`."""
+    batch_of("keypoints", pose=pose, shape=shape, trans=trans)
     points = lambda posed, beta: _detected(model, posed, beta, layout, bias)
     return _placed(model, pose, shape, trans, points)
 

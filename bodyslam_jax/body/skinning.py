@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.body.arguments import batch_of
 from bodyslam_jax.body.kinematics import (
     flatten,
     matvec,
@@ -38,8 +39,10 @@ def vertices(
 
     Leading axes broadcast. Frames that share one β (`shape` without a leading axis
     longer than 1) are several times faster than a β for each: see `_skin_shared`.
+
+    **Raises:** `ValueError` naming an argument of another shape.
     """
-    batch = jnp.broadcast_shapes(pose.shape[:-1], shape.shape[:-1], trans.shape[:-1])
+    batch = batch_of("vertices", pose=pose, shape=shape, trans=trans)
     is_shared = math.prod(shape.shape[:-1]) == 1 and model.pose_dirs.shape[-1] == 0
     pose, trans = flatten(pose, batch, 1), flatten(trans, batch, 1)
     beta = flatten(shape, batch, 1)

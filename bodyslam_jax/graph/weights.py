@@ -33,7 +33,9 @@ def weights(problem: Problem) -> dict[str, Float[Array, ""]]:
     Terms are named after the factor's class without `Prior`, in lower case:
     `human_motion`, `body_pose`, `shape`, `stature`, ...; `landmarks` and `keypoints`
     are the two reprojection terms. Units are those of σ⁻²: px⁻², rad⁻², m⁻² or leg
-    lengths⁻². Factors without a field `sigma` or `whitening` have no λ here.
+    lengths⁻². A term of which all
+    measurements are missing has 0; factors without a field `sigma` or `whitening` have
+    no λ here.
     """
     found = {}
     for name, factor in zip(term_names(problem), problem.factors, strict=True):
