@@ -13,12 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from test_motion_data import make_clip, write_amass, write_cmu
 
 from bodyslam_jax import cli
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
-from bodyslam_jax.motion import load_motion_model, read_motion, split, train
+from bodyslam_jax.motion import (
+    Guess,
+    MotionNetwork,
+    load_motion_model,
+    read_motion,
+    split,
+    train,
+)
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.training.losses import loss
 from bodyslam_jax.motion.training.sampling import corpus, draw
@@ -261,6 +269,31 @@ def test_where_weights_go_is_checked_before_training(
 def test_training_learns(trained):
     _, history = trained
     assert history[-1, 0] < history[0, 0]
+
+
+class StepForward(MotionNetwork):
+    """A custom network: a constant step, whatever the posture."""
+
+    step: Float[Array, " 3"]
+    log_sigma: Float[Array, " 3"]
+
+    def __call__(self, window):
+        last, like = window.body_pose[..., -2, :, :], window.leg[..., None]
+        cholesky = jnp.exp(self.log_sigma) * jnp.eye(3, dtype=like.dtype)
+        return Guess(
+            translation=self.step * jnp.ones_like(like),
+            cholesky=cholesky * jnp.ones_like(like)[..., None],
+            body_pose=last,
+            rotation=jnp.zeros((*like.shape[:-1], 3), like.dtype),
+        )
+
+
+def test_a_custom_network_is_trained_by_its_likelihood(body, clips, clean_batch):
+    start = StepForward(jnp.zeros(3, jnp.float32), jnp.zeros(3, jnp.float32))
+    model, history = train(clips, body, CLEAN, network=start)
+    assert isinstance(model.network, StepForward)
+    assert history[-1, 0] < history[0, 0]
+    assert loss(model.network, clean_batch, CLEAN) < loss(start, clean_batch, CLEAN)
 
 
 def test_validation_may_be_rare(body, clips, validation, trained, tmp_path):

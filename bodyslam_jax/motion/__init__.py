@@ -13,6 +13,9 @@ from bodyslam_jax.motion.capture.retarget import fit_shape as fit_shape
 from bodyslam_jax.motion.capture.retarget import place as place
 from bodyslam_jax.motion.continuation import Rollout as Rollout
 from bodyslam_jax.motion.continuation import rollout as rollout
+from bodyslam_jax.motion.network import Guess as Guess
+from bodyslam_jax.motion.network import MotionNetwork as MotionNetwork
+from bodyslam_jax.motion.network import Window as Window
 from bodyslam_jax.motion.prediction import MotionModel as MotionModel
 from bodyslam_jax.motion.prediction import Prediction as Prediction
 from bodyslam_jax.motion.prediction import check_compatible as check_compatible

@@ -5,6 +5,8 @@ A network sees a `Window`: frames k-n to k of one person, seen from H_{k-1}; it 
 two presets.
 """
 
+import abc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,19 @@ class Guess(eqx.Module):
     """θ_k, from frames up to k-1 alone, rad."""
     rotation: Float[Array, "*b 3"]
     """Rotation vector of C_{H_{k-1}}^T C_{H_k}, from frames up to k-1 alone."""
+
+
+class MotionNetwork(eqx.Module):
+    """Parameters, and a function from what precedes a step to a guess of the step.
+
+    A custom one is trained by `train(..., network=...)`, by the Gaussian likelihood of
+    its guesses, and used by `bs.build` and `Problem.with_motion_model` within a
+    `MotionModel`. All its float32 arrays are trained.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, window: Window) -> Guess:
+        """The guess of each window; leading axes of both are the same."""
 
 
 class Layer(eqx.Module):

@@ -1,6 +1,5 @@
 """The paper's network (section 3.4): joint angles up to frame k-1."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bodyslam_jax.motion.network import (
     Guess,
     Layer,
+    MotionNetwork,
     Normalisation,
     Window,
     apply_layers,
@@ -18,7 +18,7 @@ from bodyslam_jax.motion.network import (
 )
 
 
-class PaperNetwork(eqx.Module):
+class PaperNetwork(MotionNetwork):
     """Section 3.4: encoder on joint angles, decoders for position and posture."""
 
     encoder: tuple[Layer, ...]

@@ -11,6 +11,7 @@ from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import (
     Guess,
     Layer,
+    MotionNetwork,
     Normalisation,
     Window,
     apply_layers,
@@ -26,7 +27,7 @@ CONTACTS = (*ANKLES, *FEET)
 """Joints that may stand on the ground: ankles and feet."""
 
 
-class MetricNetwork(eqx.Module):
+class MetricNetwork(MotionNetwork):
     """Where the joints were over the window, and which of them stood still.
 
     The displacement is a weighted sum over contact joints and past frames of what each

@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.motion.network import Window
-from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.network import MotionNetwork, Window
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 
@@ -20,7 +19,7 @@ from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 class MotionModel(eqx.Module):
     """A trained network and what it was trained for."""
 
-    network: MetricNetwork | PaperNetwork
+    network: MotionNetwork
     body: str = eqx.field(static=True)
     """Kind of body model whose skeleton it knows, such as `default` or `smpl`."""
     fps: float = eqx.field(static=True)

@@ -31,9 +31,16 @@ def save_motion_model(
 
     `half` keeps the weights of layers in float16, in half the space. They are of order
     1, and lose their fourth digit; means, deviations and the rest stay in float32.
+
+    **Raises:** `ValueError` for a custom network, whose class no reader would know.
     """
     path = Path(path)
     network = model.network
+    if not isinstance(network, PaperNetwork | MetricNetwork):
+        raise ValueError(
+            f"{path}: found a network of class {type(network).__name__}, expected one "
+            "of the package; save a custom one with `eqx.tree_serialise_leaves`."
+        )
     sizes = {"past": model.past}
     if isinstance(network, PaperNetwork):
         sizes["width"] = network.encoder[0].weight.shape[1]

@@ -12,19 +12,36 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.motion.network import apply_layers, lower_triangle
+from bodyslam_jax.motion.network import MotionNetwork, apply_layers, lower_triangle
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.training.sampling import Batch
 
 
 def loss(
-    network: MetricNetwork | PaperNetwork, batch: Batch, settings: MotionTraining
+    network: MotionNetwork, batch: Batch, settings: MotionTraining
 ) -> Float[Array, ""]:
     """Mean loss of a batch; see the module's docstring."""
     if isinstance(network, PaperNetwork):
         return _paper_loss(network, batch)
-    return _metric_loss(network, batch, settings)
+    if isinstance(network, MetricNetwork):
+        return _metric_loss(network, batch, settings)
+    return _likelihood(network, batch)
+
+
+def _likelihood(network: MotionNetwork, batch: Batch) -> Float[Array, ""]:
+    """Of a custom network: negative log-likelihood of displacements, squared errors
+    (rad²) of postures and of the root's rotation."""
+    guess = network(batch.window)
+    error = guess.translation - batch.move * batch.window.leg[..., None]
+    whitened = jax.scipy.linalg.solve_triangular(
+        guess.cholesky, error[..., None], lower=True
+    )[..., 0]
+    diagonal = jnp.diagonal(guess.cholesky, axis1=-2, axis2=-1)
+    each = 0.5 * (whitened**2).sum(-1) + jnp.log(jnp.abs(diagonal)).sum(-1)
+    each += ((guess.body_pose - batch.pose[..., 1:, :]) ** 2).mean((-1, -2))
+    each += ((guess.rotation - batch.pose[..., 0, :]) ** 2).mean(-1)
+    return (each * batch.weight).sum() / batch.weight.sum()
 
 
 def _paper_loss(network: PaperNetwork, batch: Batch) -> Float[Array, ""]:

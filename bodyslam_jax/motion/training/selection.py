@@ -10,6 +10,7 @@ from jaxtyping import Float
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion.capture.retarget import Trial
 from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
 from bodyslam_jax.motion.training.evaluation import run_trials
 from bodyslam_jax.motion.training.measures import summary
@@ -64,6 +65,8 @@ def calibrated(
         spread = np.linalg.cholesky(error.T @ error / len(error) + 1e-10 * np.eye(3))
         new = jnp.asarray(spread, jnp.float32)
         return eqx.tree_at(lambda m: m.network.spread, model, new)
+    if not isinstance(model.network, MetricNetwork):
+        return model
     covariance = np.concatenate([r.covariance[r.valid] for r in runs]).astype(float)
     nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1) / 3
     factor = 0.5 * np.log(nees.mean())

@@ -17,7 +17,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
-from bodyslam_jax.motion.network import Normalisation, normalisation
+from bodyslam_jax.motion.network import MotionNetwork, Normalisation, normalisation
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel, in_dtype
@@ -39,10 +39,10 @@ _MEASURED = 20
 class Progress(eqx.Module):
     """All that a checkpoint must hold to continue as if nothing had happened."""
 
-    network: MetricNetwork | PaperNetwork
-    average: MetricNetwork | PaperNetwork
+    network: MotionNetwork
+    average: MotionNetwork
     """Running mean of the weights."""
-    best: MetricNetwork | PaperNetwork
+    best: MotionNetwork
     """The mean that did best on validation."""
     optimiser: optax.OptState
     history: Float[Array, "e 7"]
@@ -61,13 +61,13 @@ def trainable(network):
     )
     if isinstance(network, PaperNetwork):
         return eqx.tree_at(lambda n: n.spread, mask, False)
+    if not isinstance(network, MetricNetwork):
+        return mask
     return eqx.tree_at(lambda n: (n.unit, n.gain), mask, (False, False))
 
 
-def _measure(
-    network: MetricNetwork | PaperNetwork, batches: Sequence[Batch]
-) -> MetricNetwork | PaperNetwork:
-    """Sets normalisation from batches of training data."""
+def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
+    """Sets normalisation from batches of training data; a custom network has none."""
     rows = lambda f: np.concatenate(
         [np.asarray(f(b)).reshape(b.weight.size, -1) for b in batches]
     )
@@ -76,6 +76,8 @@ def _measure(
         outputs = normalisation(np.concatenate([move, rows(lambda b: b.pose)], -1))
         inputs = normalisation(rows(lambda b: network.features(b.window)))
         return eqx.tree_at(lambda n: (n.inputs, n.outputs), network, (inputs, outputs))
+    if not isinstance(network, MetricNetwork):
+        return network
     unit = np.sqrt((rows(lambda b: b.move) ** 2).sum(-1).mean())
     return eqx.tree_at(
         lambda n: (n.inputs, n.posture_inputs, n.posture_outputs, n.unit),
@@ -89,9 +91,7 @@ def _measure(
     )
 
 
-def initial_network(
-    key: PRNGKeyArray, settings: MotionTraining
-) -> MetricNetwork | PaperNetwork:
+def initial_network(key: PRNGKeyArray, settings: MotionTraining) -> MotionNetwork:
     """An untrained network of the kind that `settings` asks for."""
     if settings.network == "paper":
         return PaperNetwork.init(key, settings.past, settings.width[0])
@@ -113,7 +113,7 @@ def optimiser(settings: MotionTraining, steps: int) -> optax.GradientTransformat
     return optax.chain(limit, adam)
 
 
-def start(network: MetricNetwork | PaperNetwork, settings: MotionTraining) -> Progress:
+def start(network: MotionNetwork, settings: MotionTraining) -> Progress:
     """Before the first epoch."""
     moving = eqx.filter(network, trainable(network))
     return Progress(
@@ -205,6 +205,7 @@ def train(
     checkpoint: Path | None = None,
     report: Callable[[int, int, dict[str, float]], None] | None = None,
     about: dict | None = None,
+    network: MotionNetwork | None = None,
 ) -> tuple[MotionModel, Float[np.ndarray, "e 7"]]:
     """Trains a motion model; returns it and the history that `draw_history` draws.
 
@@ -213,6 +214,7 @@ def train(
     a file that every epoch rewrites, from which the same call continues after a kill;
     remove it when the weights are safe. `report(epoch, epochs, measures)` is called
     after each epoch. The same seed gives the same weights on the same machine.
+    `network` is a custom one to be trained, in place of that which `settings` ask for.
 
     **Raises:** `ValueError` if no clip is long enough, if a checkpoint belongs to
     other settings or data, or if training diverges.
@@ -222,7 +224,8 @@ def train(
     trials = place(body, resample([c for c in validation if c.phase == 0], FPS))
     steps = -(-data.num_windows // (settings.segments * settings.steps))
     key = jax.random.key(settings.seed)
-    network = initial_network(jax.random.fold_in(key, 0), settings)
+    if network is None:
+        network = initial_network(jax.random.fold_in(key, 0), settings)
     keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
     network = _measure(network, [draw(k, data, body, settings) for k in keys])
     progress = start(network, settings)
