@@ -1,8 +1,8 @@
 """BlazePose GHUM: heels, toes, a mask and rough 3-D landmarks of one person.
 
 The network reads a square around the person, turned so that the hips are below the
-shoulders (Bazarevsky et al., 2020; Grishchenko et al., 2022). MoveNet's keypoints say
-where that square is, and whether the network looked at the same person.
+shoulders (Bazarevsky et al., 2020; Grishchenko et al., 2022). The square
+follows from MoveNet's keypoints, which also verify that both saw the same person.
 """
 
 import dataclasses
@@ -52,12 +52,12 @@ class Square:
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """What the network says of the person in a square."""
+    """The network's output for the person in a square."""
 
     landmarks: Float[np.ndarray, "33 3"]
     """u px, v px in the image, visibility in 0..1."""
     presence: float
-    """How sure it is that somebody is there, 0..1."""
+    """Probability that the square contains a person, 0..1."""
     mask: UInt8[np.ndarray, "256 256"]
     """In the square: 255 is person."""
     square: Square
@@ -67,7 +67,7 @@ class Pose:
 
 
 def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | None:
-    """Where BlazePose is to look for a person with these COCO keypoints (u, v, score).
+    """BlazePose's input square for a person with these COCO keypoints (u, v, score).
 
     Args:
         least: score of keypoints that count.

@@ -1,9 +1,9 @@
-"""Where the fit of a person starts: many guesses a frame.
+"""Fits of single frames from many initial values.
 
-One view does not say which way round a body is, nor which leg is in front; a single
-descent ends in the nearest of several minima. So every few frames the body is fitted
-from each of eight headings and a few typical postures, and from the posture that
-keypoints before and after make likely (`_lift`); `_path` finds the motion among them.
+The heading and the order of limbs in depth are ambiguous in one view, and the cost has
+several local minima. So every few frames the body is fitted from each of eight headings
+with a few typical postures, and from the lifted posture (`lift`); `viterbi` chooses the
+sequence among the minima.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ NUM_HEADINGS = 8
 _POSTURES_PER_HEADING = 2
 _KEPT = 6
 _SAME = 0.06
-"""m, root mean square of joints: ends that are closer are the same."""
+"""m, root mean square of joints: fits that are closer are the same minimum."""
 _FIRST_STEPS, _LAST_STEPS = 5, 10
 _FRAME_BATCH, _DESCENT_BATCH = 32, 256
 
@@ -78,8 +78,8 @@ def fit_frames(
 def _best_distinct(
     value: Float[np.ndarray, "f n"], joints: Float[np.ndarray, "f n 24 3"], same: float
 ) -> Int[np.ndarray, "f s"]:
-    """The best ends of each frame that are not the same, cheapest first; again the same
-    where there are no others."""
+    """The best distinct minima of each frame, cheapest first, repeated if there are
+    fewer than wanted."""
     row = np.arange(len(value))
     chosen = []
     again = np.zeros(value.shape, int)  # how often an end like this has been chosen
@@ -136,8 +136,8 @@ def _frame_starts(
     sigma: Float[Array, " 25"],
     lifted: Lifted,
 ) -> Fit:
-    """Every heading with every typical posture, put where the keypoints are; the last
-    is the one guessed."""
+    """Every heading with every typical posture, placed by the keypoints; the last is
+    the lifted posture."""
     dtype = uv.dtype
     angles = jnp.arange(NUM_HEADINGS, dtype=dtype) * (2 * jnp.pi / NUM_HEADINGS)
     # Upright before the camera, facing it: H's y up is C's y down.

@@ -22,8 +22,8 @@ from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
 STILL = 0.5
-"""Displacement up to which a point counts as still, px: assumes tracking noise of about
-0.15 px (1 σ) in images of up to 1280 px, and in proportion in larger ones."""
+"""Displacement up to which a point counts as still, px: assumes tracking noise
+below 0.2 px (1 σ) and is scaled with larger images; 2.5 σ of noisier tracks instead."""
 _GAPS = (6, 15, 30, 60)
 """Frames between the two of a pair."""
 _MOST_ANCHORS = 300

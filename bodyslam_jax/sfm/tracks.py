@@ -31,8 +31,8 @@ _FEWEST_MOVING = 15
 _TIMES_STILL = 4.0
 """Displacement of a point that moves, of that of one that may be still."""
 _ROUND_TRIP = 0.5
-"""Largest forward-backward error of KLT, px: assumes subpixel noise of 0.1 to 0.2 px,
-which depends on the window and contrast and hardly on the image size."""
+"""Largest forward-backward error of KLT, px: assumes that KLT localises a window to
+clearly better than that, in images of any size."""
 _LEAST_CONTRAST = 6
 """BRISK's threshold in the flattest image, grey levels."""
 _CONTRAST, _OCTAVES = 20, 3
