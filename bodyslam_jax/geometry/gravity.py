@@ -109,7 +109,7 @@ def find_upright(
     landmarks: Float[np.ndarray, "l 3"],
     fps: float,
     fitted: Bool[np.ndarray, " h"],
-    known: Float[np.ndarray, " 3"] | None = None,
+    measured_up: Float[np.ndarray, " 3"] | None = None,
 ) -> Upright:
     """Up from all available cues, in a frame whose y axis is roughly up.
 
@@ -119,7 +119,7 @@ def find_upright(
         eyes: centres of the camera, m.
         landmarks: points of the map, m; none where the camera did not move.
         fitted: whether a person's body was fitted to keypoints, not regressed.
-        known: up measured by an accelerometer, with `GRAVITY_SIGMA`.
+        measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps)
@@ -128,8 +128,8 @@ def find_upright(
     planes.append(map_plane(landmarks, eyes, stances))
     ground = _fused([plane for plane in planes if plane is not None])
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
-    if known is not None:
-        trunk_tilt, worse = _with_measured(trunk_tilt, known), 0.0
+    if measured_up is not None:
+        trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
     tilt, slope, sigma = _combined(trunk_tilt, ground, worse)
     up = np.array([tilt[0], 1.0, tilt[1]])
     up /= np.linalg.norm(up)
@@ -157,8 +157,8 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
     """Where trunks point on average, as a small tilt, and its covariance, rad²."""
     information, total = np.zeros((2, 2)), np.zeros(2)
     for h in np.flatnonzero(present.any(axis=1)):
-        here = present[h]
-        own = trunks[h, here]
+        frames = present[h]
+        own = trunks[h, frames]
         own = own[own[:, 1] > 0.2]  # people who lie down are left out
         if not len(own):
             continue
@@ -167,7 +167,7 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         # Postures are correlated in time: about one independent sample a second.
         seconds = max(1.0, len(own) / fps)
         scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
-        view = (feet[h, here].mean(axis=1) - eyes[here])[:, [0, 2]]
+        view = (feet[h, frames].mean(axis=1) - eyes[frames])[:, [0, 2]]
         length = np.linalg.norm(view, axis=1, keepdims=True)
         view = view / np.maximum(length, 1e-9)
         along = (view[:, :, None] * view[:, None, :]).mean(axis=0)

@@ -56,17 +56,17 @@ def difference(a: Float[np.ndarray, " d"], b: Float[np.ndarray, " d"]) -> float:
     weight = np.array([_LIGHTNESS, 1.0, 1.0])
     apart = np.abs(a - b).reshape(2, 3, _BINS).mean(-1) * extent * weight
     parts = np.linalg.norm(apart, axis=1)
-    known = np.isfinite(parts)
-    return float(parts[known].mean()) if known.any() else float("nan")
+    finite = np.isfinite(parts)
+    return float(parts[finite].mean()) if finite.any() else float("nan")
 
 
 def mean_look(
     looks: Float[np.ndarray, "n d"],
 ) -> Float[np.ndarray, " d"]:
     """Mean of `n` descriptors of a person, ignoring NaN; NaN where all are."""
-    known = np.isfinite(looks)
-    total = np.where(known, looks, 0.0).sum(0)
-    count = known.sum(0)
+    finite = np.isfinite(looks)
+    total = np.where(finite, looks, 0.0).sum(0)
+    count = finite.sum(0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

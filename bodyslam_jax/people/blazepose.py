@@ -74,14 +74,14 @@ def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | N
 
     **Returns:** `None` if neither hips nor shoulders are seen.
     """
-    seen = points[:, 2] > least
+    visible = points[:, 2] > least
     middle = lambda pair: points[list(pair), :2].mean(0)
-    hips, shoulders = seen[[11, 12]].all(), seen[[5, 6]].all()
+    hips, shoulders = visible[[11, 12]].all(), visible[[5, 6]].all()
     if not hips or not shoulders:
         return None
     centre, trunk = middle((11, 12)), middle((5, 6)) - middle((11, 12))
     length = float(np.linalg.norm(trunk))
-    reach = np.linalg.norm(points[seen, :2] - centre, axis=1).max()
+    reach = np.linalg.norm(points[visible, :2] - centre, axis=1).max()
     radius = max(_REACH * float(reach), _TRUNK_REACH * length)
     if radius < 1.0:
         return None

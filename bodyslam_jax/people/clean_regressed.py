@@ -92,9 +92,9 @@ def prepare_bodies(
     )
     for h in range(len(roots.present)):
         T_CH = prepared.T_CH[h]
-        known = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
-        prepared.present[h] = known
-        where = np.flatnonzero(known)
+        valid = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
+        prepared.present[h] = valid
+        where = np.flatnonzero(valid)
         if not len(where):
             continue
         uv = np.zeros((len(where), 25, 2))

@@ -121,12 +121,12 @@ def _keypoint_evidence(
 
     Left and right of arms and legs are exchanged where that is more probable.
     """
-    seen = np.isfinite(sigma)
-    if not seen.any():
+    detected = np.isfinite(sigma)
+    if not detected.any():
         return np.zeros(len(uv)), 1.0
     plain = np.linalg.norm(predicted - uv[:, None], axis=-1) / sigma[:, None]
     better = np.argmin(np.sum(_robust(plain, scale), axis=-1), axis=1)
-    residual = plain[np.arange(len(uv)), better][seen]
+    residual = plain[np.arange(len(uv)), better][detected]
     noise = max(1.0, float(np.sqrt(np.median(residual**2) / _MEDIAN_OF_TWO)))
     cost = 0.5 * _robust(plain / noise, scale)
     total = np.sum(cost, axis=-1)

@@ -68,7 +68,7 @@ class _Frame:
     image: UInt8[np.ndarray, "y x 3"]
     mask: Bool[np.ndarray, "r c"]
     """At every `SILHOUETTE_STEP`-th pixel, where people are."""
-    known: dict[int, np.ndarray]
+    tracked: dict[int, np.ndarray]
     """By number of the tracklet, COCO keypoints."""
     others: list[np.ndarray]
 
@@ -126,7 +126,7 @@ class _Finder:
             self.last_search, self.next_search = k, k + self.interval
         points, score = _merged(found)
         looks = self._looks(image, points)
-        known = len(self.tracker.tracklets)
+        first_new = len(self.tracker.tracklets)
         clear = ~behind(points, score)
         who = self.tracker.update(k, points, looks, clear, clear & (score >= _START))
         for row, number in zip(points, who.tolist(), strict=True):
@@ -135,7 +135,7 @@ class _Finder:
                 self.others.append((k, row))
             else:
                 self._note(k, now, number, row)
-        for number in range(known, len(self.tracker.tracklets)):
+        for number in range(first_new, len(self.tracker.tracklets)):
             self._look_back(k, number)
         if any(self._was_lost(t, k) for t in self.tracker.tracklets):
             sooner = max(k + 1, self.last_search + _SOONER)
@@ -145,7 +145,9 @@ class _Finder:
 
     def result(self) -> Found:
         everybody = link(self.tracker.tracklets, self.fps)
-        people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
+        people = sorted(
+            filter(self._is_estimated, everybody), key=_presence, reverse=True
+        )
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
         unknown = np.zeros((25, 3))
@@ -160,8 +162,8 @@ class _Finder:
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
-        seen = [sum(len(t.frames) for t in pieces) for pieces in everybody]
-        others = sum(n >= _BRIEF * self.fps for n in seen) - len(people)
+        durations = [sum(len(t.frames) for t in pieces) for pieces in everybody]
+        others = sum(n >= _BRIEF * self.fps for n in durations) - len(people)
         if others > 0:
             warnings.append(
                 f"{others} more people, small or seen briefly, are kept out of the map "
@@ -181,7 +183,7 @@ class _Finder:
         large = height(tracklet.points[-1]) >= self.settings.min_height
         return large and tracklet.frames[-1] == k - 1
 
-    def _is_known(self, pieces: list[Tracklet]) -> bool:
+    def _is_estimated(self, pieces: list[Tracklet]) -> bool:
         """Whether a person is large and visible long enough to be estimated."""
         heights = [height(p) for t in pieces for p in t.points]
         least = min(self.association.min_duration * self.fps, len(self.masks))
@@ -222,7 +224,7 @@ class _Finder:
 
     def _note(self, k: int, frame: _Frame, number: int, points: np.ndarray) -> None:
         """Somebody found in a frame: their feet and silhouette, too."""
-        frame.known[number] = points
+        frame.tracked[number] = points
         square = blazepose.turned_square(points, movenet.SURE)
         if square is None or height(points) < _LEAST_FOR_FEET:
             return
@@ -249,7 +251,7 @@ class _Finder:
                 for p, look in zip(points, looks, strict=True)
             ]
             best = int(np.argmin(cost)) if cost else 0
-            taken = frame.known.values()
+            taken = frame.tracked.values()
             if not cost or cost[best] >= 1 or score[best] < _CONTINUE:
                 return
             if any(movenet.same_person(points[best], p) for p in taken):

@@ -183,8 +183,8 @@ def guess_postures(
     # Beyond the end the last frame stands still, as for frames beyond the first.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
-    lifted, known = lift(load_lifter(), scene.intrinsics, *numbers)
-    lifted = lifted.widened(jnp.where(known & trusted, 1.0, jnp.inf).astype(dtype))
+    lifted, usable = lift(load_lifter(), scene.intrinsics, *numbers)
+    lifted = lifted.widened(jnp.where(usable & trusted, 1.0, jnp.inf).astype(dtype))
     return jax.tree.map(lambda a: np.asarray(a[: len(uv)]), lifted)
 
 
@@ -201,10 +201,10 @@ def _start(
     **Returns:** the fits, and the frames at which the trajectory is cut.
     """
     enough = np.sum(np.isfinite(sigma_px), axis=1) >= MIN_KEYPOINTS
-    known = np.flatnonzero(enough)
+    usable = np.flatnonzero(enough)
     stride = max(1, round(_START_INTERVAL * fps))
     chosen = np.unique(
-        [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
+        [usable[np.argmin(np.abs(usable - k))] for k in range(0, len(uv), stride)]
     )
     fits, costs, joints = fit_frames(
         scene,

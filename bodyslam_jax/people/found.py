@@ -46,9 +46,9 @@ class Found:
     def by_frame(self, num_frames: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """For each frame the keypoints (n, 25, 3) of the numbered people, and their
         numbers (n,)."""
-        known = self.person >= 0
+        numbered = self.person >= 0
         frame, points, person = (
-            a[known] for a in (self.frame, self.points, self.person)
+            a[numbered] for a in (self.frame, self.points, self.person)
         )
         ends = np.searchsorted(frame, np.arange(1, num_frames))
         return np.split(points, ends), np.split(person, ends)

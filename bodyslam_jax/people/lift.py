@@ -105,11 +105,11 @@ def lift(
 
     **Returns:** the predictions, and the frames with enough keypoints for one.
     """
-    x, view, seen = features(intrinsics, uv, sigma, fps)
+    x, view, valid = features(intrinsics, uv, sigma, fps)
     found = lifter(x)
     orientation = jnp.swapaxes(view, -1, -2) @ found.orientation.astype(view.dtype)
     found = jax.tree.map(lambda a: a.astype(uv.dtype), found)
-    return eqx.tree_at(lambda f: f.orientation, found, orientation), seen
+    return eqx.tree_at(lambda f: f.orientation, found, orientation), valid
 
 
 def features(

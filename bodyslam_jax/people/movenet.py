@@ -122,8 +122,8 @@ SURE = 0.15
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
     """Left, top, right, bottom (px) of a person's sure keypoints, of all if too few."""
     sure = sure_points(points)
-    seen = points[sure if sure.sum() >= 2 else slice(None), :2]
-    return np.concatenate([seen.min(0), seen.max(0)])
+    chosen = points[sure if sure.sum() >= 2 else slice(None), :2]
+    return np.concatenate([chosen.min(0), chosen.max(0)])
 
 
 def box_size(points: Float[np.ndarray, "17 3"]) -> float:

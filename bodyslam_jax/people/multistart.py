@@ -155,9 +155,9 @@ def _frame_starts(
     heading = np.append(np.repeat(np.arange(NUM_HEADINGS), count), NUM_HEADINGS)
     posture = np.append(np.tile(np.arange(count), NUM_HEADINGS), count)
     orientation, latent = orientation[heading], latent[posture]
-    seen = jnp.einsum("sij,skj->ski", orientation, local[posture])
+    rotated = jnp.einsum("sij,skj->ski", orientation, local[posture])
     rays = unproject(scene.intrinsics, uv)
-    position = jax.vmap(lambda x: _place(x, rays, sigma))(seen)
+    position = jax.vmap(lambda x: _place(x, rays, sigma))(rotated)
     return Fit(orientation, position, latent)
 
 
@@ -165,8 +165,8 @@ def _roll(uv: Array, sigma: Array) -> Float[Array, "3 3"]:
     """Turn about the optical axis, for who is lying or upside down: from the torso's
     direction if it is more than 60 degrees from upright, none otherwise."""
     torso = uv[1] - uv[8]
-    known = (sigma[1] < jnp.inf) & (sigma[8] < jnp.inf)
-    safe = jnp.where(known, torso, jnp.array([0.0, -1.0], torso.dtype))
+    detected = (sigma[1] < jnp.inf) & (sigma[8] < jnp.inf)
+    safe = jnp.where(detected, torso, jnp.array([0.0, -1.0], torso.dtype))
     angle = jnp.arctan2(safe[0], -safe[1])
     angle = jnp.where(jnp.abs(angle) > jnp.pi / 3, angle, 0.0)
     return so3.exp(angle * jnp.array([0.0, 0.0, 1.0], angle.dtype))
@@ -211,8 +211,8 @@ def _descend(
     size = 6 + fits.latent.shape[-1]
     prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
 
-    def evaluate(fit: Fit, *seen: Any) -> tuple[Array, Array, Array]:
-        normal = linearise(scene, fit, shape, *seen)
+    def evaluate(fit: Fit, *measurements: Any) -> tuple[Array, Array, Array]:
+        normal = linearise(scene, fit, shape, *measurements)
         return (
             normal.hessian + jnp.diag(prior),
             normal.gradient.at[6:].add(fit.latent),

@@ -61,15 +61,15 @@ def correct_left_right(
 
 def _exchanged(
     uv: Float[np.ndarray, "t 25 2"],
-    seen: Bool[np.ndarray, "t 25"],
+    detected: Bool[np.ndarray, "t 25"],
     pairs: tuple[tuple[int, int], ...],
     fps: float,
 ) -> Bool[np.ndarray, " t"]:
     """Frames in which the labels of these pairs of one person are exchanged."""
-    size = _size(uv, seen)
+    size = _size(uv, detected)
     changes = np.full(max(len(uv) - 1, 0), _CHANGE)
     for i, j in pairs:
-        where = np.flatnonzero(seen[:, i] & seen[:, j])
+        where = np.flatnonzero(detected[:, i] & detected[:, j])
         gap = np.diff(where)
         if len(where) < 3:
             continue
@@ -87,12 +87,12 @@ def _exchanged(
     return cheapest_states(np.full(len(uv), cost), changes)
 
 
-def _size(uv: Float[np.ndarray, "t 25 2"], seen: Bool[np.ndarray, "t 25"]) -> float:
+def _size(uv: Float[np.ndarray, "t 25 2"], detected: Bool[np.ndarray, "t 25"]) -> float:
     """Of the person in the image, px: the usual box of the keypoints."""
-    known = seen[..., None]
-    low = np.where(known, uv, np.inf).min(axis=1)
-    high = np.where(known, uv, -np.inf).max(axis=1)
-    some = seen.sum(axis=1) > 1
+    valid = detected[..., None]
+    low = np.where(valid, uv, np.inf).min(axis=1)
+    high = np.where(valid, uv, -np.inf).max(axis=1)
+    some = detected.sum(axis=1) > 1
     extent = np.linalg.norm((high - low)[some], axis=-1)
     return float(np.median(extent)) if some.any() else 0.0
 

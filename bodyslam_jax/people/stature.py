@@ -61,11 +61,11 @@ def with_statures(
     """
     linear = linear_stature(body)
     shape, T_CH = roots.shape.copy(), roots.T_CH.copy()
-    for h, known in statures.items():
+    for h, measured in statures.items():
         variance = shape_sigma[h] ** 2
         before = linear.template + linear.slope @ shape[h]
-        gain = variance / (variance * linear.slope @ linear.slope + known.sigma**2)
-        shape[h] += gain * (known.value - before) * linear.slope
+        gain = variance / (variance * linear.slope @ linear.slope + measured.sigma**2)
+        shape[h] += gain * (measured.value - before) * linear.slope
         after = linear.template + linear.slope @ shape[h]
         T_CH[h, roots.present[h], :3, 3] *= after / before
     return dataclasses.replace(roots, shape=shape, T_CH=T_CH)

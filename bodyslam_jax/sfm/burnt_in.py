@@ -182,10 +182,10 @@ def masks_of(
     centre = np.stack(
         [np.bincount(of, uv[:, i], count) / counts for i in range(2)], axis=-1
     )
-    seen = np.zeros((count, num_frames), dtype=bool)
-    seen[of, frame] = True
+    visible = np.zeros((count, num_frames), dtype=bool)
+    visible[of, frame] = True
     width = np.ones(2 * _AROUND + 1, dtype=np.uint8)[None]
-    shown = cv2.dilate(seen.astype(np.uint8), width) if count else seen
+    shown = cv2.dilate(visible.astype(np.uint8), width) if count else visible
     for k in range(num_frames):
         mask = np.zeros((size[1], size[0]), dtype=np.uint8)
         for x, y in centre[shown[:, k] > 0]:

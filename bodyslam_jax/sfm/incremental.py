@@ -257,8 +257,8 @@ class Builder(Mapper):
     def _register(self, grown: PartialMap, k: int) -> bool:
         at = self.of_frame[k]
         at = at[grown.has_point[self.views.landmark[at]]]
-        known = np.flatnonzero(grown.registered)
-        nearest = known[np.argmin(np.abs(known - k))]
+        located_frames = np.flatnonzero(grown.registered)
+        nearest = located_frames[np.argmin(np.abs(located_frames - k))]
         guess = (grown.scene.R_CW[nearest], grown.scene.centre[nearest])
         found = resect(
             grown.scene.points[self.views.landmark[at]],
@@ -285,6 +285,8 @@ class Builder(Mapper):
         """The same, and how many observations were tested."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.
-        seen = np.bincount(self.views.landmark[at], minlength=self.num_landmarks)
-        at = at[seen[self.views.landmark[at]] >= 2]
+        observations = np.bincount(
+            self.views.landmark[at], minlength=self.num_landmarks
+        )
+        at = at[observations[self.views.landmark[at]] >= 2]
         return (float(grown.inlier[at].mean()) if len(at) else 0.0), len(at)

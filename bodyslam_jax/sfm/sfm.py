@@ -119,8 +119,8 @@ def reconstruct(
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
     if len(np.unique(shot.frame)) < 2:
-        seen = np.bincount(views.frame, minlength=num_frames) if len(xy) else [0]
-        text = f"too few background points: {np.median(seen):.0f} a frame."
+        per_frame = np.bincount(views.frame, minlength=num_frames) if len(xy) else [0]
+        text = f"too few background points: {np.median(per_frame):.0f} a frame."
         if num_frames < 2:
             text = "one frame shows no motion."
         return _nothing(problem, "failed", (*warnings, text))
@@ -381,12 +381,12 @@ def _pack(
 
 
 def interpolate_poses(
-    T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
+    T_WC: Float[np.ndarray, "t 4 4"], valid: Bool[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t 4 4"]:
     """Interpolates missing poses between neighbours, held before the first and after
     the last."""
-    at = np.flatnonzero(known)
-    if not len(at) or known.all():
+    at = np.flatnonzero(valid)
+    if not len(at) or valid.all():
         return T_WC
     filled = T_WC.copy()
     time = np.clip(np.arange(len(T_WC)), at[0], at[-1])

@@ -305,13 +305,13 @@ class _Tracker:
         kept, descriptors = self.brisk.compute(gray, found)
         if not len(kept):
             return
-        seen = np.array([p.pt for p in kept], dtype=np.float64)
+        candidates = np.array([p.pt for p in kept], dtype=np.float64)
         for key in reversed(self.keyframes):
             lost = np.flatnonzero(~np.isin(key.ids, self.live.ids))
             pairs = match(key.descriptors[lost], descriptors)
             if len(pairs) < 4:
                 continue
-            then, guess = key.uv[lost[pairs[:, 0]]], seen[pairs[:, 1]]
+            then, guess = key.uv[lost[pairs[:, 0]]], candidates[pairs[:, 1]]
             now, ok = self._flow(key.image, gray, then, guess, 1)
             back, ok_back = self._flow(gray, key.image, now, then, 1)
             ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < _ROUND_TRIP)
