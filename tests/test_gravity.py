@@ -6,10 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.geometry.gravity import (
     feet_plane,
-    find_stances,
     find_upright,
-    standing_feet,
 )
+from bodyslam_jax.geometry.stances import find_stances, standing_feet
 
 FPS = 30.0
 NOTHING = np.zeros((0, 3))

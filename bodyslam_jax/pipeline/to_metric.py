@@ -13,7 +13,8 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
+from bodyslam_jax.geometry.gravity import Upright, find_upright
+from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
