@@ -147,3 +147,9 @@ def test_the_optical_axis_is_turned_into_a_ray():
     vectors = so3_numpy.optical_axis_to_ray(xy)
     np.testing.assert_allclose(so3_numpy.exp(vectors)[:, :, 2], ray, atol=1e-12)
     np.testing.assert_allclose(vectors[:, 2], 0.0)
+
+
+def test_the_logarithm_in_numpy_passes_missing_rotations_on():
+    rotations = np.stack([np.eye(3), np.full((3, 3), np.nan)])
+    vectors = so3_numpy.log(rotations)
+    assert (vectors[0] == 0).all() and np.isnan(vectors[1]).all()

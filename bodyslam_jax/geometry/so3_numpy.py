@@ -18,11 +18,16 @@ def exp(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
 def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
     """Rotation vector of a rotation matrix, at most π long.
 
-    A matrix that is not quite orthogonal is replaced by the nearest rotation.
+    A matrix that is not quite orthogonal is replaced by the nearest rotation; NaN for
+    one that is not finite.
 
-    **Raises:** `ValueError` for matrices that are not finite or mirror.
+    **Raises:** `ValueError` for matrices whose determinant is not positive.
     """
-    return _of_matrix(rotation).as_rotvec().reshape(rotation.shape[:-1])
+    flat = rotation.reshape(-1, 3, 3)
+    finite = np.isfinite(flat).all(axis=(1, 2))[:, None]
+    safe = np.where(finite[..., None], flat, np.eye(3))
+    vector = np.where(finite, Rotation.from_matrix(safe).as_rotvec(), np.nan)
+    return vector.reshape(rotation.shape[:-1])
 
 
 def compose(
@@ -85,7 +90,3 @@ def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 
 
 def _of_vector(vector: np.ndarray) -> Rotation:
     return Rotation.from_rotvec(vector.reshape(-1, 3))
-
-
-def _of_matrix(rotation: np.ndarray) -> Rotation:
-    return Rotation.from_matrix(rotation.reshape(-1, 3, 3))
