@@ -6,7 +6,7 @@ not import JAX. Rotation vectors are in rad, quaternions in order x y z w.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from scipy.spatial.transform import Rotation, Slerp
 
 
@@ -57,9 +57,9 @@ def interpolate(
 
 
 def interpolate_path(
-    times: Float[np.ndarray, " n"],
+    times: Real[np.ndarray, " n"],
     rotations: Float[np.ndarray, "n 3 3"],
-    at: Float[np.ndarray, " t"],
+    at: Real[np.ndarray, " t"],
 ) -> Float[np.ndarray, "t 3 3"]:
     """Matrices at the times `at`, which lie within increasing `times` (n >= 2)."""
     return Slerp(times, Rotation.from_matrix(rotations))(at).as_matrix()

@@ -81,7 +81,7 @@ def _placed(
 ]:
     """Poses, `trans` and joints of people in the world of these cameras, smoothed."""
     T_WH = T_WC @ joint.roots
-    root = so3.log(T_WH[..., :3, :3])
+    root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
     poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
     shapes = jnp.asarray(joint.shapes)
