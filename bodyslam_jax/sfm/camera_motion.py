@@ -85,7 +85,7 @@ def stillness(views: Views, window: int = 10) -> float:
     between their median position in the first `window` frames and in any later ones.
 
     Medians over windows suppress tracking noise, so that noise of 0.5 px at 640x480
-    stays below `Structure.static_motion`.
+    stays below the limit of a static camera.
     """
     ordered = np.lexsort((views.frame, views.landmark))
     landmark, xy = views.landmark[ordered], views.xy[ordered]

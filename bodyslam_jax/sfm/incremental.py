@@ -18,7 +18,8 @@ from bodyslam_jax.types import CameraPath
 _log = logging.getLogger(__name__)
 
 _FIRST_PAIRS = 4
-"""Pairs of frames that are tried as the start of the map."""
+"""Pairs of keyframes that are tried as the start of the map; assumes no noise level, as
+the best is chosen by its share of inliers."""
 MIN_SHARED = 12
 """Points that two frames must share to be related."""
 _RELAXED = 3
