@@ -6,10 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.geometry.gravity import (
     feet_plane,
-    find_stances,
     find_upright,
-    standing_feet,
 )
+from bodyslam_jax.geometry.stances import find_stances, standing_feet
 
 FPS = 30.0
 NOTHING = np.zeros((0, 3))
@@ -154,7 +153,7 @@ def test_a_measured_gravity_holds_on_a_hill():
     hill = lambda x, z: np.tan(np.radians(12.0)) * z
     feet = walker(way(bend=0.3), floor=hill)
     given = cues(feet, (4.0, 0, 0), fitted=True)
-    found = find_upright(*given, known=np.array([0.0, 1.0, 0.0]))
+    found = find_upright(*given, measured_up=np.array([0.0, 1.0, 0.0]))
     assert off(found.up) < 1.5 < off(find_upright(*given).up)
     assert found.sigma < np.radians(1.1)
     assert np.degrees(found.ground) > 9.0

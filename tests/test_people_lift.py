@@ -53,21 +53,21 @@ def pixels(points, intrinsics):
     return points[..., :2] / points[..., 2:] * intrinsics[:2] + intrinsics[2:]
 
 
-def lift(uv, sigma, intrinsics=CAMERA.params, fps=FPS):
+def predict(uv, sigma, intrinsics=CAMERA.params, fps=FPS):
     arrays = (jnp.asarray(a) for a in (intrinsics, uv, sigma, fps))
     return lift.lift(lift.load_lifter(), *arrays)
 
 
 def test_a_guess_does_not_depend_on_the_lens_nor_on_where_the_camera_points(walk):
     _, _, points = walk
-    plain, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    plain, _ = predict(pixels(points, CAMERA.params), SIGMA)
     other = np.array([1500.0, 1400.0, 200.0, 500.0])
-    zoomed, _ = lift(pixels(points, other), SIGMA, intrinsics=other)
+    zoomed, _ = predict(pixels(points, other), SIGMA, intrinsics=other)
     np.testing.assert_allclose(zoomed.latent, plain.latent, atol=1e-4)
 
     # Turned about its centre, as a camera held on its side and pointed elsewhere.
     turn = Rotation.from_rotvec([0.3, -0.2, 1.5]).as_matrix()
-    turned, _ = lift(pixels(points @ turn.T, CAMERA.params), SIGMA)
+    turned, _ = predict(pixels(points @ turn.T, CAMERA.params), SIGMA)
     np.testing.assert_allclose(turned.latent, plain.latent, atol=0.05)
     wanted = turn @ np.asarray(plain.orientation)
     np.testing.assert_allclose(turned.orientation, wanted, atol=0.01)
@@ -78,8 +78,8 @@ def test_a_guess_does_not_depend_on_how_large_the_person_is_in_the_image(walk):
     ahead = points - points.mean(axis=(0, 1)) * [1.0, 1.0, 0.0]
     centre = CAMERA.params[2:]
     uv = pixels(ahead, CAMERA.params)
-    plain, known = lift(uv, SIGMA)
-    smaller, _ = lift(centre + 0.2 * (uv - centre), SIGMA)
+    plain, known = predict(uv, SIGMA)
+    smaller, _ = predict(centre + 0.2 * (uv - centre), SIGMA)
     assert np.asarray(known).all()
     np.testing.assert_allclose(smaller.latent, plain.latent, atol=0.03)
 
@@ -88,8 +88,8 @@ def test_a_guess_is_the_same_at_twice_the_rate(walk):
     _, _, points = walk
     uv = pixels(points, CAMERA.params)
     doubled = np.repeat(uv, 2, axis=0)
-    found, _ = lift(doubled, np.repeat(SIGMA, 2, axis=0), fps=2 * FPS)
-    plain, _ = lift(uv, SIGMA)
+    found, _ = predict(doubled, np.repeat(SIGMA, 2, axis=0), fps=2 * FPS)
+    plain, _ = predict(uv, SIGMA)
     middle = slice(15, 45)  # frames that do not reach beyond the ends
     np.testing.assert_allclose(
         found.latent[::2][middle], plain.latent[middle], atol=1e-4
@@ -98,7 +98,7 @@ def test_a_guess_is_the_same_at_twice_the_rate(walk):
 
 def test_a_guess_is_close_to_who_was_not_learnt_from(walk, body):
     R_CH, joints, points = walk
-    found, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    found, _ = predict(pixels(points, CAMERA.params), SIGMA)
     turn = Rotation.from_matrix(np.asarray(found.orientation) @ np.swapaxes(R_CH, 1, 2))
     assert np.degrees(turn.magnitude()).mean() < 12
     bones = skeleton.make_skeleton(body, 0.0)
@@ -117,11 +117,11 @@ def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
     uv, sigma = pixels(points, CAMERA.params), SIGMA.copy()
     uv[20:30], sigma[20:30] = 0.0, np.inf
     sigma[40, 5:] = np.inf
-    found, known = lift(uv, sigma)
+    found, known = predict(uv, sigma)
     missing = [*range(20, 30), 40]
     assert np.flatnonzero(~np.asarray(known)).tolist() == missing
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(found))
-    plain, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    plain, _ = predict(pixels(points, CAMERA.params), SIGMA)
     # Half a second after the last of them they are out of sight.
     np.testing.assert_allclose(found.latent[56:], plain.latent[56:], atol=1e-5)
 
@@ -152,7 +152,7 @@ def seen(walk):
 
 def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
     sigma = people.keypoint_sigma(seen, CAMERA, 0)
-    guess = lift(seen.uv[0], sigma)[0].latent[:, :5]
+    guess = predict(seen.uv[0], sigma)[0].latent[:, :5]
     prior = load_posture_prior(FPS)
     decode = np.linalg.pinv(prior.basis)[:5]
 
@@ -198,7 +198,7 @@ def test_legs_of_who_walks_away_swing(walk, seen, body):
 
 def test_in_single_precision(walk):
     _, _, points = walk
-    found, _ = lift(pixels(points, CAMERA.params), SIGMA)
+    found, _ = predict(pixels(points, CAMERA.params), SIGMA)
     single = [
         jnp.asarray(a, jnp.float32)
         for a in (CAMERA.params, pixels(points, CAMERA.params), SIGMA, FPS)

@@ -116,16 +116,17 @@ def test_numpy_has_the_same_functions_with_the_same_values():
     a, b = rng.normal(0, 1, (2, 4, 5, 3))
     share = rng.uniform(0, 1, (4, 5))
     R, S = so3_numpy.exp(a), so3_numpy.exp(b)
-    quaternion = so3_numpy.quaternion(a)
-    pairs = [
-        (so3_numpy.exp(a), so3.exp(a)),
-        (so3_numpy.log(R), so3.log(R)),
-        (so3_numpy.compose(a, b), so3.compose(a, b)),
-        (so3_numpy.between(a, b), so3.between(a, b)),
-        (so3_numpy.interpolate(R, S, share), so3.interpolate(R, S, share)),
-        (so3_numpy.from_quaternion(quaternion), so3.from_quaternion(quaternion)),
-    ]
-    for in_numpy, in_jax in pairs:
+    calls = {
+        "exp": (a,),
+        "log": (R,),
+        "compose": (a, b),
+        "between": (a, b),
+        "interpolate": (R, S, share),
+        "from_quaternion": (so3_numpy.quaternion(a),),
+    }
+    for name, arrays in calls.items():
+        in_numpy = getattr(so3_numpy, name)(*arrays)
+        in_jax = getattr(so3, name)(*map(jnp.asarray, arrays))
         np.testing.assert_allclose(in_numpy, in_jax, atol=1e-12)
 
 
@@ -147,3 +148,9 @@ def test_the_optical_axis_is_turned_into_a_ray():
     vectors = so3_numpy.optical_axis_to_ray(xy)
     np.testing.assert_allclose(so3_numpy.exp(vectors)[:, :, 2], ray, atol=1e-12)
     np.testing.assert_allclose(vectors[:, 2], 0.0)
+
+
+def test_the_logarithm_in_numpy_passes_missing_rotations_on():
+    rotations = np.stack([np.eye(3), np.full((3, 3), np.nan)])
+    vectors = so3_numpy.log(rotations)
+    assert (vectors[0] == 0).all() and np.isnan(vectors[1]).all()

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.export import Gait, gait_of_joints
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.gravity import find_stances
+from bodyslam_jax.geometry.stances import find_stances
 
 _WALKING = (0.7, posture.RUNNING)
 """Median speeds over the ground of who goes on foot and does not run, m/s."""

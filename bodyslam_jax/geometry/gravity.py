@@ -21,10 +21,11 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from bodyslam_jax.config import GRAVITY_SIGMA
 from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.geometry.stances import find_stances
 
 _DEGREE = np.pi / 180
 _TRUNK_ACROSS = 2.0 * _DEGREE
@@ -41,41 +42,14 @@ _SLOPES = (0.25, 4.0 * _DEGREE)
 theirs."""
 _FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
 """Errors of the plane through feet and of the map's that more of them do not reduce."""
-_STANCE = 0.02
+_HEIGHT_SIGMA = 0.02
 """Least standard deviation of the height of a foot that stands, m."""
 _SIZE = 0.05
 """Relative standard deviation of a person's size. A person who is estimated too large
 has all stances too low or too high by that share of the camera's height above them."""
-_SHORTEST_STANCE = 0.1
-"""s"""
 _OFF_THE_PLANE = 0.25
-"""Of the camera's height: people who are this far off the plane do not stand on it."""
-
-
-STANDING_SPEED = 0.6
-"""The lower foot stands where it is slower than this, m/s."""
-_SPEED_WINDOW = 0.1
-"""s, over which the speed of a foot is measured, so that the noise of single frames is
-averaged out."""
-
-
-def standing_feet(
-    feet: Float[np.ndarray, "t 2 3"], up: Float[np.ndarray, " 3"], fps: float
-) -> tuple[Bool[np.ndarray, " t"], Int[np.ndarray, " t"]]:
-    """Frames in which the lower foot stands, and which foot that is.
-
-    `feet` are the toe joints in frames that follow one another, m, in any world; `up`
-    need be right to 20 degrees only. A foot stands where it is slower than
-    `STANDING_SPEED`, in every direction.
-    """
-    frame = np.arange(len(feet))
-    lower = (feet @ up).argmin(axis=1)
-    half = max(1, round(_SPEED_WINDOW * fps / 2))
-    before = np.maximum(frame - half, 0)
-    after = np.minimum(frame + half, len(feet) - 1)
-    moved = np.linalg.norm(feet[after, lower] - feet[before, lower], axis=-1)
-    speed = moved * fps / np.maximum(after - before, 1)
-    return (speed < STANDING_SPEED) & (len(feet) > 1), lower
+"""Distance of the median stance from the map's plane, of the camera's height, beyond
+which people do not stand on that plane."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +83,7 @@ def find_upright(
     landmarks: Float[np.ndarray, "l 3"],
     fps: float,
     fitted: Bool[np.ndarray, " h"],
-    known: Float[np.ndarray, " 3"] | None = None,
+    measured_up: Float[np.ndarray, " 3"] | None = None,
 ) -> Upright:
     """Up from all available cues, in a frame whose y axis is roughly up.
 
@@ -119,7 +93,7 @@ def find_upright(
         eyes: centres of the camera, m.
         landmarks: points of the map, m; none where the camera did not move.
         fitted: whether a person's body was fitted to keypoints, not regressed.
-        known: up measured by an accelerometer, with `GRAVITY_SIGMA`.
+        measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps)
@@ -128,8 +102,8 @@ def find_upright(
     planes.append(map_plane(landmarks, eyes, stances))
     ground = _fused([plane for plane in planes if plane is not None])
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
-    if known is not None:
-        trunk_tilt, worse = _with_measured(trunk_tilt, known), 0.0
+    if measured_up is not None:
+        trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
     tilt, slope, sigma = _combined(trunk_tilt, ground, worse)
     up = np.array([tilt[0], 1.0, tilt[1]])
     up /= np.linalg.norm(up)
@@ -157,8 +131,8 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
     """Where trunks point on average, as a small tilt, and its covariance, rad²."""
     information, total = np.zeros((2, 2)), np.zeros(2)
     for h in np.flatnonzero(present.any(axis=1)):
-        here = present[h]
-        own = trunks[h, here]
+        frames = present[h]
+        own = trunks[h, frames]
         own = own[own[:, 1] > 0.2]  # people who lie down are left out
         if not len(own):
             continue
@@ -167,7 +141,7 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         # Postures are correlated in time: about one independent sample a second.
         seconds = max(1.0, len(own) / fps)
         scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
-        view = (feet[h, here].mean(axis=1) - eyes[here])[:, [0, 2]]
+        view = (feet[h, frames].mean(axis=1) - eyes[frames])[:, [0, 2]]
         length = np.linalg.norm(view, axis=1, keepdims=True)
         view = view / np.maximum(length, 1e-9)
         along = (view[:, :, None] * view[:, None, :]).mean(axis=0)
@@ -181,29 +155,6 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         return None
     covariance = np.linalg.inv(information)
     return covariance @ total, covariance
-
-
-def find_stances(
-    feet: Float[np.ndarray, "h t 2 3"], present: Bool[np.ndarray, "h t"], fps: float
-) -> list[Float[np.ndarray, "_ 3"]]:
-    """Where each person's feet stand: the toe joint's median place, one for each time
-    that a foot does, in a frame whose y axis is roughly up."""
-    return [_stances(*one, fps) for one in zip(feet, present, strict=True)]
-
-
-def _stances(feet, present, fps) -> Float[np.ndarray, "s 3"]:
-    found = []
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
-    for start, stop in edges.reshape(-1, 2):
-        stands, lower = standing_feet(feet[start:stop], np.array([0.0, 1.0, 0.0]), fps)
-        place = feet[start + np.arange(stop - start), lower]
-        # A change of foot ends a stance too.
-        label = np.where(stands, 1 + lower, 0)
-        ends = np.flatnonzero(np.diff(label, prepend=0, append=0))
-        for a, b in itertools.pairwise(ends):
-            if label[a] and b - a >= max(2, _SHORTEST_STANCE * fps):
-                found.append(np.median(place[a:b], axis=0))
-    return np.array(found).reshape(-1, 3)
 
 
 def _height_of_camera(eyes, stances) -> float:
@@ -235,14 +186,14 @@ def feet_plane(
     )
     # A weak prior (slope of 45 degrees, any height) makes the system regular.
     prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
-    sigma, weight = 5 * _STANCE, np.ones(len(x))
+    sigma, weight = 5 * _HEIGHT_SIGMA, np.ones(len(x))
     for _ in range(20):
         scaled = design * (weight / sigma**2)[:, None]
         information = design.T @ scaled + prior
         solution = np.linalg.solve(information, scaled.T @ x[:, 1])
         residual = x[:, 1] - design @ solution
         spread = 1.4826 * np.median(np.abs(residual))
-        sigma = max(_STANCE, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
+        sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
         weight = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
     covariance = np.linalg.inv(information)[:2, :2] + _FEET_SYSTEMATIC**2 * np.eye(2)
     return Plane(solution[:2], covariance)

@@ -6,7 +6,7 @@ not import JAX. Rotation vectors are in rad, quaternions in order x y z w.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from scipy.spatial.transform import Rotation, Slerp
 
 
@@ -18,11 +18,16 @@ def exp(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
 def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
     """Rotation vector of a rotation matrix, at most π long.
 
-    A matrix that is not quite orthogonal is replaced by the nearest rotation.
+    A matrix that is not quite orthogonal is replaced by the nearest rotation; NaN for
+    one that is not finite.
 
-    **Raises:** `ValueError` for matrices that are not finite or mirror.
+    **Raises:** `ValueError` for matrices whose determinant is not positive.
     """
-    return _of_matrix(rotation).as_rotvec().reshape(rotation.shape[:-1])
+    flat = rotation.reshape(-1, 3, 3)
+    finite = np.isfinite(flat).all(axis=(1, 2))[:, None]
+    safe = np.where(finite[..., None], flat, np.eye(3))
+    vector = np.where(finite, Rotation.from_matrix(safe).as_rotvec(), np.nan)
+    return vector.reshape(rotation.shape[:-1])
 
 
 def compose(
@@ -52,9 +57,9 @@ def interpolate(
 
 
 def interpolate_path(
-    times: Float[np.ndarray, " n"],
+    times: Real[np.ndarray, " n"],
     rotations: Float[np.ndarray, "n 3 3"],
-    at: Float[np.ndarray, " t"],
+    at: Real[np.ndarray, " t"],
 ) -> Float[np.ndarray, "t 3 3"]:
     """Matrices at the times `at`, which lie within increasing `times` (n >= 2)."""
     return Slerp(times, Rotation.from_matrix(rotations))(at).as_matrix()
@@ -85,7 +90,3 @@ def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 
 
 def _of_vector(vector: np.ndarray) -> Rotation:
     return Rotation.from_rotvec(vector.reshape(-1, 3))
-
-
-def _of_matrix(rotation: np.ndarray) -> Rotation:
-    return Rotation.from_matrix(rotation.reshape(-1, 3, 3))

@@ -1,9 +1,8 @@
-"""What somebody wears: the colours of trunk and thighs, to know people again by.
+"""Appearance for re-identification: colours of the clothes on trunk and thighs.
 
-The colours of a part are described by the cumulative histograms of L*, a* and b*.
-Their mean difference is the distance that colours must be moved by to turn one into
-the other (Wasserstein's), so little light more or less is a small distance, and means
-over time mean something.
+Each part is described by the cumulative histograms of L*, a* and b*. Their mean
+absolute difference is the Wasserstein-1 distance of the colour distributions, so that a
+small change of light is a small distance, and descriptors may be averaged over time.
 """
 
 import cv2
@@ -26,8 +25,8 @@ _LIGHTNESS = 0.5
 def describe(
     image: UInt8[np.ndarray, "y x 3"], points: Float[np.ndarray, "17 3"], least: float
 ) -> Float[np.ndarray, " d"]:
-    """Cumulative histograms of a person's trunk and thighs; NaN where too little is
-    seen of a part.
+    """Cumulative histograms of a person's trunk and thighs; NaN for a part with too few
+    samples within the image.
 
     Args:
         image: BGR.
@@ -51,23 +50,23 @@ def describe(
 
 
 def difference(a: Float[np.ndarray, " d"], b: Float[np.ndarray, " d"]) -> float:
-    """How far the colours of two descriptions are apart, in 8-bit steps of CIELAB; NaN
-    where no part is known of both."""
+    """Distance of two descriptors, in 8-bit steps of CIELAB; NaN without a common
+    part."""
     extent = np.array([high - low for low, high in _RANGES])
     weight = np.array([_LIGHTNESS, 1.0, 1.0])
     apart = np.abs(a - b).reshape(2, 3, _BINS).mean(-1) * extent * weight
     parts = np.linalg.norm(apart, axis=1)
-    known = np.isfinite(parts)
-    return float(parts[known].mean()) if known.any() else float("nan")
+    finite = np.isfinite(parts)
+    return float(parts[finite].mean()) if finite.any() else float("nan")
 
 
 def mean_look(
     looks: Float[np.ndarray, "n d"],
 ) -> Float[np.ndarray, " d"]:
-    """The description of somebody who was seen `n` times; NaN where they never were."""
-    known = np.isfinite(looks)
-    total = np.where(known, looks, 0.0).sum(0)
-    count = known.sum(0)
+    """Mean of `n` descriptors of a person, ignoring NaN; NaN where all are."""
+    finite = np.isfinite(looks)
+    total = np.where(finite, looks, 0.0).sum(0)
+    count = finite.sum(0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

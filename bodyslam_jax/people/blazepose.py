@@ -1,8 +1,8 @@
 """BlazePose GHUM: heels, toes, a mask and rough 3-D landmarks of one person.
 
 The network reads a square around the person, turned so that the hips are below the
-shoulders (Bazarevsky et al., 2020; Grishchenko et al., 2022). MoveNet's keypoints say
-where that square is, and whether the network looked at the same person.
+shoulders (Bazarevsky et al., 2020; Grishchenko et al., 2022). The square
+follows from MoveNet's keypoints, which also verify that both saw the same person.
 """
 
 import dataclasses
@@ -52,12 +52,12 @@ class Square:
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """What the network says of the person in a square."""
+    """The network's output for the person in a square."""
 
     landmarks: Float[np.ndarray, "33 3"]
     """u px, v px in the image, visibility in 0..1."""
     presence: float
-    """How sure it is that somebody is there, 0..1."""
+    """Probability that the square contains a person, 0..1."""
     mask: UInt8[np.ndarray, "256 256"]
     """In the square: 255 is person."""
     square: Square
@@ -67,21 +67,21 @@ class Pose:
 
 
 def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | None:
-    """Where BlazePose is to look for a person with these COCO keypoints (u, v, score).
+    """BlazePose's input square for a person with these COCO keypoints (u, v, score).
 
     Args:
         least: score of keypoints that count.
 
     **Returns:** `None` if neither hips nor shoulders are seen.
     """
-    seen = points[:, 2] > least
+    visible = points[:, 2] > least
     middle = lambda pair: points[list(pair), :2].mean(0)
-    hips, shoulders = seen[[11, 12]].all(), seen[[5, 6]].all()
+    hips, shoulders = visible[[11, 12]].all(), visible[[5, 6]].all()
     if not hips or not shoulders:
         return None
     centre, trunk = middle((11, 12)), middle((5, 6)) - middle((11, 12))
     length = float(np.linalg.norm(trunk))
-    reach = np.linalg.norm(points[seen, :2] - centre, axis=1).max()
+    reach = np.linalg.norm(points[visible, :2] - centre, axis=1).max()
     radius = max(_REACH * float(reach), _TRUNK_REACH * length)
     if radius < 1.0:
         return None

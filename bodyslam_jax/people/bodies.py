@@ -1,4 +1,4 @@
-"""Bodies in the camera frame, from whatever a sequence tells of its people."""
+"""Bodies in the camera frame, from a regressor's bodies or from keypoints."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from bodyslam_jax.types import Bodies, Keypoints, Sequence
 def estimate_bodies(
     sequence: Sequence, body: BodyModel, settings: PeopleFit = PeopleFit()
 ) -> Bodies:
-    """A regressor's bodies, cleaned; of people without any, bodies fitted to their
-    keypoints; else nobody."""
+    """A regressor's bodies, cleaned; bodies fitted to keypoints for people without any;
+    no bodies if there are neither."""
     camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
     if keypoints is not None:
         keypoints, _ = correct_left_right(keypoints, fps)
@@ -30,8 +30,8 @@ def estimate_bodies(
     if keypoints is None or not len(others):
         return found
     depth = None if keypoints.depth is None else keypoints.depth[others]
-    seen = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
-    fitted = fit_bodies(seen, camera, body, fps, settings)
+    remaining = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
+    fitted = fit_bodies(remaining, camera, body, fps, settings)
     for name in ("present", "poses", "shapes", "trans"):
         getattr(found, name)[others] = getattr(fitted, name)
     return found
@@ -40,7 +40,7 @@ def estimate_bodies(
 def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
     """The sequence with these people only, in this order; all of them for `()`.
 
-    **Raises:** `ValueError` if one of them is not there.
+    **Raises:** `ValueError` if the sequence lacks one of them.
     """
     if not people:
         return sequence
@@ -80,7 +80,7 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
 
 
 def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:
-    """People of whom no regressor said anything, so that their bodies are fitted."""
+    """People without regressed bodies, whose bodies are fitted to keypoints."""
     if sequence.bodies is not None:
         return np.logical_not(sequence.bodies.present.any(axis=1))
     count = 0 if sequence.keypoints is None else len(sequence.keypoints.uv)
@@ -88,7 +88,7 @@ def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:
 
 
 def nobody(num_frames: int) -> Bodies:
-    """The bodies of a video that shows none, or whose people are left out."""
+    """Bodies (0 people) of a video without people, or whose people are left out."""
     t = num_frames
     return Bodies(
         np.zeros((0, t), bool),

@@ -1,8 +1,8 @@
-"""Bodies that a regressor gave, made fit to start from.
+"""Cleaning of regressed bodies for initialisation.
 
-Regressors look at one image at a time: depth jitters by centimetres a frame, now and
-then a body is turned round, frames are missing, β changes. Posture is left as it is:
-smoothing a walk shrinks its steps, and the step is the scale.
+Regressors process single images: depth jitters by centimetres a frame, front and back
+are confused in some frames, frames are missing, β varies. Postures are not smoothed:
+that would shorten the steps of a walk, from which the scale is estimated.
 """
 
 import dataclasses
@@ -46,16 +46,16 @@ _DEPTH_ERROR = 0.05
 _BUCKET = 64
 _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
-"""Regressors draw shapes to the mean, by 0.5 to 0.8 with an error of 0.3, of which this
-is about the best linear estimate."""
+"""Regressed shapes are shrunk to the mean, by a factor of 0.5 to 0.8 with an error of
+0.3; this gain is about the best linear estimate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyNoise:
-    """How much of what a regressor says changes from frame to frame by chance.
+    """Standard deviation of the white part of a regressor's errors, per person.
 
-    From second differences, so motion that accelerates is in it: upper bounds. The
-    larger, slowly varying part of a regressor's error does not show here.
+    From second differences, which include true acceleration: upper bounds. The larger,
+    slowly varying part of the errors is not included.
     """
 
     orientation: Float[np.ndarray, " h"]
@@ -76,11 +76,11 @@ def prepare_bodies(
     fps: float,
     settings: PeopleFit = PeopleFit(),
 ) -> Bodies:
-    """One shape per person, no flips, no short gaps, in place, with a smooth depth.
+    """One shape per person, front-back confusions and short gaps corrected, smooth
+    depth.
 
-    Where there are keypoints the pelvis is moved, posture held, to where they fit best;
-    the regressor's own depth stays as a measurement beside them. Person h of `bodies`
-    is person h of `keypoints`.
+    The pelvis is fitted to the keypoints, if any, with the posture held fixed and the
+    regressor's depth as a measurement. Person h of `bodies` is person h of `keypoints`.
     """
     roots = roots_from_bodies(bodies, body)
     skeleton = make_skeleton(body, 0.0)
@@ -92,9 +92,9 @@ def prepare_bodies(
     )
     for h in range(len(roots.present)):
         T_CH = prepared.T_CH[h]
-        known = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
-        prepared.present[h] = known
-        where = np.flatnonzero(known)
+        valid = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
+        prepared.present[h] = valid
+        where = np.flatnonzero(valid)
         if not len(where):
             continue
         uv = np.zeros((len(where), 25, 2))
@@ -121,7 +121,7 @@ def _shape_gain(bodies: Bodies, settings: PeopleFit) -> float:
 
 
 def body_noise(bodies: Bodies) -> BodyNoise:
-    """What the regressor's jitter is, from the bodies as they came."""
+    """Estimates the regressor's jitter from its bodies."""
     found = []
     for present, poses, shapes, trans in zip(
         bodies.present, bodies.poses, bodies.shapes, bodies.trans
@@ -256,8 +256,8 @@ def _smooth_curve(
 ) -> Float[np.ndarray, " m"]:
     """Whittaker's smoother with Student weights: second differences of σ `jitter`.
 
-    The measurement noise is what the values' own second differences say, and its slow
-    part is taken to be as large again for about ten frames.
+    The measurement noise is estimated from the values' second differences; its variance
+    is multiplied by 10 for errors that are correlated over about ten frames.
     """
     if len(values) < 5:
         return values

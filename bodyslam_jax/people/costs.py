@@ -1,9 +1,10 @@
-"""How far one posed body is from one frame's keypoints, linearised.
+"""Cost of one posed body against the keypoints of one frame, and its linearisation.
 
 The unknowns of a frame are a small rotation δ (left, in C) of the root orientation,
 the pelvis position p_C and the latent posture z: `6 + k` numbers, then the 10 of shape
 β that all frames share. Robust cost: Geman and McClure, `ρ(s) = s / (1 + s / c²)` of
-the squared whitened distance s, as in SMPLify (Bogo et al., 2016), but there in pixels.
+the squared whitened distance s, as in SMPLify (Bogo et al., 2016), which
+has it in pixels.
 """
 
 import equinox as eqx
@@ -55,7 +56,7 @@ class Fit(eqx.Module):
 
 
 class Lifted(eqx.Module):
-    """What keypoints before and after a frame make likely there (`_lift`)."""
+    """Posture predicted from the keypoints around a frame (`lift`)."""
 
     orientation: Float[Array, "*b 3 3"]
     """R_CH."""
@@ -66,7 +67,7 @@ class Lifted(eqx.Module):
     """Of the orientation, rad per axis."""
 
     def widened(self, factor: Float[Array, "*b"]) -> "Lifted":
-        """With deviations that are this many times as large."""
+        """With standard deviations multiplied by `factor`."""
         return Lifted(
             self.orientation,
             self.latent,
@@ -76,7 +77,7 @@ class Lifted(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """What all frames and all starts share."""
+    """Data that all frames and all initial values share."""
 
     skeleton: Skeleton
     prior: PosturePrior

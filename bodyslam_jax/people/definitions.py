@@ -1,9 +1,9 @@
-"""What a detector calls hip or knee, beside what the body model calls so.
+"""Offsets between a detector's keypoints and the joints of the body model.
 
-Every detector has its own idea of where a hip is, the same in all frames of a person.
-The fit to keypoints estimates it with the shape (`_skeleton`: offsets fixed to bones);
-whoever compares keypoints with the model's joints afterwards must know it too: a leg
-that seems 5 % too short bends the knee by 36 degrees.
+Every detector has its own definition of hip or knee, the same in all frames of a
+person. The fit estimates the offsets with the shape (`skeleton`: fixed to bones). They
+must be removed before keypoints are compared with the model's joints: a leg that seems
+5 % too short bends the knee by 36 degrees.
 """
 
 import dataclasses
@@ -44,12 +44,12 @@ def as_body_keypoints(
     body: BodyModel,
     fps: float,
 ) -> Keypoints:
-    """Keypoints where the detector would have put them, had it the body's definitions.
+    """Keypoints with the detector's offsets removed, for the people `chosen`.
 
-    Of the people `chosen`, whose bodies were fitted to these keypoints; others and
-    frames without a body stay as they are. Offsets are a robust linear regression on
-    what the bodies leave of the keypoints, with `_skeleton`'s deviations as a prior;
-    frames whose errors are alike count once.
+    Their bodies were fitted to these keypoints; other people and frames without a body
+    are unchanged. Offsets are estimated by robust linear regression on the reprojection
+    residuals, with the priors of `skeleton`; frames within the correlation time of the
+    errors count once.
     """
     uv = keypoints.uv.copy()
     skeleton = make_skeleton(body, 0.0)  # the graph's

@@ -1,10 +1,10 @@
-"""Which way round a person is, and which limb is in front: BlazePose's 3-D landmarks.
+"""Relative depths of keypoints from BlazePose's 3-D landmarks: heading, limb in front.
 
-They are weak evidence. On 180 rendered frames, seen from the side, limbs are 3 to 9 cm
-(1 σ) and up to 10 cm in the mean from where they are along the line of sight, for about
-0.15 s alike; of 267 pairs of knees or ankles one of which is 10 cm nearer all were told
-right, and no body was turned round. So depths do not enter the fit: they help to choose
-among fits which explain the keypoints alike.
+They are weak evidence. On 180 rendered side views the depth of limbs has errors of 3 to
+9 cm (1 σ) and a bias of up to 10 cm, correlated over about 0.15 s; the order of knees
+or ankles 10 cm apart in depth was correct in all of 267 pairs, and no body was turned
+round. So depths do not enter the fit: they help to choose among fits with about equal
+reprojection errors.
 """
 
 import dataclasses
@@ -23,19 +23,19 @@ _JOINTS = (17, 19, 21, 16, 18, 20, 5, 8, 4, 7)
 _SIGMA = 0.12
 """m: mean and scatter of the errors together."""
 _ROBUST = 2.0
-"""Standard deviations from which a depth is taken for an outlier (Cauchy's loss)."""
+"""Scale of the Cauchy loss, in standard deviations."""
 _ALIKE = 4.0
-"""Depths that say as much as one that is independent: of successive fitted frames, a
-tenth of a second apart, two; of the limbs of a body two more."""
+"""Depths per independent one, as their errors are correlated: two for successive fitted
+frames (0.1 s apart) times two for the limbs of a body."""
 
 
 def with_depths(
     keypoints: Keypoints, found: Found, intrinsics: Intrinsics
 ) -> Keypoints:
-    """The keypoints, and how far they are behind the middle of the hips.
+    """The keypoints with their depth behind the middle of the hips (m).
 
-    BlazePose sees every person as if on the optical axis: what it says is turned by
-    the angle of their ray.
+    BlazePose's landmarks are relative to the ray through the person: they are rotated
+    into the camera frame.
     """
     depth = np.zeros(keypoints.confidence.shape)
     for h, t in zip(*np.nonzero(keypoints.confidence.any(axis=2)), strict=True):
@@ -56,9 +56,9 @@ def depth_costs(
         depth: behind the middle of the hips, m; 0 where unknown.
         joints: relative to the pelvis, in C, m.
     """
-    said, known = depth[:, None, _POINTS], depth[:, None, _POINTS] != 0
-    away = np.where(known, joints[:, :, _JOINTS, 2] - said, 0.0) / _SIGMA
-    cost = _ROBUST**2 / 2 * np.log1p((away / _ROBUST) ** 2)
+    measured = depth[:, None, _POINTS]
+    error = np.where(measured != 0, joints[:, :, _JOINTS, 2] - measured, 0.0)
+    cost = _ROBUST**2 / 2 * np.log1p((error / _SIGMA / _ROBUST) ** 2)
     return cost.sum(axis=2) / _ALIKE
 
 

@@ -1,7 +1,7 @@
 """People and keypoints from images: YOLOX finds boxes, RTMPose points in each box.
 
-For who asks for them in place of the networks that ship (`_built_in`). The models are
-fetched once to the user's cache and checked against their SHA-256; both are Apache-2.0:
+An alternative to the networks that ship (`find`). The models are fetched once to the
+user's cache and checked against their SHA-256; both are Apache-2.0:
 
 - YOLOX-S (Ge et al., 2021), Megvii's own export;
 - DWPose-L (Yang et al., 2023), an RTMPose with 133 keypoints, of which the body's and
@@ -112,7 +112,7 @@ def model_path(own: str | None, model: Model, offline: bool) -> Path:
     advice = f"put {model.url} there, or give keypoints/ instead"
     if not path.is_file():
         if offline:
-            raise ValueError(f"{path}: not there, and offline is set; {advice}.")
+            raise ValueError(f"{path}: file not found, and offline is set; {advice}.")
         log.info("fetching %s (%d MB) to %s", model.url, model.megabytes, path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

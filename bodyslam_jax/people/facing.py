@@ -1,14 +1,14 @@
-"""Which way round a regressor's bodies are: front taken for back, frame by frame.
+"""Frames in which a regressor confuses front and back, corrected by a Markov model.
 
-A hidden Markov chain of two states, as given and turned by half a turn about the body's
-own axis. What changes from frame to frame is compared with the noise that it has:
+A hidden Markov model with two states: the body as given, and rotated by π about its own
+vertical axis.
 
-- Continuity says only *whether the error begins or ends* between two frames: if it does
-  neither, both states go on alike, and however much a regressor jitters counts for
-  nothing. The turn between two frames is measured in units of the turns around it.
-- Keypoints say which state it is. Their residuals are measured in units of their own
-  median, left and right may be exchanged in the detector, and a single frame says no
-  more than that all its keypoints may be wrong.
+- Transitions: continuity of the orientation is evidence only of a *change* of state
+  between two frames. The rotation between frames is whitened by the jitter around it,
+  so that a noisy regressor does not cause changes.
+- Emissions: the reprojection error of the keypoints in either state, whitened by its
+  own median. The detector may exchange left and right, and the evidence of a single
+  frame is bounded, as all its keypoints may be wrong.
 """
 
 import dataclasses
@@ -23,19 +23,19 @@ from bodyslam_jax.people.viterbi import cheapest_states
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 """About H's y axis."""
 _PRIOR = 3.0
-"""-log odds that a regressor took front for back, for as long as errors last."""
+"""-log odds of front-back confusion, per correlation time of the errors."""
 _EXCHANGED = 4.0
 """-log odds that a detector exchanged left and right of the arms, or of the legs."""
 _ALL_WRONG = 8.0
-"""-log odds that the keypoints of a frame are all wrong: the most that a frame says."""
+"""-log odds that all keypoints of a frame are wrong: bounds a frame's evidence."""
 _LASTING = 1 / 3
-"""s: errors of keypoints and of postures stay the same for about this long, so that
-frames within it count once."""
+"""s: correlation time of errors of keypoints and postures; frames within it count
+once."""
 _TURN_SPEED = 2.0
 """rad/s, per axis: how fast people turn."""
 _JUMP_SCALE = 5.0
-"""Scale of the robust loss on turns between frames, in their standard deviations: two
-frames say at most half its square, as much as some 25 frames of keypoints."""
+"""Scale of the robust loss on rotations between frames, in standard deviations: bounds
+their evidence at half its square."""
 _WINDOW = 5
 """Frames within which the jitter of orientations is measured."""
 _MEDIAN_OF_THREE = 1.538
@@ -46,12 +46,12 @@ _MEDIAN_OF_TWO = 1.386
 
 @dataclasses.dataclass(frozen=True)
 class Facing:
-    """What was decided, and from what noise."""
+    """The decoded states and the noise level they were decoded with."""
 
     turned: Bool[np.ndarray, " f"]
-    """Frames whose body is to be turned by half a turn."""
+    """Frames whose body is to be rotated by π."""
     keypoint_noise: float
-    """Residuals of keypoints in units of what was said of them, at least 1."""
+    """Standard deviation of keypoint residuals over the assumed `sigma`, at least 1."""
 
 
 def find_turned(
@@ -69,7 +69,7 @@ def find_turned(
         time: of each frame, s, increasing.
         predicted: keypoints of the body as given, and turned, px.
         uv: the detector's keypoints, px.
-        sigma: what their errors are said to be, px; `inf` where there is none.
+        sigma: assumed standard deviation, px; `inf` for missing keypoints.
         robust_scale: of Geman and McClure's loss on keypoints, in deviations.
     """
     gap = np.maximum(np.diff(time), 1e-3)
@@ -84,9 +84,9 @@ def find_turned(
 def _continuity(
     orientation: Float[np.ndarray, "f 3 3"], gap: Float[np.ndarray, " g"]
 ) -> Float[np.ndarray, " g"]:
-    """How much less probable the next orientation is if the error begins or ends.
+    """-log likelihood ratio of a change of state against none, between frames.
 
-    Negative where the given bodies turn by about half a turn between two frames.
+    Negative where the given bodies rotate by about π between two frames.
     """
     turn = np.swapaxes(orientation[:-1], -1, -2) @ orientation[1:]
     on, off = _angle(turn), _angle(turn @ HALF_TURN)
@@ -117,26 +117,26 @@ def _keypoint_evidence(
     sigma: Float[np.ndarray, "f 25"],
     scale: float,
 ) -> tuple[Float[np.ndarray, " f"], float]:
-    """-log likelihood ratio of bodies that are turned to those as given, and the noise.
+    """-log likelihood ratio of the rotated body against the given one, and the noise.
 
-    Each frame's are those of the most probable exchange of left and right.
+    Left and right of arms and legs are exchanged where that is more probable.
     """
-    seen = np.isfinite(sigma)
-    if not seen.any():
+    detected = np.isfinite(sigma)
+    if not detected.any():
         return np.zeros(len(uv)), 1.0
     plain = np.linalg.norm(predicted - uv[:, None], axis=-1) / sigma[:, None]
     better = np.argmin(np.sum(_robust(plain, scale), axis=-1), axis=1)
-    residual = plain[np.arange(len(uv)), better][seen]
+    residual = plain[np.arange(len(uv)), better][detected]
     noise = max(1.0, float(np.sqrt(np.median(residual**2) / _MEDIAN_OF_TWO)))
     cost = 0.5 * _robust(plain / noise, scale)
     total = np.sum(cost, axis=-1)
     for half in (ARMS, LEGS):
-        here = np.array(half)
-        other = here[:, ::-1]
-        there = predicted[:, :, other] - uv[:, None, here]
-        wide = sigma[:, None, here] * noise
-        crossed = 0.5 * _robust(np.linalg.norm(there, axis=-1) / wide, scale)
-        gain = np.sum(crossed - cost[:, :, here], axis=(-1, -2)) + _EXCHANGED
+        named = np.array(half)
+        mirrored = named[:, ::-1]
+        error = predicted[:, :, mirrored] - uv[:, None, named]
+        wide = sigma[:, None, named] * noise
+        crossed = 0.5 * _robust(np.linalg.norm(error, axis=-1) / wide, scale)
+        gain = np.sum(crossed - cost[:, :, named], axis=(-1, -2)) + _EXCHANGED
         total = total + np.minimum(gain, 0.0)
     least = total.min(axis=1, keepdims=True)
     likelihood = np.logaddexp(-total, -(least + _ALL_WRONG))

@@ -1,10 +1,9 @@
-"""People in a video, by the networks that ship: a search now and then, and in between
-a look at where each person is expected.
+"""Detection and tracking of people by the networks that ship.
 
 MoveNet searches the whole image every third of a second, at a scale for people of at
 least a tenth of its longer side, and every second at one for smaller ones; in the
-frames between it sees a square around each person. Who is found in a search is also
-looked for in the frames since the last one.
+frames in between it runs on a square around each predicted person. A person found in a
+search is also tracked backwards to the last one.
 """
 
 import dataclasses
@@ -44,17 +43,17 @@ _LARGEST = 250.0
 """px of MoveNet's input: of larger people it makes several."""
 _SQUARE = 256
 _START, _CONTINUE, _SEEN = 0.22, 0.12, 0.1
-"""MoveNet's score of a person who is new, who was expected there, and of whom nothing
-is to be in the map in any case. Without people it says 0.00 to 0.07."""
+"""Least score of MoveNet that begins a track, that continues one, and that masks the
+person in the images. Without people scores are 0.00 to 0.07."""
 _SOONER = 3
-"""Frames after a search until the next where somebody was lost."""
+"""Least frames between two searches after a track was lost."""
 _OVERLAP = 0.25
 """Share of a person's box that others may cover while its colours are the person's."""
 _LITTLE = 0.03
-"""How much there is to see of somebody who is estimated, at least: of what there is of
-the person who is seen best."""
+"""Least visibility (size times confidence, summed over time) of a person who is
+estimated, relative to that of the most visible person."""
 _BRIEF = 0.2
-"""s: who is seen for less is masked without a word, as it may be nobody."""
+"""s: shorter tracks are masked without a warning, as they may be false detections."""
 _PRESENCE = 0.5
 _LEAST_FOR_FEET = 60.0
 """Height of people, px, below which BlazePose is of no use."""
@@ -69,7 +68,7 @@ class _Frame:
     image: UInt8[np.ndarray, "y x 3"]
     mask: Bool[np.ndarray, "r c"]
     """At every `SILHOUETTE_STEP`-th pixel, where people are."""
-    known: dict[int, np.ndarray]
+    tracked: dict[int, np.ndarray]
     """By number of the tracklet, COCO keypoints."""
     others: list[np.ndarray]
 
@@ -100,7 +99,7 @@ def find_people_tracked(
 
 
 class _Finder:
-    """What is remembered from frame to frame."""
+    """State of the search from frame to frame."""
 
     def __init__(self, fps: float, settings: Detect, association: Association) -> None:
         self.movenet = open_network(MOVENET)
@@ -127,7 +126,7 @@ class _Finder:
             self.last_search, self.next_search = k, k + self.interval
         points, score = _merged(found)
         looks = self._looks(image, points)
-        known = len(self.tracker.tracklets)
+        first_new = len(self.tracker.tracklets)
         clear = ~behind(points, score)
         who = self.tracker.update(k, points, looks, clear, clear & (score >= _START))
         for row, number in zip(points, who.tolist(), strict=True):
@@ -136,7 +135,7 @@ class _Finder:
                 self.others.append((k, row))
             else:
                 self._note(k, now, number, row)
-        for number in range(known, len(self.tracker.tracklets)):
+        for number in range(first_new, len(self.tracker.tracklets)):
             self._look_back(k, number)
         if any(self._was_lost(t, k) for t in self.tracker.tracklets):
             sooner = max(k + 1, self.last_search + _SOONER)
@@ -146,7 +145,9 @@ class _Finder:
 
     def result(self) -> Found:
         everybody = link(self.tracker.tracklets, self.fps)
-        people = sorted(filter(self._is_known, everybody), key=_presence, reverse=True)
+        people = sorted(
+            filter(self._is_estimated, everybody), key=_presence, reverse=True
+        )
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
         unknown = np.zeros((25, 3))
@@ -161,8 +162,8 @@ class _Finder:
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
-        seen = [sum(len(t.frames) for t in pieces) for pieces in everybody]
-        others = sum(n >= _BRIEF * self.fps for n in seen) - len(people)
+        durations = [sum(len(t.frames) for t in pieces) for pieces in everybody]
+        others = sum(n >= _BRIEF * self.fps for n in durations) - len(people)
         if others > 0:
             warnings.append(
                 f"{others} more people, small or seen briefly, are kept out of the map "
@@ -178,12 +179,12 @@ class _Finder:
         )
 
     def _was_lost(self, tracklet: Tracklet, k: int) -> bool:
-        """Whether somebody who is followed from frame to frame is no longer seen."""
+        """Whether a track of sufficient size ended in the previous frame."""
         large = height(tracklet.points[-1]) >= self.settings.min_height
         return large and tracklet.frames[-1] == k - 1
 
-    def _is_known(self, pieces: list[Tracklet]) -> bool:
-        """Whether enough is seen of somebody to be estimated."""
+    def _is_estimated(self, pieces: list[Tracklet]) -> bool:
+        """Whether a person is large and visible long enough to be estimated."""
         heights = [height(p) for t in pieces for p in t.points]
         least = min(self.association.min_duration * self.fps, len(self.masks))
         return (
@@ -212,7 +213,7 @@ class _Finder:
         return points[kept], score[kept]
 
     def _looks(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """How people look, where nobody else is in front of them."""
+        """Descriptors of clothes; NaN for people whom others overlap."""
         boxes = [movenet.box(p) for p in points]
         looks = np.full((len(points), SIZE), np.nan)
         for i, row in enumerate(points):
@@ -223,7 +224,7 @@ class _Finder:
 
     def _note(self, k: int, frame: _Frame, number: int, points: np.ndarray) -> None:
         """Somebody found in a frame: their feet and silhouette, too."""
-        frame.known[number] = points
+        frame.tracked[number] = points
         square = blazepose.turned_square(points, movenet.SURE)
         if square is None or height(points) < _LEAST_FOR_FEET:
             return
@@ -238,7 +239,7 @@ class _Finder:
         frame.mask |= blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 
     def _look_back(self, k: int, number: int) -> None:
-        """Whether somebody who was just found was there since the last search."""
+        """Extends a new track backwards to the frames since the last search."""
         tracklet = self.tracker.tracklets[number]
         for index, frame in reversed(self.recent):
             first = tracklet.points[0]
@@ -250,7 +251,7 @@ class _Finder:
                 for p, look in zip(points, looks, strict=True)
             ]
             best = int(np.argmin(cost)) if cost else 0
-            taken = frame.known.values()
+            taken = frame.tracked.values()
             if not cost or cost[best] >= 1 or score[best] < _CONTINUE:
                 return
             if any(movenet.same_person(points[best], p) for p in taken):
@@ -271,5 +272,5 @@ def _merged(found: list[_Detections]) -> _Detections:
 
 
 def _presence(pieces: list[Tracklet]) -> float:
-    """How much there is to see of somebody: confidence times size, over time."""
+    """Visibility of a person: size times confidence, summed over time."""
     return sum(height(p) * float(p[:, 2].sum()) for t in pieces for p in t.points)

@@ -1,10 +1,11 @@
 """Bodies from keypoints alone, in the manner of SMPLify, over a whole clip.
 
 Bogo et al., Keep it SMPL, ECCV 2016, fits each image by itself. Here every few frames
-are (`_starts`), then all frames of a person are fitted together, with one shape and a
-prior on how people move (`_chain`). **Metres come from the stature**: with β near the
-mean the depth is that of an adult of average size, so depth and everything else is off
-by the ratio of statures, 4 to 6 % (1 σ) for adults, and by the focal length's error.
+are (`multistart`), then all frames of a person are fitted together, with one shape and
+a prior on human motion (`trajectory_fit`). **The metric scale comes from the prior on
+stature**: with β near the mean the depth is that of an adult of average size, so depths
+have a relative error of the stature's, 4 to 6 % (1 σ) for adults, and of the focal
+length's.
 """
 
 import logging
@@ -59,7 +60,8 @@ _MOTION_SCALE = 2.0
 """Factor on the posture prior's innovations: people move less predictably than in the
 motion data."""
 _FASTEST = 8.0
-"""m/s across the line of sight, above which it is not the same person."""
+"""m/s across the line of sight, above which the trajectory is cut: faster than
+people run; assumes that fits 0.1 s apart err by well below 0.8 m across the view."""
 
 
 def fit_bodies(
@@ -71,11 +73,11 @@ def fit_bodies(
 ) -> Bodies:
     """Fits posture, shape and place of every person to their keypoints.
 
-    Confidences are taken relative to the person's own best ones: 1 means something else
-    in every detector. A point outside the image was extrapolated and does not count.
+    Confidences are relative to the person's own best ones, as their scale differs
+    between detectors. A keypoint outside the image is extrapolated and not used.
 
-    **Returns:** bodies in the camera frame, one β per person, present where there are
-    keypoints enough or a short gap between such frames.
+    **Returns:** bodies in the camera frame, one β per person, present in frames
+    with enough keypoints and short gaps between such frames.
     """
     people, frames = keypoints.confidence.shape[:2]
     roots = PersonState(
@@ -148,7 +150,7 @@ def _fit_person(
     length = -len(uv) % _BUCKET
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
     last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
-    # Guesses err for many frames alike, too; padding has none.
+    # Errors of the lifted postures are correlated in time too; padding has none.
     alike = max(1.0, settings.lift_correlation * fps) ** 0.5
     wider = np.where(np.arange(len(uv) + length) < len(uv), alike, np.inf)
     lifted = jax.tree.map(lambda a: last(jnp.asarray(a, dtype)), lifted)
@@ -174,15 +176,15 @@ def guess_postures(
     fps: float,
     trusted: bool = True,
 ) -> Lifted:
-    """What the network makes of one person's keypoints, in C. Where it sees too few,
-    and everywhere if not `trusted`, deviations are infinite."""
+    """The lifting network's posture of one person, in C. Standard deviations are
+    infinite where it has too few keypoints, and everywhere if not `trusted`."""
     dtype = scene.intrinsics.dtype
     length = -len(uv) % _BUCKET
     # Beyond the end the last frame stands still, as for frames beyond the first.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
-    lifted, known = lift(load_lifter(), scene.intrinsics, *numbers)
-    lifted = lifted.widened(jnp.where(known & trusted, 1.0, jnp.inf).astype(dtype))
+    lifted, usable = lift(load_lifter(), scene.intrinsics, *numbers)
+    lifted = lifted.widened(jnp.where(usable & trusted, 1.0, jnp.inf).astype(dtype))
     return jax.tree.map(lambda a: np.asarray(a[: len(uv)]), lifted)
 
 
@@ -194,15 +196,15 @@ def _start(
     lifted: Lifted,
     fps: float,
 ) -> tuple[Fit, np.ndarray]:
-    """The best path through the fits of every few frames, for all frames.
+    """The best path through the fits of every few frames, interpolated to all frames.
 
-    **Returns:** the fits, and the frames at which another track begins.
+    **Returns:** the fits, and the frames at which the trajectory is cut.
     """
     enough = np.sum(np.isfinite(sigma_px), axis=1) >= MIN_KEYPOINTS
-    known = np.flatnonzero(enough)
+    usable = np.flatnonzero(enough)
     stride = max(1, round(_START_INTERVAL * fps))
     chosen = np.unique(
-        [known[np.argmin(np.abs(known - k))] for k in range(0, len(uv), stride)]
+        [usable[np.argmin(np.abs(usable - k))] for k in range(0, len(uv), stride)]
     )
     fits, costs, joints = fit_frames(
         scene,
@@ -210,7 +212,7 @@ def _start(
         sigma_px[chosen],
         jax.tree.map(lambda a: a[chosen], lifted),
     )
-    # Each keypoint's half squared distance is 1 on average if errors are as said.
+    # Half the squared whitened distance of a keypoint is 1 on average by assumption.
     count = np.isfinite(sigma_px[chosen]).sum(axis=1)
     noise = max(1.0, float(np.sqrt(np.median(costs.min(axis=1) / count))))
     costs = costs + noise**2 * depth_costs(depth[chosen], joints)
@@ -242,7 +244,7 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
 
 
 def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) -> Ties:
-    """How frames hang together; nothing crosses a cut.
+    """Temporal terms between frames; none crosses a cut.
 
     The first frame of a track has the posture's stationary prior, the second the
     first-order autoregression; from the third on the terms are the full ones. Noise in

@@ -1,4 +1,4 @@
-"""Everybody who was found in a video, as BODY_25 keypoints with confidences."""
+"""All detections of people in a video, as BODY_25 keypoints with confidences."""
 
 import dataclasses
 
@@ -28,13 +28,14 @@ _LANDMARK = np.array(
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Everybody found in a video of `t` frames, one row per person and frame."""
+    """All detections in a video of `t` frames, one row per person and frame."""
 
     frame: Int[np.ndarray, " n"]
     points: Float[np.ndarray, "n 25 3"]
     """BODY_25: u px, v px, confidence."""
     person: Int[np.ndarray, " n"]
-    """Who it is, the best seen first; -1 for whom nothing is known but the place."""
+    """Number of the person, the most visible first; -1 for people who are only
+    masked."""
     relative: Float[np.ndarray, "n 25 3"]
     """Places about the middle of the hips, m, as if on the optical axis (x right, y
     down, z forward), from BlazePose; 0 where unknown."""
@@ -43,17 +44,17 @@ class Found:
     warnings: tuple[str, ...]
 
     def by_frame(self, num_frames: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """For each frame the keypoints (n, 25, 3) of the people that are known, and who
-        they are (n,)."""
-        known = self.person >= 0
+        """For each frame the keypoints (n, 25, 3) of the numbered people, and their
+        numbers (n,)."""
+        numbered = self.person >= 0
         frame, points, person = (
-            a[known] for a in (self.frame, self.points, self.person)
+            a[numbered] for a in (self.frame, self.points, self.person)
         )
         ends = np.searchsorted(frame, np.arange(1, num_frames))
         return np.split(points, ends), np.split(person, ends)
 
     def detected(self) -> DetectedPeople:
-        """Everybody, to be kept out of the map."""
+        """All detections, to be masked in the images."""
         return DetectedPeople(self.frame, self.points, self.silhouettes)
 
 

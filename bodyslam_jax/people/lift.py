@@ -1,13 +1,12 @@
-"""What two dimensions say of the third: postures guessed by a network from keypoints.
+"""Lifting of 2-D keypoints to a 3-D posture by a small network.
 
-One view of a limb does not say how far it points towards the camera, but a second of
-motion does: who walks away has legs that swing. After Martinez et al., *A simple yet
-effective baseline for 3d human pose estimation* (ICCV 2017) a few dense layers see the
-keypoints of a second, and say which posture and heading is likely in its middle, and
-how sure that is. The fit takes it for a measurement beside the keypoints, robustly, and
-as one more place to start from.
+Depth is ambiguous in a single view but better determined by a second of motion. After
+Martinez et al., *A simple yet effective baseline for 3d human pose estimation* (ICCV
+2017), dense layers map the keypoints of about a second to the posture and heading in
+its middle, with standard deviations. The fit uses it as a robust measurement beside the
+keypoints and as one more initial value.
 
-Learnt by `tools/train_lifter.py` from CMU motion capture and made-up cameras;
+Trained by `tools/train_lifter.py` on CMU motion capture with random cameras; see
 `assets/README.md`.
 """
 
@@ -25,17 +24,17 @@ from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
 
 ASSET = Path(__file__).parent / "assets" / "lifter.npz"
 SPACING = 0.1
-"""s between the frames that the network sees."""
+"""s between the network's input frames."""
 REACH = 5
-"""How many of them before, and after."""
+"""Input frames before, and after, the middle one."""
 NUM_FEATURES = (2 * REACH + 1) * 25 * 3
 _KEPT = 0.8
 """Share of hidden units, while training."""
 _NECK, _HIPS = 1, 8
 _SIZE = 0.5
-"""Root mean square of what the network sees of a person, where they are largest."""
+"""Root mean square of the input coordinates, in the frame where it is largest."""
 _FEWEST = 6
-"""Keypoints that a frame needs to be seen at all."""
+"""Least number of keypoints of a frame that is used."""
 
 
 class Lifter(eqx.Module):
@@ -53,7 +52,7 @@ class Lifter(eqx.Module):
     def __call__(
         self, x: Float[Array, "*b f"], key: PRNGKeyArray | None = None
     ) -> Lifted:
-        """With a key some of what is within is dropped, for training."""
+        """Predicts from features; with a key, with dropout, for training."""
         drop = lambda h, number: h if key is None else _dropped(h, key, number)
         h = drop(jax.nn.relu(x @ self.first + self.bias[0]), 0)
         inner = drop(jax.nn.relu(h @ self.hidden[0] + self.bias[1]), 1)
@@ -100,17 +99,17 @@ def lift(
     sigma: Float[Array, "t 25"],
     fps: Float[Array, ""],
 ) -> tuple[Lifted, Bool[Array, " t"]]:
-    """Guesses in the camera frame for all frames of one person.
+    """Predicted postures in the camera frame for all frames of one person.
 
-    **Arguments:** `sigma`, as `keypoint_sigma` has it: m, `inf` where there is none.
+    **Arguments:** `sigma`, as `keypoint_sigma` has it: m, `inf` for missing keypoints.
 
-    **Returns:** the guesses, and in which frames enough was seen for one.
+    **Returns:** the predictions, and the frames with enough keypoints for one.
     """
-    x, view, seen = features(intrinsics, uv, sigma, fps)
+    x, view, valid = features(intrinsics, uv, sigma, fps)
     found = lifter(x)
     orientation = jnp.swapaxes(view, -1, -2) @ found.orientation.astype(view.dtype)
     found = jax.tree.map(lambda a: a.astype(uv.dtype), found)
-    return eqx.tree_at(lambda f: f.orientation, found, orientation), seen
+    return eqx.tree_at(lambda f: f.orientation, found, orientation), valid
 
 
 def features(
@@ -119,30 +118,30 @@ def features(
     sigma: Float[Array, "t 25"],
     fps: Float[Array, ""],
 ) -> tuple[Float[Array, "t f"], Float[Array, "t 3 3"], Bool[Array, " t"]]:
-    """What the network sees, the turn from C to the frame in which it sees that, and
-    where that is known.
+    """The network's input, the rotation from C to the frame of the input, and the
+    frames with enough keypoints.
 
-    That frame's z is the ray to the person; in it their trunk is upright, on average
-    over the window, and their size, where largest in it, is 1/2. So neither place nor
-    focal length matter, nor how the camera is turned.
+    The z axis of that frame is the ray to the person, the trunk is upright in it on
+    average over the window, and coordinates are scaled to a size of 1/2. So the input
+    is invariant to position, focal length and rotation of the camera.
     """
     relative = jnp.where(
         sigma < jnp.inf, jnp.asarray(KEYPOINT_SIGMA, uv.dtype) / sigma, 0
     )
     enough = jnp.sum(relative > 0, axis=1) >= _FEWEST
     mark = jnp.where(enough[:, None], relative, 0)
-    there = mark > 0
-    rays = jnp.where(there[..., None], unproject(intrinsics, uv), 0)
+    present = mark > 0
+    rays = jnp.where(present[..., None], unproject(intrinsics, uv), 0)
     length = jnp.sqrt(jnp.sum(rays**2, -1, keepdims=True))
     middle = jnp.sum(rays / jnp.maximum(length, 1), axis=1)
     ahead = jnp.array([0.0, 0.0, 1.0], uv.dtype)
     view = _turn_to_axis(jnp.where(enough[:, None], middle, ahead))
     turned = jnp.einsum("tij,tkj->tki", view, rays)
     flat = turned[..., :2] / jnp.maximum(turned[..., 2:], 0.1)
-    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(uv.dtype)
+    count = jnp.maximum(jnp.sum(present, axis=1), 1).astype(uv.dtype)
     size = jnp.sqrt(jnp.sum(flat**2, (1, 2)) / count)
     trunk = flat[:, _NECK] - flat[:, _HIPS]
-    trunk = jnp.where((there[:, _NECK] & there[:, _HIPS])[:, None], trunk, 0)
+    trunk = jnp.where((present[:, _NECK] & present[:, _HIPS])[:, None], trunk, 0)
 
     step = jnp.arange(-REACH, REACH + 1, dtype=uv.dtype) * SPACING * fps
     index = jnp.arange(len(uv))[:, None] + jnp.round(step).astype(int)

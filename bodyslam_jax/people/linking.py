@@ -1,8 +1,7 @@
-"""Pieces of people -> people: who left or was hidden and is seen again.
+"""Tracklets -> people: re-identification after an occlusion or absence.
 
-With all frames known, a piece that ends and a later one that begins are of the same
-person if the person can have gone from the one place to the other in the image, looks
-as large, and wears the same. The surest pairs are joined first.
+Offline, a tracklet that ends and a later one that begins are joined if position, size
+and colours of clothes agree. Pairs of least cost are joined first.
 """
 
 import dataclasses
@@ -14,14 +13,14 @@ from bodyslam_jax.people.appearance import difference, mean_look
 from bodyslam_jax.people.tracking import GROWTH, Tracklet, displacement, height
 
 _NEAR = 1.0
-"""s: gaps up to which the place in the image counts."""
+"""s: gaps up to which the position in the image is compared."""
 _REACH = 0.2
-"""How far from where they were expected people are seen again, of their height."""
+"""Gate on the distance from the predicted position, of the person's height."""
 _REACH_PER_SECOND = 1.2
 _SAME_CLOTHES = 14.0
-"""Difference of colours up to which a person seen again after a while is the same."""
+"""Difference of colours up to which a person after a long gap is the same."""
 _CLOTHES_NEARBY = 22.0
-"""The same, where the place fits too."""
+"""The same after a short gap, where the position agrees too."""
 _JUMP = 3.0
 """Distance, of the height, over which a detector may go from one person to another;
 beyond it somebody left, and somebody came."""
@@ -60,8 +59,8 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
 
 
 def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[str]:
-    """What is to be said of people: who is taken for the same after a gap of more than
-    `max_gap` seconds, and who is not, although another was lost just before."""
+    """Warnings: people re-identified after a gap of more than `max_gap` seconds, and
+    people who are not, although another was lost nearby just before."""
     found = []
     for number, pieces in enumerate(people):
         for a, b in pairwise(pieces):

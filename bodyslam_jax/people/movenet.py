@@ -49,7 +49,7 @@ def find_people(
 def letterbox(
     image: UInt8[np.ndarray, "y x 3"], region: Region, longer: int
 ) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
-    """A part of an image at another scale, black where there is none.
+    """A part of an image at another scale, black beyond the image.
 
     **Returns:** the canvas, its sides the next multiples of 32, its content in the
     upper left corner; and its pixels per pixel of the image.
@@ -112,7 +112,7 @@ def same_person(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> b
 
 
 def sure_points(points: Float[np.ndarray, "17 3"]) -> Bool[np.ndarray, " 17"]:
-    """Keypoints that say where a person is, by MoveNet's own score."""
+    """Keypoints whose score exceeds `SURE`."""
     return points[:, 2] > SURE
 
 
@@ -122,8 +122,8 @@ SURE = 0.15
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
     """Left, top, right, bottom (px) of a person's sure keypoints, of all if too few."""
     sure = sure_points(points)
-    seen = points[sure if sure.sum() >= 2 else slice(None), :2]
-    return np.concatenate([seen.min(0), seen.max(0)])
+    chosen = points[sure if sure.sum() >= 2 else slice(None), :2]
+    return np.concatenate([chosen.min(0), chosen.max(0)])
 
 
 def box_size(points: Float[np.ndarray, "17 3"]) -> float:

@@ -1,9 +1,9 @@
-"""Where the fit of a person starts: many guesses a frame.
+"""Fits of single frames from many initial values.
 
-One view does not say which way round a body is, nor which leg is in front; a single
-descent ends in the nearest of several minima. So every few frames the body is fitted
-from each of eight headings and a few typical postures, and from the posture that
-keypoints before and after make likely (`_lift`); `_path` finds the motion among them.
+The heading and the order of limbs in depth are ambiguous in one view, and the cost has
+several local minima. So every few frames the body is fitted from each of eight headings
+with a few typical postures, and from the lifted posture (`lift`); `viterbi` chooses the
+sequence among the minima.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ NUM_HEADINGS = 8
 _POSTURES_PER_HEADING = 2
 _KEPT = 6
 _SAME = 0.06
-"""m, root mean square of joints: ends that are closer are the same."""
+"""m, root mean square of joints: fits that are closer are the same minimum."""
 _FIRST_STEPS, _LAST_STEPS = 5, 10
 _FRAME_BATCH, _DESCENT_BATCH = 32, 256
 
@@ -78,8 +78,8 @@ def fit_frames(
 def _best_distinct(
     value: Float[np.ndarray, "f n"], joints: Float[np.ndarray, "f n 24 3"], same: float
 ) -> Int[np.ndarray, "f s"]:
-    """The best ends of each frame that are not the same, cheapest first; again the same
-    where there are no others."""
+    """The best distinct minima of each frame, cheapest first, repeated if there are
+    fewer than wanted."""
     row = np.arange(len(value))
     chosen = []
     again = np.zeros(value.shape, int)  # how often an end like this has been chosen
@@ -136,8 +136,8 @@ def _frame_starts(
     sigma: Float[Array, " 25"],
     lifted: Lifted,
 ) -> Fit:
-    """Every heading with every typical posture, put where the keypoints are; the last
-    is the one guessed."""
+    """Every heading with every typical posture, placed by the keypoints; the last is
+    the lifted posture."""
     dtype = uv.dtype
     angles = jnp.arange(NUM_HEADINGS, dtype=dtype) * (2 * jnp.pi / NUM_HEADINGS)
     # Upright before the camera, facing it: H's y up is C's y down.
@@ -155,9 +155,9 @@ def _frame_starts(
     heading = np.append(np.repeat(np.arange(NUM_HEADINGS), count), NUM_HEADINGS)
     posture = np.append(np.tile(np.arange(count), NUM_HEADINGS), count)
     orientation, latent = orientation[heading], latent[posture]
-    seen = jnp.einsum("sij,skj->ski", orientation, local[posture])
+    rotated = jnp.einsum("sij,skj->ski", orientation, local[posture])
     rays = unproject(scene.intrinsics, uv)
-    position = jax.vmap(lambda x: _place(x, rays, sigma))(seen)
+    position = jax.vmap(lambda x: _place(x, rays, sigma))(rotated)
     return Fit(orientation, position, latent)
 
 
@@ -165,8 +165,8 @@ def _roll(uv: Array, sigma: Array) -> Float[Array, "3 3"]:
     """Turn about the optical axis, for who is lying or upside down: from the torso's
     direction if it is more than 60 degrees from upright, none otherwise."""
     torso = uv[1] - uv[8]
-    known = (sigma[1] < jnp.inf) & (sigma[8] < jnp.inf)
-    safe = jnp.where(known, torso, jnp.array([0.0, -1.0], torso.dtype))
+    detected = (sigma[1] < jnp.inf) & (sigma[8] < jnp.inf)
+    safe = jnp.where(detected, torso, jnp.array([0.0, -1.0], torso.dtype))
     angle = jnp.arctan2(safe[0], -safe[1])
     angle = jnp.where(jnp.abs(angle) > jnp.pi / 3, angle, 0.0)
     return so3.exp(angle * jnp.array([0.0, 0.0, 1.0], angle.dtype))
@@ -211,8 +211,8 @@ def _descend(
     size = 6 + fits.latent.shape[-1]
     prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
 
-    def evaluate(fit: Fit, *seen: Any) -> tuple[Array, Array, Array]:
-        normal = linearise(scene, fit, shape, *seen)
+    def evaluate(fit: Fit, *measurements: Any) -> tuple[Array, Array, Array]:
+        normal = linearise(scene, fit, shape, *measurements)
         return (
             normal.hessian + jnp.diag(prior),
             normal.gradient.at[6:].add(fit.latent),

@@ -1,4 +1,4 @@
-"""Bodies as files have them, and as the graph has them."""
+"""Conversion between bodies of files (SMPL's trans) and of the graph (pelvis pose)."""
 
 import dataclasses
 
@@ -43,16 +43,16 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> PersonState:
     body_pose = bodies.poses[..., 3:].reshape(*present.shape, 23, 3).astype(float)
     body_pose = np.where(present[..., None, None], body_pose, 0.0)
     shape = np.zeros((len(present), 10))
-    for h, there in enumerate(present):
-        if there.any():
-            shape[h] = np.median(bodies.shapes[h, there].astype(float), axis=0)
+    for h, frames in enumerate(present):
+        if frames.any():
+            shape[h] = np.median(bodies.shapes[h, frames].astype(float), axis=0)
     return PersonState(present, T_CH, body_pose, shape)
 
 
 def bodies_from_roots(roots: PersonState, body: BodyModel) -> Bodies:
     """Inverse of `roots_from_bodies`, for bodies whose β does not change.
 
-    That β is an estimate, no longer what a regressor said.
+    The result is marked as estimated (`shapes_regressed=False`).
     """
     frames = roots.present.shape[1]
     orientation = so3.log(roots.T_CH[..., :3, :3])

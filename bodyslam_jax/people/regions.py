@@ -1,4 +1,4 @@
-"""Where in an image people are to be looked for, and who is in front of whom."""
+"""Image regions to search for expected people, and overlap between detections."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,9 +10,9 @@ from bodyslam_jax.people.tracking import height
 _ROOM = 1.35
 """Side of the square around an expected person, of their box."""
 _MOSTLY = 0.5
-"""Share of a box, covered by a surer one, from which nobody new begins there."""
+"""Share of a box, covered by a surer one, from which no new track begins in it."""
 _ALIKE = 0.6
-"""Ratio of sizes down to which people are seen as well in a square for the larger."""
+"""Ratio of sizes down to which one square suits both people."""
 
 
 def regions(expected: list[np.ndarray], least: float, most: int) -> list[Region]:
@@ -34,7 +34,7 @@ def regions(expected: list[np.ndarray], least: float, most: int) -> list[Region]
 
 
 def square_around(points: Float[np.ndarray, "17 3"]) -> Region:
-    """Where to look for a person who is expected at these places."""
+    """The square to search for a person with these predicted keypoints."""
     box = movenet.box(points)
     x, y = (box[:2] + box[2:]) / 2
     half = max(16.0, _ROOM * height(points) / 2)
@@ -45,8 +45,8 @@ def square_around(points: Float[np.ndarray, "17 3"]) -> Region:
 def behind(
     points: Float[np.ndarray, "n 17 3"], score: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Who is mostly covered by somebody surer: limbs of two people who overlap are
-    often taken for a third's."""
+    """Detections mostly covered by a surer one: detectors often combine the limbs of
+    two overlapping people into a third person."""
     boxes = [movenet.box(p) for p in points]
     return np.array(
         [

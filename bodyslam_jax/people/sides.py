@@ -1,11 +1,10 @@
-"""Keypoints of which a detector exchanged left and right, put right.
+"""Correction of left-right exchanges in detected keypoints.
 
-Detectors look at one image at a time, and of who is seen from behind they take now and
-then the left leg for the right one, for some frames. In the image nothing moves then,
-but names jump. A hidden Markov chain of two states, named rightly and exchanged, for
-arms and for legs: between two frames the vector from each right joint to the left one
-changes little, or is its own negative if names were exchanged in between. Changes are
-measured in units of those around them.
+Detectors process single images, and may exchange the left and right limbs for some
+frames, mostly of people seen from behind. A hidden Markov model with two states
+(correct and exchanged) for the arms, and one for the legs: between two frames the
+vector from each right joint to the left one changes little, or changes sign if the
+labels were exchanged in between. Changes are whitened by the usual changes around them.
 """
 
 import dataclasses
@@ -22,13 +21,13 @@ ARMS = ((2, 5), (3, 6), (4, 7))
 LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
 """Hips, knees, ankles, big toes, small toes, heels."""
 _CHANGE = 4.0
-"""-log odds of names that are exchanged from this frame on, or no longer."""
+"""-log odds of a change of state at a frame."""
 _EXCHANGED = 3.0
-"""-log odds that names are exchanged, for as long as errors last."""
+"""-log odds of exchanged labels, per correlation time of the errors."""
 _LASTING = 1 / 3
-"""s: for about this long they stay the same."""
+"""s: correlation time of the errors."""
 _INDEPENDENT = 0.5
-"""Joints of a limb move together: each says as much as this part of one by itself."""
+"""Weight of each joint's evidence, as the joints of a limb are correlated."""
 _SCALE = 5.0
 """Scale of the robust loss on changes, in their standard deviations."""
 _WINDOW = 7
@@ -36,15 +35,16 @@ _WINDOW = 7
 _MEDIAN_OF_TWO = 1.177
 """Median length of a vector with two normal components of deviation 1."""
 _FLOOR = 0.01
-"""Change that nobody measures, of the person's size; and a pixel."""
+"""Least standard deviation of a change, of the person's size; combined with 1 px, the
+noise assumed of any detector in images of any size."""
 _LONGEST = 5
-"""Frames over which names are compared: in more a limb may be anywhere."""
+"""Longest gap, frames, over which labels are compared."""
 
 
 def correct_left_right(
     keypoints: Keypoints, fps: float
 ) -> tuple[Keypoints, Bool[np.ndarray, "h t 2"]]:
-    """Keypoints with names that make one motion; whose arms and legs were renamed."""
+    """Keypoints with exchanges undone; where arms (0) and legs (1) were exchanged."""
     uv, confidence = keypoints.uv.copy(), keypoints.confidence.copy()
     renamed = np.zeros((*confidence.shape[:2], 2), bool)
     for h in range(len(uv)):
@@ -61,15 +61,15 @@ def correct_left_right(
 
 def _exchanged(
     uv: Float[np.ndarray, "t 25 2"],
-    seen: Bool[np.ndarray, "t 25"],
+    detected: Bool[np.ndarray, "t 25"],
     pairs: tuple[tuple[int, int], ...],
     fps: float,
 ) -> Bool[np.ndarray, " t"]:
-    """Frames in which these pairs of one person have each other's names."""
-    size = _size(uv, seen)
+    """Frames in which the labels of these pairs of one person are exchanged."""
+    size = _size(uv, detected)
     changes = np.full(max(len(uv) - 1, 0), _CHANGE)
     for i, j in pairs:
-        where = np.flatnonzero(seen[:, i] & seen[:, j])
+        where = np.flatnonzero(detected[:, i] & detected[:, j])
         gap = np.diff(where)
         if len(where) < 3:
             continue
@@ -87,12 +87,12 @@ def _exchanged(
     return cheapest_states(np.full(len(uv), cost), changes)
 
 
-def _size(uv: Float[np.ndarray, "t 25 2"], seen: Bool[np.ndarray, "t 25"]) -> float:
+def _size(uv: Float[np.ndarray, "t 25 2"], detected: Bool[np.ndarray, "t 25"]) -> float:
     """Of the person in the image, px: the usual box of the keypoints."""
-    known = seen[..., None]
-    low = np.where(known, uv, np.inf).min(axis=1)
-    high = np.where(known, uv, -np.inf).max(axis=1)
-    some = seen.sum(axis=1) > 1
+    valid = detected[..., None]
+    low = np.where(valid, uv, np.inf).min(axis=1)
+    high = np.where(valid, uv, -np.inf).max(axis=1)
+    some = detected.sum(axis=1) > 1
     extent = np.linalg.norm((high - low)[some], axis=-1)
     return float(np.median(extent)) if some.any() else 0.0
 

@@ -1,10 +1,10 @@
-"""The body as this package's fits need it: points on rigid bones, and derivatives.
+"""Keypoints rigidly attached to bones, with derivatives in closed form.
 
-A keypoint that is a surface point is carried by one bone here, as at rest, which at
-nose, ears, heels and toes is within millimetres of the skinned vertex. In return the
-derivatives are geometry: turning joint j by a small vector ω about its own centre moves
-a point x below it by `ω x (x - x_j)`; no differentiation through a chain of rotations,
-which compiles and runs an order of magnitude slower.
+A surface keypoint (nose, ears, heels, toes) is attached to one bone as at rest, which
+is within millimetres of the skinned vertex. So derivatives are geometric: rotating
+joint j by a small vector ω about its own centre moves a point x below it by `ω x (x -
+x_j)`; no differentiation through a chain of rotations, which compiles and runs an order
+of magnitude slower.
 """
 
 import equinox as eqx
@@ -40,10 +40,10 @@ def _paths() -> np.ndarray:
 _PATH = _paths()
 
 
-# How far a detector's idea of a keypoint is from SMPL's, for one detector and person
-# the same in all frames: which keypoints, along which axis of the bone that
-# carries them (m, 1 σ). Mirrored in x. As extra shape components they are estimated
-# with the person; held at zero, a hip 3 cm off would read as legs bent by 20 degrees.
+# Offsets of a detector's keypoints from SMPL's, constant for a detector and person:
+# keypoints, axis of the bone they are attached to, prior standard deviation (m).
+# Mirrored in x. They are estimated as extra shape components; without them an offset
+# of the hip of 3 cm would appear as legs bent by 20 degrees.
 _OFFSETS = (
     *(((9, 12), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.04), (2, 0.02))),
     *(((2, 5), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.025), (2, 0.02))),

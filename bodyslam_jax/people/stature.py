@@ -1,4 +1,4 @@
-"""What a known stature says of a person's shape and distance."""
+"""A measured stature as information on a person's shape and distance."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -32,10 +32,10 @@ def linear_stature(body: BodyModel) -> LinearStature:
 def statures_of(
     heights: Mapping[int | None, Measured], numbers: Sequence[int]
 ) -> dict[int, Measured]:
-    """Statures by place among the people that have these `numbers`; what is given for
-    nobody in particular is everybody's.
+    """Statures by index among the people with these `numbers`; that under the key
+    `None` applies to everybody without one of their own.
 
-    **Raises:** `ValueError` if a person is named whom there is not.
+    **Raises:** `ValueError` if a stature is given for a number that nobody has.
     """
     beyond = [h for h in heights if h is not None and h not in numbers]
     if beyond and len(numbers):
@@ -61,11 +61,11 @@ def with_statures(
     """
     linear = linear_stature(body)
     shape, T_CH = roots.shape.copy(), roots.T_CH.copy()
-    for h, known in statures.items():
+    for h, measured in statures.items():
         variance = shape_sigma[h] ** 2
         before = linear.template + linear.slope @ shape[h]
-        gain = variance / (variance * linear.slope @ linear.slope + known.sigma**2)
-        shape[h] += gain * (known.value - before) * linear.slope
+        gain = variance / (variance * linear.slope @ linear.slope + measured.sigma**2)
+        shape[h] += gain * (measured.value - before) * linear.slope
         after = linear.template + linear.slope @ shape[h]
         T_CH[h, roots.present[h], :3, 3] *= after / before
     return dataclasses.replace(roots, shape=shape, T_CH=T_CH)

@@ -1,8 +1,8 @@
-"""Who is who from frame to frame, as long as a person is not out of sight for long.
+"""Online tracking of people over frames and short gaps.
 
-People are expected to go on as they moved, to keep their size and their clothes. Where
-one of the three does not hold nobody is continued: better two pieces of one person,
-which `_linking` joins with all frames known, than one piece of two people.
+Detections are assigned to tracklets by predicted position, size and colours of clothes.
+All three must agree; two tracklets of one person, which `linking` joins later, are
+preferred to one tracklet of two people.
 """
 
 import dataclasses
@@ -16,22 +16,22 @@ from bodyslam_jax.people.appearance import difference, mean_look
 from bodyslam_jax.people.movenet import box_size, sure_points
 
 _REACH = 0.15
-"""How far from where they are expected people are found a frame later, of their
+"""Gate on the distance from the predicted position after one frame, of the person's
 height."""
 _REACH_PER_SECOND = 0.8
-"""What is added to that for each second that they were not seen."""
+"""Growth of the gate for each second without a detection."""
 _FADING = 0.5
-"""Time constant with which an unseen person is taken to stop, s."""
+"""Time constant with which the predicted velocity decays, s."""
 _SMOOTHING = 0.1
 """Time constant of the velocity's mean, s."""
 GROWTH = 1.6
-"""Ratio of sizes from which it is somebody else."""
+"""Ratio of sizes from which a detection is of another person."""
 OTHER_CLOTHES = 30.0
-"""Difference of colours (`_appearance.difference`) from which it is somebody else."""
+"""Difference of colours (`appearance.difference`) from which it is another person."""
 _RECENT = 45
-"""Frames over which the look of a person is averaged."""
+"""Frames over which the colours of a person are averaged."""
 _AWHILE = 3
-"""Frames after which somebody who is seen again must be in full view."""
+"""Frames without a detection after which only an unoccluded one continues a track."""
 _FEWEST = 3
 """Keypoints that two detections must have in common to be compared."""
 _TRUNK = 0.3
@@ -40,7 +40,7 @@ _TRUNK = 0.3
 
 @dataclasses.dataclass
 class Tracklet:
-    """A person without a longer gap: what was seen of them, frame by frame."""
+    """Detections of one person without a longer gap, in order of time."""
 
     number: int
     frames: list[int]
@@ -56,7 +56,7 @@ class Tracklet:
         return mean_look(np.stack(self.looks[-_RECENT:]))
 
     def expected(self, frame: int, fps: float) -> Float[np.ndarray, "17 3"]:
-        """Keypoints in a later frame, if the person goes on, slowing down."""
+        """Predicted keypoints in a later frame, with decaying velocity."""
         time = _FADING * fps
         steps = time * (1 - np.exp(-(frame - self.frames[-1]) / time))
         points = self.points[-1].copy()
@@ -87,7 +87,7 @@ class Tracklet:
 
 
 def between(tracklet: Tracklet) -> list[tuple[int, Float[np.ndarray, "17 3"]]]:
-    """Where a person was in the frames in which they were not seen: linear."""
+    """Linearly interpolated keypoints in the gaps of a tracklet."""
     found = []
     ends = zip(tracklet.frames, tracklet.points, strict=True)
     for (first, a), (last, b) in pairwise(ends):
@@ -106,7 +106,7 @@ class Tracker:
         self.tracklets: list[Tracklet] = []
 
     def alive(self, frame: int) -> list[Tracklet]:
-        """Whom a detection in `frame` may still continue."""
+        """Tracklets that a detection in `frame` may continue."""
         return [t for t in self.tracklets if frame - t.frames[-1] <= self.max_gap]
 
     def update(
@@ -120,9 +120,9 @@ class Tracker:
         """The number of the tracklet that each detection continues or begins.
 
         Args:
-            may_return: which detections may be somebody who was not seen for a while.
-            may_start: which detections are sure enough to be somebody new; the others
-                get -1 if they continue nobody.
+            may_return: which detections may continue a track after a longer gap.
+            may_start: which detections are sure enough to begin a track; the others
+                get -1 if they continue none.
         """
         who = np.full(len(points), -1)
         alive = self.alive(frame)
@@ -150,7 +150,7 @@ class Tracker:
     def cost(
         self, tracklet: Tracklet, frame: int, points: np.ndarray, look: np.ndarray
     ) -> float:
-        """0 for the very same, 1 and more where it is taken for somebody else."""
+        """Cost of assignment: 0 for a perfect match, 1 and more outside the gates."""
         away = frame - tracklet.frames[-1]
         reach = _REACH + _REACH_PER_SECOND * (away - 1) / self.fps
         return _unlike(
@@ -172,8 +172,8 @@ class Tracker:
 
 
 def _unlike(place: float, growth: float, clothes: float) -> float:
-    """A cost below 1 only if each of the three may be: distance in what is within
-    reach, ratio of sizes, difference of clothes (NaN is unknown)."""
+    """A cost below 1 only if all three are within their gates: distance over its gate,
+    ratio of sizes, difference of clothes (NaN is unknown)."""
     growth = abs(float(np.log(growth))) / np.log(GROWTH)
     clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
     if max(place, growth, clothes) >= 1:
@@ -182,8 +182,8 @@ def _unlike(place: float, growth: float, clothes: float) -> float:
 
 
 def displacement(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> float:
-    """How far apart two sets of keypoints are, of the person's height: the median
-    forgives a lost or exchanged limb. Infinite where too few are sure in both."""
+    """Median distance of two sets of keypoints, of the person's height: robust against
+    a lost or exchanged limb. Infinite where too few are sure in both."""
     both = sure_points(a) & sure_points(b)
     if both.sum() < _FEWEST:
         return np.inf

@@ -1,9 +1,9 @@
-"""Of several fits of each frame, those that make one motion.
+"""The smoothest sequence among several fits of each frame, by dynamic programming.
 
-A path through the frames (Viterbi) weighs how well each fit explains its keypoints
-against how far the joints would have to jump between frames. Both are compared with the
-noise that they have: keypoints that are off by twice what is said of them say a quarter
-as much, and where the best fits themselves jitter, a jump is no more than their usual.
+The Viterbi algorithm minimises the sum of each fit's keypoint cost and of the motion
+between frames. Both are whitened by their estimated noise: keypoint costs by the
+variance of the residuals, motion by the median motion of the path itself, in
+iterations.
 """
 
 import dataclasses
@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _INDEPENDENT_JOINTS = 8
-"""Joints of a body move together: 24 of them say as much as about this many."""
+"""Effective number of independent joints among 24, which are correlated."""
 _MEDIAN_OF_THREE = 1.538
 """Median length of a vector with three normal components of deviation 1."""
 _ROUNDS = 3
-"""Paths that are found, each with the noise of the one before."""
+"""Iterations of the path, each with the noise estimated from the previous one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Scales:
-    """What jumps between frames are compared with."""
+    """Standard deviations of the motion between frames."""
 
     joint_speed: float = 1.2
     """m/s: how fast joints move about the pelvis, roughly."""
@@ -38,16 +38,16 @@ def best_path(
     time: Float[np.ndarray, " f"],
     noise: float = 1.0,
 ) -> Int[np.ndarray, " f"]:
-    """The end of each frame that lies on the cheapest path (Viterbi, second order).
+    """The fit of each frame that lies on the cheapest path (Viterbi, second order).
 
-    When legs cross, a leg that goes on and one that turns back move equally far; only
-    the change of velocity tells them apart.
+    Second order, as when legs cross only the change of velocity discriminates between
+    a leg that continues and one that turns back.
 
     Args:
-        costs: -log likelihood of each end if keypoints err as is said of them.
+        costs: -log likelihood of each fit under the assumed keypoint errors.
         joints: relative to the pelvis, in C, m.
         time: of each frame, s, increasing.
-        noise: errors of keypoints in units of what is said of them.
+        noise: standard deviation of keypoint errors over the assumed one.
     """
     costs = (costs - costs.min(axis=1, keepdims=True)) / noise**2
     scales = _Scales()
@@ -69,7 +69,7 @@ def _measured(
     orientation: Float[np.ndarray, "f 3 3"],
     time: Float[np.ndarray, " f"],
 ) -> _Scales:
-    """How a path that was found moves, in the median: motion and jitter together."""
+    """Median motion of a path, jitter included."""
     gap = np.maximum(np.diff(time), 1e-3)
     length = lambda v: float(np.sqrt(np.median(np.mean(np.sum(v**2, -1), -1))))
     velocity = np.diff(joints, axis=0) / gap[:, None, None]
@@ -95,7 +95,7 @@ def _cheapest(
     if frames == 1:
         return np.array([np.argmin(costs[0])])
     gap = np.maximum(np.diff(time), 1e-3)
-    # A state is the ends of two frames, [before, now]: their difference is a velocity.
+    # A state is a pair of fits [previous, current]: their difference is a velocity.
     jump = lambda k: _jump(joints, orientation, gap[k - 1], k, scales)
     total = costs[0][:, None] + costs[1] + jump(1)
     came_from = np.zeros((frames, starts, starts), int)
@@ -123,7 +123,7 @@ def _jump(
     k: int,
     scales: _Scales,
 ) -> Float[np.ndarray, "s s"]:
-    """Cost of moving from each end of frame k - 1 to each of frame k."""
+    """Cost of moving from each fit of frame k - 1 to each of frame k."""
     moved = joints[k][None] - joints[k - 1][:, None]
     squared = np.mean(np.sum(moved**2, -1), -1) / (scales.joint_speed * gap) ** 2
     cosine = np.einsum("aij,bij->ab", orientation[k - 1], orientation[k])
@@ -134,8 +134,8 @@ def _jump(
 def cheapest_states(
     turned: Float[np.ndarray, " f"], changes: Float[np.ndarray, " g"]
 ) -> Bool[np.ndarray, " f"]:
-    """States (f,) that minimise the sum of `turned` where they are true and of
-    `changes` where they change."""
+    """Binary states (f,) of least cost: the sum of `turned` where they are true and of
+    `changes` between frames where they change (Viterbi)."""
     total = np.array([0.0, turned[0]])
     came_from = np.zeros((len(turned), 2), int)
     for k in range(1, len(turned)):

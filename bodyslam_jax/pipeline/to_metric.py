@@ -13,7 +13,8 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.gravity import Upright, find_stances, find_upright
+from bodyslam_jax.geometry.gravity import Upright, find_upright
+from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
@@ -80,7 +81,7 @@ def _placed(
 ]:
     """Poses, `trans` and joints of people in the world of these cameras, smoothed."""
     T_WH = T_WC @ joint.roots
-    root = so3.log(T_WH[..., :3, :3])
+    root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
     poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
     shapes = jnp.asarray(joint.shapes)

@@ -22,8 +22,8 @@ from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
 STILL = 0.5
-"""Displacement up to which a point counts as still, px: assumes tracking noise of about
-0.15 px (1 σ) in images of up to 1280 px, and in proportion in larger ones."""
+"""Displacement up to which a point counts as still, px: assumes tracking noise
+below 0.2 px (1 σ) and is scaled with larger images; 2.5 σ of noisier tracks instead."""
 _GAPS = (6, 15, 30, 60)
 """Frames between the two of a pair."""
 _MOST_ANCHORS = 300
@@ -182,10 +182,10 @@ def masks_of(
     centre = np.stack(
         [np.bincount(of, uv[:, i], count) / counts for i in range(2)], axis=-1
     )
-    seen = np.zeros((count, num_frames), dtype=bool)
-    seen[of, frame] = True
+    visible = np.zeros((count, num_frames), dtype=bool)
+    visible[of, frame] = True
     width = np.ones(2 * _AROUND + 1, dtype=np.uint8)[None]
-    shown = cv2.dilate(seen.astype(np.uint8), width) if count else seen
+    shown = cv2.dilate(visible.astype(np.uint8), width) if count else visible
     for k in range(num_frames):
         mask = np.zeros((size[1], size[0]), dtype=np.uint8)
         for x, y in centre[shown[:, k] > 0]:

@@ -213,10 +213,10 @@ def _changes(given: Intrinsics, used: Intrinsics) -> list[str]:
             "(pixels that are not square: a stretched video): used."
         )
     k1 = used.params[4] if len(used.params) == 8 else 0.0
-    known = given.params[4] if len(given.params) == 8 else 0.0
-    if abs(k1 - known) > 1e-6:
+    assumed = given.params[4] if len(given.params) == 8 else 0.0
+    if abs(k1 - assumed) > 1e-6:
         text.append(
             f"the tracks indicate a distorted lens, k1 = {k1:.3f} where {source} "
-            f"has {known:.3f}: used."
+            f"has {assumed:.3f}: used."
         )
     return text

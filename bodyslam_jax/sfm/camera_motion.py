@@ -85,7 +85,7 @@ def stillness(views: Views, window: int = 10) -> float:
     between their median position in the first `window` frames and in any later ones.
 
     Medians over windows suppress tracking noise, so that noise of 0.5 px at 640x480
-    stays below `Structure.static_motion`.
+    stays below the limit of a static camera.
     """
     ordered = np.lexsort((views.frame, views.landmark))
     landmark, xy = views.landmark[ordered], views.xy[ordered]
@@ -143,12 +143,12 @@ def rotations_only(
     by_frame = _by_frame(views)
     R = np.tile(np.eye(3), (num_frames, 1, 1))
     direction = np.zeros((num_landmarks, 3))
-    known = np.zeros(num_landmarks, dtype=bool)
+    has_direction = np.zeros(num_landmarks, dtype=bool)
     solved = np.zeros(num_frames, dtype=bool)
     for k in range(num_frames):
         ids, xy = by_frame.get(k, _nothing())
         ray = unit_rays(xy)
-        at = known[ids]
+        at = has_direction[ids]
         if solved.any():
             R[k] = R[k - 1]
         if at.sum() >= 6 and turns:
@@ -157,7 +157,7 @@ def rotations_only(
             solved[k] = True
             new = ids[~at]
             direction[new] = ray[~at] @ R[k]
-            known[new] = True
+            has_direction[new] = True
     for _ in range(20):
         ray_W = np.einsum("mji,mj->mi", R[views.frame], unit_rays(views.xy))
         away = np.linalg.norm(ray_W - direction[views.landmark], axis=-1)

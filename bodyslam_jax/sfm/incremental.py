@@ -18,7 +18,8 @@ from bodyslam_jax.types import CameraPath
 _log = logging.getLogger(__name__)
 
 _FIRST_PAIRS = 4
-"""Pairs of frames that are tried as the start of the map."""
+"""Pairs of keyframes that are tried as the start of the map; assumes no noise level, as
+the best is chosen by its share of inliers."""
 MIN_SHARED = 12
 """Points that two frames must share to be related."""
 _RELAXED = 3
@@ -257,8 +258,8 @@ class Builder(Mapper):
     def _register(self, grown: PartialMap, k: int) -> bool:
         at = self.of_frame[k]
         at = at[grown.has_point[self.views.landmark[at]]]
-        known = np.flatnonzero(grown.registered)
-        nearest = known[np.argmin(np.abs(known - k))]
+        located_frames = np.flatnonzero(grown.registered)
+        nearest = located_frames[np.argmin(np.abs(located_frames - k))]
         guess = (grown.scene.R_CW[nearest], grown.scene.centre[nearest])
         found = resect(
             grown.scene.points[self.views.landmark[at]],
@@ -285,6 +286,8 @@ class Builder(Mapper):
         """The same, and how many observations were tested."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.
-        seen = np.bincount(self.views.landmark[at], minlength=self.num_landmarks)
-        at = at[seen[self.views.landmark[at]] >= 2]
+        observations = np.bincount(
+            self.views.landmark[at], minlength=self.num_landmarks
+        )
+        at = at[observations[self.views.landmark[at]] >= 2]
         return (float(grown.inlier[at].mean()) if len(at) else 0.0), len(at)

@@ -226,8 +226,8 @@ class _Fit:
         return p_C, front, z, q, r2, size, size * q * radial[:, None], radial
 
     def _errors(self, x: _Unknowns) -> np.ndarray:
-        _, front, *_, seen, _ = self._predict(x)
-        error = np.linalg.norm(seen - self.views.xy, axis=-1)
+        _, front, *_, predicted, _ = self._predict(x)
+        error = np.linalg.norm(predicted - self.views.xy, axis=-1)
         return np.where(front, error, 10.0)
 
     def cost(self, x: _Unknowns, sigma: float) -> float:
@@ -237,8 +237,8 @@ class _Fit:
 
     def _linearise(self, x: _Unknowns, sigma: float):
         v = self.views
-        p_C, front, z, q, r2, size, seen, radial = self._predict(x)
-        r = (seen - v.xy) / sigma
+        p_C, front, z, q, r2, size, predicted, radial = self._predict(x)
+        r = (predicted - v.xy) / sigma
         weight = front / (1 + (r**2).sum(axis=-1) / _CAUCHY**2)
         root = np.sqrt(weight)[:, None, None]
         D = np.zeros((len(z), 2, 2))
@@ -256,10 +256,10 @@ class _Fit:
         cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = -c, b, -a
         A = np.concatenate([pi @ cross, -B], axis=-1)
         G = np.empty((len(z), 2, len(x.lens)))
-        G[..., 0] = seen
-        G[..., 1] = 0.5 * seen * np.array([1.0, -1.0])
+        G[..., 0] = predicted
+        G[..., 1] = 0.5 * predicted * np.array([1.0, -1.0])
         G[..., 2] = size * q * r2[:, None]
-        G[..., 3:] = seen[..., None] * self.basis[v.frame][:, None]
+        G[..., 3:] = predicted[..., None] * self.basis[v.frame][:, None]
         G *= root / sigma
         r = r * root[..., 0]
         k, l = len(x.R), len(x.points)

@@ -55,8 +55,8 @@ class Revisits:
         self,
         scene: Scene,
         frame: int,
-        seen: Int[np.ndarray, " n"],
-        known: Bool[np.ndarray, " l"],
+        observed: Int[np.ndarray, " n"],
+        has_point: Bool[np.ndarray, " l"],
         registered: Bool[np.ndarray, " t"],
         threshold: float,
     ) -> tuple[list[tuple[int, int]], float]:
@@ -67,15 +67,15 @@ class Revisits:
         depth 1.
 
         Args:
-            seen: landmarks observed in the frame.
-            known: landmarks that are triangulated.
+            observed: landmarks observed in the frame.
+            has_point: landmarks that are triangulated.
             registered: frames whose camera is known.
             threshold: error at depth 1 up to which an observation fits.
         """
-        others = known.copy()
-        others[seen] = False
+        others = has_point.copy()
+        others[observed] = False
         others = np.flatnonzero(others)
-        rows = {int(i): self._some_views(int(i), registered) for i in seen}
+        rows = {int(i): self._some_views(int(i), registered) for i in observed}
         fresh = [i for i, r in rows.items() if len(r) >= _LEAST_VIEWS]
         if not len(others) or not fresh:
             return [], 0.0

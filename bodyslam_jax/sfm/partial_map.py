@@ -12,7 +12,9 @@ from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.loop_closure import Revisits
 
 _OUTLIER = 2.0
-"""Reprojection error beyond which an observation is an outlier, px."""
+"""Reprojection error beyond which an observation is an outlier, px: 4 σ of an assumed
+tracking noise of 0.5 px at 640x480; not scaled with the image, but `Builder.build`
+doubles it up to twice where that gives more inliers."""
 _LEAST_ANGLE = 0.5
 """Smallest angle between the rays of a point, degrees; smaller ones are tried where
 cameras cannot be located otherwise."""
@@ -80,9 +82,9 @@ class Mapper:
         """Finds points of the map again among those that frame `k` sees."""
         if not self.joining:
             return
-        seen = self.views.landmark[self.of_frame[k]]
+        observed = self.views.landmark[self.of_frame[k]]
         pairs, away = self.revisits.find(
-            grown.scene, k, seen, grown.has_point, grown.registered, self.threshold
+            grown.scene, k, observed, grown.has_point, grown.registered, self.threshold
         )
         for one, other in pairs:
             rows = self.revisits.join(one, other)
@@ -152,10 +154,10 @@ class Mapper:
         fits = np.bincount(views.landmark[good], minlength=self.num_landmarks)
         if not good.any():
             return
-        seen = views[np.flatnonzero(good)]
-        angle = widest_angle(trial.centre[seen.frame], seen.landmark, points)
+        observed = views[np.flatnonzero(good)]
+        angle = widest_angle(trial.centre[observed.frame], observed.landmark, points)
         new = (fits >= 2) & (fits >= 0.6 * count) & (angle > _FLAT * self.min_angle)
-        new &= self._parallax(trial, seen, grown) > self.min_angle
+        new &= self._parallax(trial, observed, grown) > self.min_angle
         grown.scene.points[new] = points[new]
         grown.has_point |= new
         kept = new[views.landmark]
@@ -172,9 +174,10 @@ class Mapper:
         at = grown.has_point[self.views.landmark] & near[self.views.frame]
         if np.count_nonzero(at) < _ENOUGH:
             return widest_angle(trial.centre[views.frame], views.landmark, trial.points)
-        known = self.views[np.flatnonzero(at)]
-        away = grown.scene.points[known.landmark] - grown.scene.centre[known.frame]
-        usual = np.median(np.linalg.norm(away, axis=-1))
+        triangulated = self.views[np.flatnonzero(at)]
+        centres = grown.scene.centre[triangulated.frame]
+        offset = grown.scene.points[triangulated.landmark] - centres
+        usual = np.median(np.linalg.norm(offset, axis=-1))
         centre = np.zeros_like(trial.points)
         centre[views.landmark] = trial.centre[views.frame]
         ray = trial.points - centre
@@ -215,8 +218,8 @@ class Mapper:
         return free
 
     def _nearest(self, grown: PartialMap, k: int, count: int) -> np.ndarray:
-        known = np.flatnonzero(grown.registered)
-        near = known[np.argsort(np.abs(known - k), kind="stable")][:count]
+        located = np.flatnonzero(grown.registered)
+        near = located[np.argsort(np.abs(located - k), kind="stable")][:count]
         return np.isin(np.arange(self.num_frames), near) & self._free(grown)
 
     def _refine(self, grown: PartialMap, free: np.ndarray) -> None:

@@ -120,7 +120,7 @@ def _painted(sequence: Sequence) -> Float[np.ndarray, "h t 25 3"]:
 def _draw_detected(
     mask: UInt8[np.ndarray, "y x"], people: DetectedPeople, k: int, margin: float
 ) -> None:
-    """Paints everybody whom a detector found in frame `k`."""
+    """Paints all detected people of frame `k`."""
     for index in np.flatnonzero(people.frame == k):
         draw_person(mask, people.keypoints[index], margin)
     if people.silhouettes is None:
@@ -136,10 +136,10 @@ def draw_person(
     mask: UInt8[np.ndarray, "y x"], points: Float[np.ndarray, "25 3"], margin: float
 ) -> None:
     """Paints one person, given as (u px, v px, confidence), into `mask` with 255."""
-    seen = points[:, 2] > _LEAST_CONFIDENCE
-    if seen.sum() < 2:
+    detected = points[:, 2] > _LEAST_CONFIDENCE
+    if detected.sum() < 2:
         return
-    height = _height(points, seen)
+    height = _height(points, detected)
     paint = lambda a, b, width: cv2.line(
         mask,
         _pixel(a),
@@ -149,19 +149,19 @@ def draw_person(
         lineType=cv2.LINE_8,
     )
     for i, j, width in _LIMBS:
-        if seen[i] and seen[j]:
+        if detected[i] and detected[j]:
             paint(points[i], points[j], width)
     for i, j, beyond, width in _BEYOND:
-        if seen[i] and seen[j]:
+        if detected[i] and detected[j]:
             end = points[j] + beyond * (points[j] - points[i])
             paint(points[j], end, width)
 
 
-def _height(points: np.ndarray, seen: np.ndarray) -> float:
+def _height(points: np.ndarray, detected: np.ndarray) -> float:
     """Size of a person in the image (px), also if bent or partly hidden."""
-    box = np.ptp(points[seen, :2], axis=0)
+    box = np.ptp(points[detected, :2], axis=0)
     size = float(np.hypot(*box))
-    if seen[1] and seen[8]:  # the trunk is 0.3 of the height
+    if detected[1] and detected[8]:  # the trunk is 0.3 of the height
         size = max(size, float(np.linalg.norm(points[1, :2] - points[8, :2])) / 0.3)
     return size
 

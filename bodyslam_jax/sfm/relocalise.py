@@ -54,8 +54,8 @@ def relocate(
         share: part of wrong pairs that agree by chance.
     """
     least = max(_LEAST, _BY_CHANCE * share * len(xy))
-    agree = lambda seen: len(
-        np.unique(which[np.linalg.norm(seen - xy, axis=-1) < threshold])
+    agree = lambda projected: len(
+        np.unique(which[np.linalg.norm(projected - xy, axis=-1) < threshold])
     )
     before = _project(points, pose)
     R, centre = pose

@@ -47,8 +47,8 @@ def information_from_other_tracks(
         views: observations that fit, of tracks.
         shown: the landmark that each track shows.
     """
-    seen = Views(views.frame, shown[views.landmark], views.xy)
-    J = jacobian_of_points(scene, seen)
+    merged = Views(views.frame, shown[views.landmark], views.xy)
+    J = jacobian_of_points(scene, merged)
     own = sum_by(views.landmark, np.einsum("mki,mkj->mij", J, J), len(shown))
     _, point = np.unique(shown, return_inverse=True)
     tracks = np.unique(views.landmark)

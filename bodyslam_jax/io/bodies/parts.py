@@ -127,7 +127,7 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
     if array.shape[-2:] == (3, 3):
         if joints is not None and array.size % (9 * joints):
             raise InvalidContent(f"rotations {array.shape}, not of {joints} joints")
-        rotvec = rotvec_of(array.reshape(-1, 3, 3))
+        rotvec = so3.log(array.reshape(-1, 3, 3))
         count = joints or array.shape[1]
         return rotvec.reshape(-1, 3 * count)
     return (
@@ -135,14 +135,6 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
         if joints is None
         else array.reshape(-1, 3 * joints)
     )
-
-
-def rotvec_of(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Axis-angle of rotation matrices; NaN of those that are not finite."""
-    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
-    safe = np.where(finite[:, None, None], matrices, np.eye(3))
-    found = so3.log(safe)
-    return np.where(finite[:, None], found, np.nan)
 
 
 def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:

@@ -1,0 +1,60 @@
+"""Standing feet: in which frames a foot is on the ground, and where.
+
+A foot stands while its toe joint is slow. Positions are of toe joints, m.
+"""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+STANDING_SPEED = 0.6
+"""The lower foot stands where it is slower than this, m/s: assumes that toe joints over
+`_SPEED_WINDOW` err by well below 6 cm."""
+_SPEED_WINDOW = 0.1
+"""s, over which the speed of a foot is measured, so that the noise of single frames is
+averaged out."""
+_SHORTEST_STANCE = 0.1
+"""s"""
+
+
+def standing_feet(
+    feet: Float[np.ndarray, "t 2 3"], up: Float[np.ndarray, " 3"], fps: float
+) -> tuple[Bool[np.ndarray, " t"], Int[np.ndarray, " t"]]:
+    """Frames in which the lower foot stands, and which foot that is.
+
+    `feet` are the toe joints in frames that follow one another, m, in any world; `up`
+    need be right to 20 degrees only. A foot stands where it is slower than
+    `STANDING_SPEED`, in every direction.
+    """
+    frame = np.arange(len(feet))
+    lower = (feet @ up).argmin(axis=1)
+    half = max(1, round(_SPEED_WINDOW * fps / 2))
+    before = np.maximum(frame - half, 0)
+    after = np.minimum(frame + half, len(feet) - 1)
+    moved = np.linalg.norm(feet[after, lower] - feet[before, lower], axis=-1)
+    speed = moved * fps / np.maximum(after - before, 1)
+    return (speed < STANDING_SPEED) & (len(feet) > 1), lower
+
+
+def find_stances(
+    feet: Float[np.ndarray, "h t 2 3"], present: Bool[np.ndarray, "h t"], fps: float
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Stances of each person: the median position of the standing toe joint, one for
+    each stance, m, in a frame whose y axis is roughly up."""
+    return [_stances(*one, fps) for one in zip(feet, present, strict=True)]
+
+
+def _stances(feet, present, fps) -> Float[np.ndarray, "s 3"]:
+    found = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
+    for start, stop in edges.reshape(-1, 2):
+        stands, lower = standing_feet(feet[start:stop], np.array([0.0, 1.0, 0.0]), fps)
+        place = feet[start + np.arange(stop - start), lower]
+        # A change of foot ends a stance too.
+        label = np.where(stands, 1 + lower, 0)
+        ends = np.flatnonzero(np.diff(label, prepend=0, append=0))
+        for a, b in itertools.pairwise(ends):
+            if label[a] and b - a >= max(2, _SHORTEST_STANCE * fps):
+                found.append(np.median(place[a:b], axis=0))
+    return np.array(found).reshape(-1, 3)
