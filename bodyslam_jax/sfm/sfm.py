@@ -40,7 +40,7 @@ for this test."""
 
 _CERTAIN_PARALLAX = 6.0
 """Residual of a pure rotation, in `TURNING_ERROR`, beyond which the camera
-certainly translates: 6 px at the default, assuming that tracking noise (0.5 px at
+certainly translates: 6 px, assuming that tracking noise (0.5 px at
 640x480) and a wrong focal length together stay below it."""
 
 
