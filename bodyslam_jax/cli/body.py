@@ -17,12 +17,12 @@ def body_show(
     out: Path = Path("body_model.png"),
     gender: _Gender | None = None,
 ) -> None:
-    """Draws a body model: shape components at ±2σ and a few postures.
+    """Draws a body model: shape components at ±2 σ and a few postures.
 
     Args:
-        file: Body model; without it the one that `doctor` names.
-        out: Picture to write.
-        gender: Which file of a folder; without it the neutral one.
+        file: Body model; without it the one that `bodyslam doctor` names.
+        out: Picture to write (.png).
+        gender: Gender of the file in a folder. Default: neutral.
     """
     from bodyslam_jax import body
 
@@ -42,7 +42,7 @@ def body_convert(
     Args:
         file: Any supported body model file, or a folder of them.
         out: The .npz to write.
-        gender: Which file of a folder; without it the neutral one.
+        gender: Gender of the file in a folder. Default: neutral.
     """
     from bodyslam_jax import body
 
@@ -51,11 +51,11 @@ def body_convert(
 
 
 def body_check(file: Input, /, *, gender: _Gender | None = None) -> None:
-    """Says what a body model file is, or why it is not usable.
+    """Prints the kind of a body model file, or why it cannot be used.
 
     Args:
         file: Body model file or folder.
-        gender: Which file of a folder; without it the neutral one.
+        gender: Gender of the file in a folder. Default: neutral.
     """
     from bodyslam_jax import body
 

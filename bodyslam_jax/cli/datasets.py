@@ -15,8 +15,8 @@ def emdb(source: Input, out: _Out, /, *, body_model: Path | None = None) -> None
     Args:
         source: Folder with *_data.pkl and images/.
         out: Sequence folder to write.
-        body_model: SMPL of the subject's gender, or a folder with it; it makes the true
-            joints. Without it, it is looked for where `doctor` says.
+        body_model: SMPL of the subject's gender, or a folder with it; it gives the true
+            joints. Without it, the search path that `bodyslam doctor` prints.
     """
     from bodyslam_jax import evaluation
 
@@ -54,7 +54,7 @@ def rich(
         split: train, val or test.
         sequence: Name of the sequence.
         camera: Number of the camera.
-        body_model: Folder with SMPL-X of the subjects' genders; it makes the true
+        body_model: Folder with SMPL-X of the subjects' genders; it gives the true
             joints.
         genders: gender.json of RICH's toolkit, if not in its resource/ here.
     """
@@ -73,10 +73,10 @@ def tum_amass(
     *,
     images: Path | None = None,
 ) -> None:
-    """A trajectory in TUM's format and a motion in AMASS', one ground truth.
+    """A camera trajectory (TUM) and a motion (AMASS) as one ground truth.
 
     Args:
-        trajectory: Camera to world, a line a frame.
+        trajectory: TUM file, camera to world, one line per frame.
         motion: AMASS file (.npz).
         out: Sequence folder to write.
         images: Folder of images, if there are any.

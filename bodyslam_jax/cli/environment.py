@@ -1,4 +1,4 @@
-"""What `bodyslam doctor` says: versions, devices, codecs, where models were found."""
+"""`bodyslam doctor`: versions, devices, codecs, paths of models."""
 
 import importlib.metadata
 import os
@@ -22,7 +22,7 @@ def doctor() -> None:
 
 
 def report() -> list[tuple[str, str]]:
-    """Lines of `(what, finding)`; never raises because something is missing."""
+    """Rows of `(name, finding)`; does not raise if something is missing."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}")]
     rows += [(name, _version(name)) for name in _PACKAGES]
     return rows + _devices() + _opencv() + _networks() + _models()

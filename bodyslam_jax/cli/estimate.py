@@ -34,13 +34,15 @@ def run(
         out: Run folder to write; an interrupted run in it is continued. Without it
             runs/NAME, NAME from the input, numbered if an earlier run is there.
         keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
-        bodies: Regressed bodies of any supported tool, if not in the input.
-        camera: camera.json, if not in the input.
-        tracks: tracks.npz made elsewhere, if not in the input.
-        masks: Folder of person masks, if not in the input.
-        preset: `paper` has the paper's weights, motion network and first-order steps.
-        settings: A config.yaml to start from, which prevails over a preset; options
-            beside it prevail over both.
+        bodies: Regressed bodies, the result file of a supported tool, if not in the
+            input.
+        camera: camera.json, COLMAP cameras.txt or .bin, or nerfstudio transforms.json,
+            if not in the input.
+        tracks: Point tracks (tracks.npz), if not in the input.
+        masks: Folder of person masks (.png, non-zero is a person), if not in the input.
+        preset: `paper` selects the paper's weights, motion network and solver.
+        settings: Settings file (config.yaml); it overrides the preset, and options
+            override both.
         config: Settings of every stage.
     """
     from bodyslam_jax import io, pipeline
@@ -73,11 +75,11 @@ def demo(
 
     Args:
         out: Run folder to write.
-        from_pixels: Find the walker in the images by the networks that ship, in place
-            of the keypoints and bodies that are simulated.
-        preset: `paper` has the paper's weights, motion network and first-order steps.
-        settings: A config.yaml to start from, which prevails over a preset; options
-            beside it prevail over both.
+        from_pixels: Detect the walker in the images by the networks that ship, in place
+            of simulated keypoints and bodies.
+        preset: `paper` selects the paper's weights, motion network and solver.
+        settings: Settings file (config.yaml); it overrides the preset, and options
+            override both.
         config: Settings of every stage.
     """
     from bodyslam_jax import pipeline
@@ -119,23 +121,22 @@ def evaluate(
     Args:
         run: Run folder.
         groundtruth: Folder with camera.txt (TUM) and body.npz (AMASS style).
-        body_model: SMPL, or a folder with it for each gender; makes true joints where
-            the ground truth holds none.
-        offset: Added to the run's timestamps, s: the ground truth's clock at the
-            video's first frame, where that does not start at 0.
+        body_model: SMPL, or a folder with it for each gender; it gives the true joints
+            where the ground truth has none.
+        offset: Time of the video's first frame on the ground truth's clock, s.
         json: Print JSON instead of a table.
     """
     import bodyslam_jax as bs
     from bodyslam_jax import evaluation
 
     truth = evaluation.read_truth(groundtruth, body_model)
-    # Toes and heels slide, where the joints of both sides are this body's.
+    # Foot sliding needs toes and heels, known for joints of this body only.
     body = bs.load_body_model(body_model)
     result = evaluation.read_result(run)
     if not result.present.any():
         log.warning(
-            "nobody is in this run, so that it has no metres: its errors after SE(3) "
-            "and its scale mean nothing."
+            "this run has no people and so no metric scale: ignore its errors after "
+            "SE(3) alignment and its scale."
         )
     found = evaluation.evaluate(result, truth, body, offset)
     if found.scope is not None:

@@ -1,4 +1,4 @@
-"""What is made beside a run: simulated sequences, motion models, experiments."""
+"""`bodyslam simulate`, `train-motion` and `experiment`."""
 
 import contextlib
 import logging
@@ -53,9 +53,10 @@ def train_motion(
 
     Args:
         data: File or folder of motion.
-        out: Weights to write (.npz); an interrupted training is continued.
-        body_model: Body to train for, if not the one that `doctor` names.
-        preset: `paper` is its network, loss, optimiser and choice of motion.
+        out: Weights to write (.npz); an interrupted training in it is continued.
+        body_model: Body model to train for; without it the one that `bodyslam doctor`
+            names.
+        preset: `paper` selects its network, loss, optimiser and choice of motion.
         config: Architecture and training.
     """
     from bodyslam_jax import motion
@@ -106,14 +107,14 @@ def experiment(
     on: Annotated[Experiment, tyro.conf.arg(name="")] = Experiment(),
     config: Flat = Config(),
 ) -> None:
-    """Repeats one of the paper's experiments, or of ours, on simulated sequences.
+    """Runs one of the paper's or the project's experiments on simulated sequences.
 
     Args:
-        name: Which one.
+        name: Name of the experiment.
         out: Folder for tables and figures; finished rows are kept there.
-        preset: `paper` has the paper's weights, motion network and first-order steps.
-        settings: A config.yaml to start from; options beside it prevail.
-        on: What it runs on.
+        preset: `paper` selects the paper's weights, motion network and solver.
+        settings: Settings file (config.yaml); options override it.
+        on: Data that it runs on.
         config: Settings of every stage.
     """
     if name == "scale":
@@ -126,7 +127,7 @@ def experiment(
 
 
 def _make_each_core_a_device() -> None:
-    """So that mapped solves run side by side; too late where JAX runs already."""
+    """Lets mapped solves run in parallel; has no effect once JAX has started."""
     import jax
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1

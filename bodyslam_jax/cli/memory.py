@@ -1,7 +1,8 @@
-"""Memory that is done with goes back to the system, where the C library is GNU's.
+"""Freed memory is returned to the system, where the C library is glibc.
 
-It keeps what is freed for later: hundreds of megabytes for each program compiled, in
-small pieces, and arrays up to 32 MB. A long video's run would hold twice what it needs.
+glibc keeps freed memory for later allocations: hundreds of megabytes in small pieces
+after each compilation, and arrays up to 32 MB. A long video would need
+twice the memory.
 """
 
 import ctypes
@@ -9,15 +10,15 @@ import platform
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _LEAST = 0.5
-"""Compilations quicker than this leave little, s."""
+"""Compilations shorter than this free little memory, s."""
 _MMAP_THRESHOLD = -3
 """`M_MMAP_THRESHOLD` of `malloc.h`."""
 _LARGE = 1 << 20
-"""Arrays from this size on have pages of their own, bytes."""
+"""Size from which arrays have pages of their own, bytes."""
 
 
 def return_memory() -> None:
-    """From now on, in this process: of arrays at once, of compilations after each."""
+    """Returns arrays when they are freed, and memory of compilations after each."""
     if platform.libc_ver()[0] != "glibc":
         return
     import jax

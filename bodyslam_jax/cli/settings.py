@@ -15,7 +15,7 @@ from bodyslam_jax.config import Config, MotionTraining
 
 
 def base_config(argv: list[str]) -> Config:
-    """The settings that `--preset` and `--settings` start from.
+    """The settings that `--preset` and `--settings` select.
 
     **Raises:** `ValueError` if the file is not a config.yaml.
     """
@@ -30,7 +30,7 @@ def _is_paper(argv: list[str]) -> bool:
 
 
 def option(argv: list[str], flag: str) -> str | None:
-    """What is given for a flag, after it or after its `=`; the last counts."""
+    """The value of a flag, after it or after its `=`; the last one counts."""
     found = None
     for arg, after in itertools.pairwise([*argv, None]):
         if arg == flag and after is not None:
@@ -41,7 +41,7 @@ def option(argv: list[str], flag: str) -> str | None:
 
 
 def read_settings(path: Path, base: Config) -> Config:
-    """`base` with what a config.yaml says.
+    """`base` changed by a config.yaml.
 
     **Raises:** `ValueError`, naming file and key, if it is not one.
     """

@@ -1,4 +1,4 @@
-"""Kinds of arguments that several commands have."""
+"""Types of arguments that several commands share."""
 
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,4 +1,4 @@
-"""What settings may be: of their kind, finite, and within their range."""
+"""Checks of settings: type, range, finiteness."""
 
 import dataclasses
 import math
@@ -19,11 +19,11 @@ def check(
     *,
     infinite: Collection[str] = (),
 ) -> None:
-    """Refuses settings that mean nothing, before minutes are spent.
+    """Refuses invalid settings before anything is computed.
 
     Whole numbers are 1 or more, others more than 0, unless `ranges` has the least and
-    the largest value; those named in `infinite` may be that, as standard deviations of
-    what is to say nothing. Arrays are let through: they may not be known yet.
+    the largest value. Those named in `infinite` may be infinite: a standard deviation
+    that disables a term. Arrays are not checked: JAX may be tracing them.
 
     **Raises:** `ValueError` that names the setting, what was found and what was
     expected.
@@ -43,7 +43,7 @@ def check(
 
 
 def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
-    """What was expected, where it is something else."""
+    """What was expected, or `None` if `found` is valid."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if found is None and types.NoneType in arguments:
@@ -77,7 +77,7 @@ def _out_of_range(found: Any, kind: type, within: Range | None) -> str | None:
             return None if found >= 1 else "1 or more"
         return None if 0 < found < math.inf else "more than 0, and finite"
     least, most = within
-    # Not a NaN either, which no bound is above or below.
+    # A NaN fails both comparisons.
     if least <= found <= most and math.isfinite(found):
         return None
     if found == most == math.inf:

@@ -1,4 +1,4 @@
-"""What a user knows of a video: measurements, each with a standard deviation.
+"""Measurements by the user: facts about a video, each with a standard deviation.
 
 Every field is an option of the command line (`--height 1.78`, `--focal 1250±20`) and a
 line of `config.yaml`. A value may carry its own standard deviation after `±` (or `+-`);
@@ -29,7 +29,7 @@ RANGES = {
     "end": NOT_NEGATIVE,
     "person": NOT_NEGATIVE,
 }
-"""What the numbers may be."""
+"""Ranges of the numbers."""
 _SIGMA = re.compile(r"±|\+-|\+/-")
 _NARROWEST, _WIDEST = 1.0, 179.0
 
@@ -43,38 +43,38 @@ class Measured(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What a user knows of a video and the people in it."""
+    """Facts about a video and the people in it that a user may know."""
 
     height: tuple[str, ...] = ()
-    """Stature, m, of the only person or of each by number: `1.78`, `1.78±0.01`,
-    `0=1.78 1=1.65`. Without a standard deviation 2 cm."""
+    """Stature, m, of the only person or of each by number: `1.78`, `1.78±0.01`, `0=1.78
+    1=1.65`. Default standard deviation: 2 cm."""
     focal: str | None = None
-    """Focal length, px of the video, if it is known better than by a guess: `1250`,
-    `1250±20`. Without a standard deviation 2 %."""
+    """Focal length, px of the video: `1250`, `1250±20`. Default standard deviation: 2
+    %. Without it or `--fov`, it is estimated from an initial guess."""
     fov: str | None = None
     """Horizontal field of view, degrees, in place of the focal length: `65`, `65±2`."""
     camera_path: str | None = None
-    """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `.bin`, or
-    nerfstudio `transforms.json`. Structure from motion then only makes the map."""
+    """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `images.bin`,
+    or nerfstudio `transforms.json`. Structure from motion then only makes the map."""
     camera_path_metric: bool = False
     """Whether that path is in metres, as a visual-inertial tracker's is."""
     static_camera: bool = False
-    """Whether the camera stands on a tripod: no camera motion is looked for."""
+    """Whether the camera does not move (tripod); no camera motion is estimated."""
     gravity: tuple[float, ...] = ()
-    """Direction in which things fall, in the first frame's camera axes (x right, y
-    down, z forward): `0 1 0` for a level camera. Known to 1 degree."""
+    """Direction of gravity in the axes of the first frame's camera (x right, y down, z
+    forward): `0 1 0` for a level camera. Standard deviation: 1 degree."""
     fps: float | None = None
-    """Frames a second, in place of what the file says."""
+    """Frames per second, in place of the value in the file."""
     start: float | None = None
-    """Where to begin in the video, s."""
+    """Start of the part of the video that is used, s."""
     end: float | None = None
-    """Where to end in the video, s."""
+    """End of the part of the video that is used, s."""
     person: tuple[int, ...] = ()
-    """Numbers of the people that are estimated, all without it. The others are still
-    left out of the map."""
+    """Numbers of the people that are estimated; all without it. The others are still
+    masked in the map."""
 
     def check_known(self) -> None:
-        """Refuses what cannot be; the settings that hold these call it.
+        """Refuses impossible values and combinations.
 
         **Raises:** `ValueError` that names the option, what was found and what was
         expected.

@@ -1,4 +1,4 @@
-"""How a motion model is trained."""
+"""Settings of the training of a motion model."""
 
 import dataclasses
 from typing import Literal
@@ -14,69 +14,73 @@ _MAY_BE_0 = (
 
 @dataclasses.dataclass(frozen=True)
 class MotionTraining:
-    """How a motion model is trained; `MotionTraining.paper()` is section 3.4."""
+    """Training of a motion model; `MotionTraining.paper()` is section 3.4."""
 
     network: Literal["metric", "paper"] = "metric"
-    """Metric joint positions over a window, or the paper's network on joint angles."""
+    """`metric`: network on joint positions in metres over a window; `paper`: the
+    paper's network on joint angles."""
     past: int = 16
-    """Frames before the predicted one that a window holds."""
+    """Past frames in a window."""
     future: int = 1
-    """1 if displacement may depend on the posture of the frame it leads to, else 0."""
+    """1 if the window includes the frame that the displacement leads to, else 0."""
     width: tuple[int, ...] = (320, 256, 256)
     """Units of the hidden layers."""
     members: int = 1
-    """Networks of which displacement is the mean."""
+    """Number of networks whose mean predicts displacement."""
     seed: int = 0
-    """Initial weights and every random choice follow from it."""
+    """Random seed of initial weights and of all random choices."""
     epochs: int = 80
-    """Each has as many windows as the data have: one for every 120 Hz starting point,
-    or as many as do not overlap."""
+    """Epochs; each draws as many windows as the data have 120 Hz starting points, or as
+    many as do not overlap (`sliding`)."""
     validate_every: int = 1
-    """Epochs from one look at the validation subjects to the next."""
+    """Epochs between two evaluations on the validation subjects."""
     segments: int = 128
-    """Segments in a batch; each is of another person, speed and noise level."""
+    """Segments in a batch, each of another person, speed and noise level."""
     steps: int = 16
-    """Successive windows of a segment."""
+    """Successive windows in a segment."""
     learning_rate: float = 1.5e-3
-    """Adam's at the start; falls to nothing along a cosine if `decay`."""
+    """Adam's initial learning rate."""
     decay: bool = True
-    """Whether the learning rate falls."""
+    """Whether the learning rate decays to 0 along a cosine."""
     weight_decay: float = 1e-4
-    """AdamW's."""
+    """Weight decay of AdamW."""
     clip: float | None = 1.0
-    """Largest entry of a gradient; not limited without it."""
+    """Largest magnitude of a gradient's entry. Without it, gradients are not
+    clipped."""
     averaging: float = 0.998
-    """Share that the running mean of weights, which is kept, has of itself; 0: none."""
+    """Decay of the exponential moving average of the weights, which is what is saved;
+    0: no average."""
     slope_weight: float = 2.0
     """Penalty on the squared bias of displacement per noise level: bias is scale."""
     segment_weight: float = 0.5
     """Penalty on the mean error over a segment, beside that of single steps."""
     drift_deg: float = 10.0
-    """Largest standard deviation of the slow error of joint angles, degrees."""
+    """Largest standard deviation of the correlated error of joint angles, degrees."""
     white_deg: float = 0.6
     """Largest standard deviation of the white error of joint angles, degrees."""
     root_drift: float = 1.0
     """Largest error of the root's rotation as a share of the joints'."""
     clean_share: float = 0.3
-    """Share of segments without slow errors."""
+    """Share of segments without correlated errors, 0 to 1."""
     shape_sigma: float = 1.0
-    """Standard deviation of each component of β."""
+    """Standard deviation of each component of the β that are drawn."""
     strides: tuple[int, ...] = (3, 4, 4, 4, 5)
     """Steps through 120 Hz data, one drawn per segment: 4 is real speed."""
     run_weight: float = 2.0
-    """How often a window of running is drawn beside one of walking: runs are few."""
+    """Weight with which windows of running are drawn, relative to walking; they are
+    rare."""
     other_weight: float = 0.15
     """The same for all other motion, most of which is slow; 0 leaves it out."""
     mirror: bool = True
     """Whether half of the segments are mirrored."""
     sliding: bool = True
-    """Whether windows may overlap; the paper's do not. Each is then drawn by itself:
-    successive windows of a segment (`steps`) share frames."""
+    """Whether windows may overlap; the paper's do not. Windows that do not overlap are
+    drawn one by one (`steps` 1)."""
 
     def __post_init__(self):
         ranges = dict.fromkeys(_SHARES.split(), SHARE)
         ranges |= dict.fromkeys(_MAY_BE_0.split(), NOT_NEGATIVE)
-        # What a random key is made of.
+        # The range of JAX's random keys.
         check(self, ranges | {"seed": (-(2**63), 2**63 - 1)})
         if not self.sliding and self.steps > 1:
             raise ValueError(

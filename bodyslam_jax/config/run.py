@@ -15,23 +15,25 @@ class Config(Known):
     """Settings of a whole run, one class per stage."""
 
     body_model: str | None = None
-    """Body model file or folder; without it the default body or the one found."""
+    """Body model file or folder. Without it, the body model found on this machine or
+    the one that ships (`bodyslam doctor`)."""
     motion_model: str | None = None
-    """Motion model's weights: a file, or `paper` for the paper's network, which ships
-    too; without it the default one."""
+    """Motion model: a weights file, or `paper` for the paper's network. Without it, the
+    default model; both ship."""
     people: bool = True
-    """Whether people are estimated; if not, cameras and map stay without a unit."""
+    """Whether people are estimated. Without them cameras and map have no metric
+    scale."""
     detect: Literal["auto", "built-in", "yolox", "none"] = "auto"
-    """Which networks find people in the images where no keypoints are given: those that
-    ship (also `auto`), YOLOX and RTMPose, which are fetched once, or none."""
+    """Networks that detect people where no keypoints are given: `built-in` (also
+    `auto`) ship, `yolox` (YOLOX and RTMPose) are downloaded once."""
     offline: bool = False
-    """Whether the network is never used: models must be there already."""
+    """Whether downloads are forbidden; networks must then be present already."""
     device: Literal["cpu", "gpu"] | None = None
-    """Where it is computed; without it where JAX finds best, a GPU if there is one."""
+    """Device that computes. Without it JAX's default: a GPU if there is one."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
     uncertainty: bool = True
-    """Whether standard deviations, and what is not determined, are worked out."""
+    """Whether standard deviations and unobservable directions are computed."""
     detection: Detect = Detect()
     association: Association = Association()
     tracking: Tracking = Tracking()
@@ -39,14 +41,14 @@ class Config(Known):
     people_fit: PeopleFit = PeopleFit()
     weights: GraphWeights = GraphWeights()
     solver: Literal["structured", "adam", "optimistix_lm", "jaxopt_lm"] = "structured"
-    """Second order with the problem's structure; the paper's 200 + 100 first-order
-    steps; or dense Levenberg-Marquardt of optimistix or jaxopt, for small problems."""
+    """Solver: structured Levenberg-Marquardt; the paper's 200 + 100 steps of Adam; or
+    dense Levenberg-Marquardt of optimistix or jaxopt, for small problems."""
     motion_coupling: Literal["frozen", "refreshed"] = "refreshed"
     """When motion is predicted: once, before the joint solve, or again after each
     accepted step. No derivative of the prediction enters the solve."""
     smoothing_hz: float | None = 6.0
-    """People's motion faster than this is taken for noise in the result, Hz; nothing
-    is smoothed without it."""
+    """Cut-off frequency above which people's motion in the result is smoothed as noise,
+    Hz. Without it, nothing is smoothed."""
 
     def __post_init__(self):
         check(self, RANGES)
@@ -54,9 +56,9 @@ class Config(Known):
 
     @classmethod
     def paper(cls) -> "Config":
-        """Section 3.6 of the paper: its weights, its motion network of section 3.4,
-        whose predictions are measurements that stay as they are, and its first-order
-        schedule. docs/differences_from_the_paper.md says what differs all the same."""
+        """Sections 3.4 and 3.6 of the paper: its weights, its motion network, whose
+        predictions are constant measurements, and its first-order schedule. For what
+        still differs see docs/differences_from_the_paper.md."""
         return cls(
             motion_model="paper",
             motion_coupling="frozen",

@@ -1,97 +1,106 @@
-"""What the terms of the graph are trusted to."""
+"""Standard deviations and robust losses of the graph's factors."""
 
 import dataclasses
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, check
 
 _CORRELATED = 0.999999
-"""Errors that last for ever would not be told from what is measured."""
+"""Largest AR(1) coefficient: constant errors would be indistinguishable from the
+measured quantity."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraphWeights:
-    """What each measurement is trusted to: standard deviations, and losses in them.
+    """Standard deviations of the graph's measurements, and scales of robust losses.
 
-    The defaults are inverse covariances of what is measured, with errors that last
-    taken for what they are. `GraphWeights.paper()` has the paper's λ's.
+    The defaults are measured; temporally correlated errors are modelled as AR(1).
+    `GraphWeights.paper()` has the paper's λ's.
     """
 
     pixel_sigma: float | None = None
-    """Static points in the joint graph, px. Without it, what bundle adjustment found
-    of the tracks at hand."""
+    """Standard deviation of static points in the joint graph, px. Without it, the value
+    that bundle adjustment estimated from the tracks."""
     landmark_loss: float = 1.5
-    """Cauchy scale, in standard deviations of a static point."""
+    """Scale of the Cauchy loss on static points, in standard deviations."""
     keypoint_sigma: float | None = None
-    """Keypoints of confidence 1, px; divided by the confidence. Without it, the
-    detector's usual error in metres of the body, as it appears at its distance."""
+    """Standard deviation of a keypoint of confidence 1, px; divided by the confidence.
+    Without it, the usual error of detectors in metres on the body, projected at the
+    person's depth."""
     keypoint_inflation: float = 2.5
-    """Factor on the detector's usual error at 30 fps; grows with the root of the frame
-    rate. Errors last for about 0.15 s: taken for independent, keypoints stretch the
-    body by some per cent."""
+    """Factor on the usual error of detectors at 30 fps; grows with the square root of
+    the frame rate. Keypoint errors are correlated over about 0.15 s; modelled as
+    independent, they stretch the body by some per cent."""
     keypoint_loss: float = 4.0
-    """Geman-McClure scale, in standard deviations of one keypoint, before the
-    inflation. With `keypoint_sigma` in those of a keypoint of confidence 1, for all
-    keypoints: the same distance in px, as in Bogo et al. (100 px)."""
+    """Scale of the Geman-McClure loss, in standard deviations of a keypoint before the
+    inflation. With `keypoint_sigma`, in those of a keypoint of confidence 1 for all
+    keypoints: one distance in px, as in Bogo et al. (100 px)."""
     step_error: float = 0.05
-    """Error that all of a person's steps share, as a share of them: people differ, and
-    postures are wrong for seconds. Without it steps would outvote the body's size."""
+    """Standard deviation of the error common to all steps of a person, relative:
+    people differ, and posture errors last for seconds. At 0, steps outweigh the
+    body's size."""
     fitted_step_error: float = 0.25
-    """The same where bodies are fitted to keypoints: one view hardly shows legs that
-    swing towards it, and steps come out short."""
+    """The same where bodies are fitted to keypoints: one view hardly observes legs that
+    swing towards it, so that steps come out short."""
     motion_sigma: float | None = None
-    """Instead of the motion model's own covariance, m a frame."""
+    """Standard deviation of a displacement, m per frame of 1/30 s, in place of the
+    motion model's own covariance."""
     motion_in_legs: bool = True
-    """Whether displacements are compared in lengths of the person's leg. In metres a
-    smaller person in a smaller world has smaller errors, and the estimate shrinks."""
+    """Whether displacements are compared in lengths of the person's leg. In metres,
+    errors shrink with the person and the world, which biases the scale downwards."""
     motion_correlation: float = 0.8
-    """Of the motion model's errors in successive frames."""
+    """AR(1) coefficient of the motion model's errors per frame of 1/30 s."""
     posture_sigma: float = 0.2
-    """Regressed joint rotations, stationary, rad per axis (published: 19 to 20 degrees
-    in all three)."""
+    """Stationary standard deviation of regressed joint rotations, rad per axis
+    (published: 19 to 20 degrees over all three axes)."""
     posture_correlation: float = 0.99
-    """Of their errors in successive frames at 30 fps: much of an error stays for the
-    whole video, and what changes lasts for seconds. Published errors of joints, 98 mm
-    and 19.9 m/s² (HMR2 on EMDB), go with 0.987."""
+    """AR(1) coefficient of regressed joint rotations' errors per frame of 1/30 s.
+    Published errors of joints, 98 mm and 19.9 m/s² (HMR2 on EMDB), correspond to
+    0.987."""
     posture_predicted: bool = False
-    """Whether postures are held to the motion model's prediction instead, in frames
-    that have one."""
+    """Whether postures are held to the motion model's prediction, in frames that have
+    one, in place of the regressed posture."""
     shape_sigma: float = 0.4
-    """Regressed β; one measurement a person, as the regressor errs alike in all. Where
-    bodies are fitted to keypoints it holds β to the fit, and errors are those of 1."""
+    """Standard deviation of regressed β, one measurement per person because a
+    regressor's error is common to all frames. Where bodies are fitted to keypoints, it
+    holds β to the fit, whose reported standard deviation is the prior's, 1."""
     shape_each_frame: bool = False
-    """Whether each frame counts as a measurement of β of its own."""
+    """Whether β of each frame is a measurement of its own."""
     orientation_sigma: float | None = None
-    """The motion model's prediction of how far the person turns in a frame of 1/30 s,
-    rad per axis; not used without it."""
+    """Standard deviation of the motion model's predicted turn in a frame of 1/30 s, rad
+    per axis. Without it, the prediction is not used."""
     root_sigma: float | None = 0.12
-    """Regressed orientation, stationary, rad per axis; not used without it."""
+    """Stationary standard deviation of regressed root orientation, rad per axis.
+    Without it, the orientation is not used."""
     root_correlation: float = 0.99
-    """Of its errors in successive frames at 30 fps."""
+    """AR(1) coefficient of regressed root orientation's and position's errors per frame
+    of 1/30 s."""
     root_direction: float = 0.015
-    """Regressed place of the person across the line of sight, of the distance; used
-    where there are no keypoints. Errors last as those of orientation do."""
+    """Standard deviation of the regressed root position across the line of sight,
+    relative to the distance; used where there are no keypoints."""
     root_depth: float = 0.07
     """The same along the line of sight."""
     root_turning: float | None = 0.015
-    """Change of the person's turning in a frame of 1/30 s, rad; free without it."""
+    """Standard deviation of a person's angular acceleration, rad per squared frame of
+    1/30 s. Without it, turning is not constrained."""
     upright_sigma: float | None = None
-    """How far the trunk of somebody on their feet leans from where it points on
-    average, rad in a frame of 1/30 s; free without it. 0.1 suits people who walk:
-    their pelvises sway by 0.05, for some five frames at a time."""
+    """Standard deviation of the trunk's lean of a standing person from its mean
+    direction, rad in a frame of 1/30 s; not constrained without it. 0.1 suits walkers:
+    their pelvis sways by 0.05 rad, correlated over some five frames."""
     root_smoothness: float | None = 0.02
-    """Change of the pelvis' step in a frame of 1/30 s, m; free without it. Real ones
-    are of 0.006 m; held to that, a camera that goes with the person would be thought to
-    move less, and the world to be smaller."""
+    """Standard deviation of the pelvis' acceleration, m per squared frame of 1/30 s;
+    not constrained without it. Real ones are 0.006; that tight, a camera that follows
+    the person is estimated to move less and the world to be smaller."""
     ground_sigma: float | None = 0.04
-    """How far the map's ground may be from what people stand on, m: one error for the
-    whole sequence. Without it, people need not stand on anything."""
+    """Standard deviation of the height between the map's ground and the ground that
+    people stand on, m: one error for the whole sequence. Without it, people need not
+    stand on anything."""
 
     def __post_init__(self):
         ranges = {
             name: (0, _CORRELATED) for name in vars(self) if "correlation" in name
         }
         free = ("step_error", "fitted_step_error")
-        # Deviations say nothing then; losses, factors and shares would be no numbers.
+        # An infinite standard deviation disables a term; other infinities are errors.
         never = ("correlation", "inflation", "loss", "error", "each", "predicted")
         never += ("legs",)
         silent = [x for x in vars(self) if not any(word in x for word in never)]

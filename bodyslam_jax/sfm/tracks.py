@@ -42,8 +42,8 @@ CELLS = 8
 WINDOW = 21
 """Side of the window that Lucas--Kanade follows, px (OpenCV's default)."""
 _EPIPOLAR_LIMIT = 1.5
-"""Distance from the epipolar line beyond which a point is dropped, px: 3 σ of an assumed
-tracking noise of 0.5 px at 640x480; not scaled with the image."""
+"""Distance from the epipolar line beyond which a point is dropped, px: 3 σ of an
+assumed tracking noise of 0.5 px at 640x480; not scaled with the image."""
 _RIGID_GAP = 10
 """Frames over which points must fit one rigid motion."""
 _PERSON_MARGIN = 0.06
