@@ -1,7 +1,16 @@
-"""What every test stands on: 64-bit, strict promotion, no silent recompiles."""
+"""What every test stands on: 64-bit, strict promotion, programs shared and dropped.
 
+Most of the suite's time is compiling. The tests of a file run in one process
+(`--dist loadfile`), so that they share what is traced; processes share machine code
+through JAX's persistent cache; what a file compiled is dropped at its end, which keeps
+each process below 2 GB.
+"""
+
+import gc
 import os
+from pathlib import Path
 
+import equinox as eqx
 import jax
 import jaxlib.version
 import pytest
@@ -15,6 +24,19 @@ if jaxlib.version.__version__.startswith("0.10."):
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    folder = Path(__file__).parents[1] / ".pytest_cache" / "jax"
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_of_one_module():
+    """Drops compiled programs at the end of each test file: memory stays bounded."""
+    yield
+    eqx.clear_caches()
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture
@@ -28,7 +50,7 @@ def quick_compilation():
     """For modules whose programs run once: compiling is what takes their time.
 
     With the older emitters, unoptimised code once took the wrong branch of a `where`
-    (`bodyslam_jax/compilation.py`): where a test fails without sense, leave this out.
+    (jaxlib 0.10.2): where a test fails without sense, leave this out.
     """
     jax.config.update("jax_disable_most_optimizations", True)
     yield
