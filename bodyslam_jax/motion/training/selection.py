@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion.capture.retarget import Trial
+from bodyslam_jax.motion.function_network import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
@@ -65,10 +66,13 @@ def calibrated(
         spread = np.linalg.cholesky(error.T @ error / len(error) + 1e-10 * np.eye(3))
         new = jnp.asarray(spread, jnp.float32)
         return eqx.tree_at(lambda m: m.network.spread, model, new)
-    if not isinstance(model.network, MetricNetwork):
+    if not isinstance(model.network, MetricNetwork | FunctionNetwork):
         return model
     covariance = np.concatenate([r.covariance[r.valid] for r in runs]).astype(float)
     nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1) / 3
+    if isinstance(model.network, FunctionNetwork):
+        spread = model.network.spread * float(np.sqrt(nees.mean()))
+        return eqx.tree_at(lambda m: m.network.spread, model, spread)
     factor = 0.5 * np.log(nees.mean())
     bias = lambda m: [layers[-1].bias for layers in m.network.spreads]
     shift = jnp.asarray([factor] * 3 + [0.0] * 3, jnp.float32)
