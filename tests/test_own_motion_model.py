@@ -1,4 +1,4 @@
-"""A motion model of the user's own: a function and parameters, trained and in a graph."""
+"""A motion model of the user's own: function and parameters, trained and in a graph."""
 
 import dataclasses
 

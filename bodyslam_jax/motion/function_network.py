@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, PyTree
 from bodyslam_jax.motion.network import Guess, MotionNetwork, Window
 
 Step = Callable[[Any, Window], Any]
-"""`step(parameters, window)` of one window, without batch axes: the displacement of the
-pelvis from k-1 to k in H_{k-1} (3,), m, and its standard deviation, m, one number or one
-for each axis; or a whole `Guess`."""
+"""`step(parameters, window)` of one window, without batch axes: the displacement of
+the pelvis from k-1 to k in H_{k-1} (3,), m, and its standard deviation, m, one number
+or one for each axis; or a whole `Guess`."""
 
 
 class FunctionNetwork(MotionNetwork):
