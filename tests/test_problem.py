@@ -237,7 +237,7 @@ def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
     def bytes_of(far):
         """What the factorisation keeps, and what is counted for those that go last."""
         longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
-        monkeypatch.setattr("bodyslam_jax.graph.layout.choose_lasting", longest)
+        monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
         monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", FAR)
         problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
         assert problem.layout.lasting == far

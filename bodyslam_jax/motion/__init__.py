@@ -1,6 +1,6 @@
-"""The learnt prior on human motion: from postures to how many metres the body moved.
+"""The motion model: displacement of the body in metres, from postures.
 
-Section 3.4 of the paper, made robust to the errors of estimated postures.
+Section 3.4 of the paper, made robust to errors of estimated postures.
 """
 
 from bodyslam_jax.config import MotionTraining as MotionTraining

@@ -1,4 +1,4 @@
-"""Which weights are kept, and how large their covariance is: judged on validation."""
+"""Selection of weights and calibration of covariances on validation subjects."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ DRIFTS = (0.0, 5.0, 9.0)
 """Slow joint-angle errors (degrees) at which a model is judged."""
 
 TARGETS = (0.10, 0.13, 0.18)
-"""Ratio of error to step that is hoped for at each of them."""
+"""Target ratio of error to displacement at each of them."""
 
 
 def validated(
@@ -38,25 +38,24 @@ def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
 
 
 def kept(history: Float[np.ndarray, "e 7"], drift_deg: float) -> int | None:
-    """The epoch, from 0, whose weights were kept; none if none was judged."""
+    """The epoch, from 0, whose weights were kept; `None` without validation."""
     scores = np.array([score(row, drift_deg) for row in history[:, 1:]])
     return None if np.isnan(scores).all() else int(np.nanargmin(scores))
 
 
 def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
-    """What validation prefers: small errors and slopes near 1 at noise as trained."""
-    seen = np.array(DRIFTS) <= drift_deg
+    """Lower is better: relative errors and slopes, at the drifts used in training."""
+    trained = np.array(DRIFTS) <= drift_deg
     errors, bias = row[:3] / TARGETS, np.abs(row[3:] - 1)
-    return float(np.mean(errors[seen]) + 5 * np.mean(bias[seen]))
+    return float(np.mean(errors[trained]) + 5 * np.mean(bias[trained]))
 
 
 def calibrated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> MotionModel:
-    """Sizes the covariance so that normalised errors have mean square 1.
+    """Scales the covariance to a mean square of whitened errors of 1, over all drifts.
 
-    Over all noise levels together: the network's own covariance says how they differ.
-    The paper's network has none; its constant one is measured here.
+    The paper's network predicts no covariance; its constant one is measured here.
     """
     runs = [run_trials(model, body, trials, d) for d in DRIFTS]
     error = np.concatenate([(r.predicted - r.true)[r.valid] for r in runs]).astype(

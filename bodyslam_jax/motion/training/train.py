@@ -1,4 +1,4 @@
-"""Training: one `lax.scan` per epoch, resumed after a kill, the same for one seed."""
+"""Training: one `lax.scan` per epoch; resumable and deterministic in the seed."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ _MEASURED = 20
 
 
 class Progress(eqx.Module):
-    """All that a checkpoint must hold to continue as if nothing had happened."""
+    """The state of a training run, as checkpoints hold it."""
 
     network: MotionNetwork
     average: MotionNetwork
