@@ -42,7 +42,7 @@ class Prediction(eqx.Module):
     rotation: Float[Array, "t 3"]
     """Rotation vector of C_{H_{k-1}}^T C_{H_k}, from frames up to k-1, rad."""
     valid: Bool[Array, " t"]
-    """Whether all frames that row k needs are present; else its values are undefined."""
+    """Whether all frames that row k needs are present; else values are undefined."""
 
 
 @jax.jit
