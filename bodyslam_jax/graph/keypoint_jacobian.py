@@ -87,9 +87,9 @@ def carried_by_joints(
     offset = np.array([DETECTOR_BIAS.get(n, (0.0, 0.0, 0.0)) for n in names])
     vertex = body.picks[pick]
     joint = jnp.where(skinned[:, None], body.skin_joint[vertex], own[:, None])
-    alone = np.arange(body.skin_weight.shape[1]) == 0
+    first = np.arange(body.skin_weight.shape[1]) == 0
     weight = jnp.where(
-        skinned[:, None], body.skin_weight[vertex], jnp.asarray(alone, dtype)
+        skinned[:, None], body.skin_weight[vertex], jnp.asarray(first, dtype)
     )
     features = body.pose_dirs.shape[-1]
 

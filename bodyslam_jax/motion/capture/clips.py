@@ -45,7 +45,7 @@ class Clip:
     phase: int = 0
     """Which of the interleaved decimations of one recording this is."""
     phases: int = 1
-    """How many of them there are, so that they can be put together again."""
+    """How many of them there are, for `interleave`."""
 
 
 def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
