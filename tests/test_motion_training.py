@@ -438,7 +438,7 @@ def test_two_devices_agree_with_one(tmp_path):
 
 @pytest.mark.slow
 def test_kill_9_loses_nothing(tmp_path, data):
-    """The command, killed in its second epoch and resumed, against one that ran through."""
+    """The command, killed in its second epoch and resumed, against a complete run."""
     argv = [sys.executable, "-m", "bodyslam_jax", "train-motion", str(data), *OPTIONS]
     argv[-1:] = ["4", "--epochs", "40"]
     environment = os.environ | {"BODYSLAM_CACHE": str(tmp_path / "cache")}
