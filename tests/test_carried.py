@@ -1,4 +1,4 @@
-"""Whose steps do not carry them has no say in how large the scene is."""
+"""People whose displacement is not that of their steps do not determine the scale."""
 
 import dataclasses
 
@@ -22,9 +22,9 @@ from bodyslam_jax.types import ScaleStart
 T, FPS, SCALE = 60, 20.0, 3.0
 
 
-def made(moves, says, noise=0.0):
-    """Somebody who moves along x at `moves` m/s where the posture says `says`, and a
-    camera that goes to and fro."""
+def made(moves, predicted, noise=0.0):
+    """A person who moves along x at `moves` m/s with a prediction of `predicted`, and a
+    camera that moves to and fro."""
     rng = np.random.default_rng(0)
     state = scenes.truth(rng, frames=T, landmarks=8)
     time = np.arange(T) / FPS
@@ -40,7 +40,7 @@ def made(moves, says, noise=0.0):
         (jnp.asarray(cameras), jnp.asarray(roots)),
     )
     step = np.zeros((T, 3))
-    step[:, 0] = says / FPS
+    step[:, 0] = predicted / FPS
     step[0] = np.nan
     one = motion.Prediction(
         translation=jnp.asarray(step),
@@ -49,49 +49,51 @@ def made(moves, says, noise=0.0):
         rotation=jnp.zeros((T, 3)),
         valid=jnp.ones(T, bool).at[0].set(False),
     )
-    seen = jax.tree.map(lambda x: x[None], one)
-    return state, seen
+    prediction = jax.tree.map(lambda x: x[None], one)
+    return state, prediction
 
 
-def found(state, seen, scale=SCALE, there=None):
-    there = np.ones((1, T), bool) if there is None else there
-    return carried(state, seen, there, scale, FPS)
+def found(state, prediction, scale=SCALE, present=None):
+    present = np.ones((1, T), bool) if present is None else present
+    return carried(state, prediction, present, scale, FPS)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.7, 1.4, 3.0])
-def test_who_moves_as_they_step_is_not_carried(speed):
+def test_people_who_walk_are_not_carried(speed):
     assert found(*made(speed, speed, noise=0.05)) == {}
-    # Steps and sizes that are off by a half are an error, no other cause.
+    # An error of a half in steps or sizes is not taken for another cause.
     assert found(*made(speed, 1.5 * speed, noise=0.05)) == {}
     assert found(*made(speed, 0.6 * speed, noise=0.05)) == {}
 
 
-@pytest.mark.parametrize("moves, says", [(0.0, 1.4), (1.2, 0.0), (4.0, 0.5), (1, -1)])
-def test_treadmills_wheels_and_who_is_carried_are_told(moves, says):
-    (told,) = found(*made(moves, says, noise=0.05)).items()
-    assert told[0] == 0
-    assert told[1] == pytest.approx((moves, abs(says)), abs=0.2)
+@pytest.mark.parametrize(
+    "moves, predicted", [(0.0, 1.4), (1.2, 0.0), (4.0, 0.5), (1, -1)]
+)
+def test_people_on_treadmills_on_wheels_or_carried_are_found(moves, predicted):
+    (one,) = found(*made(moves, predicted, noise=0.05)).items()
+    assert one[0] == 0
+    assert one[1] == pytest.approx((moves, abs(predicted)), abs=0.2)
     (line,) = lines_of_carried({0: (1.2, 0.1)})
-    assert "person 0 moves at 1.2 m/s where the posture says 0.1" in line
+    assert "person 0 moves at 1.2 m/s where their posture predicts 0.1" in line
 
 
-def test_nothing_is_said_of_who_is_hardly_there():
-    there = np.zeros((1, T), bool)
-    there[0, ::2] = True
-    assert found(*made(0.0, 1.4), there=there) == {}
-    state, seen = made(0.0, 1.4)
-    assert carried(state, seen, np.ones((1, T), bool), SCALE, 2.0 * T) == {}
+def test_nothing_is_concluded_from_few_frames():
+    present = np.zeros((1, T), bool)
+    present[0, ::2] = True
+    assert found(*made(0.0, 1.4), present=present) == {}
+    state, prediction = made(0.0, 1.4)
+    assert carried(state, prediction, np.ones((1, T), bool), SCALE, 2.0 * T) == {}
 
 
-def test_whoever_is_carried_tells_no_scale_and_has_no_term():
-    state, seen = made(1.4, 1.4)
-    assert scale_start(state, seen, None).motion == pytest.approx(SCALE, rel=0.05)
-    start = scale_start(state, seen, None, without=(0,))
+def test_displacements_of_carried_people_have_no_weight():
+    state, prediction = made(1.4, 1.4)
+    assert scale_start(state, prediction, None).motion == pytest.approx(SCALE, rel=0.05)
+    start = scale_start(state, prediction, None, without=(0,))
     assert start == ScaleStart()
-    path = scale_start(state, seen, None, path=2.0)
+    path = scale_start(state, prediction, None, path=2.0)
     assert path.without_motion().value == pytest.approx(2.0)
     body, weights = scenes.body_model(), dataclasses.replace(GraphWeights())
-    with_term = motion_factor(seen, state.shapes, body, weights)
-    without = motion_factor(seen, state.shapes, body, weights, without=(0,))
+    with_term = motion_factor(prediction, state.shapes, body, weights)
+    without = motion_factor(prediction, state.shapes, body, weights, without=(0,))
     assert np.abs(with_term.whitening).max() > 0
     np.testing.assert_array_equal(without.whitening, 0.0)

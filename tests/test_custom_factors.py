@@ -43,7 +43,7 @@ class Position(g.FrameFactor):
 
 
 class Declared(Position):
-    """Says itself with what a frame weighs nothing."""
+    """Declares the value with which a frame has no weight."""
 
     padding = {"trust": 0.0}
 
@@ -123,7 +123,7 @@ def best_scale(state, place, weight):
         (Precision, WEIGHT**2),
     ],
 )
-def test_added_frames_weigh_nothing_whatever_a_field_is_called(kind, trust):
+def test_added_frames_have_no_weight_whatever_the_name_of_a_field(kind, trust):
     state, place, free = made_up()
     factor = kind(place=place, trust=jnp.full(T, trust))
     problem = g.make_problem([factor], state, free=free)
@@ -159,7 +159,7 @@ def test_a_problem_made_within_jit_is_the_same():
     np.testing.assert_allclose(found, best_scale(state, place, WEIGHT), rtol=1e-9)
 
 
-def test_what_is_not_defined_in_added_frames_is_not_evaluated_there():
+def test_a_factor_is_not_evaluated_in_added_frames():
     """Values and derivatives of all that it is made of are numbers."""
     state, _, free = made_up()
     factor = Speed(jnp.arange(float(T)) / 30.0, jnp.ones((T, 3)))
@@ -209,7 +209,7 @@ def test_factors_that_added_frames_would_change_are_refused(kind, message):
     assert "\n" not in str(refused.value)
 
 
-def test_terms_of_ones_own_can_be_left_out():
+def test_own_factors_can_be_disabled():
     state, place, free = made_up()
     factors = [Position(place, jnp.full(T, WEIGHT)), Declared(place, jnp.ones(T))]
     problem = g.make_problem(factors, state, free=free)

@@ -56,7 +56,7 @@ def test_lifted_residual_has_the_loss_as_norm_and_its_gradient(loss, rng):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_what_is_an_outlier_by_its_likelihood_pulls_no_more(dtype):
+def test_blake_zisserman_ignores_outliers(dtype):
     share, area, sigma = 0.03, 160.0**2, 0.7
     c2 = 2 * np.log((1 - share) * area / (2 * np.pi * sigma**2 * share))
     loss = g.BlakeZisserman(jnp.asarray(c2**0.5, dtype))
@@ -74,7 +74,7 @@ def test_what_is_an_outlier_by_its_likelihood_pulls_no_more(dtype):
 
 
 @pytest.mark.parametrize("c", [0.3, 1.5, 4.5, 9.0])
-def test_small_errors_cost_what_they_should_in_single_precision(c):
+def test_costs_of_small_errors_are_exact_in_single_precision(c):
     s = jnp.array([0, 1e-12, 1e-6, 1e-4, 0.1, 0.9999, 1.0, 1.1, 30.0, 3e38])
     single = s.astype(jnp.float32)
     loss = g.BlakeZisserman(jnp.asarray(c, jnp.float32))
@@ -130,7 +130,7 @@ def test_keypoint_curvature_is_the_second_derivative(rng):
     assert np.allclose(single[0], turns, atol=1e-5)
 
 
-def test_curvature_of_keypoints_is_what_residuals_bend(rng):
+def test_curvature_of_keypoints_is_the_second_order_term(rng):
     problem, state, _ = make(people=1, frames=3, noise=15.0)
     normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
     state = state.retract(
@@ -160,7 +160,7 @@ def test_curvature_of_keypoints_is_what_residuals_bend(rng):
 
 
 def every_factor(rng):
-    """Each class that there is, on a state whose camera has a lens that distorts."""
+    """One factor of each class, on a state with lens distortion."""
     state = scenes.truth(rng, frames=4, people=1, landmarks=8)
     lens = jnp.array([0.1, -0.05, 0.002, -0.001])
     intrinsics = jnp.concatenate([state.intrinsics, lens])
@@ -208,7 +208,7 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
 
 
 def along(factor, state, step):
-    """The derivative along a step by the closed form, if there is one."""
+    """The derivative along a step by the closed form; `None` without one."""
     if not isinstance(factor, g.FrameFactor):
         return None
     found = factor.jacobians(state)
@@ -253,8 +253,8 @@ def test_posture_residual_of_correlated_errors_is_white(rng):
     assert abs(jnp.mean(whitened[0, 1:] * whitened[0, :-1])) < 0.01
 
 
-def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
-    """Neither its placeholder, nor, in derivatives, its infinite deviation."""
+def test_a_missing_joint_does_not_affect_the_next_frame(rng):
+    """Neither its placeholder nor, in derivatives, its infinite sigma does."""
     state = scenes.truth(rng, 4, 1, 2)
     factor = g.BodyPosePrior(
         rotation=state.poses + 0.1,
@@ -282,12 +282,12 @@ def test_a_joint_that_is_missing_says_nothing_of_the_next_frame(rng):
     assert jnp.isfinite(by_sigma(factor.sigma)).all()
 
 
-def test_runs_start_anew_after_a_gap():
+def test_correlation_is_zero_after_a_gap():
     there = jnp.array([[True, True, False, True, True]])
     assert g.ar1_correlation(there, 0.9).tolist() == [[0.0, 0.9, 0.0, 0.0, 0.9]]
 
 
-def test_motion_residual_is_linear_in_scale_and_blind_to_the_world(rng):
+def test_motion_residual_is_linear_in_scale_and_invariant_to_the_world(rng):
     state = scenes.truth(rng, frames=4, people=1, landmarks=8)
     factor = scenes.person_factors(rng, state)[1]
     at = lambda s: factor.residual(eqx.tree_at(lambda x: x.scale, state, s))
@@ -332,7 +332,7 @@ def test_layout_holds_every_observation_once(rng, frames, landmarks, far, again)
     assert sorted(np.concatenate(seen)) == list(range(len(frame)))
 
 
-def test_a_place_that_is_seen_again_does_not_widen_the_band(rng):
+def test_a_loop_closure_does_not_widen_the_band(rng):
     frames, landmarks = 600, 3000
     state = scenes.truth(rng, frames=frames, people=0, landmarks=landmarks)
     seen = scenes.observations(rng, state, 25, again=True)

@@ -57,7 +57,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def walk():
-    """A made-up gait: orientation, body pose, shape, all frames there."""
+    """A synthetic gait: orientation, body pose, shape, all frames present."""
     clip = make_clip(T)
     poses = jnp.asarray(clip.poses, jnp.float64)
     shape = 0.3 * jnp.ones(10)
@@ -69,7 +69,7 @@ def run(model, body, *args):
     return predict(model, body, *args)
 
 
-def test_the_world_may_be_turned_at_will(model, body, walk, key):
+def test_predictions_are_invariant_to_rotations_of_the_world(model, body, walk, key):
     orientation, *rest = walk
     expected = run(model, body, orientation, *rest)
     for k in jax.random.split(key, 3):
@@ -79,7 +79,7 @@ def test_the_world_may_be_turned_at_will(model, body, walk, key):
             np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-def test_steady_turning_changes_no_step(model, body, walk):
+def test_steady_yaw_does_not_change_displacements(model, body, walk):
     orientation, *rest = walk
     expected = run(model, body, orientation, *rest)
     rate = jnp.full(T, -0.02)
@@ -91,7 +91,7 @@ def test_steady_turning_changes_no_step(model, body, walk):
     )
 
 
-def test_no_prediction_looks_ahead(model, body, walk):
+def test_predictions_are_causal(model, body, walk):
     orientation, body_pose, shape, present = walk
     before = run(model, body, orientation, body_pose, shape, present)
     k = T - 3
@@ -103,7 +103,7 @@ def test_no_prediction_looks_ahead(model, body, walk):
     assert not np.array_equal(after.body_pose[k + 1], before.body_pose[k + 1])
 
 
-def test_an_absent_frame_spoils_the_windows_that_hold_it(model, body, walk):
+def test_windows_with_an_absent_frame_are_not_valid(model, body, walk):
     orientation, body_pose, shape, present = walk
     found = run(model, body, orientation, body_pose, shape, present.at[2].set(False))
     full = np.arange(T) >= model.past
@@ -222,7 +222,7 @@ def test_weights_survive_a_file(tmp_path, key, kind):
         np.testing.assert_array_equal(a, b)
 
 
-def test_weights_take_half_the_space_and_hardly_lose(tmp_path, key, model):
+def test_weights_in_half_precision_are_as_good(tmp_path, key, model):
     save_motion_model(tmp_path / "whole.npz", model)
     save_motion_model(tmp_path / "half.npz", model, half=True)
     whole, half = (tmp_path / f"{n}.npz" for n in ("whole", "half"))
@@ -235,7 +235,7 @@ def test_weights_take_half_the_space_and_hardly_lose(tmp_path, key, model):
 
 
 def test_the_papers_network_ships_and_is_what_its_preset_uses(body):
-    """Trained on walks: it tells steps of people whom it has not seen."""
+    """It was trained on walks and predicts those of other people."""
     paper = load_motion_model(Config.paper().motion_model)
     assert isinstance(paper.network, PaperNetwork) and paper.past == 2
     assert paper.network.encoder[0].weight.shape == (154, 1024)
@@ -285,7 +285,7 @@ def test_weights_of_something_else_are_refused(tmp_path, model, body):
         check_compatible(dataclasses.replace(model, body="smpl"), body, 30.0)
 
 
-def test_weights_for_another_body_stop_a_run_at_its_door(
+def test_weights_for_another_body_are_refused_before_a_run(
     monkeypatch, capsys, tmp_path, model
 ):
     save_motion_model(tmp_path / "m.npz", dataclasses.replace(model, body="smpl"))
@@ -308,7 +308,7 @@ def test_weights_for_another_body_stop_a_run_at_its_door(
     assert len(told.splitlines()) == 1
 
 
-def test_the_shipped_weights_say_what_they_are(model):
+def test_the_shipped_weights_describe_themselves(model):
     about = json.loads(model.about)
     assert "CMU" in about["data"]
     assert about["licence"]
@@ -355,7 +355,7 @@ def test_scale_is_found_by_regression(outliers, tolerance):
 
 
 def test_the_scale_of_a_few_seconds_has_a_standard_error():
-    """Windows of two seconds are too few in them to tell; shorter ones are not."""
+    """It has too few windows of two seconds, but enough shorter ones."""
     found = [scale_from_motion(*made_up_walk(seed, 100, 0.1)) for seed in range(8)]
     assert all(0 < scale.standard_error < 0.2 for scale in found)
 
@@ -390,7 +390,7 @@ def test_evaluation_of_a_perfect_and_a_shrunken_model(body, model):
         evaluate_model(model, body, [make_clip(5)], 0.0)
 
 
-def test_correlation_of_errors_is_that_of_what_made_them():
+def test_correlation_of_errors_is_that_of_their_process():
     """Errors of an AR(1) process, with gaps whose neighbours do not count."""
     rng, rho, (c, t) = np.random.default_rng(0), 0.8, (60, 200)
     error = rng.normal(0, 1, (c, t, 3))
@@ -428,7 +428,7 @@ def shared():
 @pytest.mark.parametrize(
     ("drift_deg", "ratio"), [(0.0, 0.12), (5.0, 0.16), (9.0, 0.22)]
 )
-def test_the_shipped_model_on_subjects_it_has_not_seen(model, shared, drift_deg, ratio):
+def test_the_shipped_model_on_held_out_subjects(model, shared, drift_deg, ratio):
     clips = [c for c in read_motion(shared / "cmu_locomotion.npz") if c.split == "val"]
     found = evaluate_model(model, load_body_model(), clips, drift_deg, seeds=2)["all"]
     assert found["ratio"] < ratio

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def make_clip(t=50, fps=30.0, seed=0, **changes):
-    """A smooth made-up motion that walks along z."""
+    """A smooth synthetic motion along z."""
     rng = np.random.default_rng(seed)
     time = np.arange(t) / fps
     size, shift = rng.normal(0, 0.3, (24, 3)), rng.uniform(0, 6, (24, 3))
@@ -76,7 +76,7 @@ def write_cmu(path, clips, **changes):
 
 
 def write_amass(path, t=50, rate=120.0, key="mocap_framerate", **changes):
-    """As AMASS has it: z is up, which root orientations tell too."""
+    """A file like AMASS's: z is up, also in root orientations."""
     rng = np.random.default_rng(0)
     poses = rng.normal(0, 0.1, (t, 156))
     poses[:, 0] += np.pi / 2
@@ -281,7 +281,7 @@ def test_resampling_keeps_exact_frames_and_interpolates_turns():
     np.testing.assert_allclose(at30.poses[:, 4, 0], 2.5 * np.arange(31) / 30, atol=1e-5)
 
 
-def test_phases_are_put_together_again():
+def test_phases_are_merged():
     dense = make_clip(83, fps=120.0)
     parts = [
         dataclasses.replace(

@@ -65,9 +65,7 @@ LYING[:, 2] = np.pi / 2  # the root's y axis points along the world's -x
         ({"poses": LYING}, r"mean up is \[-1.0, 0.0, 0.0\]; expected a person who"),
     ],
 )
-def test_a_sequence_that_tells_no_leg_is_passed_over(
-    tmp_path, caplog, changes, message
-):
+def test_a_sequence_without_leg_length_is_skipped(tmp_path, caplog, changes, message):
     file = tmp_path / "s" / "a.npz"
     write_amass(file, **changes)
     for path in (file, tmp_path):
@@ -89,19 +87,19 @@ def test_a_sequence_that_tells_no_leg_is_passed_over(
         (1.0, 49, r"joints \(49, 24, 3\); expected \(50, 24, 3\)"),
     ],
 )
-def test_joints_that_are_none_are_one_line(tmp_path, tall, factor, frames, message):
+def test_implausible_joints_are_one_line(tmp_path, tall, factor, frames, message):
     arrays = tall[0] | {"joints": factor * tall[0]["joints"][:frames]}
     write_amass(tmp_path / "s" / "a.npz", **arrays)
     with pytest.raises(ValueError, match=f"a.npz: {message}"):
         read_motion(tmp_path)
 
 
-def test_joints_of_another_skeleton_are_left_aside(tmp_path):
+def test_joints_of_another_skeleton_are_ignored(tmp_path):
     write_amass(tmp_path / "s" / "a.npz", joints=np.zeros((50, 22, 3)))
     assert read_motion(tmp_path)[0].leg_length == pytest.approx(0.8, abs=0.03)
 
 
-def test_only_frames_with_somebody_in_them_are_motion(tmp_path, tall):
+def test_only_frames_with_a_person_are_motion(tmp_path, tall):
     arrays = {name: np.array(value) for name, value in tall[0].items()}
     there = np.ones(50, bool)
     there[[3, 40, 41]] = False
@@ -191,7 +189,7 @@ def test_channels_may_be_in_capitals(tmp_path, spelling):
     np.testing.assert_array_equal(second.trans, first.trans)
 
 
-def test_positions_are_told_by_their_names(tmp_path):
+def test_position_channels_are_recognised_by_name(tmp_path):
     rows = np.random.default_rng(0).uniform(-20, 20, (5, 30))
     write_bvh(tmp_path / "a.bvh", rows)
     rows[:, :3] = rows[:, [2, 0, 1]]
@@ -212,7 +210,7 @@ def test_positions_are_told_by_their_names(tmp_path):
         ("Frames: 5", "Frames: 0", "0 frames; expected one or more"),
     ],
 )
-def test_a_bvh_that_cannot_be_is_one_line(tmp_path, old, new, message):
+def test_an_invalid_bvh_is_one_line(tmp_path, old, new, message):
     write_bvh(tmp_path / "a.bvh", np.zeros((5, 30)))
     respelt(tmp_path / "a.bvh", old, new)
     with pytest.raises(ValueError, match=f"a.bvh: {message}"):

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_padding_at_the_end_changes_no_prediction():
-    """As the solver pads: 23 frames at 24 a second, then 7 in which nobody is there."""
+    """As the solver pads: 23 frames at 24 a second, then 7 without the person."""
     model, body = motion.load_motion_model(), load_body_model(dtype=jnp.float64)
     clock = motion.make_clock(np.arange(23) / 24.0, model.fps)
     rng = np.random.default_rng(0)

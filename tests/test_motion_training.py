@@ -243,7 +243,7 @@ def test_settings_that_train_nothing_are_one_line_and_exit_code_1(
     assert not list(tmp_path.iterdir())
 
 
-def test_where_weights_go_is_checked_before_training(
+def test_the_output_path_is_checked_before_training(
     monkeypatch, capsys, tmp_path, data
 ):
     file, folder = tmp_path / "file", tmp_path / "folder.npz"
@@ -297,7 +297,7 @@ def test_a_custom_network_is_trained_by_its_likelihood(body, clips, clean_batch)
 
 
 def test_validation_may_be_rare(body, clips, validation, trained, tmp_path):
-    """Where it was not judged there is no figure, and the drawing copes."""
+    """Epochs without validation have NaN, also in the drawing."""
     from bodyslam_jax.motion import draw_history
 
     history = trained[1].copy()
@@ -336,7 +336,7 @@ def test_motion_that_is_not_wanted_is_left_out(clips):
 
 @pytest.mark.parametrize("past", [2, 4])
 def test_windows_of_a_corpus(clips, past):
-    """All that there are at 120 Hz, or none that shares a moment with another."""
+    """All windows at 120 Hz, or those that do not overlap."""
     settings = dataclasses.replace(NOISY, past=past, steps=1)
     span = 4 * past  # a window of 1 + past frames at 30 Hz
     lengths = [(len(c.poses) - 1) * 4 + 1 for c in clips]
@@ -353,14 +353,14 @@ def test_windows_of_a_corpus(clips, past):
         assert found.num_windows == sum(len(c.poses) // (past + 1) for c in clips)
 
 
-def test_windows_that_may_not_overlap_are_drawn_one_by_one():
+def test_windows_that_may_not_overlap_are_drawn_singly():
     with pytest.raises(ValueError, match="steps: found 16, expected 1"):
         MotionTraining(sliding=False)
     assert MotionTraining.paper().steps == 1
 
 
 def test_a_batch_is_consistent_with_its_labels(clean_batch):
-    """Noise-free, at real speed: joints that stand still tell the displacement."""
+    """Without noise, at real speed: joints in contact give the displacement."""
     batch = clean_batch
     assert batch.window.joints.shape == (64, 4, 5, 24, 3)
     assert batch.move.shape == (64, 4, 3)
@@ -438,7 +438,7 @@ def test_two_devices_agree_with_one(tmp_path):
 
 @pytest.mark.slow
 def test_kill_9_loses_nothing(tmp_path, data):
-    """The real command, killed in its second epoch, against one left in peace."""
+    """The command, killed in its second epoch and resumed, against a complete run."""
     argv = [sys.executable, "-m", "bodyslam_jax", "train-motion", str(data), *OPTIONS]
     argv[-1:] = ["4", "--epochs", "40"]
     environment = os.environ | {"BODYSLAM_CACHE": str(tmp_path / "cache")}

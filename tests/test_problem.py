@@ -1,4 +1,4 @@
-"""The door of a problem: what fits is let in, what does not is refused in one line."""
+"""Validation of problems: errors are one line."""
 
 import dataclasses
 import functools
@@ -81,7 +81,7 @@ def changed(what, where, value):
     return eqx.tree_at(lambda x: getattr(x, where), what, replace_fn=replace)
 
 
-def test_what_fits_is_let_in():
+def test_valid_problems_are_accepted():
     problem = make()
     assert len(problem.factors) == len(fitting()[1])
     assert problem.variables == tuple(v for v in g.VARIABLES if v != "intrinsics")
@@ -107,7 +107,7 @@ SHORT = lambda x: x[:, :-1]
         ("landmarks", jnp.arange(18).reshape(6, 3), "int64, expected floating point"),
     ],
 )
-def test_a_state_that_is_none_is_refused(where, value, message):
+def test_an_invalid_state_is_refused(where, value, message):
     state, factors = fitting()
     with pytest.raises(ValueError) as refused:
         g.make_problem(list(factors.values()), changed(state, where, value))
@@ -188,7 +188,7 @@ def test_no_frames_are_refused():
         g.make_problem([], none)
 
 
-def test_who_is_there_and_what_may_move_must_fit_too():
+def test_shapes_of_presence_and_mask_are_checked():
     state, _ = fitting()
     people = g.MotionPredictor(lambda *_: None, None, None, jnp.ones((1, T + 1), bool))
     with pytest.raises(ValueError, match=r"motion.present: shape \(1, 4\)"):
@@ -205,14 +205,14 @@ def test_two_observations_in_one_frame_are_refused():
         make(Reprojection=jax.tree.map(twice, factor))
 
 
-def test_nothing_is_known_of_landmarks_that_nobody_sees():
+def test_priors_on_unobserved_landmarks_are_refused():
     state, factors = fitting()
     prior = changed(factors["LandmarkPrior"], "whitening", ones(L, 3, 3))
     with pytest.raises(ValueError, match="6 landmarks have a prior and no"):
         g.make_problem([prior], state)
 
 
-def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
+def test_a_problem_too_large_for_memory_reports_how_many_frames_fit(monkeypatch):
     """And that many do."""
 
     def people_of(frames):
@@ -231,13 +231,13 @@ def test_a_problem_that_cannot_fit_says_how_many_frames_do(monkeypatch):
         g.make_problem([], people_of(int(1.2 * int(fit))))
 
 
-def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
+def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
     """As much more as the factorisation keeps for them, or some more."""
 
     def bytes_of(far):
         """What the factorisation keeps, and what is counted for those that go last."""
         longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
-        monkeypatch.setattr("bodyslam_jax.graph.layout.choose_lasting", longest)
+        monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
         monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", FAR)
         problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
         assert problem.layout.lasting == far
@@ -255,7 +255,7 @@ def test_landmarks_that_go_last_take_memory_in_every_chunk(monkeypatch):
     assert 0 < kept <= counted <= 8 * kept
 
 
-def test_a_container_may_use_less_than_the_machine_has(monkeypatch, tmp_path):
+def test_memory_limits_of_containers_are_read(monkeypatch, tmp_path):
     limit, other = tmp_path / "memory.max", tmp_path / "none"
     limit.write_text("1048576\n")
     monkeypatch.setattr(memory, "_LIMITS", (str(other), str(limit)))
@@ -264,7 +264,7 @@ def test_a_container_may_use_less_than_the_machine_has(monkeypatch, tmp_path):
     assert memory.memory() > 2**28
 
 
-def test_under_a_transformation_shapes_alone_are_looked_at():
+def test_under_a_transformation_only_shapes_are_checked():
     state, factors = fitting()
 
     def residual(state, scale):
@@ -278,7 +278,7 @@ def test_under_a_transformation_shapes_alone_are_looked_at():
         jax.eval_shape(residual, short, jnp.ones(()))
 
 
-def test_what_is_missing_may_be_zero_and_costs_nothing(quick_compilation):
+def test_missing_measurements_may_be_zero_and_cost_nothing(quick_compilation):
     state, factors = fitting()
     missing = {}
     for name in ("CameraPrior", "RootOrientation", "RootPositionPrior"):
@@ -297,7 +297,7 @@ def test_what_is_missing_may_be_zero_and_costs_nothing(quick_compilation):
     assert not slopes[0].any() and not slopes[1].any()
 
 
-def test_a_video_too_long_to_order_says_how_many_frames_fit(monkeypatch):
+def test_a_video_too_long_to_order_reports_how_many_frames_fit(monkeypatch):
     """Tables over pairs of its chunks would not fit themselves."""
 
     def reached(*_):
@@ -336,7 +336,7 @@ def test_a_video_too_long_to_order_says_how_many_frames_fit(monkeypatch):
         (changed(g.Cauchy(1.0), "scale", float("inf")), "which is not finite"),
     ],
 )
-def test_what_is_no_loss_is_refused(loss, message):
+def test_invalid_losses_are_refused(loss, message):
     track = changed(fitting()[1]["Reprojection"], "loss", lambda _: loss)
     with pytest.raises(ValueError) as refused:
         make(Reprojection=track)
@@ -404,7 +404,7 @@ def test_weights_of_frames_without_an_earlier_one_are_refused(name, field, at):
 @pytest.mark.parametrize(
     "name", ["RootOrientation", "RootPositionPrior", "HumanMotion"]
 )
-def test_errors_that_go_on_from_what_was_not_measured_are_refused(name):
+def test_correlation_with_a_missing_measurement_is_refused(name):
     factor = fitting()[1][name]
     where = "whitening" if name == "HumanMotion" else "sigma"
     measured = changed(factor, where, lambda x: jnp.ones_like(x).at[:, 0].set(0.0))
@@ -434,7 +434,7 @@ def test_a_state_has_one_precision():
         make(half)
 
 
-def test_added_frames_weigh_nothing_to_any_factor():
+def test_added_frames_have_no_weight_in_any_factor():
     """Wherever the frames are: they stay where they were as others move."""
     state, factors = fitting()
     longer = g.extend_state(state, 2)

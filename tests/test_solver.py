@@ -59,7 +59,7 @@ def last(monkeypatch, count):
     if not count:
         return
     longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
-    monkeypatch.setattr("bodyslam_jax.graph.layout.choose_lasting", longest)
+    monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
     monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", count // 2)
 
 

@@ -31,7 +31,7 @@ def people(lean, num=2, frames=30):
     return dataclasses.replace(state, roots=jnp.asarray(roots))
 
 
-def test_up_is_where_trunks_point_on_average():
+def test_up_is_the_mean_direction_of_trunks():
     lean = np.tile(0.2 * np.sin(np.arange(30) * 2 * np.pi / 10), (2, 1))
     state, there = people(lean), np.ones((2, 30), bool)
     np.testing.assert_allclose(mean_up(state, there), [0, -1, 0], atol=1e-12)
@@ -41,7 +41,7 @@ def test_up_is_where_trunks_point_on_average():
     np.testing.assert_allclose(error, 2 * np.sin(abs(lean) / 2) / 0.1, atol=1e-9)
 
 
-def test_nothing_is_said_of_who_is_not_upright_or_not_there():
+def test_people_who_lie_or_are_absent_have_no_factor():
     lean = np.zeros((2, 30))
     lean[1] = np.where(np.arange(30) % 2, 1.2, -1.2)
     there = np.ones((2, 30), bool)
@@ -61,7 +61,7 @@ def test_nothing_is_said_of_who_is_not_upright_or_not_there():
     assert lying is None
 
 
-def test_bending_down_now_and_then_costs_little_and_pulls_little():
+def test_bending_down_occasionally_is_an_outlier():
     lean = np.zeros((1, 30))
     lean[0, 10:14] = 1.2
     state, there = people(lean, num=1), np.ones((1, 30), bool)
@@ -73,7 +73,7 @@ def test_bending_down_now_and_then_costs_little_and_pulls_little():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_which_way_the_world_is_turned_does_not_matter(dtype):
+def test_the_factor_is_invariant_to_rotations_of_the_world(dtype):
     state = people(0.1 * np.random.default_rng(0).standard_normal((2, 30)))
     there = np.ones((2, 30), bool)
     turn = jnp.asarray(scenes.look(0.7, -0.4) @ scenes.look(0.1, 1.1).T)

@@ -1,11 +1,11 @@
-"""Second derivatives of keypoints by turns of the joints, in closed form.
+"""Second derivatives of keypoints by joint rotations, in closed form.
 
-A limb across the view hardly changes its image as it turns towards the camera, to
-first order. A turn of joint i about an axis `a` (in H) carries what hangs below it, and
-so the derivatives `d` by the joints below: `∂²p/∂δ_i∂δ_j = a x d_j`, and for one joint
-its symmetric part. With `d_j = b x m_j`, of what hangs below j at `m_j` from it, pulls
-`f` add up to `Σ f·(a x (b x m_j)) = a·(M_j b - b tr M_j)`, `M_j = Σ m_j f^T`: nine
-numbers a joint.
+They matter because the image of a limb that lies across the view does not change, to
+first order, as it rotates towards the camera. A rotation of joint i about an axis `a`
+(in H) moves all joints below it, and so rotates the derivatives `d_j` by them:
+`∂²p/∂δ_i∂δ_j = a x d_j`, and for i = j its symmetric part. With `d_j = b x m_j`, where
+`m_j` is the offset of a point below j, the contraction with gradients `f` is
+`Σ f·(a x (b x m_j)) = a·(M_j b - b tr M_j)`, `M_j = Σ m_j f^T`: nine numbers a joint.
 """
 
 import jax.numpy as jnp
@@ -21,8 +21,8 @@ from bodyslam_jax.graph.keypoint_jacobian import (
 )
 
 _UPPER = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
-"""1 where the joint of a coordinate (row) is above that of the other, a half where they
-are of one joint."""
+"""1 where the joint of a coordinate (row) is an ancestor of that of the other, 1/2
+where both belong to one joint."""
 
 
 def keypoint_curvature(
@@ -33,11 +33,12 @@ def keypoint_curvature(
     bias: float | Float[Array, ""],
     pull: Float[Array, "k 3"],
 ) -> tuple[Float[Array, "72 72"], Float[Array, "72 10"]]:
-    """Second derivatives of `Σ_k pull_k · p_k`, by turns and turns, by turns and shape.
+    """Second derivatives of `Σ_k pull_k · p_k` by rotations twice, and by rotations and
+    shape.
 
-    Places (m) and pulls are in H. Turns (rad) are `Exp` on the right: of the whole body
-    about the pelvis, then of each joint. Places are linear in shape. What pose blend
-    shapes add is left out.
+    Points (m) and `pull`, the gradient of the cost by them, are in H. Rotations (rad)
+    are `Exp` on the right: of the whole body about the pelvis, then of each joint.
+    Points are linear in shape. Pose blend shapes are neglected.
     """
     R = so3.exp(pose)
     found = carried_by_joints(body, R, shape, layout, bias)

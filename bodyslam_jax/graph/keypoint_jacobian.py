@@ -1,9 +1,9 @@
 """Keypoints of one person in one frame with their derivatives, in closed form.
 
 A keypoint is a weighted sum of points fixed to joints, `p = Σ_i w_i (x_i + G_i a_i)`. A
-turn `R_j Exp(δ_j)` of joint j carries what hangs below it:
-`dp/dδ_j = -[Σ_{i below j} w_i (x_i + G_i a_i - x_j)]x G_j`, plus what pose blend shapes
-add to a vertex. Forward differentiation of the chain takes twenty times as long.
+rotation `R_j Exp(δ_j)` of joint j moves all joints below it:
+`dp/dδ_j = -[Σ_{i below j} w_i (x_i + G_i a_i - x_j)]x G_j`, plus the derivative of pose
+blend shapes. Forward differentiation of the chain takes twenty times as long.
 """
 
 from typing import NamedTuple
@@ -28,10 +28,10 @@ from bodyslam_jax.graph.tracing import is_traced
 def turning_joints(
     body: BodyModel, layout: str, points: tuple[int, ...] | None = None
 ) -> tuple[int, ...]:
-    """Joints below the pelvis, from 0, whose turns move these keypoints (or all).
+    """Joints below the pelvis, from 0, whose rotations move these keypoints (or all).
 
-    Nothing hangs below a wrist that a detector of 25 keypoints sees. Every joint, where
-    pose blend shapes let each one move the skin, or the body is not known yet.
+    Hands move no keypoint of BODY_25, for example. All joints, if the body has pose
+    blend shapes or is traced.
     """
     if is_traced(body) or body.pose_dirs.shape[-1]:
         return JOINTS
@@ -52,7 +52,7 @@ def turning_joints(
 
 
 class Carried(NamedTuple):
-    """What joints carry of keypoints: `p_k = Σ_i share_ik x_i + G_i lever_ik`, m, H."""
+    """Keypoints by skinning: `p_k = Σ_i share_ik x_i + G_i lever_ik`, m, in H."""
 
     G: Float[Array, "24 3 3"]
     """Axes of the joints in H."""
@@ -76,7 +76,7 @@ def carried_by_joints(
     layout: str,
     bias: float | Float[Array, ""],
 ) -> Carried:
-    """Joints with their rotations, and where keypoints are on them."""
+    """Rotations and positions of joints, and keypoints relative to them."""
     dtype = R.dtype
     names = KEYPOINT_NAMES[layout]
     skinned = np.array([name in SURFACE_POINTS for name in names])
@@ -87,16 +87,16 @@ def carried_by_joints(
     offset = np.array([DETECTOR_BIAS.get(n, (0.0, 0.0, 0.0)) for n in names])
     vertex = body.picks[pick]
     joint = jnp.where(skinned[:, None], body.skin_joint[vertex], own[:, None])
-    alone = np.arange(body.skin_weight.shape[1]) == 0
+    first = np.arange(body.skin_weight.shape[1]) == 0
     weight = jnp.where(
-        skinned[:, None], body.skin_weight[vertex], jnp.asarray(alone, dtype)
+        skinned[:, None], body.skin_weight[vertex], jnp.asarray(first, dtype)
     )
     features = body.pose_dirs.shape[-1]
 
     rest = rest_joints(body, shape)
     by_shape_rest = body.joint_shape_dirs.reshape(24, 3, 10)
     G = turns_of(R)
-    # Places are linear in the offsets of joints from their parents, and these in shape.
+    # Positions are linear in the offsets of joints from parents, and these in shape.
     parent = jnp.array(PARENTS[1:])
     by_shape_offset = by_shape_rest[1:] - by_shape_rest[parent]
     carried = times(G[parent], by_shape_offset).reshape(23, 30)
@@ -111,7 +111,7 @@ def carried_by_joints(
     at_joint = jnp.asarray(bias, dtype) * jnp.asarray(offset, dtype)
     on_skin = skinned[:, None, None]
     arm = jnp.where(on_skin, shaped[:, None] - rest[joint], at_joint[:, None])
-    # What each joint carries of each keypoint: dense, as gathered 3 x 3 are slow.
+    # Weight of each joint for each keypoint: dense, as gathering 3 x 3 is slow.
     carries = (joint[..., None] == jnp.arange(24, dtype=joint.dtype)).astype(
         dtype
     ) * weight[..., None]
@@ -151,7 +151,7 @@ def keypoint_jacobian(
     moved = G.swapaxes(0, 1).reshape(3, 72) @ found.lever_by_shape.reshape(72, -1)
     by_shape = (share.T @ found.x_by_shape.reshape(24, 30)).reshape(-1, 3, 10)
     by_shape = by_shape + moved.reshape(3, -1, 10).swapaxes(0, 1)
-    # All that hangs below a joint, about that joint.
+    # First moment of the points below a joint, about that joint.
     moment = (path @ placed.reshape(24, -1)).reshape(23, -1, 3)
     moment = moment - (path @ share)[..., None] * x[1:, None]
     # One column for each axis of each joint, 69 in a row.
@@ -179,7 +179,7 @@ def keypoint_jacobian(
 
 
 def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
-    """Rotations of the joints in H: each doubles the length of path it has covered."""
+    """Rotations of the joints in H, by doubling the length of the path at each step."""
     G = jnp.concatenate([jnp.eye(3, dtype=R.dtype)[None], R])
     above = np.maximum(np.array(PARENTS), 0)
     for _ in range(4):  # 2^4 is more than the depth of the tree
@@ -189,6 +189,6 @@ def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
 
 
 def times(a: Float[Array, "*b i c"], b: Float[Array, "*b c j"]) -> Array:
-    """A product of many small matrices, fused: a call for each would take longer."""
+    """Products of many small matrices as fused sums, faster than a batched GEMM."""
     term = lambda c: a[..., :, c, None] * b[..., c, None, :]
     return sum((term(c) for c in range(1, a.shape[-1])), term(0))

@@ -1,11 +1,11 @@
-"""Where the observations of landmarks lie in dense blocks; NumPy, at the door.
+"""Layout of landmark observations in dense tables.
 
-Tracks are nearly contiguous in time. So frames are cut into chunks, landmarks are put
-into groups that lie within the same few, and each group is a dense table of frames by
-landmarks with holes: no list of pairs is ever made, and the reduced camera matrix is
-formed by a few matrix products. Where places are seen again, chunks stand in another
-order than that of time (`ordering.py`). Shapes are rounded up, so that videos of about
-the same length compile once.
+Tracks are nearly contiguous in time. Frames are cut into chunks, landmarks are grouped
+by the chunks that observe them, and each group is a dense table of frames by landmarks
+with empty entries. The reduced camera matrix is then formed by a few matrix products,
+without a list of pairs of observations. With loop closures chunks are eliminated in
+another order than that of time (`ordering.py`). Sizes are rounded up, so that videos of
+similar length share a program. Runs in NumPy when a problem is made.
 """
 
 import dataclasses
@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from bodyslam_jax.graph.factor import JOINTS, Limbs
-from bodyslam_jax.graph.long_tracks import choose_lasting
+from bodyslam_jax.graph.long_tracks import choose_long_tracks
 from bodyslam_jax.graph.ordering import CHUNK, PERSON, order_chunks
 
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
 _SIZE = 24
-"""Landmarks in a group. Its best value is between 16 and 32, and flat; one that follows
-the tracks would make videos of the same length compile anew."""
+"""Landmarks in a group. Run time has a flat minimum between 16 and 32; a size that
+depended on the tracks would compile a program for each video."""
 _MAX_BUCKETS = 3
 
 
@@ -31,29 +31,29 @@ class Bucket(eqx.Module):
     """`n` groups of `g` landmarks that span `width` chunks (`f` frames) each."""
 
     first_chunk: Int[Array, " n"]
-    """The place where its chunks begin."""
+    """Position of its first chunk in the order of elimination."""
     landmark: Int[Array, "n g"]
     """Row in the state; the number of landmarks for padding."""
     row: Int[Array, "n f g"]
-    """Row in the measurements; the number of measurements where there is none."""
+    """Row in the measurements; the number of measurements for an empty entry."""
     width: int = eqx.field(static=True)
     lasting: bool = eqx.field(static=True, default=False)
-    """Whether its landmarks are eliminated last, with the globals
+    """Whether its landmarks have long tracks, and are eliminated with the globals
     (`long_tracks.py`)."""
 
 
 class Layout(eqx.Module):
-    """How a problem of `t` frames is cut: static sizes and index tables."""
+    """How a problem of `t` frames is cut into blocks: static sizes and index tables."""
 
     buckets: tuple[Bucket, ...]
     num_chunks: int = eqx.field(static=True)
-    """Chunks, rounded up to a size that other videos share."""
+    """Number of chunks, rounded up."""
     bandwidth: int = eqx.field(static=True)
-    """Places that a landmark, or a factor over frames, can connect; 2 or more."""
+    """Successive chunks that a landmark or a factor can connect; 2 or more."""
     order: Int[Array, " c"] | None = None
-    """The chunk at each place; `None` in the order of time."""
+    """The chunk at each position of the elimination order; `None` for that of time."""
     reach: int = eqx.field(static=True, default=1)
-    """Places between a chunk and the next in time, at most."""
+    """Largest distance, in that order, of chunks adjacent in time."""
     limbs: Limbs = eqx.field(static=True, default=(JOINTS,))
     """Joints that factors see together, as those of one leg; narrow limbs first. Of
     joints in none, such as hands that no keypoint sees, each is a chain by itself."""
@@ -65,7 +65,7 @@ class Layout(eqx.Module):
 
     @property
     def lasting(self) -> int:
-        """Room for landmarks that are eliminated last."""
+        """Number of landmarks, with padding, that are eliminated with the globals."""
         return sum(b.landmark.size for b in self.buckets if b.lasting)
 
 
@@ -86,25 +86,25 @@ def make_layout(
     num_people: int = 0,
     limbs: Limbs = (JOINTS,),
 ) -> Layout:
-    """Groups `m` observations of landmarks; every index is known to be in range."""
+    """Groups `m` observations of landmarks. Indices are not checked."""
     count = -(-num_frames // CHUNK)
     num_chunks = round_up(count, parts=8)
     if len(frame) == 0:
         return Layout((), num_chunks, 2, limbs=limbs)
     own = num_people * PERSON
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
-    # In no order is a landmark's span below the number of chunks that see it.
+    # In any order, a landmark's span is at least the number of chunks that observe it.
     least = np.bincount(pairs // count, minlength=num_landmarks)
-    lasting = choose_lasting(least, num_chunks, own, 1, _SIZE)
+    lasting = choose_long_tracks(least, num_chunks, own, 1, _SIZE)
     rest = pairs[~np.isin(pairs // count, lasting)]
     order, reach = order_chunks(*divmod(rest, count), count, num_people)
     if order is not None:
-        # Padding is last, and nothing couples it with the rest.
+        # Padding comes last, and nothing couples it with the rest.
         order = np.append(order, np.arange(count, num_chunks))
-        # From here on a frame is where it stands.
+        # From here on, frames are numbered in the order of elimination.
         frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
     start, span = _spans(num_landmarks, frame, landmark)
-    lasting = choose_lasting(span, num_chunks, own, reach, _SIZE)
+    lasting = choose_long_tracks(span, num_chunks, own, reach, _SIZE)
     soon = span > 0
     soon[lasting] = False
     widths = _choose_widths(span[soon], num_chunks)
@@ -132,15 +132,15 @@ def make_layout(
 
 
 def _spans(num_landmarks, frame, landmark):
-    """The chunk in which each landmark is seen first, and how many there are to the
-    last; 0 of landmarks that are not seen."""
+    """The first chunk that observes each landmark, and the number of chunks from it to
+    the last; 0 for landmarks without observations."""
     first = np.full(num_landmarks, np.iinfo(np.int32).max)
     last = np.full(num_landmarks, -1)
     np.minimum.at(first, landmark, frame)
     np.maximum.at(last, landmark, frame)
-    seen = last >= 0
-    start = np.where(seen, first // CHUNK, 0)
-    return start, np.where(seen, last // CHUNK - start + 1, 0)
+    observed = last >= 0
+    start = np.where(observed, first // CHUNK, 0)
+    return start, np.where(observed, last // CHUNK - start + 1, 0)
 
 
 def _allowed(num_chunks):
@@ -149,8 +149,10 @@ def _allowed(num_chunks):
 
 
 def _choose_widths(span, num_chunks):
-    """At most three widths, so that tables hold few empty products; one more must save
-    a tenth of them, as it costs compilation and wide groups take short tracks along.
+    """At most three widths of tables, chosen to minimise empty entries.
+
+    Each additional width must save a tenth of the cost: it adds to compilation, and
+    wide groups can hold short tracks too.
     """
     allowed = _allowed(num_chunks)
     top = next(w for w in allowed if w >= span.max())
@@ -167,12 +169,12 @@ def _choose_widths(span, num_chunks):
 
 
 def _pack(start, stop, widths, num_chunks):
-    """Groups of up to `_SIZE` landmarks, the longest tracks first: of each width, the
+    """Groups of up to `_SIZE` landmarks, the longest tracks first: for each width, the
     first chunk of each group and its members.
 
-    A group takes what begins and ends within it, shorter tracks too where there is
-    room, and the number of groups is rounded up with shorter tracks: empty places cost
-    as much as full ones.
+    A group holds landmarks whose tracks begin and end within it, shorter ones where
+    there is room. The number of groups is rounded up, filled with shorter tracks: empty
+    entries cost as much as full ones.
     """
     order = np.lexsort((stop, start))
     start, stop = start[order], stop[order]

@@ -1,9 +1,9 @@
-"""Which landmarks last so long that they are eliminated last; NumPy, at the door.
+"""Selects the landmarks with long tracks, which are eliminated with the globals.
 
-The longest track tells how wide the band of the camera matrix is for all. A few
-landmarks that are seen much longer than all others are eliminated after the cameras in
-place of before: they widen the arrow of globals, and the band is as wide as the others
-need.
+The longest track determines the bandwidth of the reduced camera matrix. A few
+landmarks that are observed much longer than all others are therefore eliminated after
+the cameras: they widen the arrow of the globals, and the band becomes as narrow as the
+other landmarks allow. Runs in NumPy when a problem is made.
 """
 
 import numpy as np
@@ -12,26 +12,28 @@ from jaxtyping import Int
 from bodyslam_jax.graph.ordering import CAMERAS, CHUNK
 
 _PLACE = 5000.0
-"""Products that take as long as one place of a landmark's table."""
+"""Cost of one chunk of a landmark's table, in multiplications."""
 _GAIN = 0.8
-"""They must save this much of all products."""
+"""The cost must fall below this share of the cost without long tracks."""
 _GROUPS = (1, 2, 4, 8, 16)
-"""How many groups there may be: few sizes, so that videos share a program."""
+"""Allowed numbers of groups: few, so that videos share a program."""
 _SHARE = 0.1
-"""Of all landmarks, at most."""
+"""Largest share of all landmarks."""
 
 
-def choose_lasting(
+def choose_long_tracks(
     span: Int[np.ndarray, " l"], num_chunks: int, own: int, reach: int, size: int
 ) -> Int[np.ndarray, " k"]:
-    """The landmarks, none or some groups of `size`, that are best eliminated last.
+    """The landmarks, in groups of `size`, to be eliminated with the globals.
 
     Args:
-        span: places from the first chunk that sees a landmark to the last, both
-            counted, or how many see it, while they are not in their places yet; 0 for
-            landmarks that are not seen.
-        own: coordinates that people keep of a chunk.
-        reach: places between a chunk and the next in time.
+        span: chunks from the first that observes a landmark to the last, both counted,
+            in the order of elimination; before the order is known, the number of chunks
+            that observe it. 0 for landmarks without observations.
+        num_chunks: of the video.
+        own: coordinates of people that remain of each chunk.
+        reach: distance, in the order of elimination, of chunks adjacent in time.
+        size: landmarks in a group.
     """
     order = np.argsort(-span, kind="stable")
     ranked = span[order].astype(float)
@@ -40,7 +42,7 @@ def choose_lasting(
     pivot = own + CAMERAS
 
     def cost(count):
-        """Products of tables, of landmarks' elimination, and of all chunks'."""
+        """Multiplications of the chain of chunks, of landmarks and of tables."""
         rest = ranked[count:]
         width = int(max(rest[0] - 1, reach))
         back = np.arange(width)

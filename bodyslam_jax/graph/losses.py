@@ -26,7 +26,7 @@ class Loss(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
-        """The derivative of `rho`: 1 at 0, or nearly, and never negative."""
+        """The derivative of `rho`: (nearly) 1 at 0, and never negative."""
 
 
 class Squared(Loss):
@@ -77,11 +77,11 @@ class BlakeZisserman(Loss):
     """`rho(s) = 2 log((1 + ε) / (exp(-s / 2) + ε))`, `ε = exp(-c^2 / 2)`: saturates
     near `c^2`.
 
-    Minus twice the log-likelihood of Gaussian errors among outliers that may be
-    anywhere (Blake and Zisserman 1987; Hartley and Zisserman 2004, A6.8). What is no
-    outlier keeps its weight, where `Cauchy(1.5)` takes a third of it at one standard
-    deviation: estimates are closer, and covariances as large as their errors. But what
-    is further away than c pulls no more, so start where another loss has converged:
+    Minus twice the log-likelihood of Gaussian errors with uniform outliers
+    (Blake and Zisserman 1987; Hartley and Zisserman 2004, A6.8). Inliers
+    keep their weight, where `Cauchy(1.5)` takes a third of it at one standard
+    deviation: estimates are more accurate, and covariances consistent. Measurements
+    farther away than c have no influence, so start where another loss has converged:
 
         solution = solve(problem, state)
         where = lambda p: p.factors[0].loss
@@ -97,7 +97,7 @@ class BlakeZisserman(Loss):
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         never = -(self.scale**2) / 2
         far = jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never)
-        # The same, where the difference of logarithms has no digits left.
+        # The same without cancellation, where the logarithms are nearly equal.
         less = jnp.expm1(-jnp.minimum(s, 1) / 2)
         near = -jnp.log1p(less * jax.nn.sigmoid(-never))
         return 2 * jnp.where(s < 1, near, far)
@@ -107,7 +107,7 @@ class BlakeZisserman(Loss):
 
 
 def squared_norm(residual: Float[Array, "*m d"]) -> Float[Array, "*m"]:
-    """Of each measurement; fused for a few coordinates, whose sum would take longer."""
+    """Of each measurement; unrolled for up to three coordinates, which is faster."""
     if residual.shape[-1] > 3:
         return jnp.sum(residual**2, axis=-1)
     return sum(

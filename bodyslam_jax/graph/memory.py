@@ -1,4 +1,4 @@
-"""Whether a problem fits into memory: refused at the door, not killed on the way."""
+"""Refuses problems that do not fit into memory, before the solver is started."""
 
 import os
 from pathlib import Path
@@ -11,11 +11,11 @@ _LIMITS = (
     "/sys/fs/cgroup/memory.max",
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
 )
-"""Of a container, of both generations; a word or a huge number where there is none."""
+"""Memory limit of a container (cgroup v2, v1); no number, or a huge one, without."""
 
 
 def memory() -> int:
-    """Bytes of this machine, or that its container may use of them."""
+    """Bytes of memory of this machine, or of its container's limit."""
     found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for name in _LIMITS:
         try:
@@ -26,11 +26,11 @@ def memory() -> int:
 
 
 def memory_needed(layout: Layout, state: State) -> int:
-    """Bytes that the solver's tables take, about."""
+    """Bytes of the solver's tables, about."""
     item = state.scale.dtype.itemsize
     people = len(state.roots)
     pose = 3 * len(layout.joints)
-    person = pose + 12  # what stays of a chunk: a posture and two roots
+    person = pose + 12  # what remains of a chunk: a posture and two roots
     front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
     front += 3 * layout.lasting
     pivot = 6 * CHUNK + people * person
@@ -42,7 +42,7 @@ def memory_needed(layout: Layout, state: State) -> int:
 
 
 def check_memory(layout: Layout, state: State) -> None:
-    """Refuses what cannot fit: bytes grow linearly with frames, and say so.
+    """Refuses a problem that does not fit; memory grows linearly with frames.
 
     **Raises:** `ValueError` with the number of frames that fit.
     """

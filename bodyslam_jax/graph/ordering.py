@@ -1,10 +1,10 @@
-"""In which order chunks of frames are eliminated; NumPy, at the door.
+"""The order in which chunks of frames are eliminated.
 
-A landmark connects all chunks that see it. In the order of time, a place that is seen
-again connects what lies far apart, and the band of the camera matrix becomes as wide as
-the video is long. Chunks then stand in the order of the second eigenvector of the
-Laplacian of their graph, which puts side by side what sees the same (S. Barnard, A.
-Pothen, H. Simon, A spectral algorithm for envelope reduction of sparse matrices, 1993).
+A landmark connects all chunks that observe it. In the order of time, a loop closure
+connects distant chunks, and the bandwidth of the reduced camera matrix grows to the
+length of the video. Chunks are then sorted by the second eigenvector of the Laplacian
+of their covisibility graph (S. Barnard, A. Pothen, H. Simon, A spectral algorithm for
+envelope reduction of sparse matrices, 1993). Runs in NumPy when a problem is made.
 """
 
 from typing import NamedTuple
@@ -17,22 +17,23 @@ CHUNK = 10
 CAMERAS = 6 * CHUNK
 """Coordinates of a chunk's cameras."""
 PERSON = 81
-"""Coordinates that a person keeps of a chunk, about."""
+"""Coordinates of a person that remain of a chunk, about."""
 _GAIN = 0.7
-"""An order other than time's must save this much: it is gathered to and fro."""
+"""The cost must fall below this share of that in the order of time, as reordering
+needs gathers."""
 _TOGETHER = 4096
-"""Landmarks that are counted at once."""
+"""Landmarks processed at once."""
 _MOST = 2000
-"""Chunks that are ordered at most: their graph is a dense table, of 32 MB then."""
+"""Largest number of chunks: their graph is a dense table, then of 32 MB."""
 
 
 class Ordering(NamedTuple):
-    """Where chunks stand."""
+    """An order of elimination."""
 
     order: Int[np.ndarray, " c"] | None
-    """The chunk at each place; `None` in the order of time."""
+    """The chunk at each position; `None` for the order of time."""
     reach: int
-    """Places between a chunk and the next in time, at most."""
+    """Largest distance, in this order, of chunks adjacent in time."""
 
 
 def order_chunks(
@@ -41,15 +42,17 @@ def order_chunks(
     count: int,
     num_people: int,
 ) -> Ordering:
-    """The order of time of `count` chunks, unless another costs clearly less; `p` pairs
-    of a landmark and a chunk that sees it, none of them twice and sorted by landmark.
+    """The order of time of `count` chunks, unless another costs clearly less.
+
+    `landmark` and `chunk` are `p` distinct pairs of a landmark and a chunk that
+    observes it, sorted by landmark.
     """
     in_time = Ordering(None, 1)
     begin = np.flatnonzero(np.diff(landmark, prepend=-1))
     own = num_people * PERSON
 
     def cost(place, reach):
-        """Products that landmarks and the factorisation of all chunks take."""
+        """Multiplications for the factorisation of all chunks and for landmarks."""
         at = place[chunk]
         span = np.maximum.reduceat(at, begin) - np.minimum.reduceat(at, begin) + 1.0
         rows = reach * own + max(span.max() - 1, reach) * CAMERAS
@@ -66,10 +69,11 @@ def order_chunks(
 
 
 def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
-    # A band is as wide for one landmark as for a hundred.
+    # One landmark widens the band as much as a hundred do.
     shared = np.log1p(_shared(landmark, chunk, begin, count))
     k = np.arange(count - 1)
-    # Time connects neighbours: people do, and an interruption parts no graph.
+    # Neighbours in time are always connected: people couple them, and the graph must
+    # not fall apart where tracking was interrupted.
     in_time = 1 + shared[k, k + 1].mean()
     shared[k, k + 1] += in_time
     shared[k + 1, k] += in_time
@@ -80,12 +84,12 @@ def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
 
 
 def _shared(landmark, chunk, begin, count) -> Float[np.ndarray, "c c"]:
-    """How many landmarks two chunks both see."""
+    """Number of landmarks that both of two chunks observe."""
     shared = np.zeros((count, count))
     row = np.searchsorted(landmark[begin], landmark)
     for first in range(0, len(begin), _TOGETHER):
         here = slice(*np.searchsorted(row, [first, first + _TOGETHER]))
-        sees = np.zeros((_TOGETHER, count), np.float32)
-        sees[row[here] - first, chunk[here]] = 1
-        shared += sees.T @ sees
+        observes = np.zeros((_TOGETHER, count), np.float32)
+        observes[row[here] - first, chunk[here]] = 1
+        shared += observes.T @ observes
     return shared

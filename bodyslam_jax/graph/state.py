@@ -1,8 +1,8 @@
-"""What is estimated, and how a step moves it.
+"""The state: all variables of the graph, and how a step moves them.
 
 Cameras carry the paper's scale over-parameterisation (Section 3.6): `r_WC = s r'_WC`
 with a linear `s`. People are anchored in the camera (`T_CH`, not `T_WH`), so that the
-keypoint terms see neither the cameras nor `s`, and `s` is free to move.
+keypoint factors depend neither on the cameras nor on `s`, which can then change freely.
 """
 
 import equinox as eqx
@@ -14,7 +14,7 @@ from bodyslam_jax.geometry import so3
 
 
 class Step(eqx.Module):
-    """A flat move of a `State`, in its tangent space."""
+    """An element of the tangent space of a `State`."""
 
     scale: Float[Array, ""]
     """m per unit of the map"""
@@ -65,7 +65,7 @@ class State(eqx.Module):
         )
 
     def zero_step(self) -> Step:
-        """The step that goes nowhere."""
+        """The zero step."""
         return Step(
             scale=jnp.zeros_like(self.scale),
             cameras=jnp.zeros_like(self.cameras, shape=(*self.cameras.shape[:-2], 6)),
@@ -97,9 +97,9 @@ def retract_rotation(
 ) -> Float[Array, "*b 3"]:
     """`Log(Exp(rotation) Exp(step))`, continuous in `step` around every angle up to pi.
 
-    Where it is more than 2 rad long the logarithm is taken on the branch of the base
-    point: an axis-angle vector may leave the ball of radius pi, and does not jump
-    there. Beyond 2 pi - 2 it comes back by a full turn, to the same rotation.
+    For vectors longer than 2 rad the branch of the logarithm is that of `rotation`, so
+    an axis-angle vector may leave the ball of radius pi without a jump. Beyond 2 pi - 2
+    it wraps by a full turn, to the same rotation.
     """
     moved = so3.compose(rotation, step)
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)
@@ -117,11 +117,12 @@ def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
 
 @jax.jit
 def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
-    """1 where a camera coordinate may move, 0 where it holds the map in place.
+    """1 where a camera coordinate is free, 0 where it is held to fix the gauge.
 
     The world's origin and axes are the first camera; the unit of the map is one
-    coordinate, the largest, of the camera that is farthest from it. Seven numbers, held
-    exactly: no prior, and no null space in the normal equations.
+    coordinate, the largest, of the camera that is farthest from it. Seven numbers are
+    held exactly, so that no prior is needed and the normal equations have no null
+    space.
     """
     offset = jnp.abs(cameras[:, :3, 3] - cameras[0, :3, 3])
     held = jnp.zeros_like(offset).reshape(-1).at[jnp.argmax(offset)].set(1.0)

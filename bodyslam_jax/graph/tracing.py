@@ -1,4 +1,4 @@
-"""Whether code runs by itself or is traced: part of a larger `jit`, `vmap`, `grad`."""
+"""Tells calls that run at once from those traced in a `jit`, `vmap` or `grad`."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 def is_alone() -> bool:
-    """Whether what is called now is not part of a larger `jit`."""
+    """Whether the current call is not being traced in a larger `jit`."""
     return not isinstance(jnp.zeros(()) + 1, jax.core.Tracer)
 
 

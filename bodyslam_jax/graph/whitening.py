@@ -1,4 +1,4 @@
-"""How measurements are weighted: by covariances, and by how long errors last."""
+"""Whitening: by a covariance, and of AR(1) errors."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,15 @@ from jaxtyping import Array, Bool, Float
 
 def innovation(
     error: Float[Array, "*n"],
-    last: Float[Array, "*n"],
+    previous: Float[Array, "*n"],
     correlation: Float[Array, "*#n"],
 ) -> Float[Array, "*n"]:
-    """What is new in an error of which `correlation` lasts from frame to frame,
-    `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`: as large as the error in the long run, and
-    independent of all before. With ρ = 0, where a run begins, the error itself."""
-    return (error - correlation * last) / jnp.sqrt(1 - correlation**2)
+    """The innovation of an AR(1) error, `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`.
+
+    It has the stationary variance of the error and is independent of earlier
+    innovations. With ρ = 0, at the start of a run, it is the error itself.
+    """
+    return (error - correlation * previous) / jnp.sqrt(1 - correlation**2)
 
 
 @jax.jit

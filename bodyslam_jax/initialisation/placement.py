@@ -1,4 +1,4 @@
-"""The first state: people placed before cameras whose path has no unit yet."""
+"""The initial state: people placed relative to cameras, with the scale unknown."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ def first_state(
     roots: PersonState,
     intrinsics: Float[np.ndarray, " i"],
 ) -> graph.State:
-    """The state before any scale is known: s = 1."""
+    """The state before the scale is known: s = 1."""
     return graph.State(
         scale=jnp.ones(()),
         cameras=jnp.asarray(cameras),
@@ -40,7 +40,7 @@ def no_people(num_frames: int) -> PersonState:
 
 
 def free_people(state: graph.State) -> graph.Step:
-    """Only people move: for a camera that stands, or of which only turns are known."""
+    """Only people are free: for a static camera, or one that only rotates."""
     free = jax.tree.map(jnp.zeros_like, state.zero_step())
     ones = lambda x: jnp.ones_like(x)
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""The first scale in closed form: from how people move, and from where they stand."""
+"""The initial scale in closed form: from motion, the ground, and a known path."""
 
 import dataclasses
 from collections.abc import Collection
@@ -18,30 +18,31 @@ from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Keypoints, ScaleStart
 
-_SEEN = 0.2
-"""Confidence from which a keypoint of the feet counts as seen."""
-_STEADY = 0.3
-"""How far the scale under single feet may vary, between quartiles: on stairs, or where
-the plane is not what people stand on, it varies more."""
+_MIN_CONFIDENCE = 0.2
+"""From which a keypoint of the feet counts as visible."""
+_MAX_SPREAD = 0.3
+"""Interquartile range of the scales of single frames, as a share of their median. It is
+larger on stairs, or where people do not stand on the plane."""
 
 
 def scale_start(
     state: graph.State,
-    seen: motion.Prediction,
+    prediction: motion.Prediction,
     contact: graph.GroundContact | None,
     *,
     shared_error: float = 0.0,
     path: float = float("nan"),
     without: Collection[int] = (),
 ) -> ScaleStart:
-    """The cues of scale: motion, the ground and a metric camera path if there are any.
+    """Scales from motion, and from the ground and a camera path in metres, if given.
 
     Args:
-        shared_error: the share by which all steps may be wrong together.
-        path: m per unit of the map, as the path has it; NaN without one.
-        without: people whose motion says nothing.
+        contact: the ground factor; `None` without ground.
+        shared_error: relative error common to all predicted displacements.
+        path: m per unit of the map according to the path; NaN without one.
+        without: people whose motion is not used.
     """
-    start = _motion_scale(state, seen, without)
+    start = _motion_scale(state, prediction, without)
     if np.isfinite(path):
         start = dataclasses.replace(start, path=path, path_error=PATH_SIGMA * path)
     error = float(np.hypot(start.motion_error, shared_error * start.motion))
@@ -50,7 +51,7 @@ def scale_start(
         return start
     used = np.isfinite(np.asarray(contact.sigma))
     ground = float(np.median(np.asarray(_scales(contact, state))[used]))
-    # Metres by which the ground may be off, over units from it to the camera.
+    # Error of the ground in m, over the camera's height above it in units.
     metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
     units = state.cameras[:, :3, 3] @ contact.plane[:3] + contact.plane[3]
     error = metres / float(np.median(np.asarray(units)))
@@ -65,46 +66,47 @@ def ground_contact(
     body: BodyModel,
     weights: GraphWeights,
 ) -> graph.GroundContact | None:
-    """People stand on the map's ground, where their feet are seen; `None` without one.
+    """The factor of people who stand on the ground plane of the map, in frames with
+    visible feet; `None` without a plane, or if scales disagree from frame to frame.
 
-    Up is where people's trunks point on average.
+    Up is the mean direction of people's trunks.
     """
-    there = roots.present & registered
+    visible = roots.present & registered
     if keypoints is not None:
         feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
-        there &= (feet > _SEEN).any(axis=-1)
-    if weights.ground_sigma is None or there.sum() < 2:
+        visible &= (feet > _MIN_CONFIDENCE).any(axis=-1)
+    if weights.ground_sigma is None or visible.sum() < 2:
         return None
     plane = find_ground(
         np.asarray(state.landmarks),
         np.asarray(state.cameras[:, :3, 3]),
-        mean_up(state, there),
+        mean_up(state, visible),
     )
     if plane is None:
         return None
-    sigma = np.where(there, weights.ground_sigma * np.sqrt(there.sum()), np.inf)
+    sigma = np.where(visible, weights.ground_sigma * np.sqrt(visible.sum()), np.inf)
     contact = graph.GroundContact(body, jnp.asarray(plane), jnp.asarray(sigma))
-    every = np.asarray(_scales(contact, state))[there]
+    every = np.asarray(_scales(contact, state))[visible]
     low, middle, high = np.quantile(every, [0.25, 0.5, 0.75])
-    return contact if low > 0 and high - low < _STEADY * middle else None
+    return contact if low > 0 and high - low < _MAX_SPREAD * middle else None
 
 
 _scales = eqx.filter_jit(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(
-    state: graph.State, seen: motion.Prediction, without: Collection[int]
+    state: graph.State, prediction: motion.Prediction, without: Collection[int]
 ) -> ScaleStart:
-    """Robust regression of predicted on observed displacements, people averaged."""
+    """Robust regression of predicted on observed displacements, mean over people."""
     C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
-    turn = C_WC @ state.roots[..., :3, :3]
+    C_WH = C_WC @ state.roots[..., :3, :3]
     offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])
     found = []
     for h in range(len(state.roots)):
         if h in without:
             continue
-        one = jax.tree.map(lambda x: x[h], seen)
-        found.append(motion.scale_from_motion(one, turn[h], r_WC, offset[h]))
+        one = jax.tree.map(lambda x: x[h], prediction)
+        found.append(motion.scale_from_motion(one, C_WH[h], r_WC, offset[h]))
     usable = [f for f in found if np.isfinite(f.value) and f.value > 0]
     if not usable:
         return ScaleStart()

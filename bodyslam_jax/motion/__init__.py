@@ -1,6 +1,6 @@
-"""The learnt prior on human motion: from postures to how many metres the body moved.
+"""The motion model: displacement of the body in metres, from postures.
 
-Section 3.4 of the paper, made robust to the errors of estimated postures.
+Section 3.4 of the paper, made robust to errors of estimated postures.
 """
 
 from bodyslam_jax.config import MotionTraining as MotionTraining
@@ -16,6 +16,7 @@ from bodyslam_jax.motion.continuation import rollout as rollout
 from bodyslam_jax.motion.network import Guess as Guess
 from bodyslam_jax.motion.network import MotionNetwork as MotionNetwork
 from bodyslam_jax.motion.network import Window as Window
+from bodyslam_jax.motion.own_model import make_motion_model as make_motion_model
 from bodyslam_jax.motion.prediction import MotionModel as MotionModel
 from bodyslam_jax.motion.prediction import Prediction as Prediction
 from bodyslam_jax.motion.prediction import check_compatible as check_compatible

@@ -1,4 +1,4 @@
-"""Continuing a motion from its last postures, frame by frame."""
+"""Extrapolates a motion from its last postures, frame by frame."""
 
 import equinox as eqx
 import jax
@@ -42,8 +42,8 @@ def rollout(
 ) -> Rollout:
     """Continues a motion by `frames` frames from `p` given postures.
 
-    Two postures will do: a window that reaches further back than `p` is filled by
-    repeating the first rate of change backwards. Rates are kept to what people do.
+    Two postures suffice: a window longer than `p` is filled by extrapolating the first
+    rate of change backwards. Rates are limited to plausible ones.
     """
     check_compatible(model, body, model.fps)
     dtype = body_pose.dtype
@@ -53,14 +53,14 @@ def rollout(
     given = len(body_pose)
     turn, pose = _extended(orientation, body_pose, past)
 
-    def look(turn, pose):
+    def guess(turn, pose):
         joints = local_joints(body, pose, shape) / leg
         before = turn[-2]
-        seen = lambda x: jnp.einsum("ba,pbc->pac", before, x)
+        local = lambda x: jnp.einsum("ba,pbc->pac", before, x)
         world = jnp.einsum("pab,pjb->pja", turn, joints)
         return network(
             Window(
-                rotation=seen(turn),
+                rotation=local(turn),
                 body_pose=pose,
                 joints=jnp.einsum("ba,pjb->pja", before, world),
                 shape=shape,
@@ -70,30 +70,30 @@ def rollout(
 
     def advance(carry, _):
         turn, pose = carry  # the last `past` frames
-        # the posture head does not look at the last frame of its window
-        blind = look(
+        # The posture head does not read the last frame of its window.
+        ahead = guess(
             jnp.concatenate([turn, turn[-1:]]), jnp.concatenate([pose, pose[-1:]])
         )
-        turns = so3.between(pose[-1], blind.body_pose)
+        turns = so3.between(pose[-1], ahead.body_pose)
         next_pose = so3.compose(pose[-1], _limited(turns))
-        spin = so3.exp(_limited(blind.rotation))
+        spin = so3.exp(_limited(ahead.rotation))
         next_turn = turn[-1] @ spin
         turn = jnp.concatenate([turn, next_turn[None]])
         pose = jnp.concatenate([pose, next_pose[None]])
-        move = turn[-2] @ look(turn, pose).translation
+        move = turn[-2] @ guess(turn, pose).translation
         return (turn[1:], pose[1:]), (next_turn, next_pose, move)
 
     _, (turns, poses, moves) = jax.lax.scan(advance, (turn, pose), None, frames)
-    known = _known_path(look, turn, pose, orientation, body_pose, given)
+    given_path = _given_path(guess, turn, pose, orientation, body_pose, given)
     return Rollout(
         orientation=jnp.concatenate([orientation, turns]),
         body_pose=jnp.concatenate([body_pose, poses]),
-        trans=jnp.concatenate([known, jnp.cumsum(moves, 0)]),
+        trans=jnp.concatenate([given_path, jnp.cumsum(moves, 0)]),
     )
 
 
-def _known_path(look, turn, pose, orientation, body_pose, given):
-    """Where the given frames were: predicted too, the last one at the origin."""
+def _given_path(guess, turn, pose, orientation, body_pose, given):
+    """Predicted positions in the given frames, the last one at the origin."""
     turns = jnp.concatenate([turn[: len(turn) - min(given, len(turn))], orientation])
     poses = jnp.concatenate([pose[: len(pose) - min(given, len(pose))], body_pose])
     size = len(turn) + 1
@@ -101,7 +101,7 @@ def _known_path(look, turn, pose, orientation, body_pose, given):
     for k in range(1, given):
         last = len(turns) - given + k
         rows = jnp.clip(jnp.arange(last - size + 1, last + 1), 0)
-        steps.append(turns[last - 1] @ look(turns[rows], poses[rows]).translation)
+        steps.append(turns[last - 1] @ guess(turns[rows], poses[rows]).translation)
     path = (
         jnp.concatenate(
             [jnp.zeros((1, 3), body_pose.dtype), jnp.cumsum(jnp.stack(steps), 0)]
@@ -119,7 +119,7 @@ def _limited(angles: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 
 
 def _extended(turn, pose, past):
-    """The last `past` frames; what is missing is extrapolated back, slowing down."""
+    """The last `past` frames; missing ones are extrapolated with decaying rates."""
     missing = past - len(pose)
     if missing <= 0:
         return turn[-past:], pose[-past:]

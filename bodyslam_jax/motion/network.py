@@ -1,8 +1,8 @@
-"""What motion models are made of: their window, their guess, layers as plain arrays.
+"""Input, output and layers of the networks.
 
-A network sees a `Window`: frames k-n to k of one person, seen from H_{k-1}; it makes a
-`Guess` of the step from k-1 to k. `paper_network.py` and `position_network.py` hold the
-two presets.
+A network maps a `Window`, frames k-n to k of one person relative to H_{k-1}, to a
+`Guess` of the step from k-1 to k. The two networks are in `paper_network.py` and
+`position_network.py`; `function_network.py` wraps a user's function.
 """
 
 import abc
@@ -17,10 +17,10 @@ from bodyslam_jax.geometry import so3
 
 
 class Window(eqx.Module):
-    """What a network may see of frames k-n..k (`p = n + 1`, the last one is k)."""
+    """Frames k-n to k as a network reads them (`p = n + 1`; the last one is k)."""
 
     rotation: Float[Array, "*b p 3 3"]
-    """C_{H_{k-1}}^T C_{H_i}: root orientations seen from the body at k-1."""
+    """C_{H_{k-1}}^T C_{H_i}: root orientations relative to the body at k-1."""
     body_pose: Float[Array, "*b p 23 3"]
     """θ, axis-angle, rad."""
     joints: Float[Array, "*b p 24 3"]
@@ -118,18 +118,18 @@ class Normalisation(eqx.Module):
 
 
 def normalisation(samples: Float[np.ndarray, "n d"]) -> Normalisation:
-    """Measures it; what never varies is left as it is."""
+    """Mean and standard deviation of samples; constant components keep unit scale."""
     mean, std = samples.mean(0), samples.std(0)
     std = np.where(std < 1e-5, 1.0, std)
     return Normalisation(jnp.asarray(mean, jnp.float32), jnp.asarray(std, jnp.float32))
 
 
 def no_normalisation(size: int) -> Normalisation:
-    """Leaves vectors as they are."""
+    """The identity."""
     return Normalisation(jnp.zeros(size, jnp.float32), jnp.ones(size, jnp.float32))
 
 
 def joint_angles(window: Window) -> Float[Array, "*b p 24 3"]:
-    """The root's rotation vector, seen from H_{k-1}, and θ, of every frame (rad)."""
+    """The root's rotation vector relative to H_{k-1}, and θ, of every frame (rad)."""
     root = so3.log(window.rotation)[..., None, :]
     return jnp.concatenate([root, window.body_pose], -2)

@@ -1,4 +1,4 @@
-"""The default network: it sees where the joints are, in units of leg length."""
+"""The default network: joint positions over a window, in leg lengths."""
 
 import equinox as eqx
 import jax
@@ -21,19 +21,19 @@ from bodyslam_jax.motion.network import (
     no_normalisation,
 )
 
-SEEN = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
-"""Joints whose positions the default network sees: legs, spine, head, hands."""
+INPUT_JOINTS = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
+"""Joints that the default network reads: legs, spine, head, hands."""
 CONTACTS = (*ANKLES, *FEET)
 """Joints that may stand on the ground: ankles and feet."""
 
 
 class MetricNetwork(MotionNetwork):
-    """Where the joints were over the window, and which of them stood still.
+    """Predicts displacement from joint positions and from joints in ground contact.
 
-    The displacement is a weighted sum over contact joints and past frames of what each
-    joint's motion relative to the pelvis would mean if it stood on the ground (the
-    weights, positive and of sum 1, come from the network), plus a correction.
-    Everything is in leg lengths, so that the size of a person cancels exactly.
+    If a joint stands on the ground, the pelvis moves opposite to the joint's motion
+    relative to it. The displacement is the weighted sum of that over contact joints and
+    past frames (weights positive, of sum 1, from the network), plus a correction. All
+    is in leg lengths, so the size of the person cancels exactly.
     """
 
     trunks: tuple[tuple[Layer, ...], ...]
@@ -49,7 +49,7 @@ class MetricNetwork(MotionNetwork):
     unit: Float[Array, ""]
     """Typical displacement in leg lengths: scale of the correction."""
     gain: Float[Array, ""]
-    """Calibration of displacement, found after training; 1 is none."""
+    """Factor on displacement, calibrated after training; 1 before."""
     future: int = eqx.field(static=True, default=1)
     """1 if displacement may depend on the posture of frame k itself, else 0."""
     posture_frames: int = eqx.field(static=True, default=6)
@@ -67,7 +67,7 @@ class MetricNetwork(MotionNetwork):
     ) -> "MetricNetwork":
         frames = past + future
         posture_frames = min(posture_frames, past)
-        d = frames * len(SEEN) * 3
+        d = frames * len(INPUT_JOINTS) * 3
         d_posture = 72 * (posture_frames - 1) + 69
         keys = jax.random.split(key, 3 * members + 1)
         outputs = (frames - 1) * len(CONTACTS) + 3
@@ -102,15 +102,15 @@ class MetricNetwork(MotionNetwork):
         return window.joints[..., :count, :, :]
 
     def features(self, window: Window) -> Float[Array, "*b d"]:
-        """Positions over time as cosine coefficients: from slow to fast."""
-        seen = self.frames(window)[..., np.array(SEEN), :]
-        basis = jnp.asarray(cosine_basis(seen.shape[-3]), seen.dtype)
-        flat = seen.reshape(*seen.shape[:-2], -1)
+        """Positions over time as coefficients of a discrete cosine transform."""
+        joints = self.frames(window)[..., np.array(INPUT_JOINTS), :]
+        basis = jnp.asarray(cosine_basis(joints.shape[-3]), joints.dtype)
+        flat = joints.reshape(*joints.shape[:-2], -1)
         out = jnp.einsum("wf,...fd->...wd", basis, flat)
         return out.reshape(*out.shape[:-2], -1)
 
     def posture_features(self, window: Window) -> Float[Array, "*b d"]:
-        """How frames up to k-1 differ from frame k-1, and its posture."""
+        """Rotations from frame k-1 to earlier frames, and the posture of k-1."""
         angles = joint_angles(window)[..., -1 - self.posture_frames : -1, :, :]
         change = so3.between(angles[..., -1:, :, :], angles[..., :-1, :, :])
         flat = lambda x, n: x.reshape(*x.shape[:-n], -1)
@@ -119,7 +119,7 @@ class MetricNetwork(MotionNetwork):
     def moves(
         self, window: Window, features: Float[Array, "*b d"]
     ) -> tuple[Float[Array, "m *b 3"], Float[Array, "m *b 6"]]:
-        """Every member's displacement and error, in leg lengths."""
+        """Displacement and Cholesky entries of each member, in leg lengths."""
         contacts = self.frames(window)[..., np.array(CONTACTS), :]
         still = contacts[..., :-1, :, :] - contacts[..., 1:, :, :]
         still = still.reshape(*still.shape[:-3], -1, 3)
@@ -133,7 +133,7 @@ class MetricNetwork(MotionNetwork):
             weight = jax.nn.softmax(out[..., :-3], -1)
             stance = jnp.einsum("...i,...ic->...c", weight, still)
             moves.append(stance + self.unit * out[..., -3:])
-            # the error is learnt beside the mean without bending it
+            # The covariance must not influence what the trunk learns.
             spreads.append(apply_layers(spread, jax.lax.stop_gradient(hidden)))
         return jnp.stack(moves), jnp.stack(spreads)
 
@@ -162,7 +162,7 @@ class MetricNetwork(MotionNetwork):
 def nearest_turn(
     angles: Float[Array, "*b 3"], reference: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
-    """Of the two rotation vectors of a rotation, the one nearer to a reference."""
+    """The rotation vector of the same rotation that is nearer to a reference."""
     square = (angles * angles).sum(-1, keepdims=True)
     small = square < 1e-6
     norm = jnp.sqrt(jnp.where(small, 1.0, square))

@@ -1,4 +1,4 @@
-"""From a sequence of postures to what each step must have been, in metres."""
+"""Predicts displacements of the pelvis between frames from a sequence of postures."""
 
 from typing import TypeVar
 
@@ -17,11 +17,11 @@ from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 
 
 class MotionModel(eqx.Module):
-    """A trained network and what it was trained for."""
+    """A network, or a user's function, with the body and frame rate it is made for."""
 
     network: MotionNetwork
     body: str = eqx.field(static=True)
-    """Kind of body model whose skeleton it knows, such as `default` or `smpl`."""
+    """Kind of body model it was trained on, such as `default` or `smpl`."""
     fps: float = eqx.field(static=True)
     """Frames per second that it expects."""
     past: int = eqx.field(static=True)
@@ -31,7 +31,7 @@ class MotionModel(eqx.Module):
 
 
 class Prediction(eqx.Module):
-    """What the motion model says of every step from frame k-1 to k, in row k."""
+    """Predictions for one person; row k is the step from frame k-1 to k."""
 
     translation: Float[Array, "t 3"]
     """Displacement of the pelvis joint in H_{k-1}, m per frame."""
@@ -42,7 +42,7 @@ class Prediction(eqx.Module):
     rotation: Float[Array, "t 3"]
     """Rotation vector of C_{H_{k-1}}^T C_{H_k}, from frames up to k-1, rad."""
     valid: Bool[Array, " t"]
-    """Whether row k had all frames that it needs; if not, its values mean nothing."""
+    """Whether all frames that row k needs are present; else values are undefined."""
 
 
 @jax.jit
@@ -62,8 +62,8 @@ def sequence_windows(
 ) -> Window:
     """The `t - past` windows of a sequence; the first one's target is frame `past`.
 
-    Root orientations enter relative to the frame before the target only, so the
-    world's heading and its up axis cancel.
+    Root orientations are relative to the frame before the target, so neither the
+    heading nor the up axis of the world matters.
     """
     leg = leg_length(body, shape)
     joints = local_joints(body, body_pose, shape) / leg
@@ -83,7 +83,7 @@ Arrays = TypeVar("Arrays", MotionModel, BodyModel)
 
 
 def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:
-    """The same model with numbers of another precision."""
+    """The same model in another floating-point precision."""
     cast = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
     return jax.tree.map(cast, model)
 
@@ -110,13 +110,18 @@ def predict(
     shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Prediction:
-    """Predicts every step of one person's sequence from postures and shape alone.
+    """Predicts the displacements of one person from postures and shape (section 3.4).
 
-    `orientation` takes H to any one frame that is common to the sequence; `body_pose`
-    is θ (rad) at the model's frame rate; `present` says which frames are to be used.
-    Needs no displacement, no heading and no gravity. Section 3.4 of the paper; but the
-    default network sees steady turning taken out (`_turning`), for which it looks at
-    orientations 1.5 seconds ahead.
+    Args:
+        orientation: takes H to any frame that is common to the sequence.
+        body_pose: θ, rad, at the model's frame rate.
+        shape: β.
+        present: the frames to be used.
+
+    Neither position, heading nor the direction of gravity is needed. For the default
+    network steady yaw is removed from the orientations first (`yaw_removal.py`), which
+    uses orientations up to 1.5 s ahead; the paper's network and users' functions see
+    the orientations as they are.
 
     **Raises:** `ValueError` if the weights belong to another body model.
     """

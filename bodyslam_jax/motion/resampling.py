@@ -1,7 +1,7 @@
-"""Predictions between frames of any rate by a model that works at 30 frames a second.
+"""Predictions at any frame rate from a model that works at 30 frames per second.
 
-Postures are interpolated to the model's own clock (slerp), its steps are summed to a
-path, and the path is read off at the times of the frames.
+Postures are interpolated to the model's ticks (slerp), predicted displacements are
+summed to a path, and the path is interpolated at the times of the frames.
 """
 
 import equinox as eqx
@@ -15,20 +15,20 @@ from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
 
 
 class Clock(eqx.Module):
-    """How `t` frames lie on the `g` ticks of a motion model, and the ticks on them."""
+    """Relative positions in time of `t` frames and the `g` ticks of a motion model."""
 
     frame: Int[Array, " g"]
     """The frame at or before each tick."""
     between: Float[Array, " g"]
-    """How far on to the next frame the tick is, 0 to 1."""
+    """Position of the tick between that frame and the next, 0 to 1."""
     tick: Int[Array, " t"]
     """The tick at or before each frame."""
     beyond: Float[Array, " t"]
-    """How far on to the next tick the frame is, 0 to 1."""
+    """Position of the frame between that tick and the next, 0 to 1."""
     steps: Float[Array, " t"]
-    """Ticks that passed since the frame before."""
+    """Ticks since the previous frame."""
     same: bool = eqx.field(static=True)
-    """Whether frames are ticks, and nothing needs to be interpolated."""
+    """Whether frames coincide with ticks, so that nothing is interpolated."""
 
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
@@ -57,7 +57,7 @@ def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
 
 
 def _lengthened(clock: Clock, frames: int) -> Clock:
-    """For postures padded at the end: what is added stands at the last tick."""
+    """For postures padded at the end: added frames lie at the last tick."""
     more = frames - len(clock.tick)
     fields = (clock.tick, clock.beyond, clock.steps)
     tick, beyond, steps = (jnp.pad(x, (0, more), mode="edge") for x in fields)
@@ -92,28 +92,28 @@ def predict_between(
 
     C = so3.exp(at_ticks(so3.log(orientation)))
     pose = at_ticks(body_pose)
-    there = present[clock.frame] & (present[following] | (between == 0))
-    seen = predict(network, body, C, pose, shape, there)
+    at_tick = present[clock.frame] & (present[following] | (between == 0))
+    ticks = predict(network, body, C, pose, shape, at_tick)
 
     before = jnp.concatenate([C[:1], C[:-1]])
-    step = jnp.einsum("gij,gj->gi", before, seen.translation)
-    step = jnp.where(seen.valid[:, None], step, 0)
-    missing = jnp.cumsum(~seen.valid)
+    step = jnp.einsum("gij,gj->gi", before, ticks.translation)
+    step = jnp.where(ticks.valid[:, None], step, 0)
+    missing = jnp.cumsum(~ticks.valid)
     path = jnp.cumsum(step, axis=0) - step[:1]
     last = jnp.minimum(clock.tick + 1, len(path) - 1)
-    place = path[clock.tick] + beyond[:, None] * (path[last] - path[clock.tick])
-    moved = place - jnp.concatenate([place[:1], place[:-1]])
+    position = path[clock.tick] + beyond[:, None] * (path[last] - path[clock.tick])
+    moved = position - jnp.concatenate([position[:1], position[:-1]])
     started = jnp.concatenate([orientation[:1], orientation[:-1]])
     end = jnp.where(beyond > 0, last, clock.tick)
     start = jnp.concatenate([clock.tick[:1], clock.tick[:-1]])
     valid = (missing[end] == missing[start]) & (jnp.arange(len(steps)) > 0) & present
-    step = so3.between(pose[end - 1], seen.body_pose[end])
+    step = so3.between(pose[end - 1], ticks.body_pose[end])
     previous = jnp.concatenate([body_pose[:1], body_pose[:-1]])
     return Prediction(
         translation=jnp.einsum("tji,tj->ti", started, moved),
-        covariance=seen.covariance[end] * (steps**2)[:, None, None]
+        covariance=ticks.covariance[end] * (steps**2)[:, None, None]
         + jnp.where(valid, 0, 1)[:, None, None].astype(dtype) * jnp.eye(3, dtype=dtype),
         body_pose=so3.compose(previous, steps[:, None, None] * step),
-        rotation=seen.rotation[end] * steps[:, None],
+        rotation=ticks.rotation[end] * steps[:, None],
         valid=valid,
     )

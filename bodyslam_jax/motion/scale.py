@@ -8,21 +8,21 @@ from jaxtyping import Array, Float
 from bodyslam_jax.motion.prediction import Prediction
 
 _MODEL_SPREAD = 0.03
-"""The model's own bias from one sequence to another, as a share of displacement:
-no length of a sequence averages it out. Measured on validation subjects, 5° drift."""
+"""Standard deviation of the model's bias between sequences, relative to displacement;
+it does not average out within one. From validation subjects at 5° drift."""
 
 _DURATIONS = (1, 5, 15, 30, 60)
 """Frames over which displacement is compared; sums average the noise of depth."""
 
 
 class Scale(NamedTuple):
-    """Metres per unit of a trajectory, and how well it is known."""
+    """Metres per unit of a trajectory, with its standard error."""
 
     value: float
-    """NaN if nothing can be said."""
+    """NaN without enough displacement."""
     standard_error: float
-    """Of `value`: pieces of the sequence disagree, and the model is biased on each
-    sequence by a few per cent; inf if there is only one piece."""
+    """Of `value`: from the disagreement between parts of the sequence and the model's
+    bias of a few per cent per sequence; inf with a single part."""
     per_duration: dict[int, float]
     """The same estimate from displacements over this many frames each."""
 
@@ -33,7 +33,7 @@ def scale_from_motion(
     camera: Float[Array | np.ndarray, "t 3"],
     offset: Float[Array | np.ndarray, "t 3"],
 ) -> Scale:
-    """Scale `s` so that people move as their postures say, in closed form.
+    """The scale `s` at which people move as predicted, by linear regression.
 
     `orientation` is `C_WH`; `camera` the unscaled camera centre `r'_WC`; `offset` the
     pelvis joint relative to the camera, `C_WC r_CH`, in metres. Over every window of
@@ -49,7 +49,7 @@ def scale_from_motion(
     step = np.where(valid[:, None], step, 0.0)
     walked = np.cumsum(step, 0)
     gaps = np.cumsum(~valid)
-    found, errors, told = {}, {}, {}
+    found, errors, ratio = {}, {}, {}
     for n in _DURATIONS:
         if len(r_C) <= n:
             continue
@@ -60,7 +60,7 @@ def scale_from_motion(
             continue
         found[n], errors[n] = _robust_ratio(x, y, n)
         moved = (walked[n:] - walked[:-n])[whole]
-        told[n] = np.sqrt((moved * moved).sum() / (x * x).sum())
+        ratio[n] = np.sqrt((moved * moved).sum() / (x * x).sum())
     if not found:
         return Scale(float("nan"), float("inf"), {})
     chosen = [n for n in found if n >= 5] or list(found)
@@ -69,7 +69,7 @@ def scale_from_motion(
     sure = [n for n in chosen if np.isfinite(errors[n])] or chosen
     best = min(sure, key=lambda n: abs(found[n] - value))
     apart = np.std([found[n] for n in chosen])
-    parts = (errors[best], apart, _MODEL_SPREAD * told[best])
+    parts = (errors[best], apart, _MODEL_SPREAD * ratio[best])
     return Scale(value, float(np.linalg.norm(parts)), found)
 
 

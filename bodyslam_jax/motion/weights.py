@@ -1,4 +1,4 @@
-"""Weights in one `.npz`: a JSON header that says what they are, then plain arrays.
+"""Weights in one `.npz`: a JSON header that describes them, then plain arrays.
 
 Read without pickle. The header holds format, network, sizes, body, fps, data, licence
 and metrics.
@@ -27,10 +27,10 @@ SHIPPED = ("default", "paper")
 def save_motion_model(
     path: Path | str, model: MotionModel, *, half: bool = False
 ) -> None:
-    """Writes a model; the file appears complete or not at all.
+    """Writes a model atomically.
 
-    `half` keeps the weights of layers in float16, in half the space. They are of order
-    1, and lose their fourth digit; means, deviations and the rest stay in float32.
+    `half` stores the weights of layers in float16, in half the space; they are of order
+    1 and lose their fourth digit. All else stays in float32.
 
     **Raises:** `ValueError` for a custom network, whose class no reader would know.
     """
@@ -97,7 +97,9 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: header lacks or misstates {error}.") from None
     if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"{path}: {fps:g} frames per second; expected more than none.")
+        raise ValueError(
+            f"{path}: {fps:g} frames per second; expected a positive number."
+        )
     wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
     found = [array.shape for array in arrays]
     if wanted != found:
@@ -114,7 +116,7 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
 
 
 def _untrained(header: dict) -> MetricNetwork | PaperNetwork:
-    """Shapes and types of the network that a header describes."""
+    """Shapes and types of the network in a header."""
     sizes, key = header["sizes"], jax.random.key(0)
     if header["network"] == "paper":
         make = lambda: PaperNetwork.init(key, sizes["past"], sizes["width"])

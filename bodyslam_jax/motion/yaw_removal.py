@@ -1,10 +1,10 @@
-"""Steady turning, taken out of what the motion model sees.
+"""Removes steady yaw from the orientations that the motion model reads.
 
-Motion capture walks along straight lines; people in videos walk curves, and a network
-that has hardly seen a curve predicts steps on it that are some per cent too short. What
-a curve changes in a step is the direction of the next one, and displacement is
-predicted in the frame of the last pose, where that does not matter. So the slow part of
-the turning about the body's own up axis is removed; what swings with each stride stays.
+Training data are mostly straight walks; on curves the network predicts displacements
+that are some per cent too short. A curve changes the direction of later steps, which
+does not matter in the frame of the previous pose, in which displacement is predicted.
+So the slowly varying yaw rate about the body's up axis is removed, and the oscillation
+with each stride is kept.
 """
 
 import jax
@@ -21,18 +21,18 @@ _SIGMA = 15
 def turning_rate(
     orientation: Float[Array, "t 3 3"], present: Bool[Array, " t"]
 ) -> Float[Array, " t"]:
-    """Slow turning about the body's y axis from frame k-1 to k, rad, in row k.
+    """Low-pass filtered yaw about the body's y axis from frame k-1 to k, rad, in row k.
 
     `orientation` takes H to any one frame: the result depends neither on its heading
-    nor on where up is. Frames that are not `present` count for nothing.
+    nor on its up axis. Frames that are not `present` have no weight.
     """
     step = so3.log(so3.inverse(orientation[:-1]) @ orientation[1:])[:, 1]
-    known = (present[:-1] & present[1:]).astype(step.dtype)
+    weight = (present[:-1] & present[1:]).astype(step.dtype)
     reach = min(3 * _SIGMA, len(orientation))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SIGMA) ** 2)
     kernel = jnp.asarray(kernel, step.dtype)
     smooth = lambda x: jnp.convolve(x, kernel, "full")[reach : reach + len(x)]
-    rate = smooth(jnp.where(known > 0, step, 0)) / jnp.maximum(smooth(known), 1e-3)
+    rate = smooth(jnp.where(weight > 0, step, 0)) / jnp.maximum(smooth(weight), 1e-3)
     return jnp.concatenate([jnp.zeros_like(rate[:1]), rate])
 
 

@@ -6,10 +6,10 @@
 `r̃` is the predicted displacement of the pelvis; the residual is linear in the scale s.
 With a `body`, lengths are in leg lengths `L(β)`: in metres a smaller person in a
 smaller world would have smaller errors, and the estimate would shrink. The model's
-errors are modelled as AR(1) with correlation ρ. Default: `Σ` of the network,
-enlarged by an error common to all steps of a person (`weights.step_error` = 5 %),
-`weights.motion_correlation` = 0.8. The paper: in metres,
-`λ_mm = 100` (`weights.motion_sigma` = 0.1 m), independent.
+errors are modelled as AR(1) with correlation ρ. Default: the network's `Σ`, enlarged by
+an error common to all steps of a person (`weights.step_error` = 5 %), and
+`weights.motion_correlation` = 0.8. The paper: in metres, `λ_mm = 100`
+(`weights.motion_sigma` = 0.1 m), independent.
 """
 
 import equinox as eqx

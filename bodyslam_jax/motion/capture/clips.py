@@ -1,8 +1,8 @@
-"""Motion capture as SMPL rotations: what a clip is, and how its rate is changed.
+"""Clips of motion capture as SMPL rotations, and their resampling.
 
 Axis-angle (rad) and metres. The root's rotation takes H (x left, y up, z forward) to
-the capture's world, whose heading and up axis do not matter: only displacement seen
-from the body is ever learnt.
+the capture's world, whose heading and up axis do not matter: displacements are
+learnt in the body's frame.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ class Clip:
 
     name: str
     subject: str
-    """Whoever shares this string is kept on the same side of every split."""
+    """Clips with the same subject are on the same side of every split."""
     motion: str
     """Class, such as walk or run."""
     split: str
-    """`train`, `val` or `other` if the data say so, else empty."""
+    """`train`, `val` or `other` if the data define it, else empty."""
     fps: float
     poses: Float[np.ndarray, "t 24 3"]
     """Axis-angle, rad; row 0 takes H to the world."""
@@ -45,7 +45,7 @@ class Clip:
     phase: int = 0
     """Which of the interleaved decimations of one recording this is."""
     phases: int = 1
-    """How many of them there are, so that they can be put together again."""
+    """How many of them there are, for `interleave`."""
 
 
 def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
@@ -68,8 +68,8 @@ def rest_from_offsets(
 def hip_centre(clip: Clip) -> Float[np.ndarray, "t 3"]:
     """The middle of the hip joints in the world, m.
 
-    Body models differ in how high above the hips they put the pelvis joint, captures
-    too: what carries a path from one to another is the hips.
+    Body models and captures differ in the height of the pelvis joint above the hips,
+    so a path is transferred from one to another by the hips.
     """
     if clip.offsets is None:  # SMPL's mean shape
         below = np.array([0.0, -0.086, -0.016]) * clip.leg_length / 0.82
@@ -107,7 +107,7 @@ def mirror(clip: Clip) -> Clip:
 def padded(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     """Calls a row-wise JAX function on a power-of-two number of rows.
 
-    Clips all differ in length; without this every one of them compiles anew.
+    Clips differ in length; without padding each length would be compiled.
     """
     rows = len(arrays[0])
     extra = (1 << max(rows - 1, 1).bit_length()) - rows
@@ -126,8 +126,8 @@ def _slerp(
 def resample(clips: Sequence[Clip], fps: float = FPS) -> tuple[Clip, ...]:
     """Interpolates clips at exactly `fps`: rotations by slerp, positions linearly.
 
-    Any rate will do (100, 120.00004577, ...); where a new frame falls on an old one
-    it is that one. The last frames are dropped rather than extrapolated.
+    Any rate is allowed (100, 120.00004577, ...). A new frame that coincides with an old
+    one is copied. The last frames are dropped rather than extrapolated.
     """
     if not clips:
         return ()
@@ -165,7 +165,7 @@ def resample(clips: Sequence[Clip], fps: float = FPS) -> tuple[Clip, ...]:
 
 
 def interleave(clips: Sequence[Clip]) -> tuple[Clip, ...]:
-    """Puts the phases of one recording together again, at their common higher rate.
+    """Merges the phases of one recording, at their common higher rate.
 
     Clips of a single phase are returned as they are.
     """
@@ -200,8 +200,8 @@ def split(
 ) -> tuple[tuple[Clip, ...], tuple[Clip, ...]]:
     """Training and validation clips; no subject is in both.
 
-    Where the data name validation subjects they are it; else a random `share` of the
-    subjects, at least one, unless there is only one.
+    Validation subjects are those named in the data; else a random `share` of the
+    subjects, at least one, unless there is a single subject.
     """
     subjects = sorted({clip.subject for clip in clips})
     held = {clip.subject for clip in clips if clip.split == "val"}

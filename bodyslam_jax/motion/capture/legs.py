@@ -1,4 +1,4 @@
-"""How long a captured person's legs are, of files that hold no skeleton."""
+"""Leg length of a captured person, for files without a skeleton."""
 
 from pathlib import Path
 
@@ -7,21 +7,21 @@ import numpy as np
 from bodyslam_jax.motion.capture.clips import Clip, leg_length, root_matrices
 
 _LEGS = (0.6, 1.1)
-"""How long legs are, m."""
+"""Plausible leg lengths, m."""
 _PELVIS = np.array([0.0, -0.22, 0.03])
-"""SMPL's pelvis joint at rest, m: where it is in a file whose `trans` is zero."""
+"""SMPL's pelvis joint at rest, m: its position where `trans` is zero."""
 _UPRIGHT = 0.7
-"""Cosine between up and the body's own on average; less is no standing."""
+"""Smallest mean cosine between the world's and the body's up axis of who stands."""
 
 
 class NoLegs(ValueError):
-    """The motion is whole, but nothing in it says how long a leg is."""
+    """The motion is valid, but its leg length cannot be determined."""
 
 
 def leg_from_joints(path: Path, joints: np.ndarray, num_frames: int) -> float:
     """Leg length (m), the median over the frames.
 
-    **Raises:** `ValueError`, naming the file, if they are none of a person.
+    **Raises:** `ValueError`, naming the file, if they are not those of a person.
     """
     if joints.shape != (num_frames, 24, 3):
         raise ValueError(

@@ -213,10 +213,10 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         )
     if len(poses) == 0:
         raise ValueError(f"{path}: the sequence has no frame.")
-    there = slice(None)
+    run = slice(None)
     if "present" in names:
-        there = _longest(path, take("present"), len(poses))
-    poses, trans = poses[there], trans[there]
+        run = _longest(path, take("present"), len(poses))
+    poses, trans = poses[run], trans[run]
     _check(path, "the sequence", poses, trans)
     hands = np.zeros((len(poses), 6))
     poses = np.concatenate([poses[:, :66], hands], -1).reshape(-1, 24, 3)
@@ -231,7 +231,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         offsets=None,
         leg_length=np.nan,
     )
-    joints = number("joints")[there] if "joints" in names else np.zeros(0)
+    joints = number("joints")[run] if "joints" in names else np.zeros(0)
     if joints.shape[1:] == (24, 3):
         leg = leg_from_joints(path, joints, len(poses))
     else:
@@ -240,7 +240,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
 
 
 def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
-    """The longest run of frames that the person is there in."""
+    """The longest run of frames in which the person is present."""
     flags = present.dtype.kind in "biu" and np.isin(present, (0, 1)).all()
     if present.shape != (num_frames,) or not flags or not present.any():
         raise ValueError(

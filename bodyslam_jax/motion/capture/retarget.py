@@ -1,7 +1,7 @@
-"""Captured motion on the body model: whose shape, and how far a step is for it.
+"""Retargets motion capture to the body model: a fitted shape and a scaled path.
 
-A network must be trained on the skeleton that it is used with, and the root's path
-must fit the legs, or the feet skate and the labels lie.
+A network is trained on the skeleton it is used with. The root's path must fit the
+legs, or feet slide and the true displacements are wrong.
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ from bodyslam_jax.motion.capture.clips import (
 )
 
 _FITTED = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
-"""Bones, by their lower joint, whose length says something of shape."""
+"""Bones, by their lower joint, whose lengths determine the shape."""
 _TOLERANCE = np.where(np.isin(_FITTED, (4, 5, 7, 8)), 0.01, 0.03)
-"""How well they are to be met, m: legs matter, hips and shoulders are placed by
-captures where their markers were."""
+"""Standard deviations of their lengths, m: small for legs; captures place hips and
+shoulders where the markers were."""
 
 
 @dataclasses.dataclass(frozen=True)

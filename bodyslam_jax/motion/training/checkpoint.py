@@ -1,4 +1,4 @@
-"""Checkpoints of a training: complete or not there at all, and of one run only."""
+"""Checkpoints of a training run, written atomically and tied to that run."""
 
 import dataclasses
 import hashlib
@@ -20,7 +20,7 @@ Tree = TypeVar("Tree")
 
 
 def fingerprint(settings: MotionTraining, data: Corpus, body: BodyModel) -> str:
-    """Changes with anything that would make a checkpoint another run's."""
+    """A hash of settings, data and body: a checkpoint of another run is refused."""
     mark = hashlib.sha256(json.dumps(dataclasses.asdict(settings)).encode())
     mark.update(body.kind.encode())
     for array in (data.poses, data.path, data.start):

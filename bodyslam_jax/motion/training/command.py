@@ -34,10 +34,10 @@ def train_from_data(
     written.
     """
     _check_writable(out)
-    known, validation = split(read_motion(data))
+    training, validation = split(read_motion(data))
     checkpoint = out.with_suffix(".ckpt.npz")
     model, history = train(
-        known,
+        training,
         load_body_model(body_model),
         settings,
         validation=validation,
@@ -46,7 +46,7 @@ def train_from_data(
     )
     epoch = kept(history, settings.drift_deg)
     about = {
-        "data": f"{len(known)} clips of {data.name}",
+        "data": f"{len(training)} clips of {data.name}",
         "licence": "not stated; that of the data applies",
         "settings": dataclasses.asdict(settings),
         "metrics": {} if epoch is None else named(history[epoch, 1:]),

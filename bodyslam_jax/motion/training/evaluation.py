@@ -1,4 +1,4 @@
-"""How far a motion model can be trusted: its predictions of captured motion, judged."""
+"""Evaluates a motion model on motion capture."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,7 @@ def _steps(
 ) -> tuple[Array, ...]:
     def one(poses, estimated, trans, shape, present):
         frame = so3.exp(poses[:, 0])
-        said: Prediction = predict(
+        found: Prediction = predict(
             model,
             body,
             so3.exp(estimated[:, 0]),
@@ -43,23 +43,23 @@ def _steps(
         )
         true = jnp.einsum("tba,tb->ta", before, step)
         previous = jnp.concatenate([jnp.zeros((1, 3), trans.dtype), true[:-1]])
-        posture = so3.between(said.body_pose, poses[:, 1:])
+        posture = so3.between(found.body_pose, poses[:, 1:])
         angle = jnp.sqrt((posture**2).sum(-1) + 1e-12).mean(-1)
         turn = so3.inverse(before) @ frame
-        root = so3.log(so3.inverse(so3.exp(said.rotation)) @ turn)
-        gap = local_joints(body, said.body_pose, shape) - local_joints(
+        root = so3.log(so3.inverse(so3.exp(found.rotation)) @ turn)
+        gap = local_joints(body, found.body_pose, shape) - local_joints(
             body, poses[:, 1:], shape
         )
         return (
-            said.translation,
+            found.translation,
             true,
             previous,
-            said.covariance,
+            found.covariance,
             before,
             angle,
             jnp.sqrt((root**2).sum(-1)),
             jnp.sqrt((gap**2).sum(-1)).mean(-1),
-            said.valid,
+            found.valid,
         )
 
     return jax.vmap(one)(poses, estimated, trans, shape, present)
@@ -139,8 +139,8 @@ def evaluate_model(
     Clips of any rate; of interleaved phases only the first counts. Noise is drawn
     `seeds` times. `skip` leaves out the first frames of every clip, so that models
     with windows of different lengths are compared on the same steps. Keys of the
-    result: `all` and every class, then `constant velocity` (which is told the last
-    displacement; the model is not) over all, and `constant`, a displacement in
+    result: `all` and every class, then `constant velocity` (which knows the previous
+    displacement, as the model does not) over all, and `constant`, a displacement in
     H_{k-1} (m) that is always predicted, if there is one.
 
     **Raises:** `ValueError` if no clip is long enough for a prediction.

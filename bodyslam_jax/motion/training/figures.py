@@ -37,7 +37,7 @@ def compare(
     """Measures several models on the same steps of the same clips, with baselines.
 
     One row per model, drift and motion class; constant velocity once; the mean
-    displacement of `training` clips if there are any. `write_table` writes them.
+    displacement of `training` clips, if given. `write_table` writes them.
     """
     skip = max(model.past for model in models.values()) + 1
     rows = []
@@ -53,7 +53,7 @@ def compare(
             ]
     rows.append(
         {
-            "model": "constant velocity (told the last displacement)",
+            "model": "constant velocity (given the last displacement)",
             "drift": 0.0,
             "class": "all",
             **found["constant velocity"],
@@ -87,8 +87,8 @@ def write_table(rows: Sequence[Mapping[str, str | float]]) -> str:
         for column in COLUMNS:
             value = row.get(column)
             digits = 1 if column.endswith(("_mm", "_deg")) else 3
-            known = isinstance(value, float) and np.isfinite(value)
-            cells.append(f"{value:.{digits}f}" if known else "")
+            is_number = isinstance(value, float) and np.isfinite(value)
+            cells.append(f"{value:.{digits}f}" if is_number else "")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -164,17 +164,17 @@ def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
     if (history[:, 0] > 0).all():  # a likelihood may be negative
         left.set_yscale("log")
     judged = np.isfinite(history[:, 1])
-    at, seen = epochs[judged], history[judged]
+    at, rows = epochs[judged], history[judged]
     for i, (drift_deg, target) in enumerate(zip(DRIFTS, TARGETS, strict=True)):
-        (line,) = middle.plot(at, seen[:, 1 + i], label=f"{drift_deg:g}° drift")
+        (line,) = middle.plot(at, rows[:, 1 + i], label=f"{drift_deg:g}° drift")
         middle.axhline(target, color=line.get_color(), lw=0.7, ls=":")
-        right.plot(at, seen[:, 4 + i], color=line.get_color())
+        right.plot(at, rows[:, 4 + i], color=line.get_color())
     middle.set(title="validation error / step", xlabel="epoch")
     right.axhline(1, color="k", lw=0.7)
     right.set(title="validation slope", xlabel="epoch")
-    if len(seen):  # the first epochs may be far out
+    if len(rows):  # the first epochs may be far out
         middle.legend()
-        late = seen[len(seen) // 5 :]
+        late = rows[len(rows) // 5 :]
         middle.set_ylim(0, 1.1 * max(*TARGETS, late[:, 1:4].max()))
         low, high = late[:, 4:].min(), late[:, 4:].max()
         right.set_ylim(min(low, 0.95) - 0.02, max(high, 1.05) + 0.02)

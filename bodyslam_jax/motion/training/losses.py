@@ -1,9 +1,10 @@
-"""What training minimises.
+"""Training losses.
 
-The loss of the paper's preset is its equation 1. The default's is a mean error norm
-(not its square: errors have heavy tails) of single steps and of their mean over a
-segment, with a penalty on the slope of predicted over true displacement, which a
-graph would read as scale; posture and covariance are learnt beside it.
+The paper's network: equation 1. The default network: the mean error norm (not squared,
+as errors have heavy tails) of single displacements and of their mean over a segment,
+and a penalty on the slope of predicted over true displacement, as a biased slope biases
+the scale; posture and covariance are learnt beside it. A user's function
+(`make_motion_model`): the negative log-likelihood of true displacements.
 """
 
 import jax

@@ -1,4 +1,4 @@
-"""What is said of predicted displacements: error, bias, spread, calibration, memory.
+"""Measures of predicted displacements: error, bias, spread, calibration, correlation.
 
 Slope is the projection of predicted on true displacement: 1 is unbiased, and its
 error becomes the error of a scale estimated with the model.

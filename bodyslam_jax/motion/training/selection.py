@@ -1,4 +1,4 @@
-"""Which weights are kept, and how large their covariance is: judged on validation."""
+"""Selection of weights and calibration of covariances on validation subjects."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion.capture.retarget import Trial
+from bodyslam_jax.motion.function_network import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
@@ -19,7 +20,7 @@ DRIFTS = (0.0, 5.0, 9.0)
 """Slow joint-angle errors (degrees) at which a model is judged."""
 
 TARGETS = (0.10, 0.13, 0.18)
-"""Ratio of error to step that is hoped for at each of them."""
+"""Target ratio of error to displacement at each of them."""
 
 
 def validated(
@@ -37,25 +38,24 @@ def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
 
 
 def kept(history: Float[np.ndarray, "e 7"], drift_deg: float) -> int | None:
-    """The epoch, from 0, whose weights were kept; none if none was judged."""
+    """The epoch, from 0, whose weights were kept; `None` without validation."""
     scores = np.array([score(row, drift_deg) for row in history[:, 1:]])
     return None if np.isnan(scores).all() else int(np.nanargmin(scores))
 
 
 def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
-    """What validation prefers: small errors and slopes near 1 at noise as trained."""
-    seen = np.array(DRIFTS) <= drift_deg
+    """Lower is better: relative errors and slopes, at the drifts used in training."""
+    trained = np.array(DRIFTS) <= drift_deg
     errors, bias = row[:3] / TARGETS, np.abs(row[3:] - 1)
-    return float(np.mean(errors[seen]) + 5 * np.mean(bias[seen]))
+    return float(np.mean(errors[trained]) + 5 * np.mean(bias[trained]))
 
 
 def calibrated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> MotionModel:
-    """Sizes the covariance so that normalised errors have mean square 1.
+    """Scales the covariance to a mean square of whitened errors of 1, over all drifts.
 
-    Over all noise levels together: the network's own covariance says how they differ.
-    The paper's network has none; its constant one is measured here.
+    The paper's network predicts no covariance; its constant one is measured here.
     """
     runs = [run_trials(model, body, trials, d) for d in DRIFTS]
     error = np.concatenate([(r.predicted - r.true)[r.valid] for r in runs]).astype(
@@ -65,10 +65,13 @@ def calibrated(
         spread = np.linalg.cholesky(error.T @ error / len(error) + 1e-10 * np.eye(3))
         new = jnp.asarray(spread, jnp.float32)
         return eqx.tree_at(lambda m: m.network.spread, model, new)
-    if not isinstance(model.network, MetricNetwork):
+    if not isinstance(model.network, MetricNetwork | FunctionNetwork):
         return model
     covariance = np.concatenate([r.covariance[r.valid] for r in runs]).astype(float)
     nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1) / 3
+    if isinstance(model.network, FunctionNetwork):
+        spread = model.network.spread * float(np.sqrt(nees.mean()))
+        return eqx.tree_at(lambda m: m.network.spread, model, spread)
     factor = 0.5 * np.log(nees.mean())
     bias = lambda m: [layers[-1].bias for layers in m.network.spreads]
     shift = jnp.asarray([factor] * 3 + [0.0] * 3, jnp.float32)

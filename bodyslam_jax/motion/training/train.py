@@ -1,4 +1,4 @@
-"""Training: one `lax.scan` per epoch, resumed after a kill, the same for one seed."""
+"""Training: one `lax.scan` per epoch; resumable and deterministic in the seed."""
 
 import dataclasses
 import json
@@ -17,6 +17,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.function_network import FunctionNetwork
 from bodyslam_jax.motion.network import MotionNetwork, Normalisation, normalisation
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
@@ -37,7 +38,7 @@ _MEASURED = 20
 
 
 class Progress(eqx.Module):
-    """All that a checkpoint must hold to continue as if nothing had happened."""
+    """The state of a training run, as checkpoints hold it."""
 
     network: MotionNetwork
     average: MotionNetwork
@@ -60,6 +61,8 @@ def trainable(network):
         is_leaf=frozen,
     )
     if isinstance(network, PaperNetwork):
+        return eqx.tree_at(lambda n: n.spread, mask, False)
+    if isinstance(network, FunctionNetwork):
         return eqx.tree_at(lambda n: n.spread, mask, False)
     if not isinstance(network, MetricNetwork):
         return mask
