@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.body import load_body_model as load_body_model
     from bodyslam_jax.config import Config as Config
     from bodyslam_jax.evaluation import evaluate as evaluate
-    from bodyslam_jax.evaluation import stack_pairs as stack_pairs  # pyright: ignore
+    from bodyslam_jax.evaluation import stack_pairs as stack_pairs
     from bodyslam_jax.graph import FrameFactor as FrameFactor
     from bodyslam_jax.graph import Problem as Problem
     from bodyslam_jax.graph import State as State
