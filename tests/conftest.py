@@ -1,6 +1,7 @@
 """What every test stands on: 64-bit, strict promotion, no silent recompiles."""
 
 import os
+import sys
 
 import jax
 import jaxlib.version
@@ -48,3 +49,24 @@ def no_body_models(monkeypatch, tmp_path):
     """Hides those of whoever runs the tests."""
     monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Runs `bodyslam` with these arguments in this process.
+
+    Returns the exit code and all output, standard error last.
+    """
+    from bodyslam_jax import cli  # not before XLA's flags are set
+
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
+
+    def run(*argv) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        code, printed = stopped.value.code, capsys.readouterr()
+        text = printed.out + printed.err
+        return (1, text + code) if isinstance(code, str) else (code or 0, text)
+
+    return run
