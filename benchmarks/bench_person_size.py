@@ -28,7 +28,7 @@ from bodyslam_jax import (
     solver,
 )
 from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
-from bodyslam_jax.pipeline.joint_stage import solve_stage
+from bodyslam_jax.pipeline.solve_stage import solve_stage
 
 MUTED = graph.RootSmoothness
 """Its weight is of the person's path in the world."""
@@ -62,7 +62,7 @@ def errors(simulated, weights):
     problem = graph.make_problem(factors, state, free=free)
     held = graph.set_constant(problem.free, "scale", "cameras", "intrinsics")
     problem = dataclasses.replace(problem, free=held)
-    solution, _ = solve_stage(problem, state, config, "people alone")
+    solution, _ = solve_stage(problem, state, config, "bodies only")
     shape = solution.state.shapes[0]
     leg = lambda shape: motion.leg_length(body, jnp.asarray(shape))
     by_shape = np.asarray(jax.grad(lambda shape: jnp.log(leg(shape)))(shape))

@@ -335,6 +335,12 @@ class Result:
     """Content of `summary.json`."""
 
     @property
+    def fps(self) -> float:
+        """Mean frame rate, 1/s; 30 for a single frame."""
+        t = self.timestamps
+        return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
+
+    @property
     def located(self) -> Bool[np.ndarray, " t"]:
         """Frames whose camera was estimated: from the first to the last of
         `frames_used` in the summary, if it has them. Other poses are finite fill."""

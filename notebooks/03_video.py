@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bodyslam_jax as bs
-from bodyslam_jax import evaluation, export, io, simulation, view
+from bodyslam_jax import diagnostics, evaluation, io, simulation, view
 
 # %config InlineBackend.figure_formats = ["jpeg"]
 plt.rcParams["figure.dpi"] = 70
@@ -89,8 +89,8 @@ plan.set_xlabel("x, m")
 plan.set_ylabel("z, m")
 plan.legend()
 for facts, label in (
-    (export.camera_facts(result), "camera"),
-    (export.person_facts(result, 0), "person"),
+    (diagnostics.camera_statistics(result), "camera"),
+    (diagnostics.person_statistics(result, 0), "person"),
 ):
     speed.plot(result.timestamps, facts.speed, label=label)
     print(f"{label}: {facts.distance:.2f} m, {facts.mean_speed:.2f} m/s")

@@ -8,6 +8,7 @@ each process below 2 GB.
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -70,3 +71,24 @@ def no_body_models(monkeypatch, tmp_path):
     """Hides those of whoever runs the tests."""
     monkeypatch.delenv("BODYSLAM_BODY_MODEL", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Runs `bodyslam` with these arguments in this process.
+
+    Returns the exit code and all output, standard error last.
+    """
+    from bodyslam_jax import cli  # not before XLA's flags are set
+
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
+
+    def run(*argv) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        code, printed = stopped.value.code, capsys.readouterr()
+        text = printed.out + printed.err
+        return (1, text + code) if isinstance(code, str) else (code or 0, text)
+
+    return run

@@ -126,5 +126,5 @@ def test_fingerprint_sees_the_body_that_the_machine_has(tmp_path, monkeypatch):
 def test_fingerprint_sees_the_package(monkeypatch):
     """Another state of the source may compute something else."""
     before = fingerprint(1)
-    monkeypatch.setattr(stage_cache, "_package", lambda: b"edited")
+    monkeypatch.setattr(stage_cache, "package_hash", lambda: b"edited")
     assert fingerprint(1) != before

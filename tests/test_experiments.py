@@ -515,11 +515,11 @@ def test_learning_weights_costs_a_compilation(tmp_path):
 
 
 def test_axes_of_figures(tmp_path):
-    assert figures._log_mm([5.0, np.nan, 80.0]) == (1.0, 120.0)
-    assert figures._log_mm([0.03, 2.0]) == pytest.approx((0.01, 10.0))
-    assert figures._log_mm([np.nan, 0.0]) == (1.0, 10.0)
+    assert figures.log_limits_mm([5.0, np.nan, 80.0]) == (1.0, 120.0)
+    assert figures.log_limits_mm([0.03, 2.0]) == pytest.approx((0.01, 10.0))
+    assert figures.log_limits_mm([np.nan, 0.0]) == (1.0, 10.0)
     axis = Figure().subplots()
-    figures._draw_ratios(axis, np.arange(3), np.array([0.98, 7.3, np.nan]))
+    figures.draw_ratios(axis, np.arange(3), np.array([0.98, 7.3, np.nan]))
     assert axis.get_xlim() == pytest.approx((0.945, 1.055))
     assert [text.get_text() for text in axis.texts] == ["7.30"]
 

@@ -12,7 +12,7 @@ import yaml
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import evaluation, export
+from bodyslam_jax import diagnostics, evaluation, export
 from bodyslam_jax.body import joints, load_body_model
 from bodyslam_jax.types import Result
 
@@ -92,8 +92,8 @@ def test_only_located_cameras_are_in_the_trajectory(tmp_path, result):
     found = evaluation.read_result(tmp_path)
     np.testing.assert_array_equal(found.T_WC, result.T_WC)
     assert found.located.tolist() == [2 <= k <= 8 for k in range(12)]
-    whole = export.camera_facts(result)
-    assert export.camera_facts(cut).seconds < whole.seconds
+    whole = diagnostics.camera_statistics(result)
+    assert diagnostics.camera_statistics(cut).seconds < whole.seconds
 
 
 def test_run_folder_is_a_ground_truth_for_another(tmp_path, result, body):

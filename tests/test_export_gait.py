@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax import export, simulation
+from bodyslam_jax import diagnostics, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.export.summary import _slow_motion
+from bodyslam_jax.diagnostics.verdict import cadence_warning
 
 PERIOD, FPS, SPEED, THIGH = 36, 30.0, 1.35, 0.4
 
@@ -46,7 +46,7 @@ def changed(result, **arrays):
 
 
 def test_steps_are_counted_and_measured(stilts):
-    found = export.gait(stilts, 0)
+    found = diagnostics.gait(stilts, 0)
     assert found.frequency == pytest.approx(2 * FPS / PERIOD)
     assert found.leg == pytest.approx(2 * THIGH)
     step = SPEED / found.frequency
@@ -59,35 +59,35 @@ def test_steps_are_counted_and_measured(stilts):
 
 
 def test_a_walk_is_too_fast_where_its_frame_rate_is_twice_the_true_one(walk):
-    seen = export.gait(walk, 0)
+    seen = diagnostics.gait(walk, 0)
     assert not seen.is_fast_motion()
-    hurried = export.gait(changed(walk, timestamps=walk.timestamps / 2), 0)
-    assert hurried.is_fast_motion() and not hurried.is_slow_motion()
-    (line,) = _slow_motion(0, hurried, 0.05, 60.0)
+    hurried = diagnostics.gait(changed(walk, timestamps=walk.timestamps / 2), 0)
+    assert hurried.is_fast_motion() and not hurried.iscadence_warning()
+    (line,) = cadence_warning(0, hurried, 0.05, 60.0)
     assert "60 fps is not the video's frame rate" in line
 
 
 def test_a_walk_is_not_slow_motion_until_it_is_slowed(walk):
-    seen = export.gait(walk, 0)
-    assert 0.75 < seen.slowness < 1.3 and not seen.is_slow_motion()
-    slowed = export.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
+    seen = diagnostics.gait(walk, 0)
+    assert 0.75 < seen.slowness < 1.3 and not seen.iscadence_warning()
+    slowed = diagnostics.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
     assert slowed.slowness == pytest.approx(2.2 * seen.slowness)
     assert slowed.step == pytest.approx(seen.step)
-    assert slowed.is_slow_motion()
+    assert slowed.iscadence_warning()
     # Steps that may be shorter by half need not be of slow motion.
-    assert not slowed.is_slow_motion(0.5)
+    assert not slowed.iscadence_warning(0.5)
 
 
 def test_size_has_little_to_say_and_the_way_nothing(walk):
-    seen = export.gait(walk, 0)
-    taller = export.gait(changed(walk, joints=1.2 * walk.joints), 0)
+    seen = diagnostics.gait(walk, 0)
+    taller = diagnostics.gait(changed(walk, joints=1.2 * walk.joints), 0)
     assert taller.step == pytest.approx(seen.step)
     assert taller.slowness == pytest.approx(seen.slowness / 1.2**0.5)
     turn = Rotation.from_euler("y", 70, degrees=True)
     poses = walk.poses.copy()
     poses[0, :, :3] = (turn * Rotation.from_rotvec(poses[0, :, :3])).as_rotvec()
     turned = changed(walk, joints=walk.joints @ turn.as_matrix().T, poses=poses)
-    assert export.gait(turned, 0).slowness == pytest.approx(seen.slowness)
+    assert diagnostics.gait(turned, 0).slowness == pytest.approx(seen.slowness)
 
 
 def test_only_while_there(stilts):
@@ -96,35 +96,35 @@ def test_only_while_there(stilts):
     noise = np.random.default_rng(0).standard_normal((20, 24, 3))
     joints = stilts.joints.copy()
     joints[0, :20] = noise
-    found = export.gait(changed(stilts, present=partly, joints=joints), 0)
+    found = diagnostics.gait(changed(stilts, present=partly, joints=joints), 0)
     assert found.frequency == pytest.approx(2 * FPS / PERIOD)
 
 
 def test_who_does_not_walk_has_no_gait(stilts):
     nobody = np.zeros_like(stilts.present)
-    assert export.gait(changed(stilts, present=nobody), 0) is None
+    assert diagnostics.gait(changed(stilts, present=nobody), 0) is None
     briefly = nobody.copy()
     briefly[0, 10:40] = True  # less than one stride and a half
-    assert export.gait(changed(stilts, present=briefly), 0) is None
+    assert diagnostics.gait(changed(stilts, present=briefly), 0) is None
     briefly[0, 10] = briefly[0, 12:] = False
-    assert export.gait(changed(stilts, present=briefly), 0) is None
+    assert diagnostics.gait(changed(stilts, present=briefly), 0) is None
     still = np.repeat(stilts.joints[:, :1], 100, axis=1)
-    assert export.gait(changed(stilts, joints=still), 0) is None
+    assert diagnostics.gait(changed(stilts, joints=still), 0) is None
     noise = np.random.default_rng(1).standard_normal(stilts.joints.shape)
-    assert export.gait(changed(stilts, joints=noise), 0) is None
+    assert diagnostics.gait(changed(stilts, joints=noise), 0) is None
     on_the_spot = stilts.joints.copy()
     on_the_spot[..., 2] -= on_the_spot[:, :, :1, 2]
     spot = changed(stilts, joints=on_the_spot, timestamps=9 * stilts.timestamps)
-    assert not export.gait(spot, 0).is_slow_motion()
+    assert not diagnostics.gait(spot, 0).iscadence_warning()
 
 
 def test_a_line_tells_of_it_as_far_as_metres_are_known(walk):
-    steps = export.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
-    (line,) = _slow_motion(1, steps, np.nan, 25.0)
+    steps = diagnostics.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
+    (line,) = cadence_warning(1, steps, np.nan, 25.0)
     assert "person 1 takes" in line and "25 fps is not its frame rate" in line
     assert f"about {steps.slowness:.1f} times as fast" in line
-    assert _slow_motion(1, steps, 0.1, 25.0)
+    assert cadence_warning(1, steps, 0.1, 25.0)
     for unsure in (0.6, np.inf):
-        assert not _slow_motion(1, steps, unsure, 25.0)
-    assert not _slow_motion(0, export.gait(walk, 0), np.nan, 25.0)
-    assert not _slow_motion(0, None, 0.1, 25.0)
+        assert not cadence_warning(1, steps, unsure, 25.0)
+    assert not cadence_warning(0, diagnostics.gait(walk, 0), np.nan, 25.0)
+    assert not cadence_warning(0, None, 0.1, 25.0)

@@ -9,7 +9,7 @@ from scipy.signal import savgol_filter
 
 from bodyslam_jax import export
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.export import statistics as facts
+from bodyslam_jax.diagnostics import statistics
 from bodyslam_jax.types import Result
 
 
@@ -88,8 +88,9 @@ def test_says_what_was_found(tmp_path, body):
         "moves at 0.62 m/s, expected &lt; 0.4. look at the overlay.",
         "3.6 m",  # 3 s at 1.2 m/s
         "1.20 m/s",
-        f"{100 * facts.stature(body, np.zeros(10)):.0f} ± 2 cm",
-        "± 2.5 %",
+        f"{100 * statistics.stature(body, np.zeros(10)):.0f} ± 2 cm",
+        "known to 2.5 %",
+        "estimate 2 0.05",  # the scale itself, among the details
         "focal length guessed &amp; refined",
         "cameras alone joint C-ATE, SE(3), mm – no &lt;scale&gt; 25.1",
         "C-ATE, Sim(3), mm 8.5 8.1",
@@ -133,26 +134,26 @@ def test_a_focal_length_that_was_guessed_has_a_card(tmp_path, body):
     assert "Focal length" not in card({"guessed": False, "focal_px": 500.0})
 
 
-def test_metres_that_two_cues_dispute_say_so(tmp_path, body):
+def test_the_report_gives_the_difference_of_cues_that_contradict(tmp_path, body):
     scale = {"value": 2.0, "sigma": 0.6, "from_motion": [1.0, 0.1]}
     text = lambda scale: _text(
         _write(tmp_path, dataclasses.replace(_walk(), summary={"scale": scale}), body)
     )
-    share = lambda sigma: f"± {100 * sigma / _walk().scale:.1f} %"
+    share = lambda sigma: f"{100 * sigma / _walk().scale:.1f} %"
     disputed = text(scale | {"sigma_of_covariance": 0.06})
-    assert share(0.6) in disputed and share(0.06)[2:] in disputed
-    assert "half of what the two below are apart" in disputed
-    assert "half of what" not in text(scale | {"sigma_of_covariance": 0.6})
+    assert f"known to {share(0.6)}" in disputed and share(0.06) in disputed
+    assert "half the difference between the cues" in disputed
+    assert "half the difference" not in text(scale | {"sigma_of_covariance": 0.6})
     assert share(0.6) in text(scale)
 
 
-def test_without_people_nothing_is_in_metres(tmp_path, body):
+def test_without_people_lengths_are_in_units_of_the_map(tmp_path, body):
     scale = {"scale": {"value": 1.0, "sigma": float("inf")}}
     text = _write(tmp_path, dataclasses.replace(_walk(people=0), summary=scale), body)
     cards = text[text.index('class="cards"') : text.index("</section>")]
     assert "3 units" in cards and "own unit" in cards
-    assert "nothing tells it: there are no people" in cards
-    assert "m/s" not in cards and "How sure" not in cards
+    assert "not in metres" in cards and "there are no people" in cards
+    assert "m/s" not in cards and "known to" not in cards
 
 
 def test_absent_people_and_no_map(tmp_path, body):
@@ -167,7 +168,7 @@ def test_absent_people_and_no_map(tmp_path, body):
     assert "there for 1.9 s" in page and "nan" not in _text(page)
     assert "Stature of person 0" in page and "Stature of person 1" not in page
     # The gap is no distance: 19 + 39 frames at 1.2 m/s.
-    way = facts.person_facts(result, 0)
+    way = statistics.person_statistics(result, 0)
     np.testing.assert_allclose(way.distance, 1.2 * (19 + 39) / 30, rtol=1e-6)
     assert np.isnan(way.speed[30]) and way.speed[5] == pytest.approx(1.2)
 
@@ -177,26 +178,28 @@ def test_jitter_is_not_distance():
     noise = np.random.default_rng(0).normal(0, 0.02, (90, 3))
     still.joints[0, :, 0] = noise + [0.0, 0.9, 0.0]
     raw = np.linalg.norm(np.diff(noise[:, [0, 2]], axis=0), axis=1).sum()
-    assert facts.person_facts(still, 0).distance < 0.15 * raw
+    assert statistics.person_statistics(still, 0).distance < 0.15 * raw
 
 
 def test_skating_is_the_speed_of_the_foot_that_stands():
     result = _walk()
     result.joints[0, :, 10] = [0.0, 0.05, 0.0]
     result.joints[0, :, 11, 1] = 0.2
-    assert facts.foot_skating(result, 0) < 1e-12
+    assert statistics.foot_skating(result, 0) < 1e-12
     result.joints[0, :, 10, 0] = 0.3 * result.timestamps
-    np.testing.assert_allclose(facts.foot_skating(result, 0), 0.3)
+    np.testing.assert_allclose(statistics.foot_skating(result, 0), 0.3)
 
 
 def test_paths_are_smoothed_by_a_moving_average_that_keeps_lines():
     path = np.random.default_rng(4).standard_normal((60, 2))
     inside = slice(7, -7)
     expected = savgol_filter(path, 15, 1, axis=0)[inside]
-    np.testing.assert_allclose(facts.smoothed(path, 30.0)[inside], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        statistics.smoothed(path, 30.0)[inside], expected, atol=1e-12
+    )
     line = np.linspace(0, 3, 60)[:, None] * [1.0, -2.0]
-    np.testing.assert_allclose(facts.smoothed(line, 30.0), line, atol=1e-12)
-    np.testing.assert_array_equal(facts.smoothed(path[:2], 30.0), path[:2])
+    np.testing.assert_allclose(statistics.smoothed(line, 30.0), line, atol=1e-12)
+    np.testing.assert_array_equal(statistics.smoothed(path[:2], 30.0), path[:2])
 
 
 def test_is_read_aloud_as_it_is_read(tmp_path, body):
@@ -224,7 +227,7 @@ def test_is_read_aloud_as_it_is_read(tmp_path, body):
 def test_scenes_of_any_size_have_a_grid(tmp_path, body, size):
     result = _walk()
     result.T_WC[:, 0, 3] *= size
-    assert "Where everybody went" in _text(_write(tmp_path, result, body))
+    assert "Paths" in _text(_write(tmp_path, result, body))
 
 
 def test_skating_is_told_beside_that_of_a_real_walk(tmp_path, body):

@@ -39,7 +39,7 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
     tracks, _ = scene("orbit", num=NUM)
     first = reconstruct(tracks, CAMERA, NUM)
     turning = dataclasses.replace(first, kind="rotation", error=error)
-    monkeypatch.setattr(sfm_stage, "_reconstruct", lambda *_: turning)
+    monkeypatch.setattr(sfm_stage, "reconstruct", lambda *_: turning)
 
     def adjusted(cameras, sigma, config, guess):
         found = np.asarray(guess.params) * [0.9, 0.9, 1, 1]
@@ -47,7 +47,7 @@ def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, 
             cameras, intrinsics=found, focal_sigma=1.0, pixel_sigma=0.3
         )
 
-    monkeypatch.setattr(sfm_stage, "_adjusted", adjusted)
+    monkeypatch.setattr(sfm_stage, "adjust", adjusted)
     found = sfm_stage.estimate(sequence(tracks, 1.0, NUM), tracks, Config())
     assert found.kind == kind
     np.testing.assert_allclose(found.focal, 0.9 * CAMERA.params[0])

@@ -8,7 +8,7 @@ import pytest
 from test_frontend_motion import CAMERA, SIZE, camera_error, scene
 
 from bodyslam_jax.config import Structure
-from bodyslam_jax.pipeline import sfm_stage
+from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion_warning
 from bodyslam_jax.sfm.zoom import without_zoom
 from bodyslam_jax.types import Bodies, Keypoints, Sequence, Tracks
@@ -93,7 +93,7 @@ def test_keypoints_and_bodies_lose_the_zoom_too():
     )
     people = Keypoints(uv, confidence)
     sequence = Sequence("z", None, np.arange(2) / 30, CAMERA, people, bodies)
-    found = sfm_stage.with_intrinsics(sequence, CAMERA.params, zoom)
+    found = with_intrinsics(sequence, CAMERA.params, zoom)
     assert found.keypoints is not None and found.bodies is not None
     np.testing.assert_allclose(found.keypoints.uv[0, 0], uv[0, 0])
     expected = CENTRE + (uv[0, 1] - CENTRE) / 1.2

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scenes
 
-from bodyslam_jax import export, graph, initialisation, motion
+from bodyslam_jax import diagnostics, graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.export import summary
+from bodyslam_jax.diagnostics import scale_uncertainty
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.types import Result, ScaleStart
 
@@ -54,8 +54,8 @@ def scene(factor: float = 1.0, tilt: float = 0.0, num: int = 40) -> Result:
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 @pytest.mark.parametrize("factor", [1.0, 1.8, 0.6])
-def test_says_how_much_too_small_the_map_is(factor, tilt):
-    found = export.ground_scale(scene(factor, tilt))
+def test_ground_scale_is_the_factor_by_which_the_map_is_too_small(factor, tilt):
+    found = diagnostics.ground_scale(scene(factor, tilt))
     np.testing.assert_allclose(found, factor, rtol=0.04)  # floor: 2 cm rough
 
 
@@ -68,14 +68,14 @@ def test_the_ground_is_found_among_much_else():
     np.testing.assert_allclose(offset, 0, atol=0.02)
 
 
-def test_nothing_is_said_without_ground_or_people():
+def test_ground_scale_is_none_without_ground_or_people():
     whole = scene()
     walls = whole.landmarks[whole.landmarks[:, 1] > 0.5]
-    assert export.ground_scale(dataclasses.replace(whole, landmarks=walls)) is None
+    assert diagnostics.ground_scale(dataclasses.replace(whole, landmarks=walls)) is None
     bare = dataclasses.replace(whole, landmarks=whole.landmarks[:0])
-    assert export.ground_scale(bare) is None
+    assert diagnostics.ground_scale(bare) is None
     nobody = np.zeros_like(whole.present)
-    assert export.ground_scale(dataclasses.replace(whole, present=nobody)) is None
+    assert diagnostics.ground_scale(dataclasses.replace(whole, present=nobody)) is None
 
 
 def test_a_table_is_not_the_ground():
@@ -123,17 +123,17 @@ def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
     both = ScaleStart(motion=2.0, motion_error=0.2, ground=3.0, ground_error=0.1)
     assert both.value == pytest.approx((2 / 0.04 + 3 / 0.01) / (1 / 0.04 + 1 / 0.01))
     assert both.standard_error == pytest.approx((1 / 0.04 + 1 / 0.01) ** -0.5)
-    apart = summary.cues_apart(both)
+    apart = scale_uncertainty.cue_discrepancy(both)
     assert apart == pytest.approx(np.log(3 / 2))
-    (line,) = summary._disagreement(both, apart)
+    (line,) = scale_uncertainty.discrepancy_warning(both)
     assert "0.67 times" in line and "no better than 20 %" in line
-    assert not summary._disagreement(both, 0.0)
     nothing = ScaleStart()
     assert nothing.value == 1.0 and np.isinf(nothing.standard_error)
     unsure = dataclasses.replace(both, motion_error=0.5)
     alone = ScaleStart(motion=2.0, motion_error=0.1)
     for start in (dataclasses.replace(both, motion=2.8), unsure, alone, nothing):
-        assert summary.cues_apart(start) == 0.0
+        assert scale_uncertainty.cue_discrepancy(start) == 0.0
+        assert not scale_uncertainty.discrepancy_warning(start)
 
 
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():

@@ -37,21 +37,6 @@ def sequence(tmp_path) -> Path:
     return folder
 
 
-@pytest.fixture
-def command(monkeypatch, capsys):
-    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
-
-    def run(*argv) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        code = stopped.value.code
-        out = capsys.readouterr()
-        return (1, code) if isinstance(code, str) else (code or 0, out.err + out.out)
-
-    return run
-
-
 def test_stages_that_were_done_are_not_done_again(
     sequence, command, monkeypatch, tmp_path, caplog
 ):
@@ -179,7 +164,7 @@ def test_people_are_detected_where_nobody_gave_keypoints(
         seen.append(found)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "before_joint", stop)
+    monkeypatch.setattr(sfm, "track", stop)
     config = cli.read_settings(_settings(tmp_path), Config())
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bodyslam_jax import graph, initialisation, motion, people, solver
+from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights
-from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.diagnostics import scale_uncertainty
+from bodyslam_jax.pipeline import joint_problem
 from bodyslam_jax.types import (
     Bodies,
     Intrinsics,
@@ -55,54 +56,65 @@ def _cameras() -> SfmResult:
     )
 
 
+@pytest.fixture
+def unsolved(monkeypatch):
+    """`prepare` without the body-only solve, and with no valid prediction."""
+    invalid = _prediction(jnp.zeros(3), jnp.zeros(T, bool))
+    monkeypatch.setattr(joint_problem, "predict", lambda *_: invalid)
+    monkeypatch.setattr(
+        joint_problem, "solve_body_only", lambda _, state, __: (state, {})
+    )
+
+
 @pytest.mark.parametrize(("fitted", "share"), [(False, 0.07), (True, 0.31)])
 def test_steps_share_the_error_of_where_their_bodies_came_from(
-    monkeypatch, fitted, share
+    monkeypatch, unsolved, fitted, share
 ):
-    told = []
+    errors = []
 
     def motion_factor(*_, shared_error, **__):
-        told.append(float(shared_error[0]))
+        errors.append(float(shared_error[0]))
+        return _no_factor()
 
     def scale_start(*_, shared_error, **__):
-        told.append(shared_error)
+        errors.append(shared_error)
         return ScaleStart(motion=2.0, motion_error=0.1)
 
-    # All that compiles is left out: what the steps are trusted to is settled before.
+    # Nothing is compiled: the error that steps share is decided before.
     monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
     monkeypatch.setattr(initialisation, "scale_start", scale_start)
     monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
     monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
-    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
-    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
     sequence = dataclasses.replace(
         _sequence(None if fitted else _bodies()), keypoints=seen if fitted else None
     )
     weights = GraphWeights(step_error=0.07, fitted_step_error=0.31)
-    prepared = joint_stage.prepare(
+    prepared = joint_problem.prepare(
         sequence,
         _cameras(),
         _bodies(),
         load_body_model(dtype=jnp.float64),
         dataclasses.replace(Config(), weights=weights),
     )
-    assert told == [share] * 3  # of people alone, of the first scale, of everything
+    assert errors == [share] * 3  # body-only solve, first scale, joint problem
     assert float(prepared.state.scale) == pytest.approx(2)
 
 
 def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     monkeypatch,
+    unsolved,
 ):
-    told = []
+    calls = []
 
     def motion_factor(*_, without, **__):
-        told.append(("term", list(without)))
+        calls.append(("term", list(without)))
+        return _no_factor()
 
     def scale_start(*_, without, **__):
-        told.append(("scale", list(without)))
+        calls.append(("scale", list(without)))
         return ScaleStart(motion=2.0, motion_error=0.1, **cue)
 
     monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
@@ -112,20 +124,18 @@ def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
-    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
-    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     body = load_body_model(dtype=jnp.float64)
-    prepare = lambda: joint_stage.prepare(
+    prepare = lambda: joint_problem.prepare(
         _sequence(_bodies()), _cameras(), _bodies(), body, Config()
     )
     cue = {}
     assert prepare().warnings == ()
-    assert told == [("term", []), ("scale", []), ("term", [])]
-    told.clear()
+    assert calls == [("term", []), ("scale", []), ("term", [])]
+    calls.clear()
     cue = {"ground": 3.0, "ground_error": 0.1}
     (line,) = prepare().warnings
     assert "person 0 moves at 1.2 m/s" in line
-    assert told == [("term", []), ("scale", []), ("scale", [0]), ("term", [0])]
+    assert calls == [("term", []), ("scale", []), ("scale", [0]), ("term", [0])]
 
 
 def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
@@ -174,13 +184,13 @@ def test_people_whom_no_keypoint_shows_stay_where_a_regressor_has_them():
     factors = initialisation.people_factors(sequence, roots, GraphWeights(), body)
     (place,) = (f for f in factors if isinstance(f, graph.RootPositionPrior))
     placed = np.asarray(np.isfinite(np.asarray(place.sigma)).all(axis=-1))
-    # Person 1 from a second after the last keypoint on, and nobody else.
+    # Only person 1, from a second after the last keypoint on.
     assert not placed[0].any() and not placed[1, :30].any() and placed[1, 30:].all()
     assert not np.asarray(place.correlation)[1, :31].any()
 
 
 @pytest.mark.parametrize("shot", [slice(0, 3), slice(1, 4)])
-def test_nothing_moves_beyond_a_cut(monkeypatch, shot):
+def test_nothing_moves_beyond_a_cut(monkeypatch, unsolved, shot):
     located = np.zeros(T, bool)
     located[shot] = True
     T_WC = np.tile(np.eye(4), (T, 1, 1))
@@ -193,10 +203,8 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, shot):
     monkeypatch.setattr(
         initialisation, "scale_start", lambda *_, **__: ScaleStart(2.0, 0.1)
     )
-    monkeypatch.setattr(joint_stage, "predict", lambda *_: None)
-    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint_stage.prepare(sequence, cameras, _bodies(), body, Config())
+    prepared = joint_problem.prepare(sequence, cameras, _bodies(), body, Config())
     free = np.asarray(prepared.problem.free.cameras)
     assert not free[~located].any()
     # The first and one coordinate of the farthest of those that are left.
@@ -229,46 +237,31 @@ def test_frames_that_are_used_are_those_of_the_shot():
     assert lost.within.all()
 
 
-def test_sizes_that_nobody_measured_are_as_uncertain_as_people_differ():
+def test_variances_of_fitted_shapes_are_those_of_the_untightened_prior():
     body = load_body_model(dtype=jnp.float64)
-    given = _bodies()
-    roots = people.roots_from_bodies(given, body)
-    cameras = _cameras()
-    state = initialisation.first_state(
-        cameras.T_WC, np.zeros((0, 3)), roots, cameras.intrinsics
+    tight, scale = 0.16 * jnp.eye(10)[None], jnp.asarray(2.0)
+    inflate = lambda shapes, sigma, present: scale_uncertainty.inflate_fitted_shapes(
+        jnp.asarray(0.01),
+        shapes,
+        scale,
+        jnp.zeros((len(shapes), 10)),
+        body,
+        np.array(sigma),
+        np.array(present),
     )
-    state = dataclasses.replace(state, scale=jnp.asarray(2.0))
-    zeros = functools.partial(jnp.zeros, dtype=jnp.float64)
-    spread = solver.Marginals(
-        scale=jnp.asarray(0.01),
-        cameras=zeros((T, 3, 3)),
-        people=zeros((1, T, 3, 3)),
-        intrinsics=zeros((4, 4)),
-        shapes=0.16 * jnp.eye(10)[None],
-        landmarks=zeros((0, 3, 3)),
-    )
-    there = np.array([True])
-    found = joint_stage.of_fitted_sizes(spread, state, body, np.array([0.4]), there)
-    np.testing.assert_allclose(found.shapes[0], np.eye(10), rtol=1e-12)
+    variance, shapes = inflate(tight, [0.4], [True])
+    np.testing.assert_allclose(shapes[0], np.eye(10), rtol=1e-12)
     # The leg's slope by differences.
     leg = lambda shape: float(motion.leg_length(body, jnp.asarray(shape)))
     slope = [(leg(h) - leg(-h)) / 2e-5 / leg(0 * h) for h in 1e-5 * np.eye(10)]
     more = 4 * (1 - 0.16) * np.square(slope).sum()
-    np.testing.assert_allclose(found.scale, 0.01 + more, rtol=1e-6)
-    twice = lambda x: jnp.concatenate([x, x])
-    two = dataclasses.replace(
-        spread, shapes=twice(spread.shapes), people=twice(spread.people)
-    )
-    both = dataclasses.replace(
-        state,
-        **{name: twice(getattr(state, name)) for name in ("shapes", "roots", "poses")},
-    )
-    absent = np.array([True, False])
-    alone = joint_stage.of_fitted_sizes(two, both, body, np.array([0.4, 0.4]), absent)
-    np.testing.assert_allclose(alone.scale, found.scale)
-    measured = joint_stage.of_fitted_sizes(spread, state, body, np.array([1.0]), there)
-    np.testing.assert_array_equal(measured.shapes, spread.shapes)
-    np.testing.assert_array_equal(measured.scale, spread.scale)
+    np.testing.assert_allclose(variance, 0.01 + more, rtol=1e-6)
+    two = jnp.concatenate([tight, tight])
+    one_absent, _ = inflate(two, [0.4, 0.4], [True, False])
+    np.testing.assert_allclose(one_absent, variance)
+    unchanged, measured = inflate(tight, [1.0], [True])
+    np.testing.assert_array_equal(measured, tight)
+    np.testing.assert_array_equal(unchanged, 0.01)
 
 
 @pytest.mark.parametrize("pixels", [None, 5.0])
@@ -299,13 +292,13 @@ def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
         np.testing.assert_allclose(given, expected, rtol=1e-9)
 
 
-def test_metres_are_not_known_where_nobody_tells_them():
-    sigma = joint_stage._scale_sigma
-    assert sigma(0.04, moving=True, told=True) == pytest.approx(0.2)
+def test_scale_sigma_is_infinite_where_nothing_determines_metres():
+    sigma = scale_uncertainty.covariance_sigma
+    assert sigma(0.04, moving=True, metric=True) == pytest.approx(0.2)
     # Held at 1, the scale has no variance; that is not to know it.
-    assert sigma(0.0, moving=True, told=False) == np.inf
-    assert np.isnan(sigma(0.0, moving=False, told=False))
-    assert np.isnan(sigma(np.nan, moving=True, told=False))
+    assert sigma(0.0, moving=True, metric=False) == np.inf
+    assert np.isnan(sigma(0.0, moving=False, metric=False))
+    assert np.isnan(sigma(np.nan, moving=True, metric=False))
 
 
 def _tracked() -> SfmResult:
@@ -340,7 +333,7 @@ def test_the_weight_of_landmarks_is_what_was_asked_for(weights, expected):
     nobody = Bodies(np.zeros((0, T), bool), rows(72), rows(10), rows(3))
     config = dataclasses.replace(Config(), weights=weights)
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint_stage.prepare(_sequence(None), cameras, nobody, body, config)
+    prepared = joint_problem.prepare(_sequence(None), cameras, nobody, body, config)
     track, prior = prepared.problem.factors
     assert isinstance(track, graph.Reprojection)
     assert isinstance(prior, graph.LandmarkPrior)
@@ -404,18 +397,17 @@ def test_displacements_of_the_papers_preset_are_in_metres():
 
 @pytest.mark.parametrize("coupling", ["frozen", "refreshed"])
 def test_postures_are_held_to_predictions_only_where_there_are_any(
-    monkeypatch, coupling
+    monkeypatch, unsolved, coupling
 ):
     """Not in the frames after a gap, in which what stands there means nothing."""
     valid = np.array([[False, False, True, False]])
     predicted = _prediction(jnp.zeros(3), jnp.asarray(valid[0]))
-    monkeypatch.setattr(joint_stage, "predict", lambda *_: predicted)
-    monkeypatch.setattr(joint_stage, "_settle_people", lambda _, state, __: (state, {}))
+    monkeypatch.setattr(joint_problem, "predict", lambda *_: predicted)
     seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
     config = dataclasses.replace(Config.paper(), motion_coupling=coupling)
     body = load_body_model(dtype=jnp.float64)
-    prepared = joint_stage.prepare(sequence, _cameras(), _bodies(), body, config)
+    prepared = joint_problem.prepare(sequence, _cameras(), _bodies(), body, config)
     (factor,) = (
         f for f in prepared.problem.factors if isinstance(f, graph.BodyPosePrior)
     )
@@ -423,7 +415,7 @@ def test_postures_are_held_to_predictions_only_where_there_are_any(
     np.testing.assert_array_equal(known, valid)
     held = prepared.problem.motion is None
     assert held == (coupling == "frozen")
-    if held:  # to the prediction, which nobody makes again
+    if held:  # to the prediction, which is not repeated
         np.testing.assert_allclose(factor.rotation[0, 2], 0.2)
 
 

@@ -15,7 +15,7 @@ from test_frontend_motion import CAMERA, camera_error, scene
 from bodyslam_jax import graph, initialisation, io, people, sfm
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Known, Measured, Structure
-from bodyslam_jax.export import stature
+from bodyslam_jax.diagnostics import stature
 from bodyslam_jax.types import CameraPath, Keypoints, Sequence, Tracks
 
 

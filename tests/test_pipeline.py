@@ -11,6 +11,7 @@ from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.pipeline import to_metric
+from bodyslam_jax.pipeline.default_body import with_compatible_body
 
 CONTRACT = {
     "timestamps": (60,),
@@ -117,12 +118,12 @@ def test_a_body_that_was_found_does_not_stop_who_did_not_ask_for_it(
     found = tmp_path / "SMPL_NEUTRAL.npz"
     write_npz(load_body_model(DEFAULT), found)
     monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(found))
-    config, warnings = pipeline._with_body(Config())
+    config, warnings = with_compatible_body(Config())
     assert config.body_model == str(DEFAULT)
     (line,) = warnings
     assert line.startswith(f"{found} is not used") and "--motion-model" in line
     # Whoever names it is told that the two do not fit, and cameras need no body.
     for asked in (Config(body_model=str(found)), Config(people=False)):
-        assert pipeline._with_body(asked) == (asked, ())
+        assert with_compatible_body(asked) == (asked, ())
     monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(DEFAULT))
-    assert pipeline._with_body(Config()) == (Config(), ())
+    assert with_compatible_body(Config()) == (Config(), ())

@@ -7,13 +7,12 @@ from scipy.spatial.transform import Rotation
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.diagnostics import figures
-from bodyslam_jax.diagnostics.plausibility import (
-    PERSON_CHECKS,
-    WORLD_CHECKS,
+from bodyslam_jax.diagnostics.checks import (
     Reason,
     judge,
     status_of,
 )
+from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 
 FPS = 30.0
 
@@ -71,7 +70,7 @@ def test_feet_that_slide_are_doubted(walk):
     assert doubts(walk + slow) == set()
 
 
-def test_whoever_steps_on_the_spot_is_doubted(walk):
+def test_steps_on_the_spot_are_doubted(walk):
     """As on a treadmill: the middle of the path is taken away."""
     time = np.arange(len(walk)) / FPS
     gone = np.array([np.polyval(np.polyfit(time, x, 1), time) for x in walk[:, 0].T]).T
@@ -83,7 +82,7 @@ def test_whoever_steps_on_the_spot_is_doubted(walk):
     assert "step_short_of_reach" in doubts(small)
 
 
-def test_whoever_is_carried_on_is_doubted(walk):
+def test_people_who_are_carried_are_doubted(walk):
     """A moving walkway, which makes the walker as fast as a runner; and somebody who
     rolls along without a step."""
     time = np.arange(len(walk)) / FPS
@@ -105,7 +104,7 @@ def test_a_child_taken_for_an_adult_is_doubted_where_steps_are_quick(walk):
     assert doubts(walk) == set()
 
 
-def test_whoever_is_turned_from_the_body_given_is_doubted():
+def test_a_constant_rotation_from_the_given_body_is_doubted():
     rng = np.random.default_rng(0)
     given = Rotation.random(40, rng=rng)
     noise = Rotation.from_rotvec(rng.normal(0, 0.15, (40, 3)))
@@ -124,17 +123,17 @@ def test_whoever_is_turned_from_the_body_given_is_doubted():
     assert np.isnan(few)
 
 
-def test_up_is_told_from_where_the_image_has_its_top(truth):
+def test_up_is_compared_with_the_top_of_the_image(truth):
     assert figures.up_in_image(truth.T_WC) < 30
     for angle, axis in ((90.0, 2), (90.0, 0), (180.0, 2)):
         turn = Rotation.from_rotvec(np.radians(angle) * np.eye(3)[axis]).as_matrix()
         turned = truth.T_WC.copy()
         turned[:, :3, :3] = turned[:, :3, :3] @ turn
-        told = {"up_in_image": figures.up_in_image(turned)}
-        assert [r.name for r in judge(WORLD_CHECKS, told)] == ["up_in_image"]
+        of_person = {"up_in_image": figures.up_in_image(turned)}
+        assert [r.name for r in judge(WORLD_CHECKS, of_person)] == ["up_in_image"]
 
 
-def test_whoever_floats_or_sinks_is_doubted(walk):
+def test_people_who_float_or_sink_are_doubted(walk):
     along = walk[:, :1] - walk[:1, :1]
     gone = np.linalg.norm(along, axis=-1, keepdims=True)
     rising = walk + gone * [0.0, np.tan(np.radians(8.0)), 0.0]
@@ -145,7 +144,7 @@ def test_whoever_floats_or_sinks_is_doubted(walk):
     assert "feet_off_ground" in doubts(swaying)
 
 
-def test_whoever_crouches_is_doubted(walk):
+def test_people_who_crouch_are_doubted(walk):
     """Thighs turned forward and shins back, so that knees bend by 30 degrees more."""
     crouched = walk.copy()
     side = walk[:, 1] - walk[:, 2]
@@ -167,7 +166,7 @@ def test_whoever_crouches_is_doubted(walk):
     assert "trunk_lean" in doubts(bowed)
 
 
-def test_whoever_becomes_another_in_a_moment_is_doubted(walk):
+def test_a_sudden_change_of_identity_is_doubted(walk):
     other = walk.copy()
     half = len(walk) // 2
     about = walk[half, 0]
@@ -182,11 +181,11 @@ def test_whoever_becomes_another_in_a_moment_is_doubted(walk):
     assert "joint_acceleration" in doubts(trembling)
 
 
-def test_speeds_of_nobody_are_doubted(walk):
+def test_impossible_speeds_and_statures_are_doubted(walk):
     assert "speed" in doubts(walk * 8.0)
     for stature, names in ((1.7, set()), (2.4, {"stature"}), (0.8, {"short_stature"})):
-        told = {"stature": stature, "short_stature": stature}
-        assert {r.name for r in judge(PERSON_CHECKS, told)} == names
+        of_person = {"stature": stature, "short_stature": stature}
+        assert {r.name for r in judge(PERSON_CHECKS, of_person)} == names
 
 
 def test_a_camera_that_moves_as_no_hand_does_is_doubted(truth):

@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyslam_jax import cli, export, pipeline
+from bodyslam_jax import export, pipeline
 from bodyslam_jax.config import Config
 from bodyslam_jax.export import lock
 from bodyslam_jax.io import read_sequence
+from bodyslam_jax.pipeline import run_folder
 from bodyslam_jax.pipeline.stage_cache import fingerprint
 
 HOLD = """
@@ -90,11 +91,11 @@ def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
     message = "process 4 on node17 is writing this run.*try again in 60 s"
     with pytest.raises(ValueError, match=message), export.locked(tmp_path):
         pass
-    old = time.time() - 2 * lock._STALE
+    old = time.time() - 2 * lock.STALE
     os.utime(file, (old, old))
     with export.locked(tmp_path):
         assert json.loads(file.read_text())["pid"] == os.getpid()
-        assert time.time() - file.stat().st_mtime < lock._STALE
+        assert time.time() - file.stat().st_mtime < lock.STALE
     file.write_text("half")  # of a process that was killed as it wrote
     with export.locked(tmp_path):
         pass
@@ -102,7 +103,7 @@ def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
 
 
 def test_a_lock_is_renewed(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "_RENEWED", 0.01)
+    monkeypatch.setattr(lock, "RENEWED", 0.01)
     with export.locked(tmp_path):
         file = tmp_path / ".lock"
         os.utime(file, (0, 0))
@@ -126,20 +127,6 @@ def sequence(tmp_path) -> Path:
     return folder
 
 
-@pytest.fixture
-def command(monkeypatch, capsys):
-    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
-
-    def run(*argv) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["bodyslam", *map(str, argv)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        code, err = stopped.value.code, capsys.readouterr().err
-        return (1, err + code) if isinstance(code, str) else (code or 0, err)
-
-    return run
-
-
 def reached(*args, **kwargs):
     raise AssertionError("computed")
 
@@ -149,7 +136,7 @@ def test_a_second_run_into_a_folder_says_so_and_leaves(
     what, sequence, command, holder, monkeypatch, tmp_path
 ):
     process = holder(tmp_path / "out")
-    monkeypatch.setattr(pipeline, "_run", reached)
+    monkeypatch.setattr(run_folder, "run_stages", reached)
     argv = ["run", sequence] if what == "run" else ["demo"]
     code, err = command(*argv, "--out", tmp_path / "out")
     assert code == 1
@@ -160,7 +147,7 @@ def test_a_second_run_into_a_folder_says_so_and_leaves(
 def test_nobody_and_no_way_to_find_anybody_is_said_at_once(
     sequence, command, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(pipeline, "_run", reached)
+    monkeypatch.setattr(run_folder, "run_stages", reached)
     for file in (sequence / "keypoints").iterdir():
         file.unlink()
     (sequence / "keypoints").rmdir()

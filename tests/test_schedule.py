@@ -8,7 +8,7 @@ import scenes
 
 from bodyslam_jax import graph, solver
 from bodyslam_jax.config import Config
-from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.solver import PAPER_SCHEDULE, Solution, Stage
 from bodyslam_jax.solver.schedule import check_names, check_schedule
 
@@ -24,21 +24,21 @@ def test_the_papers_schedule_has_its_numbers_of_first_order_steps():
     ("config", "steps"), [(Config(), [20, 50]), (Config.paper(), [200, 100])]
 )
 def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
-    """All of them for the joint problem, the last of them for people alone."""
+    """All of them for the joint problem, the last of them for the body-only solve."""
     state = scenes.truth(np.random.default_rng(0), frames=2, people=0, landmarks=0)
     problem = graph.make_problem((), state)
-    told = []
+    calls = []
 
     def solve(problem, state, *, solver, schedule):
-        told.append((solver, [stage.max_steps for stage in schedule]))
+        calls.append((solver, [stage.max_steps for stage in schedule]))
         cost, counts = jnp.asarray(1.0), (jnp.array(3), jnp.array(4))
         return Solution(state, optx.RESULTS.successful, cost, (), counts, 2 * cost)
 
     monkeypatch.setattr(solver, "solve", solve)
-    _, said = joint_stage.solve_stage(problem, state, config, "joint")
-    assert said["iterations"] == 7 and said["status"] == "converged"
-    joint_stage.solve_stage(problem, state, config, "people alone")
-    assert told == [(config.solver, steps), (config.solver, steps[-1:])]
+    _, entry = solve_stage(problem, state, config, "joint")
+    assert entry["iterations"] == 7 and entry["status"] == "converged"
+    solve_stage(problem, state, config, "bodies only")
+    assert calls == [(config.solver, steps), (config.solver, steps[-1:])]
 
 
 @pytest.mark.parametrize(

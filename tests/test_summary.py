@@ -1,4 +1,4 @@
-"""What the summary says of a result, and what it doubts."""
+"""Summary and verdict of a result."""
 
 import dataclasses
 
@@ -6,14 +6,15 @@ import estimates
 import numpy as np
 import pytest
 
-from bodyslam_jax import export, simulation
+from bodyslam_jax import simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.pipeline.to_metric import assemble
+from bodyslam_jax.diagnostics import Gait, verdict
+from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.types import ScaleStart
 
 
-def test_metres_are_no_surer_than_the_two_cues_leave_them():
+def test_cues_that_contradict_bound_the_scale_sigma_from_below():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     cameras = estimates.still_camera(sequence)
@@ -24,16 +25,16 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
             estimates.standing_people(sequence), start=start, scale_sigma=sigma
         )
         moving = dataclasses.replace(cameras, kind="moving")
-        told = assemble(sequence, config, body, moving, joint, {}).summary
-        lines.append(told["headline"][1])
-        return told["scale"], " ".join(told["warnings"])
+        summary = assemble(sequence, config, body, moving, joint, {}).summary
+        lines.append(summary["headline"][1])
+        return summary["scale"], " ".join(summary["warnings"])
 
     lines = []
-    scale, said = found(2.0, 0.03)
+    scale, warnings = found(2.0, 0.03)
     assert scale["sigma"] == pytest.approx(np.log(1.5) / 2)
-    assert scale["sigma_of_covariance"] == 0.03 and "no better than" in said
-    scale, said = found(2.9, 0.03)
-    assert scale["sigma"] == 0.03 and "no better than" not in said
+    assert scale["sigma_of_covariance"] == 0.03 and "no better than" in warnings
+    scale, warnings = found(2.9, 0.03)
+    assert scale["sigma"] == 0.03 and "no better than" not in warnings
     assert found(2.0, 0.4)[0]["sigma"] == 0.4
     assert np.isnan(found(2.0, np.nan)[0]["sigma"])
     found(2.9, 4.0)
@@ -46,7 +47,7 @@ def test_metres_are_no_surer_than_the_two_cues_leave_them():
         assert part in line
 
 
-def test_noise_of_pixels_that_nobody_measured_is_not_told():
+def test_pixel_noise_is_reported_only_where_it_was_measured():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = estimates.standing_people(sequence)
@@ -57,7 +58,7 @@ def test_noise_of_pixels_that_nobody_measured_is_not_told():
         assert found["pixel_sigma"] == expected
 
 
-def test_the_summary_says_who_and_what_is_left_out():
+def test_the_summary_names_people_and_frames_that_are_left_out():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = estimates.standing_people(sequence)
@@ -72,9 +73,11 @@ def test_the_summary_says_who_and_what_is_left_out():
         cameras = dataclasses.replace(cameras, kind=kind, registered=located)
         return assemble(sequence, config, body, cameras, joint, {}).summary
 
-    # These people fit no keypoints, which is told as well.
+    # These people fit no keypoints, which is a reason as well.
     about = {"people", "frames_used"}
-    names = lambda told: [r["name"] for r in told["reasons"] if r["name"] in about]
+    names = lambda summary: [
+        r["name"] for r in summary["reasons"] if r["name"] in about
+    ]
     whole = found(joint, 0, 14)
     assert names(whole) == []
     assert whole["frames_used"] == [0, 14]
@@ -103,33 +106,33 @@ def test_the_summary_says_who_and_what_is_left_out():
     assert not any("are used" in w for w in whole["warnings"])
 
 
-def test_a_scale_that_nothing_tells_or_that_cannot_be_is_no_result():
+def test_an_undetermined_scale_is_doubtful_and_a_negative_one_failed():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = estimates.standing_people(sequence)
     cameras = dataclasses.replace(estimates.still_camera(sequence), kind="moving")
 
-    def told(**changes):
+    def verdict_on(**changes):
         one = dataclasses.replace(joint, **changes)
         found = assemble(sequence, config, body, cameras, one, {}).summary
         about = [r["name"] for r in found["reasons"] if r["name"].startswith("scale_")]
         return found["status"], about
 
     known = ScaleStart(motion=2.0, motion_error=0.1)
-    assert told(start=known, scale_sigma=0.05)[1] == []
-    assert told(start=ScaleStart(), scale_sigma=0.05)[1] == ["scale_unknown"]
-    turned = told(start=known, scale=-3.0, scale_sigma=-0.1)
+    assert verdict_on(start=known, scale_sigma=0.05)[1] == []
+    assert verdict_on(start=ScaleStart(), scale_sigma=0.05)[1] == ["scale_unknown"]
+    turned = verdict_on(start=known, scale=-3.0, scale_sigma=-0.1)
     assert turned == ("failed", ["scale_sign"])
 
 
-def test_steps_that_are_too_slow_for_people_are_told(monkeypatch):
+def test_implausibly_slow_steps_cause_a_warning(monkeypatch):
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
     joint = dataclasses.replace(estimates.standing_people(sequence), scale_sigma=np.nan)
     cameras = estimates.still_camera(sequence)
     found = lambda: assemble(sequence, config, body, cameras, joint, {}).summary
     assert found()["people"][0]["steps_per_s"] is None  # half a second
-    monkeypatch.setattr(export, "gait", lambda *_: export.Gait(0.7, 0.9, 0.8))
-    told = found()
-    assert told["people"][0]["steps_per_s"] == 0.7
-    assert any("person 0 takes 0.7 steps a second" in w for w in told["warnings"])
+    monkeypatch.setattr(verdict, "gait", lambda *_: Gait(0.7, 0.9, 0.8))
+    summary = found()
+    assert summary["people"][0]["steps_per_s"] == 0.7
+    assert any("person 0 takes 0.7 steps a second" in w for w in summary["warnings"])

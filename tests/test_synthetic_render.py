@@ -9,7 +9,8 @@ import pytest
 
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.simulation.exact_scene import look_at, walk
-from bodyslam_jax.simulation.outfit import PARTS, Figure, Outfit, dress
+from bodyslam_jax.simulation.figure import Figure, dress
+from bodyslam_jax.simulation.outfit import PARTS, Outfit
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.raster import rasterise
 from bodyslam_jax.simulation.renderer import Renderer, write_video
@@ -70,7 +71,7 @@ def project(T_WC, points):
 
 def test_depth_is_that_of_the_nearest_surface(room, renderer):
     T = camera([-1.0, 1.5, -3.0], [0.3, 0.8, 1.0])
-    inverse, _, _ = renderer._room(T[None])
+    inverse, _, _ = renderer.render_room(T[None])
     rng = np.random.default_rng(1)
     points, normals = landmarks_on(room.faces(), 20.0, rng)
     uv, z = project(T, points)
@@ -89,7 +90,7 @@ def test_depth_is_that_of_the_nearest_surface(room, renderer):
 
 def test_every_pixel_of_a_room_is_filled(renderer):
     for target in ([3.0, 0.2, 0.0], [0.0, 2.8, 1.0], [-3.0, 1.0, -4.0]):
-        inverse, _, _ = renderer._room(camera([0.2, 1.5, -1.0], target)[None])
+        inverse, _, _ = renderer.render_room(camera([0.2, 1.5, -1.0], target)[None])
         # Walls are at most 9 m away; the background's inverse depth is 0.001
         assert inverse.min() > 0.1
 
@@ -187,7 +188,7 @@ def test_rows_of_a_rolling_shutter_are_seen_from_where_the_camera_is_then(
     assert times.mean() == pytest.approx(0.0, abs=1e-12)
     assert times[-1] - times[0] == pytest.approx(0.03 * 479 / 480)
     who = rolling.frame(T, 1, [moving])[1]
-    depth = rolling._room(cameras_at(T, 1, times, 30.0))[0]
+    depth = rolling.render_room(cameras_at(T, 1, times, 30.0))[0]
     still_who = ideal.frame(T, 1, [moving])[1]
     differs = 0
     for row in range(110, 400, 29):
@@ -195,7 +196,9 @@ def test_rows_of_a_rolling_shutter_are_seen_from_where_the_camera_is_then(
         at = v + 30.0 * times[row] * moving[1]
         exact = still(ideal, now[0], at)[1][row]
         assert abs(who[row] - exact).sum() <= 2  # a pixel on the edge of a triangle
-        np.testing.assert_allclose(depth[row], ideal._room(now)[0][row], rtol=1e-4)
+        np.testing.assert_allclose(
+            depth[row], ideal.render_room(now)[0][row], rtol=1e-4
+        )
         differs += abs(still_who[row] - exact).sum()
     assert differs > 60  # and an ideal camera sees something else
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_cli import _run
 
 from bodyslam_jax import simulation
 from bodyslam_jax.body import load_body_model
@@ -193,12 +192,12 @@ def test_a_link_to_a_folder_is_written_through(simulated, tmp_path):
     ],
 )
 def test_a_refused_option_is_named_and_leaves_nothing(
-    argv, message, tmp_path, monkeypatch, capsys
+    argv, message, tmp_path, monkeypatch, command
 ):
     monkeypatch.chdir(tmp_path)
     np.savez("bad.npz", a=np.zeros(3))
-    code, _, err = _run(monkeypatch, capsys, "simulate", "new/out", *argv)
-    assert code == 1 and message in err and len(err.strip().splitlines()) == 1
+    code, text = command("simulate", "new/out", *argv)
+    assert code == 1 and message in text and len(text.strip().splitlines()) == 1
     assert list(Path().iterdir()) == [Path("bad.npz")]
 
 

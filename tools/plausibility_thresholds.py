@@ -5,7 +5,7 @@
 Motion capture is cut in pieces of 3 and 5 s; simulated sequences give their true
 people and cameras, and the keypoints that are measured of them. Prints, figure by
 figure, on how many pieces it applies, percentiles, and how many pieces the threshold
-of `bodyslam_jax.diagnostics.plausibility` would doubt; then how many are doubted at
+of `bodyslam_jax.diagnostics.thresholds` would doubt; then how many are doubted at
 all. The tables stand in `benchmarks/plausibility.md`.
 """
 
@@ -22,9 +22,9 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import graph, initialisation, motion, people, simulation
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.diagnostics import figures
-from bodyslam_jax.diagnostics.plausibility import PERSON_CHECKS, WORLD_CHECKS
+from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 from bodyslam_jax.geometry import camera
-from bodyslam_jax.pipeline import joint_stage
+from bodyslam_jax.pipeline.motion_prediction import motion_predictor, predict
 
 SECONDS = (3.0, 5.0)
 SHORTEST = 0.7
@@ -92,7 +92,7 @@ def carried_of(paths: list[Path], frames: int = 90) -> tuple[int, list[str]]:
     there = np.ones((1, frames), bool)
     roots = people.roots_from_bodies(made.bodies, body)
     roots = dataclasses.replace(roots, present=there)
-    predictor = joint_stage.motion_predictor(made, roots, body, Config())
+    predictor = motion_predictor(made, roots, body, Config())
     still = jnp.asarray(np.tile(np.eye(4), (frames, 1, 1)))
     number, found = 0, []
     clips = (clip for path in paths for clip in motion.read_motion(path))
@@ -113,7 +113,7 @@ def carried_of(paths: list[Path], frames: int = 90) -> tuple[int, list[str]]:
                 landmarks=jnp.zeros((1, 3)),
                 intrinsics=jnp.asarray(made.intrinsics.params),
             )
-            seen = joint_stage.predict(predictor, state)
+            seen = predict(predictor, state)
             number += 1
             if initialisation.carried(state, seen, there, 1.0, made.fps):
                 found.append(clip.name)

@@ -1,37 +1,39 @@
-"""What is judged of a result: figures by name, each NaN where it does not apply."""
+"""Figures of a result that checks are applied to, by name; NaN if not applicable."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import posture
-from bodyslam_jax.export import Gait, gait_of_joints
+from bodyslam_jax.diagnostics.gait import Gait, gait_of_joints
+from bodyslam_jax.diagnostics.statistics import runs as runs_of
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.stances import find_stances
 
 _WALKING = (0.7, posture.RUNNING)
-"""Median speeds over the ground of who goes on foot and does not run, m/s."""
+"""Range of median speeds over the ground in walking, m/s."""
 _STEP = 0.35
-"""Legs: who takes such steps regularly walks, however slowly."""
+"""Step length, in leg lengths, from which regular steps are a walk at any speed."""
 _MOMENT = 0.2
-"""s, in which nobody turns round or changes direction at a run."""
+"""Interval, s, in which nobody turns round or reverses a run."""
 _FEWEST = 15
-"""Frames, of one stretch, from which posture and motion are judged."""
+"""Least length of a stretch that is judged, frames."""
 _FLOOR = 1.0
-"""m that standing feet must be apart for the slope under them."""
+"""Least extent of standing feet for a slope of the ground, m."""
 
 _STANDS_OUT = 2.2
 
 _FRONT_OR_BACK = 90.0
-"""degrees from which an orientation is another reading of the image, no error."""
+"""Angle from which a difference is a front/back ambiguity, not an error, degrees."""
 
 _STRIDE = 0.45
-"""Legs: who reaches so far with each step goes somewhere, or is on a treadmill."""
+"""Reach of steps, in leg lengths, from which their length is judged."""
 _WALKS = (0.8, 1.4)
-"""Steps over their reach, of who walks: at least one foot is on the ground."""
+"""Range of step length over reach in walking."""
 _RUNNERS_STEPS = 2.4
-"""Steps a second from which they may be a run's, between which no foot stands."""
+"""Cadence from which steps may be of a run, steps a second."""
 _GETS_ON = 0.8
-"""m/s from which feet have to stand, one after the other."""
+"""Speed from which feet have to stand in turn, m/s."""
 
 
 def person_figures(
@@ -39,10 +41,10 @@ def person_figures(
 ) -> dict[str, float]:
     """One person's posture, feet and motion; y is up, in m.
 
-    Medians and means are over all stretches of frames in which the person is there,
-    extremes over each of them: nothing is a difference across a gap.
+    Medians and means are over all stretches of frames in which the person is present;
+    differences are never taken across a gap.
     """
-    runs = [joints[run] for run in _runs(present) if run.stop - run.start >= _FEWEST]
+    runs = [joints[run] for run in runs_of(present) if run.stop - run.start >= _FEWEST]
     if not runs:
         return {}
     every = np.concatenate(runs)
@@ -104,12 +106,11 @@ def up_in_image(T_WC: Float[np.ndarray, "t 4 4"]) -> float:
 def turned_from_body(
     turn: Float[np.ndarray, "t 3 3"], given: Float[np.ndarray, "t 3"]
 ) -> float:
-    """By how much a person is turned, in all frames alike, from the body that was
-    given, degrees.
+    """Rotation, common to all frames, between a person and the given body, degrees.
 
     `turn` is the estimated orientation in the camera's frame, `given` (axis-angle,
     rad) the regressor's, of the frames that have both. NaN where there are few, or
-    where they differ as front and back do: that is mended elsewhere.
+    where front and back are confused, which other checks find.
     """
     if len(turn) < _FEWEST:
         return np.nan
@@ -123,7 +124,7 @@ def floors_apart(
 ) -> float:
     """Greatest difference between the heights at which people stand, m; NaN if fewer
     than two do."""
-    stances = find_stances(joints[:, :, list(posture.FEET)], present, fps)
+    stances = find_stances(joints[:, :, list(FEET)], present, fps)
     heights = [np.median(places[:, 1]) for places in stances if len(places)]
     return float(np.ptp(heights)) if len(heights) > 1 else np.nan
 
@@ -131,15 +132,15 @@ def floors_apart(
 def keypoint_misfit(
     error: Float[np.ndarray, "t k"], size: Float[np.ndarray, " t"], fps: float
 ) -> float:
-    """Keypoints' distance from the body that is to explain them, % of the person's size
-    in the image, where it is worst for a third of a second.
+    """Largest distance of keypoints from the body over a third of a second, % of the
+    person's size in the image.
 
     `error` is NaN where nothing is measured; of a frame the median counts, of the third
     of a second too, so that outliers do not. NaN where it is nowhere `_STANDS_OUT`
     times as large as mostly: noise is no other person.
     """
-    known = np.isfinite(error).sum(axis=1) >= 5
-    frames = np.flatnonzero(known)
+    measured = np.isfinite(error).sum(axis=1) >= 5
+    frames = np.flatnonzero(measured)
     n = max(3, round(fps / 3))
     if len(frames) < n:
         return np.nan
@@ -150,7 +151,7 @@ def keypoint_misfit(
 
 
 def _strides(steps: Gait | None) -> dict[str, float]:
-    """How far each step carries somebody, over how far it reaches."""
+    """Figures of step length over reach, and of cadence."""
     if steps is None or not steps.reach > _STRIDE:
         return {}
     figure = steps.step_over_reach
@@ -163,7 +164,7 @@ def _strides(steps: Gait | None) -> dict[str, float]:
 
 
 def _goes_on_foot(steps: Gait | None, speed: Float[np.ndarray, " u"]) -> bool:
-    """Whether somebody walks: regular steps, or a walker's speed most of the time."""
+    """Whether somebody walks: regular steps, or a walking speed most of the time."""
     slow, fast = _WALKING
     if slow < np.median(speed) < fast:
         return True
@@ -173,8 +174,8 @@ def _goes_on_foot(steps: Gait | None, speed: Float[np.ndarray, " u"]) -> bool:
 def _ground_under_feet(
     joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
 ) -> dict[str, float]:
-    """How standing feet rise along the way, degrees, and scatter about that, m."""
-    feet = joints[None, :, list(posture.FEET)]
+    """Slope of the ground under standing feet, degrees, and scatter about it, m."""
+    feet = joints[None, :, list(FEET)]
     (stances,) = find_stances(feet, present[None], fps)
     if len(stances) < 3:
         return {}
@@ -188,8 +189,3 @@ def _ground_under_feet(
         height = height - rise * along
     found["feet_off_ground"] = float(np.ptp(np.percentile(height, [5, 95])))
     return found
-
-
-def _runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
-    return [slice(a, b) for a, b in edges.reshape(-1, 2)]

@@ -1,398 +1,88 @@
-"""Can a result be true? Figures of people, cameras and ground against what there is.
-
-`CHECKS` is the one table of thresholds. Those of people are from motion capture, cut
-in pieces of 3 to 5 s, and from simulated sequences, on both of which at most 2 % of
-the pieces are wrongly doubted (`benchmarks/plausibility.md` has all figures,
-`tools/plausibility_thresholds.py` makes them). A result that passes can be true; one
-that does not is `doubtful`.
-"""
-
-import dataclasses
-from collections.abc import Mapping
-from typing import Any, Literal
+"""Whether a result can be true: its figures, judged by the table of thresholds."""
 
 import numpy as np
 
-Status = Literal["ok", "doubtful", "failed"]
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics import figures
+from bodyslam_jax.diagnostics.checks import Reason, judge
+from bodyslam_jax.diagnostics.reprojection import projected_keypoints
+from bodyslam_jax.diagnostics.scale_uncertainty import cue_discrepancy
+from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
+from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
+
+_LEAST_CONFIDENCE = 0.3
+"""Of keypoints that are compared with the body."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Check:
-    """One figure, and from where on nobody believes it."""
-
-    name: str
-    what: str
-    """What the figure is, as the subject of a sentence."""
-    unit: str
-    limit: float
-    advice: str
-    """What to do."""
-    source: str
-    """Where the threshold comes from."""
-    below: bool = False
-    """Whether figures below the limit are doubted, not those above."""
-
-    def fails(self, figure: float) -> bool:
-        """Of NaN nothing is said."""
-        return figure < self.limit if self.below else figure > self.limit
-
-
-@dataclasses.dataclass(frozen=True)
-class Reason:
-    """Why a result is doubted, or is none: an entry of `reasons` in `summary.json`."""
-
-    name: str
-    message: str
-    """In plain words, with figure and expectation."""
-    expected: str
-    advice: str
-    figure: float | None = None
-    unit: str = ""
-    person: int | None = None
-    fatal: bool = False
-    """Whether nothing of the result is to be used."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """As it is written; what does not apply is left out."""
-        plain = dataclasses.asdict(self)
-        plain["status"] = "failed" if plain.pop("fatal") else "doubtful"
-        return {k: v for k, v in plain.items() if v is not None and v != ""}
-
-
-_FIT = "look at the overlay: keypoints, focal length or scale are off"
-_MOCAP = "motion capture"
-_GROUND = (
-    "if the ground is not like that, give the focal length (camera.json), or look at "
-    "the overlay: sizes and depths are off"
-)
-_IDENTITY = (
-    "look at the overlay there: keypoints may jump from one person to another, or "
-    "front and back be confused; give keypoints with track ids, or cut the video there"
-)
-_CAMERA = (
-    "if no vehicle carries the camera, look at the scene: tracks follow moving things, "
-    "or scale is off; give person masks or a video with more texture"
-)
-_CARRIED = (
-    "on wheels, on skates, on a moving walkway or carried, a person's motion tells no "
-    "size: leave the person out (--no-people) where the camera's path has metres, or "
-    "take lengths as unknown. If nothing carries the person, scale, focal length or "
-    "frame rate are off"
-)
-PERSON_CHECKS: tuple[Check, ...] = (
-    Check(
-        "standing_foot_speed",
-        "speed of the lower foot (its toe joint, median)",
-        "m/s",
-        0.4,
-        "positions from frame to frame are not to be trusted: better keypoints, a "
-        "known focal length, or a regressor's bodies (--bodies) help",
-        "given; motion capture, who does not run: median 0.09, 99 % below 0.36",
-    ),
-    Check(
-        "gliding",
-        "speed of the foot that should stand, while the person gets on,",
-        "% of the person's",
-        50.0,
-        _CARRIED,
-        _MOCAP + ", who gets on: at most 19",
-    ),
-    Check(
-        "step_short_of_reach",
-        "way that a step carries the person, over how far it reaches,",
-        "",
-        0.6,
-        "the person steps and hardly gets on: on a treadmill or on the spot that is "
-        "right, and steps tell no size. Otherwise scale or frame rate are off",
-        _MOCAP + ", who strides: at least 0.7",
-        below=True,
-    ),
-    Check(
-        "step_beyond_reach",
-        "way that a step carries the person, over how far it reaches,",
-        "",
-        1.4,
-        _CARRIED,
-        _MOCAP + ", who walks: at most 1.23",
-    ),
-    Check(
-        "step_beyond_reach_of_runner",
-        "way that a runner's step carries the person, over how far it reaches,",
-        "",
-        2.2,
-        _CARRIED,
-        _MOCAP + ", who runs: 1.6 to 1.86",
-    ),
-    Check(
-        "quick_steps",
-        "number of steps of somebody who walks",
-        "a second",
-        2.4,
-        "children step so quickly: a child's body is given or fitted as an adult's, "
-        "and every length is too large by as much; give the stature (--height). For "
-        "an adult the frame rate is off",
-        _MOCAP + ", who walks: at most 2.22",
-    ),
-    Check(
-        "turned_from_body",
-        "angle, alike in all frames, between the person and the body given",
-        "degrees",
-        15.0,
-        "on stairs, escalators and steep slopes people are tilted until they move as "
-        "on level ground, and up with them; otherwise the bodies are of another camera",
-        "ten simulated sequences: regressed bodies are off by 2 to 8, with twice the "
-        "usual errors by 5 to 17",
-    ),
-    Check(
-        "feet_off_ground",
-        "range of heights at which standing feet are, beside a slope",
-        "m",
-        0.12,
-        "the person floats or sinks: " + _GROUND,
-        _MOCAP + ", who walks: 99 % below 0.07, on uneven terrain 0.15",
-    ),
-    Check(
-        "ground_slope",
-        "slope of the ground under standing feet",
-        "degrees",
-        6.0,
-        "the person rises or sinks along the way: " + _GROUND,
-        _MOCAP + ", who walks: at most 5; streets rarely exceed 6",
-    ),
-    Check(
-        "knee",
-        "bend of both knees while walking (mean)",
-        "degrees",
-        52.0,
-        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
-        _MOCAP + ", who walks: 98 % below 48, soccer 51",
-    ),
-    Check(
-        "straighter_knee",
-        "bend of the straighter knee while walking (mean)",
-        "degrees",
-        44.0,
-        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
-        _MOCAP + ", who walks: 98 % below 40, soccer 43",
-    ),
-    Check(
-        "hip_over_ankle",
-        "height of the hips over the ankle, of the leg's length, while walking",
-        "",
-        0.84,
-        "people crouch who do not: " + _FIT,
-        _MOCAP + ", who walks: at least 0.85",
-        below=True,
-    ),
-    Check(
-        "trunk_lean",
-        "lean of the trunk while walking (mean)",
-        "degrees",
-        18.0,
-        "nobody walks so: " + _FIT,
-        _MOCAP + ", who walks: below 15, but for basketball (19 and 32)",
-    ),
-    Check(
-        "turn_of_walker",
-        "fastest turn of somebody who walks",
-        "degrees/s within 0.2 s",
-        500.0,
-        _IDENTITY,
-        _MOCAP + ", who walks: at most 170; dancing on the way 500",
-    ),
-    Check(
-        "turn",
-        "fastest turn",
-        "degrees/s within 0.2 s",
-        600.0,
-        _IDENTITY,
-        _MOCAP + ": at most 500, in a pirouette",
-    ),
-    Check(
-        "velocity_jump_of_walker",
-        "greatest change of speed of somebody who walks",
-        "m/s within 0.2 s",
-        1.8,
-        _IDENTITY,
-        _MOCAP + ", who walks: at most 1.4",
-    ),
-    Check(
-        "velocity_jump",
-        "greatest change of speed",
-        "m/s within 0.2 s",
-        2.8,
-        _IDENTITY,
-        _MOCAP + ": at most 1.9, in a jump",
-    ),
-    Check(
-        "joint_acceleration",
-        "acceleration of joints (median)",
-        "m/s²",
-        22.0,
-        "the person trembles: " + _FIT,
-        _MOCAP + ": at most 18, in a run",
-    ),
-    Check(
-        "speed",
-        "speed (95th percentile)",
-        "m/s",
-        10.0,
-        "nobody runs as fast: the frame rate, the focal length or scale is off",
-        "sprinters reach 10 to 12 m/s",
-    ),
-    Check(
-        "stature",
-        "stature",
-        "m",
-        2.2,
-        "the scale, the frame rate or the body model is off",
-        "one adult in a million is taller",
-    ),
-    Check(
-        "short_stature",
-        "stature",
-        "m",
-        0.9,
-        "the scale or the body model is off; children younger than three are no "
-        "shape of the body model",
-        "adults and children from three years",
-        below=True,
-    ),
-    Check(
-        "keypoint_misfit",
-        "greatest distance of keypoints from the body, for a third of a second",
-        "% of the person's size in the image",
-        3.5,
-        _IDENTITY,
-        "simulated sequences: at most 2.4, nowhere twice as large as mostly",
-    ),
-)
-WORLD_CHECKS: tuple[Check, ...] = (
-    Check(
-        "floors_apart",
-        "difference between the heights at which people stand",
-        "m",
-        0.35,
-        "if they do not stand on different floors, sizes of people are off: check the "
-        "focal length, or give their bodies (--bodies)",
-        "a judgement: a step or kerb is lower. True people of five simulated "
-        "sequences are within 0.01; of estimates it was not measured",
-    ),
-    Check(
-        "up_against_trunks",
-        "angle between up, as the ground tells it, and people's trunks",
-        "degrees",
-        7.5,
-        "gravity and ground contradict the people: if the ground is not a hill, "
-        "postures or focal length are off",
-        "ten simulated sequences: 0.7 to 5",
-    ),
-    Check(
-        "up_in_image",
-        "angle between up, as trunks of people who do not walk tell it, and the top of "
-        "the image",
-        "degrees",
-        60.0,
-        "people who lie, hang or stand on their hands are taken for upright, and the "
-        "world is turned by as much, unless the video is turned or the camera looks "
-        "straight down: turn the video, or use results in the camera's frame only",
-        "six simulated cameras: 6 to 13",
-    ),
-    Check(
-        "slope_of_ground",
-        "slope of the ground against people's trunks",
-        "degrees",
-        6.0,
-        "gravity and ground contradict the people: if the ground is not a hill, "
-        "postures or focal length are off",
-        "streets rarely exceed 6",
-    ),
-    Check(
-        "camera_speed",
-        "speed of the camera (95th percentile)",
-        "m/s",
-        10.0,
-        _CAMERA,
-        "nobody runs as fast; simulated cameras at most 2.6",
-    ),
-    Check(
-        "camera_acceleration",
-        "acceleration of the camera over 0.1 s (greatest)",
-        "m/s²",
-        30.0,
-        _CAMERA,
-        "simulated hand-held cameras: at most 7",
-    ),
-    Check(
-        "camera_turning",
-        "turning of the camera over 0.1 s (fastest)",
-        "degrees/s",
-        600.0,
-        _CAMERA,
-        "simulated hand-held cameras: at most 70; whipping pans 400",
-    ),
-    Check(
-        "scale_sigma",
-        "standard error of all lengths",
-        "%",
-        20.0,
-        "sizes are hardly known: a known focal length, more steps, the ground in view "
-        "or a regressor's bodies (--bodies) help",
-        "people differ by 5 to 6 %",
-    ),
-    Check(
-        "scale_cues_apart",
-        "factor between the sizes that people's motion and the ground tell",
-        "",
-        1.25,
-        "postures, focal length, frame rate or ground are off: look at both",
-        "estimates of 13 simulated sequences with bodies, 80 to 240 frames: at most "
-        "1.09; of 40 frames, or without bodies, up to 1.42, within their errors",
-    ),
-    Check(
-        "ground_under_feet",
-        "factor between the size of the map and that of the people on its ground",
-        "",
-        1.4,
-        "people do not stand on the ground of the map: scale, postures or focal "
-        "length are off, or they stand on something else",
-        "estimates of nine simulated sequences: within 1.02; the limit is a judgement",
-    ),
-)
-
-
-def judge(
-    checks: tuple[Check, ...],
-    figures: Mapping[str, float],
-    person: int | None = None,
+def implausible(
+    sequence: Sequence,
+    body: BodyModel,
+    cameras: SfmResult,
+    joint: JointEstimate,
+    result: Result,
+    up: Upright,
+    *,
+    scale_sigma: float,
+    ground_factor: float,
+    statures: list[float | None],
 ) -> list[Reason]:
-    """A reason for each figure that nobody believes; figures may be missing or NaN."""
-    found = []
-    for check in checks:
-        figure = float(figures.get(check.name, np.nan))
-        if not check.fails(figure):
-            continue
-        unit = check.unit and f" {check.unit}"
-        bound = "at least" if check.below else "at most"
-        expected = f"{bound} {check.limit:g}{unit}"
-        whose = "" if person is None else f"person {person}: "
-        found.append(
-            Reason(
-                name=check.name,
-                message=f"{whose}{check.what} is {figure:.3g}{unit}, expected "
-                f"{expected}.",
-                expected=expected,
-                advice=check.advice,
-                figure=figure,
-                unit=check.unit,
-                person=person,
-            )
-        )
-    return found
+    """Reasons where people, camera or ground are beyond what there is.
+
+    Args:
+        scale_sigma: m per unit of the map.
+        ground_factor: factor, 1 or more, between the size of the map and that of the
+            people on its ground.
+        statures: of each person, m.
+    """
+    fps, found = sequence.fps, []
+    walking = False
+    misfits = _misfits(sequence, body, joint)
+    for h, present in enumerate(result.present):
+        of_person = figures.person_figures(result.joints[h], present, fps)
+        walking |= "trunk_lean" in of_person
+        if present.any():
+            of_person["stature"] = of_person["short_stature"] = statures[h]
+            of_person["keypoint_misfit"] = misfits[h]
+            of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
+        found += judge(PERSON_CHECKS, of_person, h)
+    of_world = {
+        "floors_apart": figures.floors_apart(result.joints, result.present, fps)
+    }
+    if walking:
+        of_world["up_against_trunks"] = np.degrees(up.trunks)
+        of_world["slope_of_ground"] = np.degrees(up.ground)
+    elif result.present.any():
+        of_world["up_in_image"] = figures.up_in_image(result.T_WC[cameras.within])
+    if cameras.kind == "moving" and result.present.any():
+        of_world |= figures.camera_figures(result.T_WC[cameras.within], fps)
+        of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
+        of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
+        of_world["ground_under_feet"] = ground_factor
+    return found + judge(WORLD_CHECKS, of_world)
 
 
-def status_of(reasons: list[Reason]) -> Status:
-    """What all of it comes to."""
-    if any(reason.fatal for reason in reasons):
-        return "failed"
-    return "doubtful" if reasons else "ok"
+def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> float:
+    """Angle between a person and the given body, degrees; NaN without one."""
+    if sequence.bodies is None:
+        return np.nan
+    both = sequence.bodies.present[person] & joint.present[person]
+    given = sequence.bodies.poses[person, both, :3]
+    turn = joint.roots[person, both, :3, :3]
+    return figures.turned_from_body(np.asarray(turn), np.asarray(given, float))
+
+
+def _misfits(sequence: Sequence, body: BodyModel, joint: JointEstimate) -> list[float]:
+    """Greatest distance of each person's keypoints from the body, % of the person's
+    size in the image; NaN without keypoints."""
+    if sequence.keypoints is None or not joint.present.any():
+        return [np.nan] * len(joint.present)
+    uv = projected_keypoints(body, joint)
+    error = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
+    valid = sequence.keypoints.confidence > _LEAST_CONFIDENCE
+    error = np.where(valid & joint.present[..., None], error, np.nan)
+    size = np.linalg.norm(np.ptp(uv, axis=2), axis=-1)
+    return [
+        figures.keypoint_misfit(*one, sequence.fps)
+        for one in zip(error, size, strict=True)
+    ]

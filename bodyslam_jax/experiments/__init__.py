@@ -1,6 +1,8 @@
-"""The paper's experiments on simulated sequences, as functions of arrays.
+"""The paper's experiments, and some of its own, on simulated sequences.
 
-`bodyslam experiment NAME` is `run_experiment`.
+`bodyslam experiment NAME --out FOLDER` calls `run_experiment`: inputs are the settings
+of `config.Experiment` and `Config`; outputs are tables and figures in the folder, rows
+in `rows`, finished stages in `stages`.
 """
 
 from bodyslam_jax.config import Experiment as Experiment

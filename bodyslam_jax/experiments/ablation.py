@@ -1,4 +1,8 @@
-"""What each part of the estimate is worth: ablations that the paper lacks."""
+"""Rows of `bodyslam experiment ablation`: what each part of the estimate contributes.
+
+Input is a `Case` with its prepared problem; output the errors against the truth, the
+solver's status, steps and processor time.
+"""
 
 import dataclasses
 import time
@@ -11,34 +15,33 @@ from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.experiments.scoring import NAMES
 from bodyslam_jax.experiments.variants import FULL, VARIANTS
-from bodyslam_jax.pipeline import joint_stage
 from bodyslam_jax.pipeline.case import Case
+from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.pipeline.solve_stage import solve_stage
 
 INDEPENDENT = {
     "motion_correlation": 0.0,
     "posture_correlation": 0.0,
     "root_correlation": 0.0,
 }
-"""Weights under which every frame's errors are taken for its own."""
+"""Weights that model the errors of different frames as independent."""
 SETTINGS: dict[str, GraphWeights] = {
     "errors of frames independent": dataclasses.replace(GraphWeights(), **INDEPENDENT),
     "β measured anew in every frame": GraphWeights(shape_each_frame=True),
     "the paper's weights": GraphWeights.paper(),
 }
-"""Other weights, solved from the start that they give."""
+"""Other weights; scale and bodies are initialised with them, too."""
 PUBLISHED = "as published"
 """The paper's weights, its motion network and its first-order schedule together."""
 ORDERS = ("second order", "first order, as long", "first order, 200 + 100 steps")
 _TRIAL = 20
-"""Steps from which the time of one is known."""
+"""Number of steps over which the time of one is measured."""
 
 
-def ablate(
-    case: Case, prepared: joint_stage.Prepared, variant: str
-) -> dict[str, float | str]:
+def ablate(case: Case, prepared: Prepared, variant: str) -> dict[str, float | str]:
     """Errors of one of `VARIANTS`, solved from the start of the full problem, m.
 
-    Where there is nothing to leave out, nothing is solved, and `status` says so.
+    Nothing is solved if the problem lacks the factor; `status` then is `no such term`.
     """
     problem, start = VARIANTS[variant](prepared.problem, prepared.state)
     if variant == FULL:
@@ -49,22 +52,22 @@ def ablate(
 
 
 def with_weights(case: Case, weights: GraphWeights) -> dict[str, float | str]:
-    """Errors with other weights from beginning to end, m."""
+    """Errors with other weights in all stages, m."""
     config = dataclasses.replace(case.config, weights=weights)
     return _solved(case, case.prepare(config), config)
 
 
 def with_motion_model(case: Case, file: str) -> dict[str, float | str]:
-    """Errors with another motion model, such as one that sees fewer past frames."""
+    """Errors with another motion model, such as one with fewer past frames."""
     config = dataclasses.replace(case.config, motion_model=file)
     return _past(config) | _solved(case, case.prepare(config), config)
 
 
 def as_published(case: Case) -> dict[str, float | str]:
-    """Errors with the paper's weights, network and schedule, m; NaN where that network
-    does not know the body.
+    """Errors with the paper's weights, network and schedule, m; NaN for a body that the
+    network was not trained on.
 
-    Cameras, map and regressed bodies are those that all methods begin with.
+    Cameras, map and regressed bodies are the start values of all methods.
     """
     paper = Config.paper()
     names = ("weights", "motion_model", "motion_coupling", "solver")
@@ -76,13 +79,11 @@ def as_published(case: Case) -> dict[str, float | str]:
     return _past(config) | _solved(case, case.prepare(config), config)
 
 
-def compare_orders(
-    case: Case, prepared: joint_stage.Prepared
-) -> dict[str, dict[str, float | str]]:
+def compare_orders(case: Case, prepared: Prepared) -> dict[str, dict[str, float | str]]:
     """The structured solver against Adam: at equal processor time, and as in the paper.
 
-    Compilation is left out of both. Adam starts where the structured solver does, with
-    the paper's rate and, at equal time, all variables free from the first step.
+    Times are without compilation. Adam has the same start, the paper's learning rate
+    and, at equal time, all variables free from the first step.
     """
     problem, state = prepared.problem, prepared.state
     schedule = solver.PAPER_SCHEDULE
@@ -102,19 +103,19 @@ def compare_orders(
 
 
 def _past(config: Config) -> dict[str, float | str]:
-    """How many past frames the motion model sees."""
+    """Number of past frames that the motion model takes."""
     return {"past": float(motion.load_motion_model(config.motion_model).past)}
 
 
 def _solved(
     case: Case,
-    prepared: joint_stage.Prepared,
+    prepared: Prepared,
     config: Config,
     start: tuple[graph.Problem, graph.State] | None = None,
 ) -> dict[str, float | str]:
-    """The row of a solution: from `start`, or else of the problem as prepared."""
+    """The row of a solution from `start`, by default that of the prepared problem."""
     problem, state = start or (prepared.problem, prepared.state)
-    solution, stage = joint_stage.solve_stage(problem, state, config, "joint")
+    solution, stage = solve_stage(problem, state, config, "joint")
     return _row(case, prepared, solution.state, stage)
 
 
@@ -151,8 +152,12 @@ def _row(case, prepared, state, stage, solution=None, seconds=None):
     row = {**found, "radius": case.radius, "scale_ratio": 1 / found["scale"]}
     if solution is not None:
         steps = sum(int(n) for n in solution.num_steps)
-        told = {"status": solution.status, "steps": float(steps), "seconds": seconds}
-        return row | told | {"cost": float(solution.cost)}
+        costs_of_solve = {
+            "status": solution.status,
+            "steps": float(steps),
+            "seconds": seconds,
+        }
+        return row | costs_of_solve | {"cost": float(solution.cost)}
     names = ("status", "iterations", "seconds", "cost_after")
     status, steps, taken, cost = (stage[name] for name in names)
     return row | {

@@ -1,4 +1,4 @@
-"""What `bodyslam experiment` does: says what it costs, computes what is missing."""
+"""`bodyslam experiment`: computes the rows that are missing and writes the report."""
 
 import logging
 from pathlib import Path
@@ -19,10 +19,10 @@ def run_experiment(
 ) -> list[Path]:
     """Computes the rows that `out` lacks and writes tables and figures; their paths.
 
-    Rows are kept in `out/rows` under a fingerprint of all that they follow from, stages
-    before the joint estimate in `out/stages`. Tables are written after every row, so
-    that an interrupted experiment leaves what it has. A row that cannot be computed is
-    left out, and said so.
+    Rows are kept in `out/rows` under a fingerprint of their inputs, stages before the
+    joint estimate in `out/stages`. Tables are written after every row, so that an
+    interrupted experiment leaves those that are finished. A row that cannot be computed
+    is left out with a warning.
 
     **Raises:** `ValueError` if there is no such experiment, if `out` cannot be written,
     or if no row could be computed; `ValueError` or `FileNotFoundError`, before anything

@@ -1,4 +1,8 @@
-"""The paper's table 1: full estimate, no motion model, and simpler ways to metres."""
+"""Rows of `bodyslam experiment table1`: the full estimate against simpler methods.
+
+Input is a `Case`; output the errors of all `METHODS` from the same tracks, keypoints
+and regressed bodies.
+"""
 
 from typing import Any
 
@@ -13,7 +17,7 @@ from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.experiments.scoring import NAMES
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.pipeline.case import Case, trajectories
-from bodyslam_jax.pipeline.joint_stage import solve_stage
+from bodyslam_jax.pipeline.solve_stage import solve_stage
 
 METHODS = {
     "no_mm": "no motion model: cameras in the map's own unit, people from keypoints",
@@ -28,14 +32,14 @@ METHODS = {
 _EVERY = 3
 """Frames from one drawn point of a path to the next."""
 _NEAR = 5
-"""Landmarks nearest to the ankles, whose depth is taken for the person's."""
+"""Number of landmarks near the ankles whose depth stands for the person's."""
 
 
 def compare_methods(case: Case) -> dict[str, Any]:
     """Errors of all `METHODS` on one sequence: `full/c_ate_se3` and so on, m.
 
-    Beside them what is true of the sequence, the scale over what it should be at the
-    start (`start_ratio`) and at the end (`scale_ratio`), steps and status.
+    Also the true properties of the sequence, estimated over true scale at the start
+    (`start_ratio`) and at the end (`scale_ratio`), steps and status.
     """
     prepared = case.prepare()
     alone = prepared.state
@@ -89,29 +93,29 @@ def _paths(case: Case, states: dict[str, graph.State], present: np.ndarray) -> d
     }
     valid = jnp.asarray(case.cameras.registered, float)
     for name, state in states.items():
-        there = trajectories(
+        estimate = trajectories(
             state, case.body, present, case.cameras.registered, truth.fps
         )
         camera, human = evaluation.align(
             "A1",
             truth.T_WC,
-            there.T_WC,
+            estimate.T_WC,
             valid,
             truth.joints[0, :, 0],
-            there.joints[0, :, 0],
+            estimate.joints[0, :, 0],
             jnp.asarray(present[0], float),
         )
-        found[f"camera/{name}"] = camera.apply(there.T_WC[:, :3, 3])
-        found[f"human/{name}"] = human.apply(there.joints[0, :, 0])
+        found[f"camera/{name}"] = camera.apply(estimate.T_WC[:, :3, 3])
+        found[f"human/{name}"] = human.apply(estimate.joints[0, :, 0])
     thin = lambda x: np.round(np.asarray(x)[::_EVERY, ::2], 4).tolist()
     return {name: thin(path) for name, path in found.items()}
 
 
 def depth_scale(case: Case) -> float:
-    """Metres per unit of the map if what is seen at the feet is as far as the person.
+    """Metres per unit of the map if landmarks at the feet are at the person's depth.
 
-    In each frame the regressed depth of the pelvis over the median depth of the
-    landmarks that are nearest, in the image, to the ankles; of that the median.
+    The median over frames of the regressed depth of the pelvis over the median depth
+    of the landmarks that are nearest to the ankles in the image.
     """
     cameras, keypoints = case.cameras, case.sequence.keypoints
     if keypoints is None:

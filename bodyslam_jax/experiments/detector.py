@@ -1,4 +1,4 @@
-"""Where a detector puts the keypoints of rendered people, whose joints are known."""
+"""Errors of detected keypoints of rendered people, whose joints are known."""
 
 from typing import Any
 
@@ -12,36 +12,36 @@ from bodyslam_jax.simulation.point_tracks import is_behind
 from bodyslam_jax.types import Sequence
 
 _TALLEST = 60.0
-"""Height in the image, px, from which a person has to be found."""
+"""Height in the image, px, above which a person counts as detectable."""
 _GROSS = 0.1
-"""Of the stature: a keypoint further away is of something else."""
+"""Error, in statures, beyond which a keypoint is an outlier."""
 _NAMES = KEYPOINT_NAMES["body25"]
 
 
 def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str, Any]:
-    """How often the first person is found, and how far off each keypoint is.
+    """Detection rate of the first person, and errors of each keypoint.
 
-    `found` is the share of the frames in which the person is larger than 60 px and half
-    of the joints are in the image with nothing in front. `keypoints` has for each name:
+    `found` is the detection rate over the frames in which the person is larger than 60
+    px and half of the joints are visible. `keypoints` has for each name:
     `offset`, the mean error in the frame of the joint that it moves with (x to the left
     on the left side, mirrored on the right, y up and z forward at rest), a constant
     fitted to the errors in the image at the true depth; `spread`, the standard
-    deviation of what remains in the image; both shares of the stature; `seen`, the
-    share of the frames found and with nothing in front of it in which it is given;
-    `gross`, the share of these that is of something else.
+    deviation of what remains in the image; both in statures; `seen`, the share of the
+    frames in which the person is found and the point is visible in which it is
+    detected; `gross`, the share of outliers among these.
     """
     exact, depth, R_CJ, inside = _truth(simulated)
     wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
     if found.keypoints is None or not wanted.any():
         return {"found": 0.0, "keypoints": {}}
-    uv, there, number = _nearest(found, exact)
+    uv, valid, number = _nearest(found, exact)
     stature = np.ptp(simulated.person.skin[:, 1])
     error = (uv - exact) / simulated.intrinsics[:2] * depth[:, :, None] / stature
     return {
         "found": float(number[wanted].mean()),
         "keypoints": {
             name: _offset(
-                error[:, k], R_CJ[:, k], there[:, k], inside[:, k], number & wanted,
+                error[:, k], R_CJ[:, k], valid[:, k], inside[:, k], number & wanted,
                 mirrored=name.startswith("right"),
             )
             for k, name in enumerate(_NAMES)
@@ -86,30 +86,30 @@ def _nearest(
 ) -> tuple[
     Float[np.ndarray, "t 25 2"], Bool[np.ndarray, "t 25"], Bool[np.ndarray, " t"]
 ]:
-    """Of the people found in each frame the one who is there, if anybody is: within a
-    quarter of the height in the median."""
-    uv, there = found.keypoints.uv, found.keypoints.confidence > 0
+    """The detection in each frame that is of the person, if any: within a quarter of
+    the height in the median."""
+    uv, valid = found.keypoints.uv, found.keypoints.confidence > 0
     away = np.linalg.norm(uv - exact, axis=-1)
-    few = there.sum(axis=-1) < 5
-    middle = np.ma.median(np.ma.masked_array(away, ~there), axis=-1).filled(np.inf)
+    few = valid.sum(axis=-1) < 5
+    middle = np.ma.median(np.ma.masked_array(away, ~valid), axis=-1).filled(np.inf)
     middle = np.where(few, np.inf, middle)
     who, frame = middle.argmin(axis=0), np.arange(uv.shape[1])
     near = middle[who, frame] < 0.25 * np.ptp(exact[..., 1], axis=1)
-    return uv[who, frame], there[who, frame] & near[:, None], near
+    return uv[who, frame], valid[who, frame] & near[:, None], near
 
 
 def _offset(error, R_CJ, given, in_view, counted, *, mirrored: bool) -> dict[str, Any]:
     """`detection_figures` of one keypoint; `error` in the image, of the stature."""
-    seen = given & in_view & counted
-    good = seen & (np.linalg.norm(error, axis=1) < _GROSS)
+    detected = given & in_view & counted
+    good = detected & (np.linalg.norm(error, axis=1) < _GROSS)
     row: dict[str, Any] = {
-        "seen": float(seen.sum() / max((counted & in_view).sum(), 1)),
-        "gross": float(1 - good.sum() / seen.sum()) if seen.any() else np.nan,
+        "seen": float(detected.sum() / max((counted & in_view).sum(), 1)),
+        "gross": float(1 - good.sum() / detected.sum()) if detected.any() else np.nan,
     }
     if good.sum() < 10:
         return {**row, "offset": [np.nan] * 3, "spread": np.nan}
     A, b = R_CJ[good, :2].reshape(-1, 3), error[good].reshape(-1)
-    # Where a view never changes its depth is not seen: there it is taken to be small
+    # A view that never changes does not determine depth, which a prior keeps small.
     ridge = 1e-3 * len(A) * np.eye(3)
     offset = np.linalg.solve(A.T @ A + ridge, A.T @ b)
     rest = b - A @ offset

@@ -1,4 +1,4 @@
-"""Pictures like the paper's, of simulated sequences; `about` says which, below each."""
+"""Figures in the form of the paper's, as PNG; `about`, the data, stands below each."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,11 @@ _THEIRS: dict[str, Any] = {
     "markersize": 4,
     "label": "the paper's, its own data",
 }
-"""How the paper's figures are drawn, in the colour of ours."""
+"""Style of the paper's values, in the colour of ours."""
 _LETTERS = 17
-"""Of the smallest print in an inch."""
+"""Letters of the smallest print in an inch."""
 _FAR = 0.25
-"""From a ratio of 1: what is farther off is told as a number and sets no axis."""
+"""Distance from a ratio of 1 beyond which a value is printed and not drawn to scale."""
 
 
 def _figure(width: float, height: float):
@@ -30,14 +30,14 @@ def _figure(width: float, height: float):
 
 
 def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper center"):
-    """One legend of what is drawn in `axes`, outside them: it covers nothing."""
-    known = {}
+    """One legend for all `axes`, outside them."""
+    entries = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            known.setdefault(label, handle)
+            entries.setdefault(label, handle)
     figure.legend(
-        known.values(),
-        known.keys(),
+        entries.values(),
+        entries.keys(),
         ncols=columns,
         fontsize=8,
         title=title,
@@ -47,20 +47,20 @@ def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper cent
 
 
 def _save(figure, path: Path, about: str) -> None:
-    """Writes a picture, with what it is of below it: it may be shown alone."""
+    """Writes a figure with its data named below it, so that it can be shown alone."""
     line = int(_LETTERS * figure.get_figwidth())
     figure.supxlabel(textwrap.fill(about, line), fontsize=7, color=_TRUTH)
     figure.savefig(path, dpi=110)
 
 
-def _log_mm(values: Sequence[float]) -> tuple[float, float]:
+def log_limits_mm(values: Sequence[float]) -> tuple[float, float]:
     """Ends of a log axis of errors: from 1 mm, or less where one of them is less."""
-    known = np.array(values, float)
-    known = known[np.isfinite(known) & (known > 0)]
-    if not known.size:
+    finite = np.array(values, float)
+    finite = finite[np.isfinite(finite) & (finite > 0)]
+    if not finite.size:
         return 1.0, 10.0
-    low = 10.0 ** np.floor(np.log10(0.99 * known.min()))
-    return min(1.0, low), max(10.0, 1.5 * known.max())
+    low = 10.0 ** np.floor(np.log10(0.99 * finite.min()))
+    return min(1.0, low), max(10.0, 1.5 * finite.max())
 
 
 def draw_table(
@@ -73,7 +73,7 @@ def draw_table(
     figure = _figure(max(7.0, 1.5 + 0.55 * len(rows)), 7.5)
     axes = figure.subplots(4, 1, sharex=True)
     at = np.arange(len(rows))
-    known = [(k, p) for k, p in enumerate(paper) if p is not None]
+    published = [(k, p) for k, p in enumerate(paper) if p is not None]
     methods = (
         (-0.2, "no_mm", _BASELINE, "no motion model"),
         (0.2, "full", _OURS, "full"),
@@ -85,11 +85,11 @@ def draw_table(
         for shift, method, color, meaning in methods:
             key = f"{method}/{name}"
             ours = [1e3 * (row.get(key) or np.nan) for row in rows]
-            theirs = [1e3 * p[key] for _, p in known]
+            theirs = [1e3 * p[key] for _, p in published]
             axis.bar(at + shift, ours, 0.4, color=color, label=meaning)
-            axis.plot([k + shift for k, _ in known], theirs, color=color, **_THEIRS)
+            axis.plot([k + shift for k, _ in published], theirs, color=color, **_THEIRS)
             drawn += [*ours, *theirs]
-        axis.set(ylabel=label, yscale="log", ylim=_log_mm(drawn))
+        axis.set(ylabel=label, yscale="log", ylim=log_limits_mm(drawn))
         axis.grid(axis="y", alpha=0.3)
     scale = axes[3]
     scale.axhline(1, color=_TRUTH, lw=1)
@@ -97,8 +97,8 @@ def draw_table(
     scale.plot(at, full, "s", color=_OURS, label="scale, full")
     start = [1 / r["start_ratio"] if r.get("start_ratio") else np.nan for r in rows]
     scale.plot(at, start, "x", color=_TRUTH, label="scale, closed form")
-    theirs = [p["full/scale"] for _, p in known]
-    scale.plot([k + 0.2 for k, _ in known], theirs, color=_OURS, **_THEIRS)
+    theirs = [p["full/scale"] for _, p in published]
+    scale.plot([k + 0.2 for k, _ in published], theirs, color=_OURS, **_THEIRS)
     scale.set(ylabel="scale (best 1)", xlabel="sequence", xlim=(-0.6, len(rows) - 0.4))
     scale.grid(axis="y", alpha=0.3)
     scale.set_xticks(at, [str(r["sequence"]) for r in rows], rotation=60, fontsize=8)
@@ -155,24 +155,24 @@ def draw_variants(path: Path, rows: Sequence[Row], about: str) -> None:
         value = [1e3 * (row.get(name) or np.nan) for row in rows]
         axis.barh(at, value, color=_OURS)
         label = f"{name[0].upper()}-ATE, SE(3), mm"
-        axis.set(xlabel=label, xscale="log", xlim=_log_mm(value))
+        axis.set(xlabel=label, xscale="log", xlim=log_limits_mm(value))
     ratio = np.array([row.get("scale_ratio") for row in rows], float)
-    _draw_ratios(scale, at, ratio)
+    draw_ratios(scale, at, ratio)
     scale.set(xlabel="estimated / true scale")
     for axis in (*errors, scale):
         axis.grid(axis="x", alpha=0.3)
     for y, row in zip(at, rows, strict=True):
         if row.get("c_ate_se3") is None:
             where = errors[0].get_yaxis_transform()
-            said = "none" if "c_ate_se3" in row else str(row.get("status"))
-            errors[0].text(0.02, y, said, transform=where, fontsize=7, va="center")
+            status = "none" if "c_ate_se3" in row else str(row.get("status"))
+            errors[0].text(0.02, y, status, transform=where, fontsize=7, va="center")
     errors[0].set_yticks(at, [str(row["label"]) for row in rows], fontsize=8)
     errors[0].set_ylim(-0.7, len(rows) - 0.3)
     _save(figure, path, about)
 
 
-def _draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
-    """Points about 1; what is farther off than the axis goes stands at its end."""
+def draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
+    """Points about 1; values beyond the axis are printed at its end."""
     off = np.abs(ratio - 1)
     near = off <= _FAR
     end = 1.1 * max(off[near].max(initial=0.0), 0.05)
@@ -197,7 +197,7 @@ def _draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
 def draw_structure(
     path: Path, rows: Sequence[Row], paper: Sequence[Row | None], about: str
 ) -> None:
-    """C-ATE of the shaken cameras, and after both optimisations."""
+    """C-ATE of the perturbed cameras, and after both optimisations."""
     figure = _figure(max(6.0, 1.5 + 1.1 * len(rows)), 3.4)
     axis = figure.subplots()
     stages = ("perturbed", "no_landmarks", "landmarks")
@@ -207,17 +207,19 @@ def draw_structure(
         at = np.arange(len(rows)) + 0.27 * (k - 1)
         ours = [1e3 * (row.get(stage) or np.nan) for row in rows]
         axis.bar(at, ours, 0.25, color=color, label=stage.replace("_", " "))
-        known = [(x, 1e3 * p[stage]) for x, p in zip(at, paper, strict=True) if p]
-        axis.plot([x for x, _ in known], [v for _, v in known], color=color, **_THEIRS)
-        drawn += [*ours, *(v for _, v in known)]
-    axis.set(ylabel="C-ATE, SE(3), mm", yscale="log", ylim=_log_mm(drawn))
+        theirs = [(x, 1e3 * p[stage]) for x, p in zip(at, paper, strict=True) if p]
+        axis.plot(
+            [x for x, _ in theirs], [v for _, v in theirs], color=color, **_THEIRS
+        )
+        drawn += [*ours, *(v for _, v in theirs)]
+    axis.set(ylabel="C-ATE, SE(3), mm", yscale="log", ylim=log_limits_mm(drawn))
     axis.set_xticks(np.arange(len(rows)), [str(row["sequence"]) for row in rows])
     _legend(figure, [axis], "simulated", columns=4)
     _save(figure, path, about)
 
 
 def draw_learning(path: Path, row: Row, about: str) -> None:
-    """The error on the training sequences by step, and the weights on the way."""
+    """The error on the training sequences and the weights, by step."""
     figure = _figure(9.0, 3.0)
     left, right = figure.subplots(1, 2)
     left.plot(np.array(row["history"], float), "o-", color=_OURS)

@@ -1,4 +1,4 @@
-"""What an experiment is made of: rows that are computed one by one, and kept."""
+"""Experiments as plans: rows that are computed one by one and cached, and a report."""
 
 import dataclasses
 import functools
@@ -21,15 +21,15 @@ solve of everything, s a frame; a problem of new shapes, s."""
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One row: what it follows from, what it costs, how it is computed."""
+    """One row: its inputs, its cost, and the function that computes it."""
 
     label: str
     key: tuple[Any, ...]
     seconds: float
-    """Of processor time, about."""
+    """Estimated processor time, s."""
     compute: Callable[[], Row]
     form: Any
-    """What a kept row must have for the report, as `_journal.fits` takes it."""
+    """What a kept row must have for the report, as for `row_cache.fits`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Plan:
 
 
 def check_files(experiment: Experiment, config: Config) -> None:
-    """Reads what rows will need, before minutes are spent on others.
+    """Reads the files that rows will need, before minutes are spent on other rows.
 
     **Raises:** `FileNotFoundError` or `ValueError`, naming the file or the option.
     """
@@ -63,7 +63,7 @@ def check_files(experiment: Experiment, config: Config) -> None:
 
 
 def named(settings: Simulation) -> str:
-    """Such as `M2-room`."""
+    """The name of a sequence and its family, such as `M2-room`."""
     return f"{settings.sequence}-{settings.family}"
 
 
@@ -94,9 +94,9 @@ def by_sequence(
     effort: tuple[float, float],
     form: dict[str, Any],
 ) -> list[Job]:
-    """One row a sequence; `effort` are solves and kinds of problem.
+    """One row per sequence; `effort` are numbers of solves and of compiled problems.
 
-    `form` is what a row must have beside its sequence.
+    `form` lists the fields of a row beside its sequence.
     """
     case = cases(config, stages)
 

@@ -1,4 +1,4 @@
-"""Learnt weights as rows: what they are, and what a sequence gains by them."""
+"""Rows of `bodyslam experiment weights`: learnt weights, and errors with them."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from bodyslam_jax.experiments.weights import (
 
 
 def described(learned: Learned) -> dict[str, Any]:
-    """Names, logarithms and factors of the weights, and how they were found."""
+    """Names, logarithms and factors of the weights, and the history of learning."""
     return {
         "names": list(learned.names),
         "log": learned.log.tolist(),
@@ -27,7 +27,7 @@ def described(learned: Learned) -> dict[str, Any]:
 
 
 def judge(trial: Trial, learned: Learned) -> dict[str, float]:
-    """Errors with the weights as they were and as learnt: `before/scale` and so on."""
+    """Errors with the original and the learnt weights: `before/scale` and so on."""
     row = {}
     for when, log in (
         ("before", np.zeros_like(learned.log)),

@@ -1,7 +1,7 @@
-"""The paper's own figures, on its own recordings, which were never released.
+"""Results published in the paper, on its own recordings, which were not released.
 
 Henning, Laidlow, Leutenegger, "BodySLAM", ECCV 2022: table 1 and the appendix. Other
-data than ours, so they stand beside our tables for their size, not as a comparison.
+data than ours: in our tables they indicate the order of magnitude only.
 """
 
 _ROWS = """

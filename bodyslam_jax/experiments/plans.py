@@ -1,4 +1,8 @@
-"""What each experiment computes, row by row, and what it writes of it."""
+"""The experiments of `bodyslam experiment NAME`, each as a plan of rows and a report.
+
+Inputs are the settings of `config.Experiment`; outputs are those of the report, in
+`experiments.reports`, `table1` and `video_table`.
+"""
 
 import dataclasses
 import functools
@@ -31,8 +35,8 @@ ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 NOISE_LEVELS = ("none", "low", "real")
 LEARNING_STEPS = 12
 DERIVATIVE = 240.0
-"""Processor time of compiling the solver's derivative, s: where sequences are few and
-short, most of what learning takes."""
+"""Processor time of compiling the solver's derivative, s, which dominates where
+sequences are few and short."""
 
 
 def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -71,12 +75,13 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
         (len(PERTURBATIONS) * 1.5, 3.0),
         reports.SCALE,
     )
-    told = about(experiment, config)
-    return Plan(jobs, functools.partial(reports.write_scale, about=told))
+    data = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_scale, about=data))
 
 
 def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Shaken cameras, optimised with and without landmarks: the paper's five."""
+    """Perturbed cameras, optimised with and without landmarks: the paper's five
+    sequences."""
     jobs = by_sequence(
         experiment,
         config,
@@ -87,12 +92,12 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
         (2.5, 4.0),
         reports.STRUCTURE,
     )
-    told = about(experiment, config)
-    return Plan(jobs, functools.partial(reports.write_structure, about=told))
+    data = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_structure, about=data))
 
 
 def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """How well the motion model predicts clips that it was not trained on."""
+    """Prediction errors of the motion model on clips that it was not trained on."""
     source = experiment.motion or str(reports.CLIPS)
 
     def compute() -> Row:
@@ -112,7 +117,7 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Terms off and on, other weights, noise levels, first against second order."""
+    """Disabled and added factors, other weights, noise levels, solvers compared."""
     case = cases(config, stages)
 
     @functools.lru_cache(maxsize=1)
@@ -152,15 +157,15 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
             quiet = dataclasses.replace(s, noise=noise)
             one = lambda q=quiet: ablation_.ablate(case(q), prepared(q), FULL)
             add(quiet, f"noise: {noise}", one)
-    told = about(experiment, config)
-    return Plan(jobs, functools.partial(reports.write_ablation, about=told))
+    data = about(experiment, config)
+    return Plan(jobs, functools.partial(reports.write_ablation, about=data))
 
 
 def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """Weights learnt on some sequences, and what each of all sequences gains.
 
-    Cameras and map stay as bundle adjustment left them, which takes landmarks out of
-    the problem: what is learnt is how people are weighed.
+    Cameras and map are held as bundle adjustment left them, which takes landmarks out
+    of the problem: only weights of people's factors are learnt.
     """
     chosen = simulations(
         experiment, ("E1", "M1", "M4", "D2", "E2", "M2", "D1"), ("room",)
@@ -191,9 +196,9 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
     jobs = [Job("learnt", key, seconds, learnt, reports.LEARNT)]
     for group, settings in (("training", training), ("test", test)):
         for s in settings:
-            told = {"sequence": named(s), "set": group}
-            row = lambda s=s, told=told: {**told, **judge(trial(s), learned())}
-            form = {**told, **reports.JUDGED}
+            labels = {"sequence": named(s), "set": group}
+            row = lambda s=s, labels=labels: {**labels, **judge(trial(s), learned())}
+            form = {**labels, **reports.JUDGED}
             label = f"{group}-{named(s)}"
             jobs.append(Job(label, (s, *key), cost(s, 2.0, 1.0), row, form))
     write = functools.partial(reports.write_weights, about=about(experiment, config))
@@ -201,7 +206,7 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Pixels alone beside simulated keypoints and bodies, all ten, both families."""
+    """From pixels alone, and with simulated keypoints and bodies, on all sequences."""
     jobs = video_.jobs(experiment, config, stages, ALL)
     return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
 

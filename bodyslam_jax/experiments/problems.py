@@ -1,4 +1,4 @@
-"""Variants of a joint problem: terms left out, variables held, states rescaled."""
+"""Operations on joint problems and states: without map, rescaled, stacked."""
 
 import dataclasses
 
@@ -25,11 +25,10 @@ def rebuild(
 def without_map(
     problem: graph.Problem, state: graph.State, *, hold_cameras: bool
 ) -> tuple[graph.Problem, graph.State]:
-    """Neither landmarks, nor their term, nor the ground among them; with `hold_cameras`
-    s alone moves the cameras.
+    """The problem without landmarks, their factors, and ground contact, which rests on
+    them; with `hold_cameras` the cameras move through s only.
 
-    Section 4.2 of the paper: what people say of the scale, or of the cameras, when
-    nothing else does.
+    Section 4.2 of the paper: people alone determine scale or cameras.
     """
     bare = eqx.tree_at(lambda s: s.landmarks, state, state.landmarks[:0])
     free = dataclasses.replace(problem.free, landmarks=problem.free.landmarks[:0])
@@ -46,5 +45,5 @@ def with_scale(state: graph.State, scale: Float[Array, ""] | float) -> graph.Sta
 
 
 def stacked(states: list[graph.State]) -> graph.State:
-    """States of one shape, one after the other along a new leading axis."""
+    """States of one shape, stacked along a new leading axis."""
     return jax.tree.map(lambda *x: jnp.stack(x), *states)

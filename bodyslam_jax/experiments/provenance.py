@@ -1,4 +1,4 @@
-"""What tables say they are of: the noise level, and whatever is not as by default."""
+"""The data behind a table, in words: noise level, and settings that are not default."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -9,24 +9,24 @@ from bodyslam_jax.pipeline.stage_cache import body_model_file
 
 
 def about(experiment: Experiment, config: Config) -> str:
-    """What the rows of an experiment are of, in a sentence or two."""
+    """Simulation and settings of the rows of an experiment, in a sentence or two."""
     first = f"Simulated sequences, noise level `{experiment.noise}`."
     return f"{first} {deviations(experiment, config)}".rstrip()
 
 
 def deviations(experiment: Experiment, config: Config) -> str:
-    """Seed, length, motion, models and settings that are not as by default, if any.
+    """Seed, length, motion, models and settings that differ from the defaults, if any.
 
-    Settings are told against the preset that they are nearest to. A body model that
-    was found on this machine counts as one that was named.
+    Settings are compared with the preset that they are nearest to. A body model found
+    on this machine counts as named by the user.
     """
-    said = []
+    parts = []
     if experiment.seed is not None:
-        said.append(f"seed {experiment.seed}")
+        parts.append(f"seed {experiment.seed}")
     if experiment.frames is not None:
-        said.append(f"{experiment.frames} frames each")
+        parts.append(f"{experiment.frames} frames each")
     if experiment.motion is not None:
-        said.append(f"motion of `{experiment.motion}`")
+        parts.append(f"motion of `{experiment.motion}`")
     body = body_model_file(config.body_model)
     config = dataclasses.replace(config, body_model=None if body is None else str(body))
     mine = dict(_flat(config))
@@ -36,9 +36,9 @@ def deviations(experiment: Experiment, config: Config) -> str:
         for preset, theirs in against.items()
     }
     preset = min(differing, key=lambda name: len(differing[name]))
-    said += [f"preset `{preset}`"] if preset != "default" else []
-    said += differing[preset]
-    return f"Not as by default: {'; '.join(said)}." if said else ""
+    parts += [f"preset `{preset}`"] if preset != "default" else []
+    parts += differing[preset]
+    return f"Not as by default: {'; '.join(parts)}." if parts else ""
 
 
 def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,4 +1,7 @@
-"""Tables and figures of finished rows: Markdown, CSV and PNG beside one another."""
+"""Reports of the experiments on scale, landmarks, motion, ablation and weights.
+
+Inputs are finished rows; each report is written as Markdown, CSV and PNG.
+"""
 
 import functools
 from pathlib import Path
@@ -19,7 +22,7 @@ from bodyslam_jax.experiments.tables import (
 )
 
 CLIPS = Path(simulation.__file__).parent / "assets" / "walking.npz"
-"""The clips that ship."""
+"""The clips that are part of the package."""
 SCALE = {
     **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
     **dict.fromkeys(("history", "h_ate"), [[float]]),
@@ -46,7 +49,7 @@ JUDGED = {
     for when in ("before", "after")
     for name in ("error", "scale", "j_ate_se3")
 }
-"""What kept rows must have for the reports below, see `_journal.fits`."""
+"""What kept rows must have for the reports below, see `row_cache.fits`."""
 
 
 def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
@@ -95,13 +98,13 @@ def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """C-ATE of shaken cameras with and without landmarks, by the paper's."""
+    """C-ATE of perturbed cameras with and without landmarks, beside the paper's."""
     names = ("original", "perturbed", "no_landmarks", "landmarks")
     theirs: list[Row | None] = []
     beside = []
     for row in rows:
-        known = paper.STRUCTURE.get(row["sequence"].split("-")[0])
-        values = None if known is None else [1e-3 * v for v in known]
+        published = paper.STRUCTURE.get(row["sequence"].split("-")[0])
+        values = None if published is None else [1e-3 * v for v in published]
         theirs.append(values and dict(zip(names, values, strict=True)))
         found = theirs[-1] or {}
         beside.append({**row, **{f"paper:{name}": v for name, v in found.items()}})
@@ -163,7 +166,9 @@ def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> lis
 
 def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Every variant's errors, sequence by sequence."""
-    number = functools.partial(Column, average=False)  # a mean of variants says nothing
+    number = functools.partial(
+        Column, average=False
+    )  # a mean over variants is meaningless
     columns = [
         Column("variant", "label"),
         number("C-ATE SE(3), mm", "c_ate_se3", MM),

@@ -1,4 +1,4 @@
-"""Finished rows kept on disk: an interrupted experiment goes on where it stopped."""
+"""Finished rows on disk, so that an interrupted experiment resumes."""
 
 import json
 import logging
@@ -17,12 +17,12 @@ Row = dict[str, Any]
 
 
 class Journal:
-    """A folder with one JSON file a row, named by all that the row follows from."""
+    """A folder with one JSON file per row, named by a fingerprint of its inputs."""
 
     def __init__(self, folder: Path):
         self.folder = folder
         self.computed = 0
-        """Rows that were not on disk."""
+        """Number of rows that were not on disk."""
 
     def path(self, name: str, label: str, *key: Any) -> Path:
         words = re.sub(r"[^A-Za-z0-9.]+", "_", label).strip("_")
@@ -46,7 +46,7 @@ class Journal:
         compute: Callable[[], Row],
         form: Any = dict,
     ) -> Row:
-        """The row of this `key`, from disk if it is there; `label` is for people."""
+        """The row of this `key`, from disk if present; `label` is for the log."""
         found = self.kept(name, label, key, form)
         if found is not None:
             log.info("%s %s: taken from an earlier run", name, label)

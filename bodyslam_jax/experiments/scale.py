@@ -1,4 +1,8 @@
-"""Recovery of a perturbed scale through people alone (section 4.2, appendix D)."""
+"""Rows of `bodyslam experiment scale`: recovery of a perturbed scale (section 4.2).
+
+Input is a `Case`; output, for each perturbation, s and H-ATE after each iteration of a
+solve in which people alone determine the scale (appendix D).
+"""
 
 import dataclasses
 
@@ -12,7 +16,7 @@ from bodyslam_jax.experiments.problems import with_scale, without_map
 from bodyslam_jax.pipeline.case import Case, trajectories
 
 PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
-"""The paper's 1/s': what the estimated s should come to."""
+"""The paper's 1/s', which the estimated s should reach."""
 SCHEDULE = (
     solver.Stage(("scale", "roots"), max_steps=5, rtol=1e-4),
     solver.Stage(max_steps=30),
@@ -24,9 +28,9 @@ class ScaleRecovery:
     """`p` perturbations of one sequence, solved together; `n` iterations."""
 
     perturbation: Float[np.ndarray, " p"]
-    """1/s': the s that would undo it."""
+    """1/s': the s that undoes it."""
     scale: Float[np.ndarray, " p"]
-    """What was found, in the unit of the perturbed map."""
+    """Estimated s, for the unit of the perturbed map."""
     history: Float[np.ndarray, "p n"]
     """s after each iteration, the start included."""
     h_ate: Float[np.ndarray, "p n"]
@@ -39,7 +43,7 @@ class ScaleRecovery:
 
     @property
     def spread(self) -> float:
-        """How far answers lie apart, of their mean: 0 if the start does not matter."""
+        """Range of the estimates over their mean; 0 if the start does not matter."""
         answer = self.scale / self.perturbation
         return float(np.ptp(answer) / answer.mean())
 
@@ -53,17 +57,17 @@ def scale_recovery(
 ) -> ScaleRecovery:
     """Cameras of the true size, made `1/p` as large and held; s starts at 1.
 
-    Only s and people are free, no landmark is seen. All perturbations are one solve,
-    mapped over its first states and shared out among JAX's devices. The cameras are
-    those of the pipeline (the paper takes the motion capture's), put to their true size
-    by Sim(3).
+    Only s and people are free, without landmarks. All perturbations are one solve,
+    mapped over its first states and distributed over JAX's devices. The cameras are
+    those of the pipeline (the paper takes the motion capture's), scaled to their true
+    size by Sim(3).
     """
     if prepared is None:
         found = case.prepare()
         prepared = without_map(found.problem, found.state, hold_cameras=True)
     problem, state = prepared
     true_size = graph.rescaled(with_scale(state, 1.0), case.map_scale)
-    state, seen = _recover(
+    state, history = _recover(
         jnp.asarray(perturbations),
         problem,
         true_size,
@@ -76,8 +80,8 @@ def scale_recovery(
     return ScaleRecovery(
         perturbation=np.array(perturbations),
         scale=np.asarray(state.scale),
-        history=np.asarray(seen["scale"]),
-        h_ate=np.asarray(seen["h_ate"]),
+        history=np.asarray(history["scale"]),
+        h_ate=np.asarray(history["h_ate"]),
     )
 
 
@@ -96,5 +100,5 @@ _recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 7))
 
 
 def _h_ate(state, truth: Trajectories, body, present, registered):
-    there = trajectories(state, body, present, registered, truth.fps)
-    return evaluate_trajectories(there, truth)["h_ate_se3"]
+    estimate = trajectories(state, body, present, registered, truth.fps)
+    return evaluate_trajectories(estimate, truth)["h_ate_se3"]

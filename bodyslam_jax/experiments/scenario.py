@@ -1,4 +1,4 @@
-"""What experiments run on, and how states are scored on it."""
+"""Simulations of an experiment, and errors of states on a simulated case."""
 
 import zlib
 from collections.abc import Sequence as Ordered
@@ -19,10 +19,10 @@ def score_of(case: Case, state: graph.State, present: np.ndarray) -> dict[str, f
 def simulations(
     experiment: Experiment, sequences: Ordered[str], families: Ordered[str]
 ) -> list[Simulation]:
-    """What an experiment runs on: its own sequences unless others were asked for.
+    """Simulations of an experiment: its default sequences unless others are requested.
 
-    A seed that was chosen makes every sequence another one, and not all of them the
-    same: their names count as well.
+    A seed that is given changes every sequence differently, as it is combined with the
+    sequence's name.
     """
     chosen = dict.fromkeys(experiment.sequences or sequences)  # each once
     kinds = families

@@ -1,4 +1,4 @@
-"""How far a state is from the truth: pure, so that it maps, jits and differentiates."""
+"""Errors of a state against the truth, as a function that jit, vmap and grad take."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,9 +25,9 @@ PLAUSIBLE = (
     "gravity_error",
     *(f"{name}{whose}" for name in evaluation.FIGURES for whose in ("", "_of_truth")),
 )
-"""Whether people slide, float or crouch: rad, m, s; without the result's low pass."""
+"""Figures of gravity, feet and posture, rad, m, s; without the result's low pass."""
 _FRAMES = 100
-"""Numbers of frames are rounded up to this, so that lengths share what is compiled."""
+"""Numbers of frames are padded to multiples of this, so that lengths share programs."""
 
 
 def errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
@@ -45,8 +45,8 @@ def score(
 ) -> dict[str, float]:
     """`errors` of one state as plain numbers, compiled once for many lengths.
 
-    `leg_ratio` is the length of the first person's legs over what it should be; beside
-    it stand the figures named in `PLAUSIBLE`.
+    `leg_ratio` is estimated over true leg length of the first person; the figures named
+    in `PLAUSIBLE` are added.
     """
     frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
     estimate = trajectories(state, body, present, registered, truth.fps)

@@ -1,4 +1,8 @@
-"""What structural landmarks add: cameras shaken, then optimised (appendix C)."""
+"""Rows of `bodyslam experiment landmarks`: what structural landmarks add (appendix C).
+
+Input is a `Case` and the seed of the perturbation; output C-ATE, m, of the perturbed
+cameras and after optimisation with and without landmarks.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +12,10 @@ from bodyslam_jax import graph
 from bodyslam_jax.experiments.problems import with_scale, without_map
 from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.pipeline.case import Case
-from bodyslam_jax.pipeline.joint_stage import solve_stage
+from bodyslam_jax.pipeline.solve_stage import solve_stage
 
 SHIFT, TURN = 0.1, 0.01
-"""m, rad: the paper's, per coordinate, uniform."""
+"""The paper's uniform perturbation of each coordinate, m and rad."""
 
 
 def shake(
@@ -24,7 +28,7 @@ def shake(
 ) -> graph.State:
     """Moves every camera by up to `shift` m and `turn` rad in each coordinate.
 
-    Coordinates that hold the map in place stay; `shift` is metres by the state's s.
+    Coordinates that fix the gauge stay; `shift` is in metres by the state's s.
     """
     low, high = -jnp.ones(6), jnp.ones(6)
     draw = jax.random.uniform(
@@ -36,20 +40,20 @@ def shake(
 
 
 def landmark_ablation(case: Case, *, seed: int = 0) -> dict[str, float | str]:
-    """C-ATE of the shaken cameras, and optimised with and without landmarks, m.
+    """C-ATE, m, of the perturbed cameras, and optimised with and without landmarks.
 
-    `original` are the cameras of bundle adjustment in the map's own unit (the paper's
-    first column, arbitrary in scale); everything after has s from the motion model.
+    `original` is that of bundle adjustment in the map's own unit (the paper's first
+    column, of arbitrary scale); all others have s from the motion model.
     """
     prepared = case.prepare()
     problem, state = prepared.problem, prepared.state
     shaken = shake(state, problem.free, jax.random.key(seed))
     bare, bare_state = without_map(problem, shaken, hold_cameras=False)
-    with_map, told = solve_stage(problem, shaken, case.config, "joint")
-    without, told_bare = solve_stage(bare, bare_state, case.config, "joint")
+    with_map, stage = solve_stage(problem, shaken, case.config, "joint")
+    without, stage_bare = solve_stage(bare, bare_state, case.config, "joint")
     row: dict[str, float | str] = {
-        "status": told["status"],
-        "status_no_landmarks": told_bare["status"],
+        "status": stage["status"],
+        "status_no_landmarks": stage_bare["status"],
         "radius": case.radius,
     }
     states = {

@@ -1,4 +1,4 @@
-"""The paper's table 1 of finished rows, the paper's own figures beside ours."""
+"""The report of `bodyslam experiment table1`: our rows beside the paper's values."""
 
 import math
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from bodyslam_jax.experiments.tables import (
 
 _GROUPS = {"se3": "SE(3)", "sim3": "Sim(3)"}
 _PAIR = {"no_mm": "no MM", "full": "full"}
-"""What the paper compares."""
+"""The methods that the paper compares."""
 _PAPER = "paper:"
-"""Before the keys of the paper's figures in a row of ours."""
+"""Prefix of the keys of the paper's values in our rows."""
 _NUMBERS = ("frames", "radius", "start_ratio", "start_sigma", "scale_ratio", "steps")
 _PATH = [[float]]
 FORM: dict[str, Any] = {
@@ -36,7 +36,7 @@ FORM: dict[str, Any] = {
         for name in ("truth", *_PAIR)
     },
 }
-"""What a kept row must have, beside its sequence."""
+"""Fields of a cached row beside its sequence."""
 _SEQUENCE = Column("sequence", "sequence")
 _BEHIND = [
     Column("frames", "frames", digits=0),
@@ -66,11 +66,11 @@ _PLAUSIBLE = [
         for of, whose in (("", ""), (", truth", "_of_truth"))
     ),
 ]
-"""Whether the full estimate's people slide, float or crouch."""
+"""Gravity, feet and posture of the full estimate."""
 
 
 def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Table 1, what is behind it, and the baselines; all of it in one CSV."""
+    """Table 1, details of its rows, and the baselines; all in one CSV."""
     papers = [paper.table1_row(row["sequence"].split("-")[0]) for row in rows]
     rows = [_completed(*both) for both in zip(rows, papers, strict=True)]
     baselines = {name: METHODS[name] for name in METHODS if name not in _PAIR}
@@ -108,7 +108,7 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def _completed(row: Row, theirs: Row) -> Row:
-    """A row with what follows from it, and the paper's figures."""
+    """A row with derived values and those of the paper."""
     scale, error = row["full/scale"], row["full/c_ate_se3"]  # `None`: not finite
     return {
         **row,

@@ -1,4 +1,4 @@
-"""Rows as Markdown and CSV: one table or several, under what they are of."""
+"""Rows as Markdown and CSV: one table or several, with the data named above them."""
 
 import csv
 import dataclasses
@@ -18,7 +18,7 @@ Cell = str | float | int | None
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """What stands in a column, and how."""
+    """A column: its key in the rows, unit and format."""
 
     title: str
     key: str
@@ -26,7 +26,7 @@ class Column:
     """From the row's unit (SI) to the table's."""
     digits: int = 1
     average: bool = True
-    """Whether the last row has its mean."""
+    """Whether the last row holds its mean."""
 
     def value(self, row: dict[str, Any]) -> Cell:
         found = row.get(self.key)
@@ -51,8 +51,8 @@ def markdown(
         for column in columns:
             values = [column.value(row) for row in rows]
             numbers = [v for v in values if isinstance(v, (int, float))]
-            known = column.average and len(numbers) == len(rows)
-            last.append(column.text(sum(numbers) / len(rows)) if known else "")
+            averaged = column.average and len(numbers) == len(rows)
+            last.append(column.text(sum(numbers) / len(rows)) if averaged else "")
         if any(last):
             lines.append(["**mean**", *last[1:]])
     escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
@@ -64,7 +64,7 @@ def to_csv(
 ) -> str:
     """The same columns in full precision, units as in the titles.
 
-    The last one, `data`, has what the rows are of, if that is given.
+    The last one, `data`, names the data, if given.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -88,8 +88,10 @@ def write_tables(
     parts: Sequence[tuple[str, Sequence[Column], Sequence[Row]]],
     about: str,
 ) -> list[Path]:
-    """`name.md` with all parts under their titles, `name.csv` with the first, of which
-    `about` says what data they are of."""
+    """`name.md` with all parts under their titles and `name.csv` with the first.
+
+    `about` names the data.
+    """
     text = head
     for title, columns, rows in parts:
         text += f"## {title}\n\n{markdown(columns, rows, mean=len(rows) > 1)}\n"

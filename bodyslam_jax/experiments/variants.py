@@ -1,4 +1,4 @@
-"""Other problems from the same measurements: terms off, terms on, variables held."""
+"""Variants of a joint problem: factors disabled or added, variables held constant."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,38 +14,39 @@ from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.experiments.problems import rebuild
 from bodyslam_jax.initialisation import upright_factor
 
-_SEE_SCALE = (
+_SCALE_FACTORS = (
     graph.HumanMotion,
     graph.RootSmoothness,
     graph.GroundContact,
 )
-"""What ties the map's unit to metres."""
+"""Factors that relate the map's unit to metres."""
 
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
 
-ASKED_FOR = GraphWeights(upright_sigma=0.1)
-"""Of what is off by default: how upright people walk, rad."""
+OPTIONAL = GraphWeights(upright_sigma=0.1)
+"""Sigmas of factors that are off by default: of an upright trunk, rad."""
 _FPS = 30.0
-"""Of the simulated sequences."""
+"""Frame rate of the simulated sequences, 1/s."""
 
 
 def without(*kinds: type[graph.Factor]) -> Variant:
-    """The problem without these terms; s is held where nothing is left to see it.
+    """The problem without these factors; s is held where none is left that
+    determines it.
 
-    Where they measure nothing, it is the very problem that was given.
+    If the problem has no such factors it is returned as it is.
     """
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
-        muted = graph.disable(problem, *kinds)
-        if eqx.tree_equal(muted, problem):
+        disabled = graph.disable(problem, *kinds)
+        if eqx.tree_equal(disabled, problem):
             return problem, state
-        seeing = [f for f in problem.factors if isinstance(f, _SEE_SCALE)]
-        if all(isinstance(f, kinds) for f in seeing):
-            muted = dataclasses.replace(
-                muted, free=graph.set_constant(muted.free, "scale")
+        remaining = [f for f in problem.factors if isinstance(f, _SCALE_FACTORS)]
+        if all(isinstance(f, kinds) for f in remaining):
+            disabled = dataclasses.replace(
+                disabled, free=graph.set_constant(disabled.free, "scale")
             )
-        return muted, state
+        return disabled, state
 
     return variant
 
@@ -61,20 +62,20 @@ def held(*names: str) -> Variant:
 
 
 def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
-    """No point of the map is seen; points stay, since nothing else says where they
-    are, and cameras are free."""
+    """The problem without observations of landmarks: landmarks are held, as no factor
+    determines them, and cameras are free."""
     return held("landmarks")(
         *without(graph.Reprojection, graph.LandmarkPrior)(problem, state)
     )
 
 
 def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
-    """β as the regressor has it, not as people alone have moved it, and held there."""
-    (said,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
-    known = jnp.isfinite(said.sigma)
-    count = known.sum(axis=1, dtype=said.shape.dtype)
-    mean = jnp.where(known, said.shape, 0.0).sum(axis=1) / jnp.maximum(count, 1)
-    shapes = jnp.where(known.any(axis=1), mean, state.shapes)
+    """β held at the regressor's value, not at that of the body-only solve."""
+    (prior,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
+    valid = jnp.isfinite(prior.sigma)
+    count = valid.sum(axis=1, dtype=prior.shape.dtype)
+    mean = jnp.where(valid, prior.shape, 0.0).sum(axis=1) / jnp.maximum(count, 1)
+    shapes = jnp.where(valid.any(axis=1), mean, state.shapes)
     return held("shapes")(problem, dataclasses.replace(state, shapes=shapes))
 
 
@@ -83,7 +84,7 @@ def beside(
         [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.Factor | None
     ],
 ) -> Variant:
-    """One more term, if there is anything for it to say."""
+    """The problem with one more factor, if `make` returns one."""
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
         body, present = _person(problem)
@@ -98,7 +99,7 @@ def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     motion = problem.motion
     if motion is not None:
         return motion.body, motion.present
-    for factor in problem.factors:  # where predictions stay as they are
+    for factor in problem.factors:  # with frozen predictions there is no motion model
         if isinstance(factor, graph.KeypointReprojection):
             return factor.body, jnp.isfinite(factor.sigma).any(axis=-1)
     raise ValueError("the problem has no people; expected a moving person.")
@@ -123,7 +124,7 @@ VARIANTS: dict[str, Variant] = {
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
     "with up direction": beside(
-        lambda body, state, there: upright_factor(state, there, _FPS, ASKED_FOR)
+        lambda body, state, present: upright_factor(state, present, _FPS, OPTIONAL)
     ),
 }
-"""What `ablation` solves, from the start of the full problem but for what is held."""
+"""The variants of `ablation`, solved from the start of the full problem."""

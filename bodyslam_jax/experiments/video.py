@@ -1,9 +1,9 @@
-"""From pixels alone, beside keypoints and bodies that are simulated: the same images.
+"""Rows of `bodyslam experiment video`: estimates from rendered video.
 
-Every sequence is rendered with people in clothes. Medium ones have furniture in the
-way, difficult ones a second person, too, and a rolling shutter. The pipeline then sees
-the video and camera.json, and: nothing else (`pixels`); the simulated keypoints of the
-people (`keypoints`); these and bodies as of a regressor (`bodies`).
+Every sequence is rendered with people in clothes; medium ones have furniture that
+occludes them, difficult ones also a second person and a rolling shutter. Input of the
+pipeline are the video and camera.json, and: nothing else (`pixels`); simulated
+keypoints (`keypoints`); these and bodies as of a regressor (`bodies`).
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ FORM: dict[str, Any] = {
     **dict.fromkeys((*FIGURES, "size"), float),
     "status": str,
 }
-"""What a kept row must have, beside its sequence."""
+"""Fields of a cached row beside its sequence."""
 _SECONDS = 0.6
 """Processor time of all stages, a frame and input, s."""
 _READOUT = 0.015
@@ -59,7 +59,7 @@ def jobs(
 
 
 def filmed(settings: Simulation) -> Simulation:
-    """The same with what stands in the way and who else is there."""
+    """The simulation with occluding furniture and further people."""
     level = settings.sequence[0]
     return dataclasses.replace(
         settings,
@@ -73,9 +73,9 @@ def filmed(settings: Simulation) -> Simulation:
 def video_row(
     settings: Simulation, which: str, config: Config = Config(), stages: Path = Path()
 ) -> Row:
-    """Renders, runs everything on the images, and compares with the truth.
+    """Renders, runs the pipeline on the images, and compares with the truth.
 
-    `which` is of `INPUTS`. The film and finished stages are kept in `stages`.
+    `which` is one of `INPUTS`. The film and finished stages are kept in `stages`.
 
     **Raises:** as `simulation.simulate` and `pipeline.run`.
     """

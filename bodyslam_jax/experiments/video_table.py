@@ -1,4 +1,4 @@
-"""The tables of `experiment video`: each with standard errors of its means."""
+"""The report of `bodyslam experiment video`: tables with standard errors of means."""
 
 import math
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ _FIGURES = (
     Column("gravity error, degrees", "gravity_error", _DEGREES, 2),
 )
 _TRUE = {name: f"{name}_of_truth" for name in FIGURES}
-"""Figures that the truth has as well."""
+"""Figures that are computed of the truth as well."""
 
 
 def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
@@ -99,9 +99,9 @@ def _summary(rows: Sequence[Row]) -> str:
 
 
 def _mean(values: Sequence[float | None], column: Column) -> str | None:
-    """`43.7 ± 6.7`; how many had no such figure, if any."""
-    known = [v for v in values if v is not None and math.isfinite(v)]
-    numbers = np.array(known, float) * column.factor
+    """`43.7 ± 6.7`, and the number of rows that lack the figure, if any."""
+    finite = [v for v in values if v is not None and math.isfinite(v)]
+    numbers = np.array(finite, float) * column.factor
     if not len(numbers):
         return None
     d = column.digits

@@ -1,4 +1,4 @@
-"""Weights learnt through the solver: the gradient of the error at its optimum.
+"""Weights learnt through the solver, for `bodyslam experiment weights`.
 
 The solution depends on the weights by the implicit function theorem (`solver.solve`
 has its derivative), so an error after alignment can be lowered by gradient on training
@@ -22,8 +22,9 @@ from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.experiments.problems import without_map
 from bodyslam_jax.experiments.scoring import errors
-from bodyslam_jax.pipeline import joint_stage, stage_cache
+from bodyslam_jax.pipeline import stage_cache
 from bodyslam_jax.pipeline.case import Case, trajectories
+from bodyslam_jax.pipeline.joint_problem import Prepared
 
 log = logging.getLogger(__name__)
 WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
@@ -40,13 +41,13 @@ WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
     "landmark": (graph.Reprojection, "sigma"),
     "landmark loss": (graph.Reprojection, "loss"),
 }
-"""What each weight multiplies: a term's field."""
+"""The field of a factor that each weight multiplies."""
 SCALE_UNIT, JOINT_UNIT = 0.05, 0.05
-"""What counts as an error of 1: in log s, and in J-ATE, m."""
+"""Units of the training error: of log s, and of J-ATE, m."""
 SCHEDULE = (solver.Stage(),)
 """From a solution with other weights no first step is needed."""
 PRIOR = 0.02
-"""Cost of a weight that is off by a factor e: few sequences decide little."""
+"""Cost of a weight that differs by a factor e: a prior, as sequences are few."""
 
 
 class Trial(eqx.Module):
@@ -73,21 +74,19 @@ class Learned:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """What a step of learning leaves for the next, as arrays."""
+    """The state of learning after a step, as arrays."""
 
     names: tuple[str, ...]
     standing: tuple[np.ndarray, ...]
-    """Weights, Adam's memory, and the solution of each sequence."""
+    """Weights, moments of Adam, and the solution of each sequence."""
     history: Float[np.ndarray, " n"]
     path: Float[np.ndarray, "n w"]
 
 
-def make_trial(
-    case: Case, prepared: joint_stage.Prepared, *, hold_cameras: bool
-) -> Trial:
+def make_trial(case: Case, prepared: Prepared, *, hold_cameras: bool) -> Trial:
     """The problem of a case and its solution with the weights as they are.
 
-    With `hold_cameras` there are no landmarks, and a solve is far cheaper.
+    With `hold_cameras` there are no landmarks, which makes a solve far cheaper.
     """
     problem, state = prepared.problem, prepared.state
     if hold_cameras:
@@ -129,7 +128,7 @@ def _scaled(factor: graph.Factor, field: str, by: Array) -> graph.Factor:
     if field == "whitening":
         new = old / by
     else:
-        # Infinite is missing, and has no derivative.
+        # An infinite sigma marks missing data and has no derivative.
         missing = jnp.isinf(old)
         new = jnp.where(missing, jnp.inf, jnp.where(missing, 1.0, old) * by)
     return eqx.tree_at(lambda f: getattr(f, field), factor, new)
@@ -146,10 +145,10 @@ def outcome(
     solution = solver.solve(problem, trial.state, schedule=schedule)
     motion = problem.motion
     present = trial.truth.present if motion is None else motion.present
-    there = trajectories(
+    estimate = trajectories(
         solution.state, trial.body, present, trial.registered, trial.truth.fps
     )
-    return solution.state, solution.cost, errors(there, trial.truth)
+    return solution.state, solution.cost, errors(estimate, trial.truth)
 
 
 def training_error(found: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
@@ -182,8 +181,8 @@ def learn_weights(
 ) -> Learned:
     """Adam on the mean training error over `trials`, each solved from its last answer.
 
-    What a step leaves for the next is kept in the file `progress`: learning that was
-    interrupted goes on from there, and comes to the same.
+    The state after each step is kept in the file `progress`: learning that was
+    interrupted continues from there, to the same result.
 
     **Raises:** `ValueError` if there is no trial, or if `progress` has other weights.
     """
@@ -229,7 +228,7 @@ def _mean_error(
     for k, (trial, state) in enumerate(zip(trials, states, strict=True)):
         error, gradient, state = error_and_gradient(trial, names, value, state)
         total += float(error) / len(trials)
-        # A solve that failed says nothing; one sequence decides no more than 1.
+        # A failed solve has no gradient; that of one sequence is clipped to length 1.
         if not np.all(np.isfinite(gradient)):
             log.warning("training sequence %d: no gradient, left out of this step", k)
             gradient = jnp.zeros_like(gradient)
@@ -240,7 +239,7 @@ def _mean_error(
 
 
 def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
-    """What an earlier run left, `None` if it is nothing that can be read."""
+    """The progress of an earlier run; `None` if there is none that can be read."""
     if not progress.exists():
         return None
     try:

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from bodyslam_jax.export.statistics import PathFacts, runs
+from bodyslam_jax.diagnostics.statistics import PathStatistics, runs
 from bodyslam_jax.types import Result
 
 # Colours that stand for CSS variables; replaced in the SVG text.
@@ -54,7 +54,7 @@ _STYLE: Any = {
 
 
 def person_color(person: int) -> str:
-    """The colour that stands for a person in every figure."""
+    """The colour of a person in every figure."""
     return _PEOPLE[person % len(_PEOPLE)]
 
 
@@ -132,11 +132,13 @@ def costs(stages: Sequence[Mapping[str, Any]]) -> str:
         ax.margins(x=0.12)
         ax.grid(axis="x")
         ax.tick_params(axis="y", length=0)
-        ax.set_xlabel("cost before (ring) and after (dot), no unit")
+        ax.set_xlabel("cost before (ring) and after (dot)")
         return _svg(figure)
 
 
-def speeds(result: Result, camera: PathFacts, people: Sequence[PathFacts]) -> str:
+def speeds(
+    result: Result, camera: PathStatistics, people: Sequence[PathStatistics]
+) -> str:
     """Speed over the ground of camera and people."""
     curves = {"camera": (camera.speed, CAMERA)}
     for person, facts in enumerate(people):
@@ -145,12 +147,12 @@ def speeds(result: Result, camera: PathFacts, people: Sequence[PathFacts]) -> st
 
 
 def _extent(result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """Box around camera and people with a margin; the floor and 2 m are in it."""
+    """Box around camera and people with a margin, which contains heights 0 and 2 m."""
     points = [
         result.T_WC[:, :3, 3],
         *(
-            joints[here].reshape(-1, 3)
-            for joints, here in zip(result.joints, result.present, strict=True)
+            joints[present].reshape(-1, 3)
+            for joints, present in zip(result.joints, result.present, strict=True)
         ),
     ]
     every = np.concatenate(points)
@@ -174,14 +176,14 @@ def _paths(
         _stick_figures(ax, result, a)
     ax.plot(*result.T_WC[:, axes, 3].T, color=CAMERA, label="camera")
     ax.plot(*result.T_WC[0, axes, 3], "o", color=CAMERA, markersize=6)
-    for person, (joints, here) in enumerate(
+    for person, (joints, present) in enumerate(
         zip(result.joints, result.present, strict=True)
     ):
         color = person_color(person)
-        for run in runs(here):
+        for run in runs(present):
             ax.plot(*joints[run, 0][:, axes].T, color=color)
-        if here.any():
-            start = joints[np.argmax(here), 0]
+        if present.any():
+            start = joints[np.argmax(present), 0]
             ax.plot(*start[list(axes)], "o", color=color, markersize=6)
     ax.set_aspect("equal", adjustable="box")
     ax.set_xlim(low[a], high[a])
@@ -204,9 +206,9 @@ _LIMBS = (
 
 
 def _stick_figures(ax: Axes, result: Result, along: int) -> None:
-    """A few postures of each person on the way."""
-    for person, here in enumerate(result.present):
-        frames = np.flatnonzero(here)
+    """Stick figures of each person at several frames."""
+    for person, present in enumerate(result.present):
+        frames = np.flatnonzero(present)
         if not len(frames):
             continue
         for frame in frames[np.linspace(0, len(frames) - 1, 9).round().astype(int)]:
@@ -222,7 +224,7 @@ def _stick_figures(ax: Axes, result: Result, along: int) -> None:
 
 
 def _view_directions(ax: Axes, result: Result, size: float) -> None:
-    """Where the camera looks, every now and then."""
+    """Arrows of the camera's viewing direction at several frames."""
     every = max(1, len(result.T_WC) // 12)
     T_WC = result.T_WC[::every]
     centre, ahead = T_WC[:, [0, 2], 3], T_WC[:, [0, 2], 2]
@@ -248,7 +250,7 @@ def _legend(ax: Axes, result: Result) -> None:
 
 
 def labelled(svg: str, caption: str) -> str:
-    """A figure that is read aloud as its caption, with ids that no other one has."""
+    """A figure with its caption as label for screen readers, and with unique ids."""
     mark = f"f{zlib.crc32(caption.encode()):x}-"
     svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{mark}", svg)
     name = html.escape(caption)

@@ -36,11 +36,11 @@ def check_folder(
     """Fails early, before anything is computed, where a run could not be written.
 
     Args:
-        source: what will be run, by the names of `input` in `summary.json`.
-        begun_for: the same of an unfinished run in `folder`.
+        source: the input of the run, with the keys of `input` in `summary.json`.
+        begun_for: the input of an unfinished run in `folder`.
 
     **Raises:** `ValueError` naming the folder and what is wrong with it: not writable,
-    a full disk, files that are no run's, or the run of another input.
+    a full disk, files that are not of a run, or the run of another input.
     """
     owner = begun_for or _finished_for(folder)
     if owner is None:
@@ -71,7 +71,7 @@ def _finished_for(folder: Path) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def run_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder whose files appear in `folder` when the block ends well.
+    """A hidden folder whose files are moved to `folder` when the block succeeds.
 
     Files of an earlier run are then removed, others (the stage cache) are kept. If the
     block raises, what it wrote is deleted and `folder` is as it was.
@@ -91,7 +91,7 @@ def run_folder(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _partial(folder: Path) -> Iterator[Path]:
-    """A hidden folder in `folder`, gone afterwards, and `folder` too if it is empty."""
+    """A temporary hidden folder in `folder`; a created `folder` is removed if empty."""
     try:
         with atomic.hidden_folder(folder) as partial:
             yield partial
@@ -116,7 +116,7 @@ _NOT_WRITABLE = (
 
 
 def write_run(folder: Path, result: Result, config: Any = None) -> None:
-    """Writes the contract's files but for report and overlay; all of them or none.
+    """Writes the files of the contract except report and overlay; all or none.
 
     `config` is the settings as resolved, a dataclass or a dictionary. To add report and
     overlay, use `run_folder` and `write_files`.
@@ -141,7 +141,7 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
             result.poses[h],
             result.trans[h],
             result.betas[h],
-            fps=frame_rate(result),
+            fps=result.fps,
             joints=result.joints[h],
             present=result.present[h],
             timestamps=result.timestamps,
@@ -151,18 +151,12 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
     (folder / _LAST).write_text(json.dumps(plain(result.summary), indent=2) + "\n")
 
 
-def frame_rate(result: Result) -> float:
-    """Mean frame rate, 1/s; 30 for a single frame."""
-    t = result.timestamps
-    return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
-
-
 def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:
     """Writes points as binary PLY, m."""
     if len(points):
         trimesh.PointCloud(points).export(path, file_type="ply")
         return
-    # trimesh refuses to write no point at all, and an empty map is a result too.
+    # trimesh refuses an empty cloud, but an empty map is a valid result.
     properties = "".join(f"property float {axis}\n" for axis in "xyz")
     path.write_text(
         f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n"
@@ -177,7 +171,7 @@ def to_yaml(config: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The same in what JSON and YAML know: NumPy and paths made plain, NaN null."""
+    """The value in types of JSON and YAML: arrays as lists, paths as text, NaN null."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

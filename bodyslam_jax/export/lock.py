@@ -1,9 +1,10 @@
 """One run at a time writes a run folder.
 
 The lock is a file, `.lock`, that names the process which holds it. On one machine the
-system's lock on that file decides, so that a process that was killed holds nothing. On
-a file system that several machines share such locks may not be seen by the others:
-there the file counts, whose time its holder renews, until it is `_STALE` old.
+operating system's lock on that file decides, so that a killed process holds nothing.
+On a file system shared by several machines such locks may be invisible to the others:
+there the existence of the file decides. Its holder renews its modification time; a file
+that is older than `STALE` is abandoned.
 """
 
 import contextlib
@@ -19,21 +20,21 @@ from typing import Any
 
 try:
     import fcntl
-except ImportError:  # Windows: the file's own word and its age have to do
+except ImportError:  # Windows: the file's content and age decide
     fcntl = None
 
 _NAME = ".lock"
-_RENEWED = 10.0
-"""s, after which the holder renews the file's time."""
-_STALE = 60.0
-"""s, after which a file that is not renewed is left over."""
+RENEWED = 10.0
+"""Period after which the holder renews the file's modification time, s."""
+STALE = 60.0
+"""Age from which a file that is not renewed is abandoned, s."""
 _UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL}
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Holds the run folder for this process; a folder that was not there and stays
-    empty is gone afterwards.
+    """Holds the run folder for this process. A folder that was created for it and stays
+    empty is removed afterwards.
 
     **Raises:** `ValueError`, one line that names folder, process and machine, if
     another process holds it.
@@ -58,14 +59,14 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _acquire(path: Path) -> int:
-    """The open lock file, which says that it is this process's."""
+    """The open lock file, with this process as its owner."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if not _lock(file):
                 raise _held(path, _owner(file))
             if not _is_still(path, file):
-                os.close(file)  # its holder has just left, and removed it
+                os.close(file)  # its holder has just released and removed it
                 continue
             owner = _owner(file)
             if owner is not None and _holds(owner, os.fstat(file).st_mtime, path):
@@ -82,7 +83,7 @@ def _acquire(path: Path) -> int:
 
 
 def _lock(file: int) -> bool:
-    """Whether the system gives the lock, or knows none here."""
+    """Whether the system grants the lock, or does not support locks here."""
     if fcntl is None:
         return True
     try:
@@ -93,25 +94,25 @@ def _lock(file: int) -> bool:
 
 
 def _is_still(path: Path, file: int) -> bool:
-    """Whether the path still leads to the open file."""
+    """Whether the path still refers to the open file."""
     try:
-        there, held = os.stat(path), os.fstat(file)
+        on_disk, held = os.stat(path), os.fstat(file)
     except FileNotFoundError:
         return False
-    return (there.st_ino, there.st_dev) == (held.st_ino, held.st_dev)
+    return (on_disk.st_ino, on_disk.st_dev) == (held.st_ino, held.st_dev)
 
 
 def _holds(owner: dict[str, Any], renewed: float, path: Path) -> bool:
-    """Whether the process that a file names may still be at work, though no lock of
-    the system says so."""
+    """Whether the process that a file names may still hold it, although the system
+    reports no lock."""
     if owner.get("host") == socket.gethostname():
-        # Its own lock would have been seen, if there are any.
+        # A lock of the system, if supported, would have been found before.
         return fcntl is None and _is_alive(owner.get("pid")) and _is_new(renewed, path)
     return _is_new(renewed, path)
 
 
 def _is_new(renewed: float, path: Path) -> bool:
-    """By the clock of the file system, which is the other machine's, too."""
+    """Whether a file is not yet abandoned, by the clock of the shared file system."""
     probe = path.with_name(f"{path.name}-{os.getpid()}")
     try:
         probe.touch()
@@ -120,7 +121,7 @@ def _is_new(renewed: float, path: Path) -> bool:
         now = time.time()
     finally:
         probe.unlink(missing_ok=True)
-    return now - renewed < _STALE
+    return now - renewed < STALE
 
 
 def _is_alive(pid: Any) -> bool:
@@ -149,11 +150,11 @@ def _held(path: Path, owner: dict[str, Any] | None) -> ValueError:
         who = f"process {owner.get('pid')} on {owner.get('host')}"
     advice = "wait for it or give another folder"
     if owner is not None and owner.get("host") != socket.gethostname():
-        advice += f"; if it is no more, try again in {_STALE:.0f} s"
+        advice += f"; if it is no more, try again in {STALE:.0f} s"
     return ValueError(f"{path.parent}: {who} is writing this run; {advice}.")
 
 
 def _renew(path: Path, done: threading.Event) -> None:
-    while not done.wait(_RENEWED):
+    while not done.wait(RENEWED):
         with contextlib.suppress(OSError):
             os.utime(path)

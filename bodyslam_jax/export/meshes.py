@@ -1,4 +1,4 @@
-"""What other programs read: meshes, BVH skeletons, TRC markers."""
+"""Results for other programs: meshes, BVH skeletons, TRC markers."""
 
 from pathlib import Path
 
@@ -8,7 +8,6 @@ import trimesh
 from jaxtyping import Float, Int
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS, BodyModel, rest_joints
-from bodyslam_jax.export.folder import frame_rate
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 
@@ -17,9 +16,9 @@ def write_mesh(
     path: Path, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> None:
     """Writes one mesh, m; the suffix is `.glb`, `.obj`, `.ply` or `.stl`."""
-    known = (".glb", ".obj", ".ply", ".stl")
-    if path.suffix.lower() not in known:
-        raise ValueError(f"{path}: suffix {path.suffix!r}, not one of {known}.")
+    suffixes = (".glb", ".obj", ".ply", ".stl")
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: suffix {path.suffix!r}, not one of {suffixes}.")
     trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 
@@ -27,7 +26,7 @@ def write_bvh(path: Path, result: Result, body: BodyModel, person: int = 0) -> N
     """Writes a person's motion as BVH: cm, degrees, channels Z X Y, SMPL's 24 joints.
 
     Offsets are the rest joints of the person's shape; the root is the pelvis joint in
-    the result's world. Frames where the person is not present hold fill.
+    the result's world. Frames in which the person is absent are filled, not estimated.
     """
     rest = np.asarray(rest_joints(body, jnp.asarray(result.betas[person], body.dtype)))
     rest = 100.0 * rest.astype(np.float64)
@@ -59,14 +58,14 @@ def write_bvh(path: Path, result: Result, body: BodyModel, person: int = 0) -> N
     degrees = np.degrees(so3.euler(turns, "ZXY"))[:, order]
     pelvis = 100.0 * result.trans[person] + rest[0]
     table = np.concatenate([pelvis, degrees.reshape(num, 72)], axis=1)
-    lines += ["MOTION", f"Frames: {num}", f"Frame Time: {1 / frame_rate(result):.8f}"]
+    lines += ["MOTION", f"Frames: {num}", f"Frame Time: {1 / result.fps:.8f}"]
     lines += [_numbers(row) for row in table]
     path.write_text("\n".join(lines) + "\n")
 
 
 def write_trc(path: Path, result: Result, person: int = 0) -> None:
     """Writes a person's joints as TRC markers (OpenSim), mm; absent frames empty."""
-    num, rate = len(result.timestamps), frame_rate(result)
+    num, rate = len(result.timestamps), result.fps
     head = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"]
     head += ["OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"]
     facts = [f"{rate:.4f}"] * 2 + [str(num), "24", "mm", f"{rate:.4f}", "1", str(num)]

@@ -1,4 +1,4 @@
-"""One HTML file that opens offline: what was found, how sure, and how it came about."""
+"""The report: one HTML file that opens offline."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -10,8 +10,12 @@ import numpy as np
 import yaml
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics.statistics import (
+    PathStatistics,
+    camera_statistics,
+    person_statistics,
+)
 from bodyslam_jax.export import figures
-from bodyslam_jax.export import statistics as facts
 from bodyslam_jax.export.folder import plain
 from bodyslam_jax.export.summary_cards import cards
 from bodyslam_jax.export.tables import errors_section, folded, table
@@ -21,22 +25,15 @@ from bodyslam_jax.types import Result
 def write_report(path: Path, result: Result, body: BodyModel) -> None:
     """Writes the report of a result: no other file, no network, light or dark.
 
-    All but numbers about the paths comes from `result.summary`; a part that it lacks is
-    left out. Keys, beside those that `summary.summarise` writes:
-
-    - `stages`: a list of `name`, `cost_before`, `cost_after`, `iterations`, `seconds`;
-    - `scale`: `value`, `sigma` (of the value), `sigma_of_covariance` if less;
-    - `intrinsics`: `guessed`, `guess_px`, `focal_px`, `focal_sigma_px`;
-    - `people`: a list, with `stature_sigma_m` if known;
-    - `per_frame`: lists of one number (or `None`) per frame, `reprojection_px`,
-        `keypoint_px`, `tracks`, `inliers`;
-    - `errors`: a mapping from a name for what was evaluated ("cameras alone, arbitrary
-        scale", "joint estimate, in metres") to its errors by `evaluation`'s names; a
-        text in place of a number says why there is none.
+    Distances and speeds are computed from the result, all else comes from
+    `result.summary` (keys as written by `summary.summarise`); parts that it lacks are
+    left out. The optional key `errors` maps a name of what was evaluated ("cameras
+    alone, arbitrary scale", "joint estimate, in metres") to its errors by the names of
+    `evaluation`; a text in place of a number tells why there is no number.
     """
     summary = plain(result.summary)
-    camera = facts.camera_facts(result)
-    people = [facts.person_facts(result, h) for h in range(len(result.poses))]
+    camera = camera_statistics(result)
+    people = [person_statistics(result, h) for h in range(len(result.poses))]
     source = summary.get("input") or {}
     name = source.get("name") if isinstance(source, dict) else str(source)
     sections = [
@@ -112,7 +109,7 @@ def _warnings(warnings: Sequence[str]) -> str:
 
 
 def _reasons(reasons: Sequence[dict[str, Any]]) -> str:
-    """Why the result is not to be trusted, and what to do, before anything of it."""
+    """Why the result is doubtful or failed, and what to do about it."""
     if not reasons:
         return ""
     items = "".join(
@@ -120,7 +117,7 @@ def _reasons(reasons: Sequence[dict[str, Any]]) -> str:
         f"<em>{html.escape(str(r.get('advice', '')))}.</em></li>"
         for r in reasons
     )
-    title = "Why this is not to be trusted"
+    title = "Why this result is in doubt"
     return f'<section class="warnings"><h2>{title}</h2><ul>{items}</ul></section>'
 
 
@@ -131,22 +128,25 @@ def _figure(svg: str, caption: str, kind: str = "full") -> str:
 
 def _trajectories(result: Result) -> str:
     above, side = figures.trajectories(result)
+    from_side = "From the side. The floor is at the height of standing feet."
     return (
-        '<section><h2>Where everybody went</h2><div class="two">'
+        '<section><h2>Paths</h2><div class="two">'
         + _figure(above, "From above. Arrows: where the camera looks.", "half")
-        + _figure(side, "From the side. The floor is where the feet are.", "half")
+        + _figure(side, from_side, "half")
         + "</div></section>"
     )
 
 
 def _motion(
-    result: Result, camera: facts.PathFacts, people: Sequence[facts.PathFacts]
+    result: Result,
+    camera: PathStatistics,
+    people: Sequence[PathStatistics],
 ) -> str:
     if len(result.timestamps) < 2:
         return ""
     svg = figures.speeds(result, camera, people)
     caption = "Speed over the ground, paths smoothed over half a second."
-    return f"<section><h2>How fast</h2>{_figure(svg, caption)}</section>"
+    return f"<section><h2>Speed</h2>{_figure(svg, caption)}</section>"
 
 
 def _stages(summary: Mapping[str, Any]) -> str:
@@ -159,7 +159,7 @@ def _stages(summary: Mapping[str, Any]) -> str:
         for stage in stages
         if min(stage.get("cost_before") or 0, stage.get("cost_after") or 0) > 0
     ]
-    parts = ["<section><h2>How the estimate came about</h2>"]
+    parts = ["<section><h2>Stages of the estimate</h2>"]
     if drawn:
         parts.append(_figure(figures.costs(drawn), "Cost of each stage."))
     parts.append('<div class="two">')
@@ -174,16 +174,16 @@ def _stages(summary: Mapping[str, Any]) -> str:
 
 _CURVES = (
     (
-        "How well it fits",
+        "Reprojection error",
         "error, px",
         {"reprojection_px": "landmarks", "keypoint_px": "keypoints"},
         "Mean reprojection error of each frame.",
     ),
     (
-        "What was seen",
+        "Landmarks per frame",
         "number per frame",
-        {"tracks": "tracked points", "inliers": "of them kept"},
-        "Points of the map seen in each frame.",
+        {"tracks": "tracked points", "inliers": "inliers"},
+        "Observations of landmarks in each frame.",
     ),
 )
 
@@ -206,13 +206,14 @@ def _per_frame(result: Result, per_frame: Mapping[str, Sequence[Any]]) -> str:
 
 
 def _details(result: Result, summary: Mapping[str, Any]) -> str:
-    """Everything else, folded away."""
+    """Scale, intrinsics, counts, versions and settings, folded away."""
     labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     lens = [
         (label, round(float(value), 5))
         for label, value in zip(labels, result.intrinsics, strict=False)
     ]
     parts = [folded("Camera intrinsics (px)", table(["parameter", "value"], lens))]
+    parts.append(folded("Scale", _scale_table(result, summary.get("scale") or {})))
     for title, key in (
         ("Counts", "counts"),
         ("Versions", "versions"),
@@ -222,3 +223,17 @@ def _details(result: Result, summary: Mapping[str, Any]) -> str:
             text = yaml.safe_dump(summary[key], sort_keys=False)
             parts.append(folded(title, f"<pre>{html.escape(text)}</pre>"))
     return f"<section><h2>Details</h2>{''.join(parts)}</section>"
+
+
+def _scale_table(result: Result, scale: Mapping[str, Any]) -> str:
+    """The scale of the map and its cues, m per unit of the map before scaling."""
+    rows = [("estimate", result.scale, scale.get("sigma"))]
+    for cue, name in (
+        ("from_motion", "people's motion alone"),
+        ("from_ground", "ground under people's feet alone"),
+        ("from_path", "given camera path alone"),
+    ):
+        if scale.get(cue) is not None:
+            rows.append((name, *scale[cue]))
+    columns = ["scale", "m per unit of the unscaled map", "standard deviation"]
+    return table(columns, rows)

@@ -16,8 +16,8 @@ def errors_section(errors: Mapping[str, Mapping[str, Any]]) -> str:
     others = [row for row in evaluation.ROWS if row[0] not in _FIRST]
     return (
         "<section><h2>Error against the truth</h2>"
-        "<p>Means over all frames. SE(3) keeps the size that was estimated; Sim(3) "
-        "corrects it with the truth, which is not to be had in the wild.</p>"
+        "<p>Means over all frames. SE(3) alignment keeps the estimated size; Sim(3) "
+        "corrects it by the truth, which is unknown outside of benchmarks.</p>"
         f"{_error_table(errors, first)}"
         f"{folded('More errors', _error_table(errors, others))}</section>"
     )
@@ -46,7 +46,7 @@ def _error_table(
 
 
 def _error(value: Any, factor: float) -> str:
-    """A number, or a dash and why there is none."""
+    """A number, or a dash with the reason why there is none."""
     why = f" <small>{html.escape(value)}</small>" if isinstance(value, str) else ""
     return number(value, factor) + why
 

@@ -14,8 +14,8 @@ from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.pipeline import before_joint
-from bodyslam_jax.pipeline.joint_stage import Prepared, prepare
-from bodyslam_jax.pipeline.sfm_stage import with_intrinsics
+from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
 from bodyslam_jax.types import Bodies, Result, Sequence, SfmResult
 

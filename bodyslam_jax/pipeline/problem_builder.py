@@ -7,8 +7,8 @@ from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline import before_joint, find_people
 from bodyslam_jax.pipeline.case import Case
-from bodyslam_jax.pipeline.joint_stage import prepare
-from bodyslam_jax.pipeline.sfm_stage import with_intrinsics
+from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.joint_problem import prepare
 from bodyslam_jax.types import Sequence
 
 

@@ -1,9 +1,8 @@
-"""Stage results kept on disk, so that an interrupted run is finished, not repeated.
+"""Results of stages on disk, so that an interrupted run resumes.
 
-A stage's result is a dataclass of arrays and plain values. It is stored as an `.npz`
-named after a hash of all that it was computed from: another input, other settings,
-other weights in a file that they name, or another state of the package simply do not
-find it.
+A result is a dataclass of arrays and plain values, stored as an `.npz` whose name has a
+hash of all inputs: the sequence, the settings, the content of files that they name, and
+the source of the package. If any of them changes, the stage is computed again.
 """
 
 import dataclasses
@@ -31,27 +30,28 @@ _CACHE = ".cache"
 """The folder of stage results in that of a run."""
 UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
 UNREADABLE += (zipfile.BadZipFile, zlib.error)
-"""What `load` raises of a file that is damaged, or of another state of the package."""
+"""Errors that `load` raises for a file that is damaged or of another version."""
 _FILES = ("body_model", "motion_model", "motion")
-"""Settings that name a file: what it holds counts, and not where it lies."""
+"""Settings that name a file: their fingerprint is that of its content."""
 
 
 def fingerprint(*parts: Any) -> str:
     """A hash of settings, arrays and files (by size and content of their ends).
 
-    Files that settings name count as files, and so does the package as it is.
+    Files that settings name are hashed by content; the source of the package is
+    included.
     """
-    digest = hashlib.sha256(_package())
+    digest = hashlib.sha256(package_hash())
     for part in parts:
         _update(digest, part)
     return digest.hexdigest()[:16]
 
 
 def body_model_file(setting: str | None) -> Path | None:
-    """The file or folder that `body_model` of the settings stands for.
+    """The file or folder of the setting `body_model`.
 
-    Without a setting it is what was found on this machine, `None` where that is the
-    body that ships.
+    Without a setting it is the body model found on this machine, or `None` for the
+    default body.
     """
     if setting is not None:
         return Path(setting)
@@ -59,8 +59,8 @@ def body_model_file(setting: str | None) -> Path | None:
 
 
 @functools.cache
-def _package() -> bytes:
-    """A hash of the package's source, and of the models and motion that ship."""
+def package_hash() -> bytes:
+    """A hash of the package's source, models and motion."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     kept = (
@@ -79,7 +79,7 @@ def _update(digest: Any, part: Any) -> None:
         digest.update(str(part.name).encode())
         if part.is_dir():
             for item in sorted(part.iterdir()):
-                # A run that is written into its own input is no part of it.
+                # A run folder inside the input is not part of the input.
                 run = item.is_dir() and (item / _CACHE).is_dir()
                 if not item.name.startswith(".") and not run:
                     _update(digest, item)
@@ -109,19 +109,20 @@ def _update(digest: Any, part: Any) -> None:
 def _named_file(name: str, setting: str | None) -> Path | None:
     if name == "body_model":
         return body_model_file(setting)
-    return None if setting is None else Path(setting)  # what ships is the package's
+    # The default belongs to the package, which has a hash of its own.
+    return None if setting is None else Path(setting)
 
 
 @dataclasses.dataclass(frozen=True)
 class Cache:
-    """A folder of stage results; `folder=None` keeps nothing."""
+    """A folder of stage results; nothing is kept with `folder=None`."""
 
     folder: Path | None
     source: dict[str, Any] | None = None
-    """What the stages are of, kept beside them for `owner`."""
+    """Description of the input, stored beside the stages for `owner`."""
 
     def stage(self, name: str, key: str, kind: type[T], compute: Callable[[], T]) -> T:
-        """The result of stage `name`, from disk if `key` is the same as then."""
+        """The result of stage `name`, from disk if stored under the same `key`."""
         if self.folder is None:
             return compute()
         path = self.folder / f"{name}-{key}.npz"
@@ -143,7 +144,7 @@ class Cache:
         return result
 
     def owner(self) -> dict[str, Any] | None:
-        """The `source` that the folder was begun for, `None` if it was not begun."""
+        """The `source` stored in the folder, `None` if there is none."""
         if self.folder is None:
             return None
         try:
@@ -200,7 +201,7 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
         return tuple(_decode(item, None, archive) for item in header["tuple"])
     if "fields" in header:
         fields = header["fields"]
-        # Also where a new field has a default, which need not be what was computed.
+        # A default of a new field need not be what was computed, so it does not count.
         if not dataclasses.is_dataclass(kind) or fields.keys() != {
             field.name for field in dataclasses.fields(kind)
         }:

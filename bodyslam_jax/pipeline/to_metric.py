@@ -1,6 +1,4 @@
-"""The optimum as a result in metres, in an upright world."""
-
-import dataclasses
+"""The joint estimate as a result in metres, in a world whose y axis is up."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +9,6 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import people
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
-from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.gravity import Upright, find_upright
 from bodyslam_jax.geometry.stances import find_stances
@@ -19,20 +16,22 @@ from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 
-def assemble(
+def to_metric(
     sequence: Sequence,
     config: Config,
     body: body_.BodyModel,
     cameras: SfmResult,
     joint: JointEstimate,
-    seconds: dict[str, float],
-) -> Result:
-    """The optimum in a metric world whose y axis is up; standing feet are at y = 0."""
+) -> tuple[Result, Upright]:
+    """The optimum in a metric world whose y axis is up, and how up was found.
+
+    Standing feet are at y = 0.
+    """
     T_WC = joint.cameras.copy()
     T_WC[:, :3, 3] *= joint.scale
     joints = _placed(sequence, config, body, joint, T_WC)[2]
     landmarks = joint.scale * joint.landmarks
-    turn, found = level(
+    turn, up = level(
         T_WC,
         T_WC @ joint.roots,
         joints[:, :, list(FEET)],
@@ -61,8 +60,7 @@ def assemble(
         joints=joints,
         present=joint.present,
     )
-    summary = summarise(sequence, config, body, cameras, joint, result, found, seconds)
-    return dataclasses.replace(result, summary=summary)
+    return result, up
 
 
 _joints = eqx.filter_jit(body_.joints)
@@ -79,7 +77,7 @@ def _placed(
     Float[np.ndarray, "h t 3"],
     Float[np.ndarray, "h t 24 3"],
 ]:
-    """Poses, `trans` and joints of people in the world of these cameras, smoothed."""
+    """Poses, `trans` and joints of people in the world of these cameras, low-passed."""
     T_WH = T_WC @ joint.roots
     root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
@@ -97,7 +95,7 @@ def floor_height(
     present: Bool[np.ndarray, "h t"],
     fps: float,
 ) -> float:
-    """Height of what standing feet stand on, m; if none stand, of the lowest feet.
+    """Height of the floor under standing feet, m; if none stand, under the lowest.
 
     `joints` are in a world whose y axis is up, m.
     """
@@ -111,7 +109,7 @@ def floor_height(
 
 
 def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
-    """How far the toe joints lie above the sole of a body that stands, m."""
+    """Height of the toe joints above the sole of a standing body, m."""
     template = np.asarray(body.template, np.float64)[:, 1]
     skin = template + np.asarray(body.shape_dirs, np.float64)[:, 1] @ shape
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(shape)))
@@ -119,15 +117,15 @@ def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float
 
 
 def _smoothed(sequence, config, present, poses, pelvis):
-    """People's rotations and paths in the world without what is too fast for them."""
+    """People's rotations and paths in the world, low-passed at `smoothing_hz`."""
     if config.smoothing_hz is None:
         return poses, pelvis
     how = (sequence.fps, config.smoothing_hz)
     poses, pelvis = poses.copy(), pelvis.copy()
-    for h, there in enumerate(present):
+    for h, frames in enumerate(present):
         joints = poses[h].reshape(-1, 24, 3)
-        poses[h] = low_pass_rotations(joints, there, *how).reshape(-1, 72)
-        pelvis[h] = low_pass(pelvis[h], there, *how)
+        poses[h] = low_pass_rotations(joints, frames, *how).reshape(-1, 72)
+        pelvis[h] = low_pass(pelvis[h], frames, *how)
     return poses, pelvis
 
 
@@ -141,12 +139,11 @@ def level(
     fitted: Bool[np.ndarray, " h"],
     gravity: tuple[float, ...] = (),
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
-    """The rigid motion to a world whose y axis is up, and how that is known.
+    """The rigid motion to a world whose y axis is up, and the cues it is based on.
 
-    Cues (see `find_upright`) are taken in a world that is roughly upright already: up
-    is there where a measurement has it (`gravity`: the direction in which things fall,
-    in the first camera's axes), else where people's trunks point on average, or,
-    without people, where the first camera's top does.
+    Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
+    opposite to `gravity` (in the first camera's axes) if that is measured, else the
+    mean direction of people's trunks, or, without people, the first camera's -y.
     """
     up = -T_WC[0, :3, 1]
     if gravity:

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 LEVELS = 7
-"""Resolutions of each texture, every one half of the one before."""
+"""Resolutions of each texture, each half of the one before."""
 _BORDER = 2
 
 
@@ -21,7 +21,7 @@ def pyramid(texture: UInt8[np.ndarray, "h w 3"]) -> list[np.ndarray]:
 def pack(
     pyramids: list[list[np.ndarray]],
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "n levels 2"]]:
-    """All images in one, on shelves, and where the origin of each is in it (x, y)."""
+    """All images packed into one, and the origin (x, y) of each in it, px."""
     padded = [
         (i, k, _bordered(image))
         for i, levels in enumerate(pyramids)
@@ -48,6 +48,6 @@ def pack(
 
 
 def _bordered(image: np.ndarray) -> np.ndarray:
-    """With its edge repeated, so that bilinear look-up never sees a neighbour."""
+    """The image with its edge repeated, so that bilinear look-up has no bleeding."""
     b = _BORDER
     return cv2.copyMakeBorder(image, b, b, b, b, cv2.BORDER_REPLICATE)

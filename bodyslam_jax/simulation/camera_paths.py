@@ -1,4 +1,4 @@
-"""Where the person walks and how somebody with a camera in hand films it.
+"""Paths of people on the floor, and of a hand-held camera that films them.
 
 World: y up, floor at y = 0, metres; paths on the floor are (x, z).
 """
@@ -16,18 +16,18 @@ from bodyslam_jax.simulation.exact_scene import look_at
 
 @dataclasses.dataclass(frozen=True)
 class Handling:
-    """How a camera is held: easy, medium or difficult."""
+    """Motion of a hand-held camera: easy, medium or difficult."""
 
     radius: tuple[float, float]
-    """RMS distance of the camera from its mean place in a room, m."""
+    """RMS distance of the camera from its mean position in a room, m."""
     speed: float
     """RMS speed of that motion, m/s."""
     aim: float
     """RMS distance by which the camera misses the person's middle, m."""
     shake: float
-    """RMS tremor, m."""
+    """RMS of fast motion, m."""
     tremble: float
-    """RMS tremor of the direction, rad per axis."""
+    """RMS of fast rotation, rad per axis."""
     swing: float
     """RMS change of the side from which a person is followed, rad."""
     track_life: float
@@ -54,7 +54,7 @@ def smooth_noise(
 def floor_path(
     family: str, around: bool, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "2"]]:
-    """A closed path to walk on, and the place of a camera that stays.
+    """A closed path to walk on, and the place of a camera that stays in a room.
 
     In a room the path is a loop in front of the camera at 2.5 to 6 m, or with `around`
     a larger one around it; to be followed, it is 70 m long. Turned and run through at
@@ -126,7 +126,7 @@ def _in_hand(
     handling: Handling,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "t 4 4"]:
-    """Aims at the person as a hand does: a little late, a little off, trembling."""
+    """Camera poses aimed at the person with delay, offset and tremor, as of a hand."""
     t = len(person)
     late = np.concatenate([np.repeat(person[:1], 4, axis=0), person])[:t]
     target = gaussian_filter1d(late, 0.25 * FPS, axis=0, mode="nearest")

@@ -1,7 +1,7 @@
 """Small exact scenes in plain arrays, for tests and benchmarks of the graph.
 
-Nothing is read and nothing rendered: a hand-held camera goes along beside a walking
-body and sees static landmarks. World: y up, floor at y = 0, metres.
+Without files and images: a hand-held camera moves beside a walking body and observes
+static landmarks. World: y up, floor at y = 0, metres.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ def scene(
     noise: float = 0.0,
     outliers: float = 0.0,
 ) -> Scene:
-    """A scene of `num_frames` at 30 fps in which every landmark is seen.
+    """A scene of `num_frames` at 30 fps in which every landmark is observed.
 
     Landmarks are born in the image of a random frame, at 2 to 8 m, and stay in view
     for `track_length` frames on average (fewer where they leave the image). `noise` is
@@ -85,8 +85,8 @@ def scene(
     T = T_WC[frame]
     p_C = np.einsum("mji,mj->mi", T[:, :3, :3], landmarks[landmark] - T[:, :3, 3])
     uv = p_C[:, :2] / p_C[:, 2:] * intrinsics[:2] + intrinsics[2:]
-    seen = (p_C[:, 2] > 0.1) & ((uv > 0) & (uv < np.array(size) - 1)).all(axis=1)
-    order = np.flatnonzero(seen)[np.argsort(frame[seen], kind="stable")]
+    visible = (p_C[:, 2] > 0.1) & ((uv > 0) & (uv < np.array(size) - 1)).all(axis=1)
+    order = np.flatnonzero(visible)[np.argsort(frame[visible], kind="stable")]
     frame, landmark, uv = frame[order], landmark[order], uv[order]
     uv = uv + noise * rng.standard_normal(uv.shape)
     wrong = rng.random(len(uv)) < outliers

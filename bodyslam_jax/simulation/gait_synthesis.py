@@ -1,10 +1,10 @@
 """Long walks from short recordings: captured steps, joined and bent along a path.
 
-Trials are joined where their postures and velocities agree (same phase of the gait)
-and blended over a third of a second; the whole body is turned a little every frame to
-follow a path. Neither may make feet slide, so the pelvis is not blended but follows
-from the feet: whichever point of the soles carries the weight moves exactly as it did
-in the recording. World: y up, floor at y = 0.
+Trials are joined where their body poses and velocities agree (same phase of the gait)
+and blended over a third of a second; the body is turned slightly in every frame to
+follow a path. So that feet do not slide, the pelvis is not blended but follows from the
+feet: the point of the soles in contact with the floor moves exactly as in the
+recording. World: y up, floor at y = 0.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ _PLAYED = 18
 """Frames of a trial that are played between two blends at least."""
 _MAX_CLIPS = 40
 _LOOK_AHEAD = 1.2
-"""How far ahead on the path people walk to, m."""
+"""Distance of the target point ahead on the path, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
             "walking to make long walks of."
         )
     kept = kept[:_MAX_CLIPS]
-    is_right = all(c.fps == FPS for c in kept)  # nothing to compile for what ships
+    is_right = all(c.fps == FPS for c in kept)  # clips that ship need no compilation
     return tuple(kept) if is_right else resample(kept, FPS)
 
 
@@ -107,7 +107,7 @@ def _about_y(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
 
 
 class _Library:
-    """All frames of all clips, on the body: what joins and feet need to know."""
+    """Features for joining, and feet, of all frames of all clips."""
 
     def __init__(self, person: Person, clips: Sequence[Clip]):
         self.soles = Soles(person)
@@ -148,7 +148,7 @@ class _Library:
         self.features = self._features(joints)
 
     def _bend_toes(self, person: Person) -> None:
-        """Bends toes that would go through the floor: captures have them rigid."""
+        """Bends toes that would penetrate the floor, as captures have rigid toes."""
         G, x = person.joints(self.poses, self.pelvis)
         for ankle, toe in ((7, 10), (8, 11)):
             tips = np.flatnonzero(person.weights[:, toe] > 0.9)
@@ -166,7 +166,7 @@ class _Library:
             self.poses[:, toe] = so3.log(local)
 
     def _differences(self, x: np.ndarray) -> np.ndarray:
-        """From the frame before; a clip's first frame repeats the second's."""
+        """Differences to the previous frame; a clip's first repeats the second."""
         d = np.diff(x, axis=0, prepend=x[:1])
         first = np.flatnonzero(np.diff(self.clip, prepend=-1))
         d[first] = d[first + 1]
@@ -183,7 +183,7 @@ class _Library:
         return np.arctan2(smooth[:, 0], smooth[:, 2])
 
     def _features(self, joints: np.ndarray) -> np.ndarray:
-        """Joints and their velocities seen from the heading: what must agree, m."""
+        """Joints and their velocities relative to the heading, m; similar at seams."""
         level = so3.exp(_about_y(-self.yaw))
         joints = np.einsum("tij,tkj->tki", level, joints)
         velocity = self._differences(joints) * FPS
@@ -202,7 +202,7 @@ class _Plan:
     share: Float[np.ndarray, "t 2"]
     """Sums to 1."""
     yaw: Float[np.ndarray, "t 2"]
-    """By which each is turned so that the parts fit, rad; steering comes on top."""
+    """Yaw of each so that the parts fit, rad; steering is added."""
 
 
 def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan:

@@ -1,4 +1,4 @@
-"""Tracks of static points as a front end would find them."""
+"""Simulated tracks of static points, with the errors of a feature tracker."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,9 +19,9 @@ _DENSITY = 9.0
 """Points per m² of all surfaces."""
 _CELLS = (8, 6)
 _TRIED = 700
-"""Points in the image of which visible ones are chosen, so that halls stay quick."""
+"""Candidates in the image of which visible ones are chosen: a bound on run time."""
 _BORDER = 3.0
-"""Distance from the image's edge at which points are given up, px."""
+"""Distance from the image's edge at which tracks end, px."""
 
 
 def track_points(
@@ -36,11 +36,11 @@ def track_points(
     life: float,
     wanted: int = 200,
 ) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
-    """About `wanted` tracks a frame, spread over the image, and where their points are.
+    """About `wanted` tracks a frame, spread over the image, and their true points.
 
-    A track ends when its point leaves the image or gets behind furniture or a person,
-    and by chance after `life` frames on average; a point found again is a new track, as
-    a front end would not know. Tracks of a single frame are dropped.
+    A track ends when its point leaves the image or is occluded by furniture or a
+    person, and at random after `life` frames on average; a point observed again starts
+    a new track. Tracks of a single frame are dropped.
     """
     points, normals = landmarks_on(room.faces(), _DENSITY, rng)
     strength = rng.random(len(points))
@@ -52,19 +52,19 @@ def track_points(
         p_C = (points - eye) @ T[:3, :3]
         uv = project(p_C, intrinsics)
         low, high = _BORDER, np.array(size) - 1 - _BORDER
-        seen = (p_C[:, 2] > 0.3) & ((uv > low) & (uv < high)).all(axis=1)
-        seen &= ((eye - points) * normals).sum(axis=1) > 0.12 * p_C[:, 2]
-        some = np.flatnonzero(seen)
+        visible = (p_C[:, 2] > 0.3) & ((uv > low) & (uv < high)).all(axis=1)
+        visible &= ((eye - points) * normals).sum(axis=1) > 0.12 * p_C[:, 2]
+        some = np.flatnonzero(visible)
         if len(some) > _TRIED:
             some = np.union1d(
-                rng.choice(some, _TRIED, replace=False), alive[seen[alive[:, 1]], 1]
+                rng.choice(some, _TRIED, replace=False), alive[visible[alive[:, 1]], 1]
             )
         some = some[~room.is_hidden(eye, points[some])]
         for body in joints_C[:, k]:
             some = some[~_behind_person(uv[some], p_C[some, 2], body, intrinsics)]
-        seen[:] = False
-        seen[some] = True
-        alive = alive[seen[alive[:, 1]] & (rng.random(len(alive)) > 1 / life)]
+        visible[:] = False
+        visible[some] = True
+        alive = alive[visible[alive[:, 1]] & (rng.random(len(alive)) > 1 / life)]
         if len(alive) < wanted:
             fresh = _spread(
                 uv, some[~np.isin(some, alive[:, 1])], strength, alive[:, 1], size,
@@ -130,9 +130,9 @@ def _behind_person(uv, depth, joints_C, intrinsics) -> Bool[np.ndarray, " n"]:
 
 
 def _disturb(frame, track, uv, size, noise: Noise, rng):
-    """White noise of a size of each track's own; gross errors, alone or till the end.
+    """Adds white noise of a sigma per track, and outliers.
 
-    Half of the outliers are single wrong matches, half are tracks that stick to
+    Half of the outliers are single wrong matches, half are tracks that drift with
     something that moves.
     """
     count = int(track.max()) + 1

@@ -1,8 +1,8 @@
 """The body in NumPy: joints, keypoints and skin without a compiler.
 
 The same equations as `bodyslam_jax.body`, which a test compares, for bodies without
-pose blend shapes. A simulator runs each of them once, on a length that the next
-sequence does not share, and compiling would take longer than everything else.
+pose blend shapes. A simulator evaluates them once per sequence, each of another length,
+so that compiling would take longer than everything else.
 """
 
 import numpy as np

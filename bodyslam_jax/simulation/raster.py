@@ -7,15 +7,15 @@ from jaxtyping import Float, Int
 
 
 class Hits(NamedTuple):
-    """What is seen at `p` pixels, each named once."""
+    """The visible surface at `p` distinct pixels."""
 
     pixel: Int[np.ndarray, " p"]
-    """Flat number, row by row."""
+    """Flat index, row-major."""
     face: Int[np.ndarray, " p"]
     weights: Float[np.ndarray, "p 3"]
-    """Of the face's three corners in the point that is seen; they sum to 1."""
+    """Barycentric weights of the face's three corners; they sum to 1."""
     inverse: Float[np.ndarray, " p"]
-    """Inverse depth there, 1/m."""
+    """Inverse depth, 1/m."""
 
 
 def rasterise(
@@ -24,11 +24,11 @@ def rasterise(
     faces: Int[np.ndarray, "f 3"],
     inverse_depth: Float[np.ndarray, "rows cols"],
 ) -> Hits:
-    """What is seen of a mesh in front of what there is.
+    """The part of a mesh that is in front of a depth buffer.
 
-    Triangles are small, so each tries all pixels of its bounding box; those of equal
-    box size go together. Back faces do not show. Weights are linear in the image, which
-    for triangles of a few pixels is the perspective's.
+    Triangles are small, so each tests all pixels of its bounding box; those of equal
+    box size are processed together. Back faces are culled. Weights are interpolated
+    linearly in the image, which for triangles of a few pixels equals perspective.
     """
     rows, columns = inverse_depth.shape
     a, b, c = (uv[faces[:, k]] for k in range(3))
@@ -39,13 +39,13 @@ def rasterise(
     low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
     # Counter-clockwise seen from outside, which an image with y down turns round.
     size = high - low + 1
-    seen = (area < -1e-12) & (size[:, 0] > 0) & (size[:, 1] > 0)
+    visible = (area < -1e-12) & (size[:, 0] > 0) & (size[:, 1] > 0)
     extent = np.maximum(size[:, 0], size[:, 1])
     pixels, owners, depths, shares = [], [], [], []
     side = 1
-    while seen.any():
-        now = np.flatnonzero(seen & (extent <= side))
-        seen[now] = False
+    while visible.any():
+        now = np.flatnonzero(visible & (extent <= side))
+        visible[now] = False
         if len(now):
             step = np.arange(side)
             x = (low[now, 0, None, None] + step).astype(float)

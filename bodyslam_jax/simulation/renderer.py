@@ -1,10 +1,10 @@
-"""Pictures of the room and the people in it, quick enough for films, in NumPy and cv2.
+"""A renderer of rooms and people, fast enough for video, in NumPy and OpenCV.
 
 Every rectangle is cast against all pixels of its outline's bounding box: inverse depth
 and texture coordinates are linear along each row there, so hidden surfaces and the near
 plane take one comparison, and each row may have a camera of its own (rolling shutter).
-All textures lie, at every resolution, in one image, so that a frame is looked up at
-once. The bodies' small triangles go through a z-buffer.
+All textures lie, at every resolution, in one image, so that one look-up draws a frame.
+The bodies' small triangles are drawn with a z-buffer.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.atlas import LEVELS, pack, pyramid
-from bodyslam_jax.simulation.outfit import Figure
+from bodyslam_jax.simulation.figure import Figure
 from bodyslam_jax.simulation.raster import rasterise, vertex_normals
 from bodyslam_jax.simulation.room import Room, Surface, texture_size
 from bodyslam_jax.simulation.shutter import Shutter, cameras_at
@@ -31,18 +31,18 @@ _TEXELS = 130.0
 _NOISE = 1.5
 """Standard deviation of the image noise at medium grey, grey levels."""
 _MOST_INSTANTS = 6
-"""Images that make up one with motion blur."""
+"""Largest number of images that are averaged for motion blur."""
 _BLUR_STEP = 2.0
-"""Motion between two of them that is not seen as a step, px."""
+"""Motion between two of them that is not visible as a step, px."""
 
 Moving = tuple[
     Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]
 ]
-"""Vertices at a frame, their first and second difference, as `_shutter.around`, m."""
+"""Vertices at a frame, their first and second difference, as `shutter.around`, m."""
 
 
 class Renderer:
-    """A room and people in it, ready to be seen from anywhere."""
+    """A room with people, to be rendered from any camera."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Renderer:
     def frame(
         self, T_WC: Float[np.ndarray, "t 4 4"], k: int, people: Sequence[Moving]
     ) -> tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]:
-        """Image `k` (BGR) of a camera's path, and which person is seen where.
+        """Image `k` (BGR) of a camera's path, and the visible person at each pixel.
 
         The second value is 0 for none and h + 1 for person h, in the middle of the
         exposure.
@@ -113,12 +113,12 @@ class Renderer:
         y, x = self.rng.integers(0, 64, 2)
         width, height = self.size
         noise = self.noise[y : y + height, x : x + width]
-        # Photons come at random: noise grows with the root of what is seen.
+        # Shot noise: its deviation grows with the root of the intensity.
         image += noise * np.sqrt(np.maximum(image + 20, 0) / 148)
         return np.clip(image, 0, 255).astype(np.uint8), who
 
     def _instants(self, T_WC, k: int, people: Sequence[Moving]) -> int:
-        """How many images make up one of that exposure."""
+        """Number of images to average for this exposure."""
         span = self.shutter.exposure
         if span == 0:
             return 1
@@ -138,8 +138,8 @@ class Renderer:
         return int(np.clip(np.ceil(max(moved) / _BLUR_STEP), 1, _MOST_INSTANTS))
 
     def _instant(self, T, when, people, normals):
-        """An image without noise from the cameras of all rows, or one for all."""
-        inverse_depth, image, floor = self._room(T)
+        """A noise-free image; `T` has one camera per row, or one for all rows."""
+        inverse_depth, image, floor = self.render_room(T)
         for moving in people:
             self._shadow(image, floor, T, when, moving)
         who = np.zeros(inverse_depth.shape, int)
@@ -155,9 +155,9 @@ class Renderer:
         when: Float[np.ndarray, " n"],
         moving: Moving,
     ) -> Float[np.ndarray, "v 3"]:
-        """Pixel and depth of moving points, each as the row sees it on which it is."""
-        here, first, second = moving
-        at = lambda tau: here + tau * first + tau**2 / 2 * second
+        """Pixel and depth of moving points, at the exposure time of their own row."""
+        position, first, second = moving
+        at = lambda tau: position + tau * first + tau**2 / 2 * second
         focal, centre = self.intrinsics[:2], self.intrinsics[2:]
         depth = lambda p: np.where(abs(p[:, 2:]) < 1e-6, 1e-6, p[:, 2:])
         middle = len(T) // 2
@@ -176,8 +176,8 @@ class Renderer:
             uv = p[:, :2] / depth(p) * focal + centre
         return np.concatenate([uv, p[:, 2:]], axis=1)
 
-    def _room(self, T):
-        """Inverse depth, colours and which pixels are floor."""
+    def render_room(self, T):
+        """Inverse depth, colours, and a mask of the floor."""
         width, height = self.size
         best = np.full((height, width), 1e-3, np.float32)
         map_x = np.zeros((height, width), np.float32)
@@ -238,9 +238,9 @@ class Renderer:
         return best, image.astype(np.float32), floor
 
     def _outline(self, surface: Surface, T):
-        """Bounding box, px, of what is in front of the near plane; or `None`.
+        """Bounding box, px, of the part in front of the near plane, or `None`.
 
-        With cameras of rows it holds for all of them, with a margin.
+        With a camera per row it covers all of them, with a margin.
         """
         corners = np.array(
             [surface.origin + a * surface.edge_u + b * surface.edge_v
@@ -290,7 +290,7 @@ class Renderer:
         image[part] *= (1 - (0.55 / 255) * share)[:, :, None]
 
     def _body(self, image, inverse_depth, who, T, when, h, moving, normal) -> None:
-        """Draws a person with smooth shading, in front of what is behind."""
+        """Draws a person with smooth shading, by the depth buffer."""
         figure = self.figures[h]
         uv = self._project(T, when, moving)
         if uv[:, 2].min() < _NEAR:
@@ -309,7 +309,7 @@ class Renderer:
 
 
 def _soften(image: Float[np.ndarray, "r c 3"], mask: Bool[np.ndarray, "r c"]) -> None:
-    """A camera has no hard edges: softens an outline by one pixel, in place."""
+    """Softens an outline by one pixel, in place, as a lens does."""
     x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
     if not w:
         return

@@ -1,4 +1,4 @@
-"""A room as boxes: walls, floor, ceiling and furniture, and what hides what.
+"""A room of boxes: walls, floor, ceiling and furniture, with occlusion tests.
 
 World: y up, floor at y = 0, metres.
 """
@@ -26,7 +26,7 @@ class Surface:
     edge_v: Float[np.ndarray, "3"]
     """Along the texture's columns, downwards on walls, m."""
     normal: Float[np.ndarray, "3"]
-    """Unit vector to the side from which it is seen."""
+    """Unit vector to the visible side."""
     kind: str
     """`floor`, `ceiling`, `wall` or `furniture`."""
 
@@ -113,7 +113,7 @@ def furnish(
     *,
     is_hall: bool = False,
 ) -> Room:
-    """A room around two paths, whose furniture is in nobody's way or view.
+    """A room around two paths, whose furniture neither blocks nor occludes anybody.
 
     Walls are 1.2 to 2.5 m from the paths; a hall is higher and has more in its middle.
     """
@@ -159,11 +159,11 @@ def put_in_the_way(
     *,
     most_hidden: float = 0.35,
 ) -> Room:
-    """The room with up to three more pieces that hide people for a while.
+    """The room with up to three more pieces that occlude people temporarily.
 
-    They are low cupboards, which hide legs, and pillars; they stand between the camera
-    and the first person, in nobody's way, and hide that person's feet for no more than
-    a share `most_hidden` of the time.
+    They are low cupboards, which occlude legs, and pillars. They stand between the
+    camera and the first person, off both paths, and occlude that person's feet for no
+    more than a share `most_hidden` of the time.
     """
     ways = np.concatenate([*people, camera])[::3, [0, 2]]
     pelvis = people[0]

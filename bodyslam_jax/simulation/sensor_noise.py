@@ -1,16 +1,14 @@
-"""Measurements with the errors that real systems make.
+"""Measurement noise of detectors, regressors and trackers, correlated over time.
 
-Sizes follow published errors of detectors and regressors: HMR-class networks are off by
-about 60 mm after Procrustes alignment and by 18 to 20 m/s² in acceleration, so that
-most of their error must vary slowly; keypoints err by a share of what annotators
-disagree by (COCO's σ), again slowly. Pure white noise would make smoothing look far too
-good.
+Magnitudes follow published errors. HMR-class networks have errors of about 60 mm after
+Procrustes alignment and of 18 to 20 m/s² in acceleration, so that most of their error
+varies slowly; errors of keypoints are a share of the disagreement of annotators (COCO's
+σ), also slowly varying. White noise would make smoothing look far too good.
 
-Of published accelerations one can say that 9 mm of white error would explain them. That
-is not how they are made here: joint rotations err by a constant and by a first-order
-autoregressive part, whose innovations alone come to 18.7 of 19.2 m/s². What is drawn
-anew in every frame (`posture_white`) moves joints by 2 mm, and a variogram over frames
-shows no white part of the error.
+The published accelerations could be explained by 9 mm of white noise. Here they come
+from AR(1) noise on joint rotations, beside a constant bias: its innovations cause 18.7
+of 19.2 m/s². The white part (`posture_white`) moves joints by 2 mm, too little to show
+in a variogram over frames.
 """
 
 import dataclasses
@@ -27,14 +25,14 @@ from bodyslam_jax.simulation.posing import Person
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """How wrong measurements are; 1 in `rates` is once in every frame."""
+    """Magnitudes of the errors of measurements; rates are shares of all frames."""
 
     keypoint_share: float
-    """Of annotators' disagreement that a detector's error amounts to."""
+    """Sigma of keypoints over the disagreement of annotators."""
     keypoint_correlation: float
-    """Of its slow part from frame to frame."""
+    """AR(1) coefficient of its slow part, per frame."""
     outlier_rate: float
-    """Share of keypoints that lie somewhere else."""
+    """Share of keypoints that are outliers."""
     swap_rate: float
     """Share of frames in which left and right are exchanged."""
     gap_rate: float
@@ -45,7 +43,7 @@ class Noise:
     """Joint rotations, slow part, rad per axis."""
     posture_correlation: float
     posture_white: float
-    """Joint rotations, white part, rad per axis: little beside the slow part."""
+    """Joint rotations, white part, rad per axis; small beside the slow part."""
     root_drift: float
     """Orientation, slow part, rad per axis."""
     root_white: float
@@ -63,7 +61,7 @@ class Noise:
     track: tuple[float, float]
     """Standard deviation of a track's pixels, drawn between these, px."""
     track_outliers: float
-    """Share of observations of tracks that are of something else."""
+    """Share of observations of tracks that are outliers."""
 
 
 NOISE = {
@@ -80,11 +78,11 @@ NOISE = {
         *((0.5, 0.8), 0.3, (0.05, 0.10), 0.006, 4.0, (0.5, 1.0), 0.03),
     ),
 }
-"""`real` is what published systems do, `low` about a third of it."""
+"""`real` follows published systems, `low` is about a third of it."""
 
 
 def noise_of_keypoints(settings: Simulation) -> Noise:
-    """The errors that these settings ask for."""
+    """The noise of keypoints under these settings."""
     noise = NOISE[settings.keypoint_noise or settings.noise]
     share = settings.keypoint_errors * noise.keypoint_share
     rates = {"outlier_rate": settings.outliers, "swap_rate": settings.exchanged}
@@ -93,10 +91,10 @@ def noise_of_keypoints(settings: Simulation) -> Noise:
 
 
 def noise_of_bodies(settings: Simulation) -> Noise:
-    """The same for regressed bodies.
+    """The noise of regressed bodies under these settings.
 
-    Second differences of an autoregression have the variance (1 - ρ)(6 - 2ρ) of its
-    own, of white noise 6: less jitter is a slower error, more is white noise added.
+    Second differences of AR(1) noise of unit variance have variance (1 - ρ)(6 - 2ρ),
+    those of white noise 6: less jitter means a larger ρ, more means added white noise.
     """
     noise = NOISE[settings.body_noise or settings.noise]
     lasting, jitter = settings.body_errors, settings.body_jitter
@@ -133,7 +131,7 @@ def ar1(
 def project(
     p_C: Float[np.ndarray, "*b 3"], intrinsics: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "*b 2"]:
-    """Pinhole projection, px; what is behind the camera comes out far away."""
+    """Pinhole projection, px; points behind the camera are projected far away."""
     z = np.maximum(p_C[..., 2:], 1e-3)
     return p_C[..., :2] / z * intrinsics[:2] + intrinsics[2:]
 
@@ -149,9 +147,9 @@ def detect_keypoints(
 ) -> tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]:
     """Pixels and confidences of BODY_25 keypoints at `p_C` in the camera frame.
 
-    Confidence falls with how wrong the detector is likely to be there and then:
-    occluded joints and bad moments err more and are less sure. Missing is 0 0 0, as is
-    what furniture or another person hides.
+    Confidence decreases with the expected error: occluded joints and bad moments have
+    larger errors and lower confidence. Missing keypoints are 0 0 0, as are those hidden
+    by furniture or another person.
     """
     t = len(p_C)
     exact = project(p_C, intrinsics)
@@ -159,7 +157,7 @@ def detect_keypoints(
     scale = np.sqrt(extent.prod(axis=1).clip(100.0))[:, None]
     sigma = noise.keypoint_share * np.array(KEYPOINT_SPREAD["body25"]) * scale
     hidden = _self_occlusion(p_C, joints_C, intrinsics)
-    # How bad a moment it is: a factor on the error, which the detector half knows
+    # A slowly varying factor on the error, which confidence follows in part
     trouble = np.exp(0.4 * ar1(rng, (t, 25), 0.95)) * (1 + 0.9 * hidden)
     slow = ar1(rng, (t, 25, 2), noise.keypoint_correlation)
     white = rng.standard_normal((t, 25, 2))
@@ -223,7 +221,7 @@ def _episodes(rng, shape, rate: float, length: float) -> Bool[np.ndarray, "t n"]
 
 @dataclasses.dataclass(frozen=True)
 class Regressed:
-    """Bodies as a network would give them for some of the frames."""
+    """Bodies as a network regresses them, for some of the frames."""
 
     frame: Int[np.ndarray, " m"]
     poses: Float[np.ndarray, "m 72"]
@@ -232,7 +230,7 @@ class Regressed:
     trans: Float[np.ndarray, "m 3"]
     """m, camera frame: the pelvis is at `J_0(β) + trans`."""
     box: Float[np.ndarray, "m 3"]
-    """The crop that the network saw: centre and side, px."""
+    """The crop that the network took: centre and side, px."""
     camera: Float[np.ndarray, "m 3"]
     """The same as weak perspective `s tx ty` in that crop."""
     poses_crop: Float[np.ndarray, "m 72"]
@@ -248,9 +246,9 @@ def regress_bodies(
     noise: Noise,
     rng: np.random.Generator,
 ) -> Regressed:
-    """What a regressor says of a `person` with these true poses in the camera frame.
+    """Bodies regressed for a `person` with these true poses in the camera frame.
 
-    It sees crops around `keypoints`; frames without enough of them are left out.
+    Crops are around `keypoints`; frames without enough of them are left out.
     """
     t = len(poses_C)
     level = np.where(_HANDS_FEET, 1.5, 1.0)[:, None]
@@ -269,9 +267,9 @@ def regress_bodies(
     shape = shape + noise.shape_white * rng.standard_normal(10)
     flicker = 0.1 * noise.shape_white * ar1(rng, (t, 10), 0.9)
     shapes = shape + flicker
-    seen = person.rest_joints(shape)
-    # Whoever takes a person for taller sees them as far away by as much
-    taller = np.ptp(seen[:, 1]) / np.ptp(person.rest[:, 1])
+    visible = person.rest_joints(shape)
+    # Size and depth are ambiguous: a taller estimate is farther in proportion.
+    taller = np.ptp(visible[:, 1]) / np.ptp(person.rest[:, 1])
     sigma = rng.uniform(*noise.depth)
     depth = 1 + sigma * np.sqrt(0.7) * np.clip(rng.standard_normal(), -1.5, 1.5)
     depth = depth + sigma * np.sqrt(0.3) * ar1(rng, (t, 1), noise.posture_correlation)
@@ -310,7 +308,7 @@ def crop_boxes(
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
     """SPIN's crops: mean of the sure keypoints, 1.2 times their larger extent.
 
-    The second value says where there were enough of them.
+    The second value tells where there were enough of them.
     """
     sure = confidence > 0.2
     found = sure.sum(axis=1) >= 6

@@ -1,4 +1,4 @@
-"""The ten named sequences: a walk, a camera, a room, and what is measured of them."""
+"""The ten named sequences: walk, camera, room, and measurements of them."""
 
 import dataclasses
 import zlib
@@ -44,12 +44,12 @@ LENGTH = {
 """Frames of each sequence at 30 fps."""
 _MOST_PEOPLE = 3
 _AROUND = ("E3", "M2", "M4", "D2")
-"""Where the person walks round the camera; in the others in front of it."""
+"""Sequences in which the person walks round the camera; else in front of it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Actor:
-    """One person of a sequence: what is true of them and what is measured."""
+    """One person of a sequence: truth and measurements."""
 
     person: Person
     """The true body at rest."""
@@ -58,7 +58,7 @@ class Actor:
     joints: Float[np.ndarray, "t 24 3"]
     """True joints, world."""
     keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
-    """Measured pixels and confidences, BODY_25; 0 0 0 is missing."""
+    """Measured pixels and confidences, BODY_25; missing points are 0 0 0."""
     bodies: Regressed
     """Measured bodies in the camera frame."""
 
@@ -75,7 +75,7 @@ class Actor:
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedSequence:
-    """A sequence with everything that is true about it; world: y up, floor at 0, m."""
+    """A sequence with its truth and measurements; world: y up, floor at 0, m."""
 
     name: str
     settings: Simulation
@@ -95,7 +95,7 @@ class SimulatedSequence:
     """True joints, world."""
     room: Room
     keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
-    """Measured pixels and confidences, BODY_25; 0 0 0 is missing."""
+    """Measured pixels and confidences, BODY_25; missing points are 0 0 0."""
     bodies: Regressed
     """Measured bodies in the camera frame."""
     tracks: Tracks
@@ -103,16 +103,16 @@ class SimulatedSequence:
     landmarks: Float[np.ndarray, "l 3"]
     """True places of the tracks' points, world."""
     others: tuple[Actor, ...] = ()
-    """Whoever else walks there."""
+    """Further people."""
 
     @property
     def seed(self) -> int:
-        """What everything random follows from."""
+        """The seed of all random numbers."""
         return _seed_of(self.settings)
 
     @property
     def actors(self) -> tuple[Actor, ...]:
-        """All people, the one whom the camera is on first."""
+        """All people; the camera follows the first."""
         first = Actor(self.person, self.walk, self.joints, self.keypoints, self.bodies)
         return (first, *self.others)
 
@@ -172,7 +172,7 @@ def simulate(
             raise ValueError(f"{what} {value}: expected 0 to {1 / FPS:.4f} s, a frame.")
     name = f"{settings.sequence}-{settings.family}"
     seed = _seed_of(settings)
-    # One stream each, so that a noise level changes nothing that is true
+    # One stream each, so that the noise level does not change the truth
     truth, key, reg, pts = np.random.default_rng(seed).spawn(4)
     source = settings.motion or str(ASSETS / "walking.npz")
     clips = walking_clips(read_motion(source), source)
@@ -218,10 +218,10 @@ def _other(
     clips: tuple[Clip, ...],
     num_frames: int,
 ) -> tuple[Person, Walk]:
-    """Person `h` with a shape and a path of their own beside the first's.
+    """Person `h`, of another shape, on a path beside the first person's.
 
-    Who walks in a room has a smaller or larger loop that begins up to an eighth ahead
-    or behind; in a hall, one beside it that begins up to 2.5 m ahead or behind.
+    In a room it is a smaller or larger loop, shifted by up to an eighth of it; in a
+    hall a parallel path, shifted by up to 2.5 m.
     """
     rng = np.random.default_rng([_seed_of(settings), h])
     own = person.of_shape(np.clip(rng.standard_normal(10), -2.0, 2.0))
@@ -250,8 +250,8 @@ def measure(
     streams: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
     others: Sequence[tuple[Person, Walk]] = (),
 ) -> SimulatedSequence:
-    """Measures what is true; `streams` are for keypoints, bodies and tracks of the
-    first person, those of the `others` are their own."""
+    """Adds measurements; `streams` are for keypoints, bodies and tracks of the first
+    person, `others` have their own."""
     R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
     to_camera = lambda x: np.einsum("tab,tjb->tja", R_CW, x - centre[:, None])
     everyone = [(person, walk), *others]

@@ -2,7 +2,7 @@
 
 Between frames everything moves quadratically in time through three frames. A frame's
 time is the middle of the exposure of its middle row, so that neither a long exposure
-nor a rolling shutter shifts what is seen in time on the whole.
+nor a rolling shutter shifts the image in time on average.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from bodyslam_jax.geometry import so3_numpy as so3
 
 @dataclasses.dataclass(frozen=True)
 class Shutter:
-    """How long each row is exposed, and how much later the last row is than the first.
+    """Exposure of each row, and delay between the first and the last row.
 
-    Zeros are an ideal camera, whose whole image is of one instant.
+    Zeros are an ideal camera with a global shutter.
     """
 
     exposure: float = 0.0
@@ -30,7 +30,7 @@ class Shutter:
         return self.readout * ((np.arange(rows) + 0.5) / rows - 0.5)
 
     def instants(self, count: int) -> Float[np.ndarray, " {count}"]:
-        """Times within the exposure at which light is gathered, evenly, s."""
+        """Times within the exposure that are averaged, evenly spaced, s."""
         return self.exposure * ((np.arange(count) + 0.5) / count - 0.5)
 
 
@@ -41,13 +41,13 @@ def around(
 ]:
     """Value, first and second difference of a series at frame `k`, a frame apart.
 
-    At an end the motion goes on evenly.
+    At the ends the motion is extrapolated with constant velocity.
     """
-    here = values[k]
+    value = values[k]
     last, first = len(values) - 1, 0
-    before = values[k - 1] if k > first else 2 * here - values[min(k + 1, last)]
-    after = values[k + 1] if k < last else 2 * here - before
-    return here, (after - before) / 2, after - 2 * here + before
+    before = values[k - 1] if k > first else 2 * value - values[min(k + 1, last)]
+    after = values[k + 1] if k < last else 2 * value - before
+    return value, (after - before) / 2, after - 2 * value + before
 
 
 def cameras_at(

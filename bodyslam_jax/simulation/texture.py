@@ -1,4 +1,4 @@
-"""Textures with something to see at every distance: stains, tiles, shapes, letters."""
+"""Textures with detail at every scale: stains, tiles, shapes, letters."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -85,7 +85,7 @@ def _shape(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
 
 
 def _letters(rng: np.random.Generator, image: np.ndarray, dot: int) -> None:
-    """A word in a script that nobody reads: 5 by 7 dots a letter."""
+    """A word of random letters of 5 by 7 dots."""
     count = int(rng.integers(2, 7))
     dots = rng.random((7, 6 * count)) < 0.5
     dots[:, 5::6] = False

@@ -1,8 +1,7 @@
-"""Simulated sequences as folders, films and the objects that the pipeline takes."""
+"""Simulated sequences as folders, with their ground truth."""
 
 import contextlib
 import dataclasses
-import functools
 import json
 import os
 import shutil
@@ -11,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.io import atomic, write_body, write_tum
+from bodyslam_jax.simulation.as_types import shapes_regressed
 from bodyslam_jax.simulation.camera_paths import FPS
-from bodyslam_jax.simulation.outfit import dress
-from bodyslam_jax.simulation.renderer import Renderer, write_video
+from bodyslam_jax.simulation.film import render
+from bodyslam_jax.simulation.renderer import write_video
 from bodyslam_jax.simulation.sensor_noise import Regressed
 from bodyslam_jax.simulation.sequences import SimulatedSequence, simulate
-from bodyslam_jax.simulation.shutter import Shutter, around
-from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Result, Sequence
 
 _MARK = "simulation.json"
 """Settings of the simulation; a folder with it may be written again."""
@@ -39,8 +37,8 @@ _OWN = (
     "tracks.npz",
     _FILM,
 )
-"""What a simulation writes. It appears in this order and goes in the reverse, so that
-what is there only in part has neither tracks nor frames: no reader takes it."""
+"""Files of a simulation. They are written in this order and removed in the reverse, so
+that an incomplete folder has neither tracks nor frames and is refused by readers."""
 _DEMO_FRAMES = 105
 
 
@@ -83,7 +81,7 @@ def check_folder(folder: Path, settings: Simulation) -> None:
 
 
 def demo_settings(seed: int = 0) -> Simulation:
-    """Of the demo: three and a half seconds in which the camera goes along."""
+    """Settings of the demo: 3.5 s in which the camera follows a walker."""
     return Simulation(
         sequence="M1", family="follow", length=_DEMO_FRAMES, seed=seed, render=True
     )
@@ -96,12 +94,12 @@ def demo_scene(
     *,
     people: bool = True,
 ) -> Path:
-    """Renders the walker whom a camera goes along with.
+    """Renders the demo: a walker whom a moving camera follows.
 
-    Writes a sequence folder without tracks, so that they come from the video. What is
-    there of the same seed is kept. `simulated` is the demo's scene of that seed, if
-    there is one already. Without `people` there are neither keypoints nor bodies, so
-    that people come from the video, too.
+    Writes a sequence folder without tracks, so that they come from the video. A
+    scene of the same seed is kept. `simulated` is the demo's scene of that seed, if
+    it was simulated already. Without `people` there are neither keypoints nor bodies,
+    so that people come from the video, too.
     """
     settings = demo_settings(seed)
     if _earlier(Path(folder)) == _mark(settings, False, people):
@@ -115,7 +113,7 @@ def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
     """Renders a sequence to a folder with the video and the camera's calibration only,
     so that people and tracks have to be found in the images; with the ground truth.
 
-    A film of the same settings that is there is kept.
+    An existing film of the same settings is kept.
 
     **Raises:** as `write_sequence`.
     """
@@ -126,94 +124,9 @@ def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
     return write_sequence(folder, simulated, tracks=False, people=False)
 
 
-def render(simulated: SimulatedSequence) -> Iterator[UInt8[np.ndarray, "rows cols 3"]]:
-    """The frames (BGR) of a simulated sequence, one after the other."""
-    for image, _ in render_people(simulated):
-        yield image
-
-
-def render_people(
-    simulated: SimulatedSequence,
-) -> Iterator[tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]]:
-    """The frames (BGR), and which person is seen where: 0 for none, h + 1 for h."""
-    rng = np.random.default_rng([simulated.seed, 1])
-    actors = simulated.actors
-    figures = [
-        dress(a.person, one)
-        for a, one in zip(actors, rng.spawn(len(actors)), strict=True)
-    ]
-    renderer = Renderer(
-        simulated.room, figures, simulated.intrinsics, simulated.size, rng,
-        Shutter(simulated.settings.exposure, simulated.settings.readout),
-    )  # fmt: skip
-    posed = [
-        f.person.joints(a.walk.poses, a.walk.pelvis)
-        for f, a in zip(figures, actors, strict=True)
-    ]
-    last = simulated.num_frames - 1
-
-    @functools.lru_cache(maxsize=4)
-    def skins(k: int) -> list[Float[np.ndarray, "v 3"]]:
-        return [
-            f.person.vertices(G[k], x[k])
-            for f, (G, x) in zip(figures, posed, strict=True)
-        ]
-
-    for k in range(last + 1):
-        window = [skins(i) for i in range(max(k - 1, 0), min(k + 1, last) + 1)]
-        moving = [around(np.stack(one), min(k, 1)) for one in zip(*window, strict=True)]
-        yield renderer.frame(simulated.T_WC, k, moving)
-
-
-def as_sequence(simulated: SimulatedSequence) -> Sequence:
-    """What is measured, as the readers would give it; without a video."""
-    actors, t = simulated.actors, simulated.num_frames
-    present = np.zeros((len(actors), t), bool)
-    poses, shapes = np.zeros((len(actors), t, 72)), np.zeros((len(actors), t, 10))
-    trans = np.zeros((len(actors), t, 3))
-    for h, actor in enumerate(actors):
-        bodies = actor.bodies
-        present[h, bodies.frame] = True
-        poses[h, bodies.frame] = bodies.poses
-        shapes[h, bodies.frame] = bodies.shapes
-        trans[h, bodies.frame] = bodies.trans
-    uv, confidence = (np.stack([a.keypoints[i] for a in actors]) for i in range(2))
-    return Sequence(
-        name=simulated.name,
-        frames=None,
-        timestamps=simulated.timestamps,
-        intrinsics=Intrinsics(simulated.intrinsics, *simulated.size),
-        keypoints=Keypoints(uv, confidence),
-        bodies=Bodies(present, poses, shapes, trans, _shapes_regressed(simulated)),
-        tracks=simulated.tracks,
-    )
-
-
-def as_truth(simulated: SimulatedSequence) -> Result:
-    """What is true, as a result that evaluation compares with."""
-    return Result(
-        timestamps=simulated.timestamps,
-        T_WC=simulated.T_WC,
-        scale=1.0,
-        intrinsics=simulated.intrinsics,
-        landmarks=simulated.landmarks,
-        poses=np.stack([a.poses for a in simulated.actors]),
-        trans=np.stack([a.trans for a in simulated.actors]),
-        betas=np.stack([a.person.shape for a in simulated.actors]),
-        joints=np.stack([a.joints for a in simulated.actors]),
-        present=np.ones((len(simulated.actors), simulated.num_frames), bool),
-    )
-
-
-def _shapes_regressed(simulated: SimulatedSequence) -> bool:
-    """Not where bodies are written as they truly are."""
-    settings = simulated.settings
-    return (settings.body_noise or settings.noise) != "none"
-
-
 @contextlib.contextmanager
 def _partial(folder: Path, settings: Simulation) -> Iterator[Path]:
-    """A hidden folder in `folder`, gone afterwards, with every folder made in vain."""
+    """A temporary hidden folder in `folder`; on failure created folders are removed."""
     try:
         _check(folder, settings)
         home = Path(os.path.realpath(folder))
@@ -255,21 +168,21 @@ def _earlier(folder: Path) -> dict[str, Any] | None:
 
 
 def _move(partial: Path, folder: Path, settings: Simulation) -> None:
-    """Puts what is in `partial` in the place of an earlier simulation."""
+    """Replaces an earlier simulation by the content of `partial`."""
     earlier = _earlier(folder) or {}
     was_rendered = bool(earlier.get("render"))
-    # Whoever is interrupted from here on leaves a simulation of no settings.
+    # An interruption from here on leaves a folder marked as unfinished.
     mark = {"unfinished": True, "render": was_rendered or settings.render}
     (partial / "mark").write_text(json.dumps(mark))
     os.replace(partial / "mark", folder / _MARK)
     for name in ("keypoints", "groundtruth"):
-        if (folder / name).is_symlink():  # to files that are somebody's
+        if (folder / name).is_symlink():  # its target belongs to somebody else
             (folder / name).unlink()
     for pattern in reversed(_OWN):
         if pattern != _FILM or was_rendered:
             for old in folder.glob(pattern):
                 old.unlink()
-    with contextlib.suppress(OSError):  # there is none, or it holds what is not ours
+    with contextlib.suppress(OSError):  # absent, or with other files in it
         (folder / "keypoints").rmdir()
     for pattern in _OWN:
         for new in sorted(partial.glob(pattern)):
@@ -320,7 +233,7 @@ def _write(
 
 
 def _mark(settings: Simulation, tracks: bool, people: bool) -> dict[str, Any]:
-    """What a folder is of: settings, and which measurements it holds."""
+    """The mark of a folder: settings, and which measurements it holds."""
     measured = {"tracks": tracks, "people": people}
     return {**dataclasses.asdict(settings), "measured": measured}
 
@@ -336,7 +249,7 @@ def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
         poses=bodies.poses,
         betas=bodies.shapes,
         trans=bodies.trans,
-        shapes_regressed=np.array(_shapes_regressed(simulated)),
+        shapes_regressed=np.array(shapes_regressed(simulated)),
     )
     np.savez_compressed(
         folder / "bodies_weak_perspective.npz",
@@ -346,7 +259,7 @@ def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
         betas=bodies.shapes,
         camera=bodies.camera,
         bbox=bodies.box,
-        shapes_regressed=np.array(_shapes_regressed(simulated)),
+        shapes_regressed=np.array(shapes_regressed(simulated)),
     )
 
 

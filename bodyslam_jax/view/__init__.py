@@ -1,4 +1,4 @@
-"""What a person looks at: the overlay video, and single frames of it."""
+"""The overlay video of bodies and map on the images, and single frames of it."""
 
 from bodyslam_jax.view.overlay import can_write as can_write
 from bodyslam_jax.view.overlay import write_overlay as write_overlay

@@ -1,4 +1,4 @@
-"""The overlay video: bodies and tracked points over the frames, a map from above."""
+"""The overlay video: bodies and tracked points on the frames, and a top view."""
 
 import concurrent.futures
 import contextlib
@@ -33,14 +33,13 @@ def write_overlay(
 
     **Arguments:**
 
-    - `frames`: the video, BGR, one image per frame of the result, of the size that the
-        intrinsics are for; if it ends early the rest is drawn on black, as is all
-        without it.
+    - `frames`: the video, BGR, one image per frame of the result, of the size of the
+        intrinsics; frames that are missing are drawn on black.
     - `tracks`: points to draw; `size`: width and height (px) where there are no frames,
         else twice the principal point.
     - `max_width`: larger frames are drawn smaller, px.
-    - `codec`: OpenCV cannot ask its VP9 encoder for speed, and VP8, which plays in the
-        same browsers, is three times as fast.
+    - `codec`: VP8 by default, which plays in the same browsers as VP9 and is three
+        times as fast, as OpenCV cannot set the speed of its VP9 encoder.
 
     **Raises:** `ValueError` if this OpenCV has no such encoder; `OSError` if the video
     could not be written whole.
@@ -65,7 +64,7 @@ def write_overlay(
     if not writer.isOpened():
         raise ValueError(f"{path}: OpenCV cannot write {codec} here.")
     drawn = pictures(first, source, result, body, tracks, (width, height), zoom)
-    # Encoding and drawing each keep one core busy, outside of Python's lock.
+    # Encoding and drawing run in parallel: both release Python's lock.
     with concurrent.futures.ThreadPoolExecutor(1) as encoder:
         pending = None
         for picture in drawn:
@@ -88,8 +87,8 @@ def can_write(path: Path, codec: str) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Standard error closed: OpenCV prints about every `.webm` that all is as it should
-    be, and nothing but the file descriptor turns that off."""
+    """Redirects standard error at the file descriptor: the encoder reports success of
+    every `.webm` there, which no setting turns off."""
     sys.stderr.flush()
     kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 2)
@@ -102,7 +101,7 @@ def _quiet() -> Iterator[None]:
 
 
 def check_length(path: Path, num_frames: int) -> None:
-    """OpenCV does not say when a disk is full, but the video is then cut short."""
+    """Checks the length of a video, as OpenCV does not report a full disk."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     found = 0
     while found < num_frames and capture.grab():

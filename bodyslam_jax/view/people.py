@@ -1,6 +1,6 @@
-"""Bodies over an image: the painter's algorithm on a coarser mesh.
+"""Bodies on an image, by the painter's algorithm on a decimated mesh.
 
-Triangles are drawn farthest first, without those that reach behind the camera.
+Triangles are drawn farthest first; those that reach behind the camera are left out.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from bodyslam_jax.view.style import PEOPLE, Image
 _CELL = 0.025
 """Size of the cells in which vertices are merged, m."""
 _NEAR = 0.05
-"""Triangles that come nearer to the camera's plane than this are not drawn, m."""
+"""Triangles nearer to the camera's plane than this are not drawn, m."""
 _CHUNK = 16
 """Frames whose meshes are computed together."""
 
@@ -39,10 +39,10 @@ def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Ima
 
 
 def coarse_body(body: BodyModel) -> BodyModel:
-    """The same body with about a quarter of its vertices.
+    """The body with about a quarter of its vertices.
 
-    Vertices in one cell of a grid over the rest pose are merged into the first of them:
-    a subset, so that shape, skinning and joints stay those of the whole body. Keypoints
+    Vertices in one cell of a grid over the rest pose are merged into the first of
+    them. As the rest is a subset, shape, skinning and joints are unchanged; keypoints
     on the skin move within their cells.
     """
     template = np.asarray(body.template)

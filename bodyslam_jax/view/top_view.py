@@ -1,4 +1,4 @@
-"""Tracked points over an image, and the inset: everybody from above."""
+"""Tracked points on an image, and the inset: camera and people from above."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ _POINT = (90, 230, 120)
 
 
 def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[list]:
-    """Of each frame, where its points are and were in the frames before."""
+    """For each frame, its points and their positions in the preceding frames."""
     found: list[list] = [[] for _ in range(num_frames)]
     if tracks is None:
         return found
@@ -41,8 +41,8 @@ class Plan:
         self.side = int(0.34 * min(size))
         self.result = result
         places = [result.T_WC[:, [0, 2], 3]]
-        for joints, here in zip(result.joints, result.present, strict=True):
-            places.append(joints[here, 0][:, [0, 2]])
+        for joints, present in zip(result.joints, result.present, strict=True):
+            places.append(joints[present, 0][:, [0, 2]])
         every = np.concatenate(places)
         low, high = every.min(0), every.max(0)
         self.centre = (low + high) / 2
@@ -78,9 +78,9 @@ class Plan:
     def _paths(self, end: int) -> list[tuple[np.ndarray, tuple[int, int, int]]]:
         paths: list[tuple[np.ndarray, tuple[int, int, int]]]
         paths = [(self.result.T_WC[:end, [0, 2], 3], CAMERA)]
-        for h, here in enumerate(self.result.present):
-            seen = np.flatnonzero(here[:end])
-            for part in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
+        for h, present in enumerate(self.result.present):
+            visible = np.flatnonzero(present[:end])
+            for part in np.split(visible, np.flatnonzero(np.diff(visible) > 1) + 1):
                 place = self.result.joints[h, part, 0][:, [0, 2]]
                 paths.append((place, PEOPLE[h % len(PEOPLE)]))
         return paths
@@ -92,8 +92,8 @@ class Plan:
             if len(path):
                 line = self._to_inset(path)
                 cv2.polylines(inset, [line], False, color, 2, cv2.LINE_AA, 4)
-        for h, here in enumerate(self.result.present):
-            if here[frame]:
+        for h, present in enumerate(self.result.present):
+            if present[frame]:
                 place = self.result.joints[h, frame, :1][:, [0, 2]]
                 spot = self._to_inset(place)[0].tolist()
                 cv2.circle(inset, spot, 5 * 16, PEOPLE[h % 4], -1, cv2.LINE_AA, 4)

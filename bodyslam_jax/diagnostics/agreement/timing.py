@@ -1,8 +1,7 @@
-"""Whether bodies are of the same moments as keypoints: shifted, or every n-th frame.
+"""Shift and ratio of frame rates between keypoints and bodies.
 
-People move through the image and move their limbs, so keypoints of one frame fit the
-bodies of that frame better than those of its neighbours. Which frame of the bodies a
-frame of the keypoints fits best is tried out for shifts and for ratios of frame rates.
+People move, so keypoints of a frame fit the bodies of the same time better than those
+of its neighbours. Shifts and ratios of frame rates are searched for the best fit.
 """
 
 import dataclasses
@@ -10,8 +9,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.diagnostics.explanations import disagreement, evenly
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.explanations import disagreement, evenly
+from bodyslam_jax.diagnostics.agreement.image_points import (
     People,
     distances,
     have_points,
@@ -19,17 +18,17 @@ from bodyslam_jax.diagnostics.image_points import (
 )
 
 _STEPS = (2, 3, 4, 5, 6, 8, 10)
-"""Every n-th frame, renumbered."""
+"""Values of n for every n-th frame, renumbered."""
 _RATES = (24 / 25, 24 / 30, 25 / 30, 24 / 60, 25 / 60, 30 / 50, 24 / 50)
-"""Frame rates that one and the same video is converted between, as ratios."""
+"""Ratios of frame rates between which videos are commonly converted."""
 _LONGEST = 90
 """Frames: shifts beyond this are not tried."""
 _SAMPLE = 50
 """Frames that are compared."""
 _FEWEST = 8
 _PENALTY, _RATE_PENALTY = 2e-4, 0.003
-"""Of each frame of a shift, and of an odd ratio of rates, in sizes of a person: of
-equal ones the simplest."""
+"""Penalties, in sizes of a person, per frame of a shift and on ratios of rates that are
+not integer: among equal fits the simplest wins."""
 
 _NEAR, _ALIKE = 0.06, 0.01
 
@@ -41,9 +40,9 @@ class Timing:
     rate: float = 1.0
     shift: int = 0
     disagreement: float = np.nan
-    """As `disagreement` has it."""
+    """As of `explanations.disagreement`."""
     better: float = 0.0
-    """Share of frames in which it is smaller than as given."""
+    """Share of frames in which the distance is smaller than as given."""
 
     def __call__(self, frame: np.ndarray) -> np.ndarray:
         return np.round(self.rate * frame + self.shift + 1e-9).astype(int)
@@ -59,13 +58,13 @@ class Timing:
 
 
 def best_timing(people: People) -> tuple[Timing, Timing]:
-    """As given, and the one at which bodies and keypoints fit best."""
-    posed = project(people.camera, people.bodies)
+    """The given timing, and the one at which bodies and keypoints fit best."""
+    projected = project(people.camera, people.bodies)
     (where,) = np.nonzero(have_points(people.keypoints).any(1))
-    pairs = people.keypoints.shape[1] * posed.shape[1]
+    pairs = people.keypoints.shape[1] * projected.shape[1]
     where = evenly(where, max(_SAMPLE // 3, min(_SAMPLE, 4 * _SAMPLE // pairs)))
-    given = _fit(people.keypoints[where], posed, where, Timing(), 3)
-    reach = min(_LONGEST, len(posed) // 3)
+    given = _fit(people.keypoints[where], projected, where, Timing(), 3)
+    reach = min(_LONGEST, len(projected) // 3)
     tries = [Timing(shift=d) for d in range(-reach, reach + 1) if d]
     ratios = [*map(float, _STEPS), *_RATES]
     ends = [
@@ -73,30 +72,30 @@ def best_timing(people: People) -> tuple[Timing, Timing]:
         for p in (people.keypoints, people.bodies)
     ]
     for rate in (r for a in ratios for r in (a, 1 / a)):
-        # What was numbered anew ends so early that it fits when it is put back.
+        # A renumbered kind ends early enough to fit into the video when put back.
         last = ends[0] * rate if rate > 1 else ends[1] / rate
-        if last < len(posed) + max(rate, 1 / rate):
+        if last < len(projected) + max(rate, 1 / rate):
             tries.append(Timing(rate=rate))
-    found = [_fit(people.keypoints[where], posed, where, t, _FEWEST) for t in tries]
+    found = [_fit(people.keypoints[where], projected, where, t, _FEWEST) for t in tries]
     best = min((given, *found), key=_cost)
     if best.rate != 1:
-        # An odd rate near every n-th frame fits nearly as well, and is less likely.
+        # A rate close to an integer ratio fits nearly as well, and is less likely.
         steps = [t for t in found if t.step and abs(t.rate / best.rate - 1) < _NEAR]
         steps = [t for t in steps if t.disagreement < best.disagreement + _ALIKE]
         best = min(steps, key=_cost, default=best)
     if best.rate == 1 and best.shift:
-        share = _share_better(people.keypoints, posed, best.shift)
+        share = _share_better(people.keypoints, projected, best.shift)
         best = dataclasses.replace(best, better=share)
     return given, best
 
 
-def _share_better(seen, posed, shift: int) -> float:
-    """Of all frames for which there are bodies in either timing."""
-    frame = np.arange(len(posed))
-    frame = frame[(frame + shift >= 0) & (frame + shift < len(posed))]
+def _share_better(detected, projected, shift: int) -> float:
+    """Share of frames that fit better, of those with bodies in either timing."""
+    frame = np.arange(len(projected))
+    frame = frame[(frame + shift >= 0) & (frame + shift < len(projected))]
     nearest = []
     for at in (frame, frame + shift):
-        apart = distances(seen[frame], posed[at])
+        apart = distances(detected[frame], projected[at])
         nearest.append(np.where(np.isfinite(apart), apart, np.inf).min((1, 2)))
     both = np.isfinite(nearest).all(0)
     return float((nearest[1] < nearest[0])[both].mean()) if both.any() else 0.0
@@ -108,17 +107,17 @@ def _cost(timing: Timing) -> float:
 
 
 def _fit(
-    seen: Float[np.ndarray, "s k 14 2"],
-    posed: Float[np.ndarray, "t b 14 2"],
+    detected: Float[np.ndarray, "s k 14 2"],
+    projected: Float[np.ndarray, "t b 14 2"],
     where: np.ndarray,
     timing: Timing,
     fewest: int,
 ) -> Timing:
     at = timing(where)
-    inside = (at >= 0) & (at < len(posed))
-    inside[inside] = have_points(posed[at[inside]]).any(1)
+    inside = (at >= 0) & (at < len(projected))
+    inside[inside] = have_points(projected[at[inside]]).any(1)
     if inside.sum() < max(fewest, 0.3 * len(where)):
         return dataclasses.replace(timing, disagreement=np.inf)
-    value = disagreement(seen[inside], posed[at[inside]])
+    value = disagreement(detected[inside], projected[at[inside]])
     value = value if np.isfinite(value) else np.inf
     return dataclasses.replace(timing, disagreement=value)

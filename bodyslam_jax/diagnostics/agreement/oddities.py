@@ -1,12 +1,12 @@
-"""What is odd about people, without one thing that would explain it beyond doubt."""
+"""Warnings of unusual people in the image, without one clear explanation."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from bodyslam_jax.diagnostics.explanations import ImageMap
-from bodyslam_jax.diagnostics.facing import opposed, shares, trunk_directions
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.explanations import ImageMap
+from bodyslam_jax.diagnostics.agreement.facing import opposed, shares, trunk_directions
+from bodyslam_jax.diagnostics.agreement.image_points import (
     MID_HIP,
     NECK,
     People,
@@ -16,48 +16,48 @@ from bodyslam_jax.diagnostics.image_points import (
     in_common,
     project,
 )
-from bodyslam_jax.diagnostics.undo import with_keypoints_mapped_back
+from bodyslam_jax.diagnostics.agreement.undo import with_keypoints_mapped_back
 from bodyslam_jax.types import Sequence
 
 _FEWEST = 10
-"""Frames from which it is said what is so in most of them."""
+"""Least number of frames for a statement about most of them."""
 _MOST = 0.8
 _OPPOSED = 0.6
 _ELSEWHERE, _SOME = 0.6, 0.1
-"""Distance from which a body is not its person's, and the share of frames to say so."""
+"""Distance from which a body is not its person's, and the share of frames to warn."""
 _RATIO = 0.12
 """Difference in size (relative) beyond a regressor's usual error."""
 _OUTSIDE = 0.02
-"""Share of points outside the image of the wrong orientation that settles it."""
+"""Share of points outside the image that proves the other orientation."""
 
 
 def warn_of_oddities(
     sequence: Sequence, people: People, warn: Callable[[str], None], *, sides: bool
 ) -> Sequence:
-    """The sequence, with keypoints turned back if they cannot be of it as they are.
+    """The sequence, with keypoints turned back if they do not fit into the image.
 
     Args:
-        sides: whether it is not yet said that left and right contradict.
+        sides: whether to warn of left and right sides that contradict.
 
-    **Raises:** `ValueError` if there is nothing of the bodies in the image.
+    **Raises:** `ValueError` if most bodies are outside the image.
     """
-    posed = project(people.camera, people.bodies)
+    projected = project(people.camera, people.bodies)
     for h in range(min(people.keypoints.shape[1], people.bodies.shape[1])):
-        seen = people.keypoints[:, h]
+        detected = people.keypoints[:, h]
         if sides:
-            _warn_of_sides(h, seen, posed[:, h], warn)
-        _warn_of_person(h, seen, posed[:, h], people, warn)
+            _warn_of_sides(h, detected, projected[:, h], warn)
+        _warn_of_person(h, detected, projected[:, h], people, warn)
     sequence = _upright(sequence, people, warn)
     if sequence.keypoints is None:
-        _check_bodies_alone(people, posed, warn)
+        _check_bodies_alone(people, projected, warn)
     else:
         _warn_of_renumbering(sequence, warn)
         _warn_of_a_corner(sequence, warn)
     return sequence
 
 
-def _warn_of_sides(h: int, seen, posed, warn) -> None:
-    shown, against = opposed(seen, posed)
+def _warn_of_sides(h: int, detected, projected, warn) -> None:
+    shown, against = opposed(detected, projected)
     if shown.sum() >= _FEWEST and against.sum() > _OPPOSED * shown.sum():
         warn(
             f"person {h}: left and right of the keypoints contradict the bodies in "
@@ -68,8 +68,8 @@ def _warn_of_sides(h: int, seen, posed, warn) -> None:
         )
 
 
-def _warn_of_person(h: int, seen, posed, people: People, warn) -> None:
-    apart = distances(seen[:, None], posed[:, None])[:, 0, 0]
+def _warn_of_person(h: int, detected, projected, people: People, warn) -> None:
+    apart = distances(detected[:, None], projected[:, None])[:, 0, 0]
     both = np.isfinite(apart)
     if both.sum() < _FEWEST:
         return
@@ -83,7 +83,7 @@ def _warn_of_person(h: int, seen, posed, people: People, warn) -> None:
             "person's size from the keypoints: of somebody else there?"
         )
     near = both & ~away
-    big, small = (centred(uv[near])[1] for uv in in_common(seen, posed))
+    big, small = (centred(uv[near])[1] for uv in in_common(detected, projected))
     ratio = big / np.maximum(small, 1e-3)
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < _FEWEST:
@@ -104,7 +104,7 @@ def _warn_of_person(h: int, seen, posed, people: People, warn) -> None:
 
 
 def _upright(sequence: Sequence, people: People, warn) -> Sequence:
-    """Whether people lie or stand on their heads nearly all the time."""
+    """Warns of people who lie or are upside down nearly all the time."""
     width, height = sequence.intrinsics.width, sequence.intrinsics.height
     kind = "keypoints" if have_points(people.keypoints).any() else "bodies"
     points = people.keypoints
@@ -162,15 +162,15 @@ def _exceeds(sequence: Sequence, width: int, height: int) -> bool:
     return bool(beyond.any(-1).mean() > _OUTSIDE)
 
 
-def _check_bodies_alone(people: People, posed, warn) -> None:
+def _check_bodies_alone(people: People, projected, warn) -> None:
     """Bodies without keypoints: in the image, and in a camera's frame."""
     width, height = people.camera.width, people.camera.height
-    there = have_points(people.bodies)
-    if not there.any():
+    present = have_points(people.bodies)
+    if not present.any():
         return
-    u, v = posed[..., 0], posed[..., 1]
+    u, v = projected[..., 0], projected[..., 1]
     inside = ((u >= 0) & (u < width) & (v >= 0) & (v < height)).any(-1)
-    share = 100 * float((~inside[there]).mean())
+    share = 100 * float((~inside[present]).mean())
     if share > 70:
         raise ValueError(
             f"bodies are outside the image of {width}x{height} px in {share:.0f} % of "
@@ -180,7 +180,7 @@ def _check_bodies_alone(people: People, posed, warn) -> None:
         )
     if share > 20:
         warn(f"bodies are outside the image in {share:.0f} % of their frames.")
-    trunk = (people.bodies[..., NECK, :] - people.bodies[..., MID_HIP, :])[there]
+    trunk = (people.bodies[..., NECK, :] - people.bodies[..., MID_HIP, :])[present]
     away = trunk[:, 2] > 0.8 * np.linalg.norm(trunk, axis=-1)
     if len(away) >= _FEWEST and away.mean() > _MOST:
         warn(
@@ -191,13 +191,13 @@ def _check_bodies_alone(people: People, posed, warn) -> None:
 
 
 def _warn_of_renumbering(sequence: Sequence, warn) -> None:
-    """Keypoints that end where every n-th frame, numbered anew, would."""
+    """Warns of keypoints that end where every n-th frame, renumbered, would."""
     if sequence.bodies is not None:
         return
-    seen = np.any(sequence.keypoints.confidence > 0, axis=(0, 2))
-    t, count = len(seen), int(np.flatnonzero(seen)[-1]) + 1
+    detected = np.any(sequence.keypoints.confidence > 0, axis=(0, 2))
+    t, count = len(detected), int(np.flatnonzero(detected)[-1]) + 1
     for n in (2, 3, 4, 5, 6, 10):
-        if count == -(-t // n) and count >= _FEWEST and seen[:count].mean() > _MOST:
+        if count == -(-t // n) and count >= _FEWEST and detected[:count].mean() > _MOST:
             warn(
                 f"keypoints only in frames 0 to {count - 1} of {t}, one frame in {n}: "
                 f"taken as they are numbered; if only one frame in {n} was looked at, "
@@ -206,8 +206,8 @@ def _warn_of_renumbering(sequence: Sequence, warn) -> None:
 
 
 def _warn_of_a_corner(sequence: Sequence, warn) -> None:
-    """Keypoints that fill a quarter of the image only, as those of a copy of half the
-    size do: nobody who stands on the ground before a level camera is there."""
+    """Warns of keypoints in the upper left quarter only, as of a copy of half the size:
+    people on the ground before a level camera are not all there."""
     keypoints = sequence.keypoints
     size = np.array([sequence.intrinsics.width, sequence.intrinsics.height])
     uv = keypoints.uv[keypoints.confidence > 0]

@@ -1,8 +1,8 @@
-"""Keypoints and bodies as the same 14 points of the image, so that they compare.
+"""Keypoints and bodies as the same 14 image points, for comparison.
 
-NumPy only: this runs before anything is compiled. The points are those of BODY_25 that
-are joints of SMPL: neck, shoulders, elbows, wrists, hips, knees, ankles; neck and
-middle hip are midpoints, as OpenPose defines them. NaN is missing.
+NumPy only, as this runs before anything is compiled. The points are those of BODY_25
+that are joints of SMPL: neck, shoulders, elbows, wrists, hips, knees, ankles; neck and
+middle hip are midpoints, as OpenPose defines them. Missing points are NaN.
 """
 
 import dataclasses
@@ -25,20 +25,20 @@ SWAPPED = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
 _JOINT = np.array([-1, 17, 19, 21, 16, 18, 20, -1, 2, 5, 8, 1, 4, 7])
 """SMPL's joint of each point; -1 are midpoints."""
 _BEHIND = 1e6
-"""Pixel of what is behind the camera: far from everything."""
+"""Pixel of points behind the camera, far from everything."""
 _FEWEST = 5
 """Points in common from which two people are compared."""
 _FARTHEST = 3.0
-"""Distance, in sizes of a person, beyond which all distances are alike."""
+"""Distances are clipped to this, in sizes of a person."""
 _SURE = 0.25
-"""Confidence, of a person's usual best, from which a keypoint counts."""
+"""Least confidence of a keypoint, relative to the person's usual best."""
 _SMALLEST = 10.0
-"""Sizes below this are not divided by, px."""
+"""Lower bound on sizes in denominators, px."""
 
 
 @dataclasses.dataclass(frozen=True)
 class People:
-    """Who is seen in each of `t` frames, by either kind of input."""
+    """People in each of `t` frames, by either kind of input."""
 
     keypoints: Float[np.ndarray, "t k 14 2"]
     """px"""
@@ -48,25 +48,25 @@ class People:
 
     @property
     def both(self) -> Bool[np.ndarray, " t"]:
-        """Frames in which there is somebody of either kind."""
+        """Frames with people of both kinds."""
         return np.logical_and(
             have_points(self.keypoints).any(1), have_points(self.bodies).any(1)
         )
 
 
 def people_of(sequence: Sequence, body: BodyModel) -> People:
-    """All people, in the order of the sequence; a missing kind has no one."""
+    """All people, in the order of the sequence; a missing kind is empty."""
     t = sequence.num_frames
-    seen, posed = np.zeros((t, 0, 14, 2)), np.zeros((t, 0, 14, 3))
+    detected, projected = np.zeros((t, 0, 14, 2)), np.zeros((t, 0, 14, 3))
     if sequence.keypoints is not None:
-        seen = sure_points(sequence.keypoints).transpose(1, 0, 2, 3)
+        detected = sure_points(sequence.keypoints).transpose(1, 0, 2, 3)
     if sequence.bodies is not None:
-        posed = body_points(sequence.bodies, body).transpose(1, 0, 2, 3)
-    return People(seen, posed, sequence.intrinsics)
+        projected = body_points(sequence.bodies, body).transpose(1, 0, 2, 3)
+    return People(detected, projected, sequence.intrinsics)
 
 
 def sure_points(keypoints: Keypoints) -> Float[np.ndarray, "h t 14 2"]:
-    """The keypoints that their detector is about as sure of as of any, px."""
+    """Keypoints of high confidence, px; NaN for others."""
     confidence = keypoints.confidence[..., POINTS]
     best = [np.quantile(c[c > 0], 0.9) if (c > 0).any() else 1.0 for c in confidence]
     least = _SURE * np.reshape(best, (-1, 1, 1))
@@ -115,30 +115,30 @@ def project(
 
 
 def have_points(points: Float[np.ndarray, "*n 14 c"]) -> Bool[np.ndarray, "*n"]:
-    """Whether enough of a person's points are there to compare them."""
+    """Whether enough of a person's points are valid for a comparison."""
     return np.isfinite(points[..., 0]).sum(-1) >= _FEWEST
 
 
 def sizes(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
-    """Longer side of the box around each person, px; NaN if nobody is there."""
-    there = np.isfinite(uv)
-    low = np.where(there, uv, np.inf).min(-2)
-    high = np.where(there, uv, -np.inf).max(-2)
+    """Longer side of the box around each person, px; NaN for an absent person."""
+    valid = np.isfinite(uv)
+    low = np.where(valid, uv, np.inf).min(-2)
+    high = np.where(valid, uv, -np.inf).max(-2)
     size = np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0)
     return np.where(have_points(uv), size.max(-1).clip(_SMALLEST), np.nan)
 
 
 def distances(
-    seen: Float[np.ndarray, "t k 14 2"], posed: Float[np.ndarray, "t b 14 2"]
+    detected: Float[np.ndarray, "t k 14 2"], projected: Float[np.ndarray, "t b 14 2"]
 ) -> Float[np.ndarray, "t k b"]:
     """Mean distance of the points of two people, in sizes of the first; NaN where they
     share too few."""
-    apart = np.hypot(*np.moveaxis(seen[:, :, None] - posed[:, None], -1, 0))
-    there = np.isfinite(apart)
-    size = sizes(seen)[:, :, None]
+    apart = np.hypot(*np.moveaxis(detected[:, :, None] - projected[:, None], -1, 0))
+    valid = np.isfinite(apart)
+    size = sizes(detected)[:, :, None]
     limit = _FARTHEST * np.where(np.isfinite(size), size, 1.0)
-    total = np.where(there, np.minimum(apart, limit[..., None]), 0.0).sum(-1)
-    count = there.sum(-1)
+    total = np.where(valid, np.minimum(apart, limit[..., None]), 0.0).sum(-1)
+    count = valid.sum(-1)
     return np.where(count >= _FEWEST, total / np.maximum(count, 1) / size, np.nan)
 
 
@@ -161,12 +161,12 @@ def in_common(
     a: Float[np.ndarray, "*n 14 2"], b: Float[np.ndarray, "*n 14 2"]
 ) -> tuple[Float[np.ndarray, "*n 14 2"], Float[np.ndarray, "*n 14 2"]]:
     """Two people with the points that both have."""
-    there = np.isfinite(a) & np.isfinite(b)
-    return np.where(there, a, np.nan), np.where(there, b, np.nan)
+    valid = np.isfinite(a) & np.isfinite(b)
+    return np.where(valid, a, np.nan), np.where(valid, b, np.nan)
 
 
 def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m"]:
-    """Of what is not NaN; NaN if nothing is."""
+    """The median without NaN; NaN if there is nothing else."""
     count = np.isfinite(values).sum(axis, keepdims=True)
     ordered = np.sort(values, axis=axis)  # NaN last
     at = lambda i: np.take_along_axis(ordered, np.maximum(i, 0), axis=axis)
@@ -174,12 +174,11 @@ def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m
 
 
 def compact(points: Float[np.ndarray, "t h 14 c"], most: int):
-    """The same with at most `most` people a frame, whoever is there first: people of
-    the same frame in the same row need not be the same."""
-    there = have_points(points)
-    order = np.argsort(~there, axis=1, kind="stable")
-    width = min(most, int(there.sum(1).max(initial=0)))
+    """The first `most` people of each frame; a row need not be one person."""
+    valid = have_points(points)
+    order = np.argsort(~valid, axis=1, kind="stable")
+    width = min(most, int(valid.sum(1).max(initial=0)))
     order = order[:, :width]
     chosen = np.take_along_axis(points, order[:, :, None, None], axis=1)
-    kept = np.take_along_axis(there, order, axis=1)
+    kept = np.take_along_axis(valid, order, axis=1)
     return np.where(kept[..., None, None], chosen, np.nan)

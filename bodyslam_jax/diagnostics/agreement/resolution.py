@@ -1,20 +1,23 @@
-"""What is done about an explanation that is believed: undone, warned of, or refused."""
+"""The consequence of an accepted explanation: undone, a warning, or a refusal."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics.explanations import Explanation
-from bodyslam_jax.diagnostics.facing import shares, trunk_directions
-from bodyslam_jax.diagnostics.image_points import People, people_of, sizes
-from bodyslam_jax.diagnostics.undo import with_bodies_moved, with_keypoints_mapped_back
+from bodyslam_jax.diagnostics.agreement.explanations import Explanation
+from bodyslam_jax.diagnostics.agreement.facing import shares, trunk_directions
+from bodyslam_jax.diagnostics.agreement.image_points import People, people_of, sizes
+from bodyslam_jax.diagnostics.agreement.undo import (
+    with_bodies_moved,
+    with_keypoints_mapped_back,
+)
 from bodyslam_jax.types import Sequence
 
 _TOO_FAR = 1.6
-"""Times that a regressor may take everybody for too near or too far."""
+"""Largest factor by which a regressor may misjudge all depths."""
 _ASIDE = 0.2
-"""Distance to which a regressor may place everybody to the same side."""
+"""Largest common shift by a regressor, in sizes of a person."""
 
 Warn = Callable[[str], None]
 
@@ -28,9 +31,9 @@ def undone(
     best: float,
     warn: Warn,
 ) -> Sequence:
-    """The sequence without what was found, or the refusal.
+    """The sequence with the effect of the explanation undone, where that is safe.
 
-    **Raises:** `ValueError` if it is not known which side is right.
+    **Raises:** `ValueError` if it is ambiguous which side is right.
     """
     figures = (
         f"distance {best:.2f} of a person's size then, {given:.2f} as they are (median)"
@@ -77,8 +80,8 @@ def _refocused(sequence, body, factor: float, figures: str, warn: Warn) -> Seque
 
 
 def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence:
-    """A crop cannot be undone, as it is measured to some pixels only; another principal
-    point can, if it is the middle of the image, which most tools take."""
+    """A crop is not undone, as it is measured to some pixels only; another principal
+    point is, if it is the middle of the image, which most tools assume."""
     camera = sequence.intrinsics
     fx, fy, cx, cy = camera.params[:4]
     to_middle = np.array([(camera.width - 1) / 2 - cx, (camera.height - 1) / 2 - cy])

@@ -1,14 +1,13 @@
-"""What may have been done to keypoints or bodies that do not agree, each as a forecast.
+"""Hypotheses of what was done to keypoints or bodies that disagree.
 
-An explanation says where the keypoints would lie if the bodies were right but for it.
-The one that comes nearest to the keypoints is found by trying them all: turned,
+An explanation predicts the keypoints from the bodies under one hypothesis: turned,
 mirrored and resized images, cameras of another focal length, other units and other
-axes. What they do to people's size and to their place in the image tells them apart:
+axes. All are tested. Their effects on size and position in the image distinguish them:
 
-- a resized copy multiplies pixels about the image's corner, size and place alike;
-- another focal length multiplies them about the principal point;
-- another unit of `trans` changes the size, not the place;
-- a crop, or another principal point, moves the place, not the size.
+- a resized copy scales size and position about the image's corner;
+- another focal length scales both about the principal point;
+- another unit of `trans` changes the size, not the position;
+- a crop, or another principal point, changes the position, not the size.
 """
 
 import dataclasses
@@ -18,7 +17,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.image_points import (
     SWAPPED,
     People,
     centred,
@@ -30,20 +29,20 @@ from bodyslam_jax.diagnostics.image_points import (
 Forecast = Callable[[Float[np.ndarray, "t b 14 3"]], Float[np.ndarray, "t b 14 2"]]
 
 _PLACE, _SIZE = 0.04, 0.12
-"""How near a ratio must be to one that there is a reason for, relative: measured by
-people's place in the image, and by their size, in which regressors err."""
+"""Relative tolerances to a common ratio: of ratios measured by positions in the image,
+and by sizes, in which regressors have larger errors."""
 _SIMPLE = (1 / 4, 1 / 3, 3 / 8, 4 / 9, 1 / 2, 2 / 3, 3 / 4, 4 / 5)
-"""Sizes that videos are copied at: 2160, 1440, 1080, 960, 720, 540, 480 lines."""
+"""Ratios of common video formats: 2160, 1440, 1080, 960, 720, 540, 480 lines."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageMap:
-    """`q = A p + b`: pixels of the true image -> pixels of the one keypoints are of."""
+    """`q = A p + b`: pixels of the video -> pixels of the image of the keypoints."""
 
     A: Float[np.ndarray, "2 2"]
     b: Float[np.ndarray, " 2"]
     swap: bool = False
-    """Whether what is left there is called right."""
+    """Whether left and right are exchanged."""
 
     def __call__(
         self, uv: Float[np.ndarray, "*n 14 2"]
@@ -58,7 +57,7 @@ class ImageMap:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """One thing that may have happened; `kind` says which of the fields it has."""
+    """One hypothesis; `kind` determines which of the fields it has."""
 
     kind: str
     """`agree`, `sides`, `keypoints` (`image`), `axes` (`R`), `focal`, `unit`
@@ -66,21 +65,21 @@ class Explanation:
     forecast: Forecast
     image: ImageMap | None = None
     R: Float[np.ndarray, "3 3"] | None = None
-    """Turns given bodies to where they are."""
+    """Rotates given bodies into the camera frame."""
     factor: float = 1.0
-    """Resized by; or the bodies' focal length over the camera's; or units in 1 m."""
+    """Factor of resizing; the bodies' focal length over the camera's; units per m."""
     name: str = ""
     reason: bool = True
-    """Whether the factor is one that has a reason, not just what was measured."""
+    """Whether the factor is a common one, not merely the measured one."""
 
 
 def disagreement(
-    seen: Float[np.ndarray, "t k 14 2"], posed: Float[np.ndarray, "t b 14 2"]
+    detected: Float[np.ndarray, "t k 14 2"], projected: Float[np.ndarray, "t b 14 2"]
 ) -> float:
-    """How far people of the one kind are from the nearest of the other, the median over
-    people and frames, in sizes of a person; of the kind that has fewer without a
-    partner. NaN if there is too little to compare."""
-    apart = distances(seen, posed)
+    """Median distance, over people and frames, from one kind to the nearest person of
+    the other, in sizes of a person; the smaller of both directions. NaN if there is too
+    little to compare."""
+    apart = distances(detected, projected)
     apart = np.where(np.isfinite(apart), apart, np.inf)
     if not apart.size:
         return np.nan
@@ -95,23 +94,23 @@ def disagreement(
 
 
 def explanations(people: People) -> Iterator[Explanation]:
-    """All of them, that of agreement first; `people` are those of a few frames."""
+    """All explanations, beginning with agreement; `people` are of a few frames."""
     camera = people.camera
     plain = lambda p: project(camera, p)
     yield Explanation("agree", plain)
     yield Explanation("sides", lambda p: plain(p)[..., SWAPPED, :])
-    posed = plain(people.bodies)
-    ratios = _ratios(people.keypoints, posed)
+    projected = plain(people.bodies)
+    ratios = _ratios(people.keypoints, projected)
     for name, image in _symmetries(camera.width, camera.height):
         if name:
             yield _of_image(plain, image, name)
-        places = _ratios(people.keypoints, image(posed), about_corner=True)
+        places = _ratios(people.keypoints, image(projected), about_corner=True)
         places = [p for p in places if any(abs(np.log(p / r)) < 0.2 for r in ratios)]
         for scale, reason in _likely(places, _SIMPLE, _PLACE):
             resized = ImageMap(scale * image.A, scale * image.b, image.swap)
             yield _of_image(plain, resized, name, scale, reason)
     yield from _other_bodies(people, ratios)
-    yield from _moved(people.keypoints, posed, ratios, plain)
+    yield from _moved(people.keypoints, projected, ratios, plain)
 
 
 def _of_image(plain, image, name, factor=1.0, reason=True) -> Explanation:
@@ -129,12 +128,12 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
     for R in _axes():
         yield Explanation("axes", turned(R), R=R, name=_axes_name(R))
     longer = max(camera.width, camera.height)
-    # What tools take where they are not told (`io.bodies.tool_focal`), and SPIN's.
+    # Default focal lengths of tools (`io.bodies.tool_focal`), and SPIN's.
     usual = np.array(
         [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
     )
     for factor, reason in _likely(ratios, usual / fx, _SIZE, inverse=False):
-        # Of people nearby, the size is not quite proportional to the focal length.
+        # The size of people nearby is not quite proportional to the focal length.
         for by in (1.0,) if reason else (0.85, 0.92, 1.0, 1.08, 1.17):
             value = by * factor
             forecast = scaled([1, 1, value])
@@ -148,7 +147,7 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
 
 
 def _of_unit(camera, factor):
-    """Only the place is in another unit; the body's own size is the model's."""
+    """Only the position is in another unit; the body's size is the model's."""
 
     def forecast(p):
         pelvis = p[..., 7:8, :]
@@ -157,11 +156,11 @@ def _of_unit(camera, factor):
     return forecast
 
 
-def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
-    """Moved by a constant, at the same size or resized, which nothing bounds."""
+def _moved(detected, projected, ratios, plain) -> Iterator[Explanation]:
+    """Shifts by any constant, at the same size or resized."""
     middles = [
-        [centred(uv)[0] for uv in in_common(seen[:, k], posed[:, b])]
-        for k, b in _pairs(seen, posed)
+        [centred(uv)[0] for uv in in_common(detected[:, k], projected[:, b])]
+        for k, b in _pairs(detected, projected)
     ]
     for scale in (1.0, *ratios):
         shift = np.concatenate([q - scale * p for q, p in middles])
@@ -173,18 +172,18 @@ def _moved(seen, posed, ratios, plain) -> Iterator[Explanation]:
             yield Explanation(kind, forecast, image, factor=scale)
 
 
-def _pairs(seen, posed) -> list[tuple[int, int]]:
-    """Rows that may be of one person, likelier ones first."""
-    rows = itertools.product(range(seen.shape[1]), range(posed.shape[1]))
+def _pairs(detected, projected) -> list[tuple[int, int]]:
+    """Pairs of rows that may be of one person, likelier ones first."""
+    rows = itertools.product(range(detected.shape[1]), range(projected.shape[1]))
     return sorted(rows, key=lambda pair: (sum(pair), abs(pair[0] - pair[1])))[:24]
 
 
-def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
-    """How many times as large people are in keypoints as in bodies, or as far from the
+def _ratios(detected, projected, about_corner: bool = False) -> list[float]:
+    """Ratios of people's size in keypoints and in bodies, or of their distance from the
     image's corner, by pairs of rows."""
     found: list[float] = []
-    for k, b in _pairs(seen, posed):
-        pair = in_common(seen[:, k], posed[:, b])
+    for k, b in _pairs(detected, projected):
+        pair = in_common(detected[:, k], projected[:, b])
         (q, big), (p, small) = (centred(uv) for uv in pair)
         if about_corner:
             ratio = (q * p).sum(-1) / np.maximum((p**2).sum(-1), 1.0)
@@ -202,17 +201,17 @@ def _ratios(seen, posed, about_corner: bool = False) -> list[float]:
 
 
 def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, bool]]:
-    """The measured ratios, and those near them that there is a reason for."""
-    known = [*reasons, *(1 / r for r in reasons)] if inverse else list(reasons)
+    """The measured ratios, and the common ratios near them."""
+    candidates = [*reasons, *(1 / r for r in reasons)] if inverse else list(reasons)
     for ratio in ratios:
-        for reason in known:
+        for reason in candidates:
             if abs(np.log(reason / ratio)) < tolerance:
                 yield float(reason), True
         yield ratio, False
 
 
 def _symmetries(width: int, height: int) -> Iterator[tuple[str, ImageMap]]:
-    """The ways to turn and mirror an image of that size, none first."""
+    """Rotations and reflections of an image of that size, identity first."""
     w, h = width - 1.0, height - 1.0
     matrix = lambda *rows: np.array(rows, dtype=np.float64)
     yield "", ImageMap(np.eye(2), np.zeros(2))
@@ -241,7 +240,7 @@ def _symmetries(width: int, height: int) -> Iterator[tuple[str, ImageMap]]:
 
 
 def _axes() -> Iterator[Float[np.ndarray, "3 3"]]:
-    """The rotations that exchange axes, without the one that does nothing."""
+    """The rotations that permute axes, without the identity."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             R = np.zeros((3, 3))
@@ -251,7 +250,7 @@ def _axes() -> Iterator[Float[np.ndarray, "3 3"]]:
 
 
 def _axes_name(R: Float[np.ndarray, "3 3"]) -> str:
-    """What x, y, z of a camera are among the given axes."""
+    """Names of the camera's x, y, z among the given axes."""
     letters = [
         ("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in R
     ]
@@ -263,9 +262,9 @@ def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> Peop
     """Keypoints of some frames beside bodies of others; frames beyond the end have no
     bodies."""
     inside = (bodies_at >= 0) & (bodies_at < len(people.bodies))
-    posed = people.bodies[np.where(inside, bodies_at, 0)]
-    posed = np.where(inside[:, None, None, None], posed, np.nan)
-    return People(people.keypoints[frames], posed, people.camera)
+    projected = people.bodies[np.where(inside, bodies_at, 0)]
+    projected = np.where(inside[:, None, None, None], projected, np.nan)
+    return People(people.keypoints[frames], projected, people.camera)
 
 
 def some_frames(people: People, most: int) -> np.ndarray:

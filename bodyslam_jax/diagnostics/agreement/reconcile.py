@@ -1,14 +1,15 @@
-"""Whether keypoints, bodies and camera are of one video, before time is spent on it.
+"""Agreement of keypoints, bodies and camera, checked before anything is estimated.
 
-Bodies are projected and compared with the keypoints, frame by frame. Where they do not
-meet, what may have been done to one of them is tried out (`_explanations`, `_timing`):
+Bodies are projected and compared with the keypoints, frame by frame. If they disagree,
+hypotheses of what was done to one of them are tested (`explanations`, `timing`):
 
-- what explains it beyond doubt is undone, and a warning says what was assumed;
-- what contradicts itself is refused, in one line with both sides and the figure;
-- what is merely odd is a warning.
+- the effect of a clearly best hypothesis is undone, with a warning;
+- a contradiction is refused, in one line with both sides and the figure;
+- anything else that is unusual is a warning.
 
-Distances are in sizes of a person: the longer side of the box around the keypoints.
-Bodies of common regressors lie 0.05 to 0.13 from the keypoints of common detectors.
+Distances are relative to the size of a person, the longer side of the box around the
+keypoints. Bodies of common regressors are 0.05 to 0.13 from keypoints of common
+detectors.
 """
 
 import dataclasses
@@ -18,75 +19,75 @@ from collections.abc import Callable
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics.exchanges import put_back_exchanges
-from bodyslam_jax.diagnostics.explanations import (
+from bodyslam_jax.diagnostics.agreement.exchanges import put_back_exchanges
+from bodyslam_jax.diagnostics.agreement.explanations import (
     Explanation,
     disagreement,
     explanations,
     of_frames,
     some_frames,
 )
-from bodyslam_jax.diagnostics.facing import shares, trunk_directions
-from bodyslam_jax.diagnostics.identities import settle_identities
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.facing import shares, trunk_directions
+from bodyslam_jax.diagnostics.agreement.identities import settle_identities
+from bodyslam_jax.diagnostics.agreement.image_points import (
     People,
     compact,
     distances,
     people_of,
     project,
 )
-from bodyslam_jax.diagnostics.oddities import warn_of_oddities
-from bodyslam_jax.diagnostics.renumbering import settle_times
-from bodyslam_jax.diagnostics.timing import best_timing
-from bodyslam_jax.diagnostics.verdicts import undone
+from bodyslam_jax.diagnostics.agreement.oddities import warn_of_oddities
+from bodyslam_jax.diagnostics.agreement.renumbering import settle_times
+from bodyslam_jax.diagnostics.agreement.resolution import undone
+from bodyslam_jax.diagnostics.agreement.timing import best_timing
 from bodyslam_jax.types import Sequence
 
 _log = logging.getLogger(__name__)
 
 _BELIEVED = 0.2
-"""Distance that an explanation has to come down to."""
+"""Largest distance under an explanation that is accepted."""
 _BETTER = 0.7
-"""What it may leave of the distance without it."""
+"""Largest distance under it, relative to that without it."""
 _COPY, _MUCH_BETTER = 0.15, 0.5
-"""The same where any shift and size would do."""
+"""The same for a copy of arbitrary shift and size."""
 _GAIN = 0.03
-"""Distance that it has to gain."""
+"""Least decrease of the distance."""
 _BETTER_TIME, _GAIN_TIME = 0.87, 0.012
-"""The same of another timing, which changes less."""
+"""The same for another timing, which has a smaller effect."""
 _HINT, _MORE = 0.95, 0.6
-"""The same where it is only warned of, and the share of frames that are nearer then."""
+"""The same for a warning only, and the share of frames that must improve."""
 _CONTRADICTION, _DOUBT = 0.35, 0.25
-"""Distance from which bodies and keypoints are not of the same people; are doubtful."""
+"""Distances from which bodies and keypoints contradict each other; are doubtful."""
 _SAMPLE = 40
 """Frames that are compared for each explanation."""
 _CROWD = 12
-"""People of each kind and frame that are compared."""
+"""Largest number of people of each kind and frame that are compared."""
 
 Warn = Callable[[str], None]
 
 
 def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
-    """The sequence with its parts in agreement; itself if they are.
+    """The sequence with its parts in agreement; unchanged if they agree already.
 
-    Told from keypoints, bodies and camera alone; images are not looked at. New warnings
-    say what was undone, and what is odd.
+    Uses keypoints, bodies and camera, not the images. New warnings name what was undone
+    and what is unusual.
 
     Args:
-        body: whose joints stand for the bodies' own; any of a person's size will do.
+        body: the model whose joints are compared; any of a person's size is adequate.
 
     **Raises:** `ValueError`, one line with both sides and the figure, where they
-    contradict each other and nothing says which is right.
+    contradict each other and it is ambiguous which is right.
     """
     if sequence.keypoints is None and sequence.bodies is None:
         return sequence
-    said: list[str] = []
+    new_warnings: list[str] = []
     try:
-        settled = _settle(sequence, body, said.append)
+        settled = _settle(sequence, body, new_warnings.append)
     except ValueError as error:
         raise ValueError(f"{sequence.name}: {error}") from None
-    if not said:
+    if not new_warnings:
         return settled
-    new = [text for text in said if text not in sequence.warnings]
+    new = [text for text in new_warnings if text not in sequence.warnings]
     for text in new:
         _log.warning("%s: %s", sequence.name, text)
     return dataclasses.replace(settled, warnings=(*sequence.warnings, *new))
@@ -111,8 +112,8 @@ def _settle(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
 def _made_to_meet(
     sequence: Sequence, body: BodyModel, crowd: People, warn: Warn
 ) -> tuple[Sequence, bool]:
-    """Bodies and keypoints at the same place and time in the image; and whether left
-    and right were found to contradict."""
+    """The sequence with bodies and keypoints at the same place and time, and whether
+    their left and right sides contradict each other."""
     pairs = crowd.keypoints.shape[1] * crowd.bodies.shape[1]
     frames = some_frames(crowd, max(_SAMPLE // 3, min(_SAMPLE, 4 * _SAMPLE // pairs)))
     given, chosen, best = _best_explanation(of_frames(crowd, frames, frames))
@@ -143,8 +144,8 @@ def _made_to_meet(
 
 
 def _best_explanation(people: People) -> tuple[float, Explanation | None, float]:
-    """Distance as given (NaN: not known), and the explanation that is believed, if any,
-    with what it leaves."""
+    """Distance as given (NaN if unknown), the accepted explanation, if any, and the
+    distance under it."""
     tried = [
         (disagreement(people.keypoints, e.forecast(people.bodies)), e)
         for e in explanations(people)
@@ -166,8 +167,8 @@ def _best_explanation(people: People) -> tuple[float, Explanation | None, float]
 
 
 def _complexity(explanation: Explanation) -> float:
-    """Distance that what leaves more free has to gain: a measured factor in place of
-    one that there is a reason for, a crop, a crop of any size."""
+    """Penalty, as a distance, on explanations with more free parameters: a measured
+    factor in place of a common one, a crop, a crop of any size."""
     measured = {"keypoints": 0.012, "focal": 0.02, "unit": 0.04}
     free = {"crop": 0.03, "copy": 0.04}
     if explanation.kind in free:
@@ -178,19 +179,19 @@ def _complexity(explanation: Explanation) -> float:
 
 
 def _oddness(explanation: Explanation, people: People) -> float:
-    """Of two that turn the image alike, the one after which people stand."""
+    """Penalty, as a distance, on image rotations after which people are not upright."""
     upright = lambda uv: shares(trunk_directions(uv))[1]["upright"]
-    seen = people.keypoints
+    detected = people.keypoints
     if explanation.kind == "keypoints" and explanation.name:
-        righted = explanation.image.inverse(seen)
-        return 0.0 if upright(righted) > max(0.5, upright(seen)) else _GAIN
+        righted = explanation.image.inverse(detected)
+        return 0.0 if upright(righted) > max(0.5, upright(detected)) else _GAIN
     if explanation.kind == "axes" and explanation.R[2, 2] == 1:
-        return 0.0 if upright(seen) > 0.5 else _GAIN
+        return 0.0 if upright(detected) > 0.5 else _GAIN
     return 0.0
 
 
 def _apart(crowd: People, given: float) -> str:
-    """Why bodies and keypoints are not of the same people."""
+    """The message for bodies and keypoints that are not of the same people."""
     posed = project(crowd.camera, crowd.bodies)
     nearest = distances(crowd.keypoints, posed)
     nearest = np.where(np.isfinite(nearest), nearest, np.inf).min(

@@ -1,4 +1,4 @@
-"""Do people stand on the ground of the map? A check of what came out."""
+"""Size of the map relative to the people who stand on its ground."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from bodyslam_jax.types import Result
 
 _FEET = list(FEET)
 _SOLE = 0.027
-"""How far these joints lie above what the sole stands on, m, in the default body."""
+"""Height of these joints above the sole in the default body, m."""
 _UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -27,11 +27,11 @@ def ground_scale(result: Result) -> float | None:
         return None
     normal, offset = plane[:3], plane[3]
     factors = []
-    for joints, here in zip(result.joints, result.present, strict=True):
-        feet = joints[here][:, _FEET]
+    for joints, present in zip(result.joints, result.present, strict=True):
+        feet = joints[present][:, _FEET]
         low = feet[np.arange(len(feet)), (feet @ normal).argmin(axis=1)]
         low = low - _SOLE * normal
-        eye = result.T_WC[here, :3, 3]
+        eye = result.T_WC[present, :3, 3]
         towards = (low - eye) @ normal
         reach = np.full(len(low), np.nan)
         down = towards < -1e-3

@@ -1,9 +1,9 @@
-"""What people's own shape says: which way they face, and that they stand upright."""
+"""Orientation of people in the image: upright or lying, from the front or behind."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.image_points import (
     ANKLES,
     L_HIP,
     L_SHOULDER,
@@ -14,22 +14,22 @@ from bodyslam_jax.diagnostics.image_points import (
 )
 
 _LYING = 55.0
-"""Angle between a trunk and the vertical of the image from which it lies, degrees."""
+"""Angle from the image's vertical beyond which a trunk is lying, degrees."""
 _WIDE = 0.15
-"""Width of hips and shoulders over the length of the trunk from which it shows whether
-somebody is seen from the front or from behind."""
+"""Width of hips and shoulders over the length of the trunk above which front and back
+are distinguishable."""
 
 
 def trunk_directions(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
     """Direction from neck to hips, rad: 0 points down, positive to the image's right.
 
-    NaN where the legs, if they are seen, go another way: people who bend or sit.
+    NaN where visible legs point another way, as of people who bend or sit.
     """
     trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
     ankles = uv[..., ANKLES, :]
-    there = np.isfinite(ankles[..., :1])
-    count = there.sum(-2)
-    foot = np.where(there, ankles, 0.0).sum(-2) / np.maximum(count, 1)
+    valid = np.isfinite(ankles[..., :1])
+    count = valid.sum(-2)
+    foot = np.where(valid, ankles, 0.0).sum(-2) / np.maximum(count, 1)
     leg = foot - uv[..., MID_HIP, :]
     with np.errstate(invalid="ignore"):
         straight = (leg * trunk).sum(-1) > 0.5 * np.linalg.norm(
@@ -42,8 +42,8 @@ def trunk_directions(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"
 def shares(
     directions: Float[np.ndarray, "*n"],
 ) -> tuple[int, dict[str, float]]:
-    """How many people there are in all frames, and the shares of those who are upright,
-    upside down, or whose heads point to the left or to the right."""
+    """Number of people in all frames, and the shares of those who are upright, upside
+    down, or whose heads point to the left or to the right."""
     angle = np.degrees(directions[np.isfinite(directions)])
     if not len(angle):
         return 0, dict.fromkeys(("upright", "upside down", "left", "right"), 0.0)
@@ -57,8 +57,8 @@ def shares(
 
 
 def facings(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
-    """Positive where somebody is seen from behind, negative from the front: width of
-    shoulders and hips over the trunk's length; NaN if not known."""
+    """Signed width of shoulders and hips over the trunk's length: positive from behind,
+    negative from the front; NaN if unknown."""
     trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
     across = (
         uv[..., R_SHOULDER, :]
@@ -71,9 +71,9 @@ def facings(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
 
 
 def opposed(
-    seen: Float[np.ndarray, "*n 14 2"], posed: Float[np.ndarray, "*n 14 2"]
+    detected: Float[np.ndarray, "*n 14 2"], projected: Float[np.ndarray, "*n 14 2"]
 ) -> tuple[Bool[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-    """Where it shows in both which way somebody faces, and where they contradict."""
-    a, b = facings(seen), facings(posed)
+    """Where the facing is distinguishable in both, and where both contradict."""
+    a, b = facings(detected), facings(projected)
     shown = (np.abs(np.nan_to_num(a)) > _WIDE) & (np.abs(np.nan_to_num(b)) > _WIDE)
     return shown, shown & (np.nan_to_num(a) * np.nan_to_num(b) < 0)

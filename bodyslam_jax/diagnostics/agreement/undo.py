@@ -1,4 +1,4 @@
-"""Takes back what was done to keypoints or bodies, once it is known."""
+"""Inverse operations on keypoints and bodies: image maps, motions, frame numbers."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,13 +8,13 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_MIRRORED
-from bodyslam_jax.diagnostics.explanations import ImageMap
+from bodyslam_jax.diagnostics.agreement.explanations import ImageMap
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
 def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
-    """Keypoints in the true image, which were in one that `image` makes of it."""
+    """Keypoints mapped back from the image that `image` makes of the video's."""
     keypoints = sequence.keypoints
     uv, confidence = image.inverse(keypoints.uv), keypoints.confidence
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
@@ -29,7 +29,7 @@ def with_bodies_moved(
     place: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 3"]],
     R: Float[np.ndarray, "3 3"] | None = None,
 ) -> Sequence:
-    """Bodies whose pelvis (m) goes through `place`, turned about it by `R`."""
+    """Bodies with pelvis positions (m) mapped by `place`, rotated about them by `R`."""
     bodies = sequence.bodies
     at = bodies.present
     J_0 = np.asarray(body.joint_template[0], float)
@@ -46,7 +46,7 @@ def with_bodies_moved(
 def retimed(
     bundle: Keypoints | Bodies, new: Callable[[Int[np.ndarray, " t"]], np.ndarray]
 ):
-    """The same arrays with frame k at frame `new(k)`; beyond the end it is dropped."""
+    """The arrays with frame k at `new(k)`; frames beyond the end are dropped."""
     arrays = {k: v for k, v in vars(bundle).items() if isinstance(v, np.ndarray)}
     t = next(iter(arrays.values())).shape[1]
     at = new(np.arange(t))

@@ -1,4 +1,4 @@
-"""What a person wants to know of a result, as numbers: how far, how fast, how tall."""
+"""Statistics of a result: distances, speeds, statures."""
 
 import dataclasses
 
@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
-from bodyslam_jax.export.folder import frame_rate
 from bodyslam_jax.types import Result
 
 _UP = 1
@@ -15,19 +14,19 @@ _UP = 1
 _PLAN = [0, 2]
 _FEET = list(FEET)
 _SMOOTHING = 0.5
-"""Moving average over so many seconds, so that jitter is not counted as distance."""
+"""Window of a moving average, s, so that jitter does not count as distance."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PathFacts:
-    """One moving thing: the camera, or a person's pelvis."""
+class PathStatistics:
+    """The path of the camera, or of a person's pelvis."""
 
     seconds: float
-    """How long it is there."""
+    """Total time in which it is present."""
     distance: float
     """Length of the smoothed path on the ground, m."""
     speed: Float[np.ndarray, " t"]
-    """Of the smoothed path, m/s; NaN where it is not there."""
+    """Of the smoothed path, m/s; NaN where absent."""
     height: float
     """Mean height above y = 0, m."""
 
@@ -37,24 +36,24 @@ class PathFacts:
         return self.distance / self.seconds if self.seconds > 0 else 0.0
 
 
-def camera_facts(
+def camera_statistics(
     result: Result, used: Bool[np.ndarray, " t"] | None = None
-) -> PathFacts:
-    """The camera's way in the frames `used`, by default those that are located."""
+) -> PathStatistics:
+    """The camera's path in the frames `used`, by default those that are located."""
     if used is None:
         used = result.located
-    return _path_facts(result, result.T_WC[:, :3, 3], used)
+    return _path_statistics(result, result.T_WC[:, :3, 3], used)
 
 
-def person_facts(result: Result, person: int) -> PathFacts:
-    """A person's way: that of the pelvis joint, where the person is present."""
-    return _path_facts(result, result.joints[person, :, 0], result.present[person])
+def person_statistics(result: Result, person: int) -> PathStatistics:
+    """A person's path: that of the pelvis joint, where the person is present."""
+    return _path_statistics(result, result.joints[person, :, 0], result.present[person])
 
 
-def _path_facts(
+def _path_statistics(
     result: Result, points: Float[np.ndarray, "t 3"], present: Bool[np.ndarray, " t"]
-) -> PathFacts:
-    t, fps = result.timestamps, frame_rate(result)
+) -> PathStatistics:
+    t, fps = result.timestamps, result.fps
     speed = np.full(len(t), np.nan)
     distance, seconds = 0.0, 0.0
     for run in runs(present):
@@ -66,11 +65,11 @@ def _path_facts(
             rate = steps / np.maximum(np.diff(t[run]), 1e-9)
             speed[run] = np.append(rate, rate[-1])
     height = float(points[present, _UP].mean()) if present.any() else 0.0
-    return PathFacts(seconds, distance, speed, height)
+    return PathStatistics(seconds, distance, speed, height)
 
 
 def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
-    """The stretches of frames in which something is there."""
+    """The stretches of consecutive frames in `present`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
     return [slice(a, b) for a, b in edges.reshape(-1, 2)]
 
@@ -80,7 +79,7 @@ def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, 
     size = min(int(_SMOOTHING * fps) | 1, len(points) - 1 + len(points) % 2)
     if size < 3:
         return points
-    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    # Without `scipy.signal`, whose import would delay every command.
     beyond = ((size // 2, size // 2), (0, 0))
     wide = np.pad(points, beyond, mode="reflect", reflect_type="odd")
     return np.lib.stride_tricks.sliding_window_view(wide, size, axis=0).mean(axis=-1)
@@ -89,7 +88,7 @@ def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, 
 def foot_skating(result: Result, person: int) -> float:
     """Median horizontal speed of the lower foot, m/s.
 
-    Of a real walk it is about 0.1, not 0: it is also of when the lower foot changes.
+    About 0.1 for a real walk, not 0, as the lower foot changes.
     """
     speeds = [np.zeros(0)]
     for run in runs(result.present[person]):
@@ -104,10 +103,10 @@ def foot_skating(result: Result, person: int) -> float:
 
 def distance_to_camera(result: Result, person: int) -> tuple[float, float]:
     """Least and greatest distance of the pelvis from the camera, m."""
-    there = result.present[person]
-    if not there.any():
+    present = result.present[person]
+    if not present.any():
         return 0.0, 0.0
-    gap = result.joints[person, there, 0] - result.T_WC[there, :3, 3]
+    gap = result.joints[person, present, 0] - result.T_WC[present, :3, 3]
     length = np.linalg.norm(gap, axis=1)
     return float(length.min()), float(length.max())
 
@@ -117,3 +116,14 @@ def stature(body: BodyModel, betas: Float[np.ndarray, " 10"]) -> float:
     template = np.asarray(body.template, np.float64)[:, _UP]
     tall = template + np.asarray(body.shape_dirs, np.float64)[:, _UP] @ betas
     return float(tall.max() - tall.min())
+
+
+def stature_and_sigma(
+    body: BodyModel,
+    betas: Float[np.ndarray, " 10"],
+    covariance: Float[np.ndarray, "10 10"],
+) -> tuple[float, float]:
+    """`stature` and its standard deviation for the covariance of β, m."""
+    height = stature(body, betas)
+    slope = np.array([stature(body, betas + e) - height for e in np.eye(10)])
+    return height, float(np.sqrt(slope @ covariance @ slope))

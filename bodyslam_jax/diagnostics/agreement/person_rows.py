@@ -28,9 +28,9 @@ def have_any(
     )
 
 
-def in_words(there: Bool[np.ndarray, "h t"], rows) -> str:
-    """By what a reader of a warning finds these rows."""
-    ends = sorted(tuple(np.flatnonzero(there[row])[[0, -1]].tolist()) for row in rows)
+def in_words(present: Bool[np.ndarray, "h t"], rows) -> str:
+    """The first and last frames of rows, for warnings."""
+    ends = sorted(tuple(np.flatnonzero(present[row])[[0, -1]].tolist()) for row in rows)
     spans = ", ".join(f"{first}-{last}" for first, last in ends[:6])
     more = f" and {len(ends) - 6} more" if len(ends) > 6 else ""
     return f"frames {spans}{more}"
@@ -61,7 +61,7 @@ def gathered(
 
 
 def _keypoints(keypoints: Keypoints, persons: list[Person]) -> Keypoints:
-    """The surer of two that are in one frame."""
+    """Keypoints joined; of two in one frame those of higher confidence."""
     shape = (len(persons), *keypoints.confidence.shape[1:])
     uv, confidence = np.zeros((*shape, 2)), np.zeros(shape)
     sure = keypoints.confidence.sum((1, 2))
@@ -74,8 +74,8 @@ def _keypoints(keypoints: Keypoints, persons: list[Person]) -> Keypoints:
 
 
 def _bodies(bodies: Bodies, persons: list[Person], apart) -> Bodies:
-    """Of two in one frame the one that is nearer to the keypoints on the whole; without
-    keypoints the one that is there for longer."""
+    """Bodies joined; of two in one frame the one nearer to the keypoints on average,
+    without keypoints the one present for longer."""
     names = ("present", "poses", "shapes", "trans")
     arrays = {name: getattr(bodies, name) for name in names}
     out = {
@@ -92,9 +92,9 @@ def _bodies(bodies: Bodies, persons: list[Person], apart) -> Bodies:
         if person.keypoints:
             near = apart[:, list(person.keypoints)][:, :, rows]
             near = np.where(np.isfinite(near), near, np.inf).min(1)
-            there = np.isfinite(near).sum(0)
+            present = np.isfinite(near).sum(0)
             total = np.where(np.isfinite(near), near, 0.0).sum(0)
-            cost = cost + np.where(there > 0, total / np.maximum(there, 1), 1e3)
+            cost = cost + np.where(present > 0, total / np.maximum(present, 1), 1e3)
         best = np.where(bodies.present[rows].T, cost, np.inf).argmin(1)
         row = np.array(rows)[best]
         for name, array in arrays.items():

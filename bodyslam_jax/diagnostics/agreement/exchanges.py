@@ -1,5 +1,5 @@
-"""Two people whose numbers a tracker exchanged for a while, in one kind and not in the
-other: as they cross, or hide each other."""
+"""Identities that a tracker exchanged for a while, in keypoints or in bodies: where
+people cross or occlude each other."""
 
 import dataclasses
 import itertools
@@ -9,7 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter
 
-from bodyslam_jax.diagnostics.image_points import People, centred, distances, project
+from bodyslam_jax.diagnostics.agreement.image_points import (
+    People,
+    centred,
+    distances,
+    project,
+)
 from bodyslam_jax.types import Sequence
 
 _CLEAR = 0.1
@@ -18,17 +23,16 @@ _FEWEST = 5
 _WINDOW = 9
 """Frames over which one is an outlier."""
 _JUMP = 1.5
-"""Times that one kind jumps further than the other, if that is the one exchanged."""
+"""Ratio of jumps from which the kind that jumps further is the exchanged one."""
 
 
 def put_back_exchanges(
     sequence: Sequence, people: People, warn: Callable[[str], None]
 ) -> Sequence:
     """The sequence with keypoints and bodies of the same person in the same row, in all
-    frames. Where neither kind jumps, bodies follow the keypoints, and who is who after
-    people have crossed is the keypoints' guess."""
-    posed = project(people.camera, people.bodies)
-    apart = distances(people.keypoints, posed)
+    frames. Where neither kind jumps, bodies are changed to follow the keypoints."""
+    projected = project(people.camera, people.bodies)
+    apart = distances(people.keypoints, projected)
     rows = range(min(apart.shape[1:]))
     for i, j in itertools.combinations(rows, 2):
         at = np.zeros(len(apart), bool)
@@ -36,7 +40,9 @@ def put_back_exchanges(
             at[first : last + 1] = True
         if not at.any():
             continue
-        jumps = [_jump(points[:, [i, j]], at) for points in (people.keypoints, posed)]
+        jumps = [
+            _jump(points[:, [i, j]], at) for points in (people.keypoints, projected)
+        ]
         what = "keypoints" if jumps[0] > _JUMP * jumps[1] else "bodies"
         sure = max(jumps) > _JUMP * min(jumps)
         sequence = _exchanged(sequence, what, (i, j), at)
@@ -52,36 +58,38 @@ def put_back_exchanges(
 def _stretches(
     apart: Float[np.ndarray, "t 2 2"],
 ) -> Iterator[tuple[int, int]]:
-    """First and last frames of what fits exchanged."""
+    """First and last frames of the stretches that fit better exchanged."""
     gain = apart[:, 0, 0] + apart[:, 1, 1] - apart[:, 0, 1] - apart[:, 1, 0]
-    (known,) = np.nonzero(np.isfinite(gain))
-    if len(known) < _FEWEST:
+    (comparable,) = np.nonzero(np.isfinite(gain))
+    if len(comparable) < _FEWEST:
         return
-    smooth = median_filter(gain[known], _WINDOW, mode="nearest")
+    smooth = median_filter(gain[comparable], _WINDOW, mode="nearest")
     decided = np.abs(smooth) > _CLEAR
     if not decided.any():
         return
-    # Where both fit, as people cross, it stays as it was.
-    last = np.maximum.accumulate(np.where(decided, np.arange(len(known)), -1))
+    # Where both fit, as people cross, the last decision is kept.
+    last = np.maximum.accumulate(np.where(decided, np.arange(len(comparable)), -1))
     exchanged = smooth[np.where(last >= 0, last, decided.argmax())] > 0
     edges = np.diff(np.concatenate([[False], exchanged, [False]]).astype(int))
     starts: Int[np.ndarray, " n"] = np.flatnonzero(edges == 1)
     ends = np.flatnonzero(edges == -1) - 1
     for first, last in zip(starts.tolist(), ends.tolist(), strict=True):
         if last - first + 1 >= _FEWEST:
-            begin = 0 if first == 0 else int(known[first])
-            end = len(apart) - 1 if last == len(known) - 1 else int(known[last])
+            begin = 0 if first == 0 else int(comparable[first])
+            end = (
+                len(apart) - 1 if last == len(comparable) - 1 else int(comparable[last])
+            )
             yield begin, end
 
 
 def _jump(points: Float[np.ndarray, "t 2 14 2"], at: Bool[np.ndarray, " t"]) -> float:
-    """How far two people move, in sizes, where stretches begin and end; the largest."""
+    """Largest motion of either person, in sizes, where stretches begin and end."""
     middle, radius = centred(points)
     largest = 0.0
     for frame in np.flatnonzero(np.diff(at.astype(int))):
         for person in range(2):
-            there = np.flatnonzero(np.isfinite(radius[:, person]))
-            before, after = there[there <= frame], there[there > frame]
+            visible = np.flatnonzero(np.isfinite(radius[:, person]))
+            before, after = visible[visible <= frame], visible[visible > frame]
             if len(before) and len(after):
                 a, b = before[-1], after[0]
                 moved = np.linalg.norm(middle[b, person] - middle[a, person])

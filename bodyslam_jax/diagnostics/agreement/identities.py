@@ -1,8 +1,8 @@
-"""Who is who between keypoints and bodies: each person once, with all that is theirs.
+"""Identities of people in keypoints and bodies: one row per person.
 
-Trackers lose people and find them under another number, or follow one person twice. As
-keypoints and bodies are usually made by different programs, the one kind tells which
-numbers of the other belong together.
+Trackers lose people and find them again under another number, or follow one person
+twice. As keypoints and bodies usually come from different programs, each kind shows
+which rows of the other belong together.
 """
 
 import functools
@@ -12,25 +12,30 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics.image_points import (
+from bodyslam_jax.diagnostics.agreement.image_points import (
     centred,
     distances,
     people_of,
     project,
 )
-from bodyslam_jax.diagnostics.person_rows import Person, gathered, have_any, in_words
+from bodyslam_jax.diagnostics.agreement.person_rows import (
+    Person,
+    gathered,
+    have_any,
+    in_words,
+)
 from bodyslam_jax.types import Sequence
 
 _SAME = 0.3
-"""Distance of keypoints and bodies, in sizes of a person, below which it is one."""
+"""Distance of keypoints and bodies, in sizes of a person, within one person."""
 _TWICE = 0.15
-"""Distance of two people of one kind below which they are one person followed twice."""
+"""Distance of two rows of one kind below which they follow the same person."""
 _OVERLAP = 0.15
-"""Share of a person's frames that may be another's, too, and the two yet be one."""
+"""Share of frames that two rows of one person may have in common."""
 _MOST = 0.8
 _FEWEST = 3
 _SOON = 5
-"""Frames after which a person without keypoints is still recognised by the place."""
+"""Frames after which a person without keypoints is still recognised by position."""
 _HABIT = 0.05
 """Distance by which other keypoints have to be nearer than those of the same row."""
 
@@ -38,34 +43,34 @@ Warn = Callable[[str], None]
 
 
 def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
-    """The sequence with one row per person; itself if that is how it came."""
+    """The sequence with one row per person; unchanged if it has that already."""
     people = people_of(sequence, body)
-    posed = project(people.camera, people.bodies)
-    there = have_any(sequence)
-    apart = distances(people.keypoints, posed)
-    persons = _pair(apart, there)
-    persons = _joined(persons, apart, (people.keypoints, posed), there)
-    if there[0].any():
-        persons = _attached(persons, apart, posed, there[1])
+    projected = project(people.camera, people.bodies)
+    present = have_any(sequence)
+    apart = distances(people.keypoints, projected)
+    persons = _pair(apart, present)
+    persons = _joined(persons, apart, (people.keypoints, projected), present)
+    if present[0].any():
+        persons = _attached(persons, apart, projected, present[1])
     else:
-        persons = _joined_by_place(persons, posed, there[1], warn)
-    _say_who_is_one(persons, there, warn)
-    persons = _worth_keeping(persons, sequence, posed, apart, there, warn)
+        persons = _joined_by_place(persons, projected, present[1], warn)
+    _say_who_is_one(persons, present, warn)
+    persons = _worth_keeping(persons, sequence, projected, apart, present, warn)
     return gathered(sequence, persons, apart)
 
 
-def _pair(apart, there) -> list[Person]:
-    """Everybody with keypoints, with the bodies that fit them best, then the others.
+def _pair(apart, present) -> list[Person]:
+    """People with keypoints, with the bodies that fit them best, then the others.
 
     Rows of the same number stay together unless other keypoints fit clearly better.
     """
-    seen_at, posed_at = there
+    seen_at, posed_at = present
     middle, count = _medians(apart)
     persons = [Person((int(k),), ()) for k in np.flatnonzero(seen_at.any(1))]
     free = set(np.flatnonzero(posed_at.any(1)).tolist())
     own = np.eye(*middle.shape, dtype=bool)
     cost = np.where(count >= _FEWEST, middle, np.inf) - _HABIT * own
-    # Rows that are never there together say nothing against each other.
+    # Rows that share no frame do not contradict each other.
     cost = np.where(own & (count == 0), _SAME - 0.01, cost)
     paired: dict[int, int] = {}
     for at in np.argsort(cost, axis=None, kind="stable"):
@@ -82,17 +87,17 @@ def _pair(apart, there) -> list[Person]:
     return [*persons, *(Person((), (b,)) for b in sorted(free))]
 
 
-def _joined(persons, apart, points, there) -> list[Person]:
-    """People of whom the one kind lies on the other's, unless at two places."""
+def _joined(persons, apart, points, present) -> list[Person]:
+    """People joined whose keypoints and bodies coincide, unless at two places."""
     middle, count = _medians(apart)
-    # All of what is there for a frame or two only.
-    seen, posed = (at.sum(1) for at in there)
-    enough = np.minimum(_FEWEST, np.minimum(seen[:, None], posed))
+    # Rows of a frame or two count with all their frames.
+    detected, projected = (at.sum(1) for at in present)
+    enough = np.minimum(_FEWEST, np.minimum(detected[:, None], projected))
     fits = (count >= np.maximum(enough, 1)) & (middle < _SAME)
 
     @functools.cache
     def same_place(kind: int, rows_a, rows_b) -> bool:
-        return _same_place(points[kind], rows_a, rows_b, there[kind])
+        return _same_place(points[kind], rows_a, rows_b, present[kind])
 
     def linked(a: Person, b: Person) -> bool:
         crossed = [fits[np.ix_(x.keypoints, y.bodies)] for x, y in ((a, b), (b, a))]
@@ -101,17 +106,17 @@ def _joined(persons, apart, points, there) -> list[Person]:
     def at_two_places(kind: int, rows_a, rows_b) -> bool:
         if not rows_a or not rows_b:
             return False
-        a, b = (there[kind][list(rows)].any(0) for rows in (rows_a, rows_b))
+        a, b = (present[kind][list(rows)].any(0) for rows in (rows_a, rows_b))
         if (a & b).sum() <= _OVERLAP * min(a.sum(), b.sum()):
             return False
         return not same_place(kind, rows_a, rows_b)
 
     def one(a: Person, b: Person) -> bool:
         kinds = ((0, a.keypoints, b.keypoints), (1, a.bodies, b.bodies))
-        known = linked(a, b) or any(
+        measured = linked(a, b) or any(
             x and y and same_place(kind, x, y) for kind, x, y in kinds
         )
-        return known and not any(at_two_places(*kind) for kind in kinds)
+        return measured and not any(at_two_places(*kind) for kind in kinds)
 
     done: list[Person] = []
     waiting = list(persons)
@@ -130,9 +135,9 @@ def _joined(persons, apart, points, there) -> list[Person]:
     return done
 
 
-def _attached(persons, apart, posed, posed_at) -> list[Person]:
-    """Bodies of frames without keypoints, to those that they go on from or lead to."""
-    shape = centred(posed)
+def _attached(persons, apart, projected, posed_at) -> list[Person]:
+    """Bodies in frames without keypoints, joined to the rows that they continue."""
+    shape = centred(projected)
     lone = [
         p
         for p in persons
@@ -167,9 +172,9 @@ def _frames(posed_at, person: Person) -> np.ndarray:
     return np.flatnonzero(posed_at[list(person.bodies)].any(0))
 
 
-def _joined_by_place(persons, posed, posed_at, warn: Warn) -> list[Person]:
-    """Without keypoints: a body that begins where another has just ended."""
-    middle, radius = centred(posed)
+def _joined_by_place(persons, projected, posed_at, warn: Warn) -> list[Person]:
+    """Without keypoints: joins a body that begins where another has just ended."""
+    middle, radius = centred(projected)
     ends = lambda p: _frames(posed_at, p)[[0, -1]]
     done: list[Person] = []
     for person in sorted(persons, key=lambda p: int(ends(p)[0])):
@@ -194,7 +199,7 @@ def _joined_by_place(persons, posed, posed_at, warn: Warn) -> list[Person]:
 
 
 def _goes_on(middle, radius, end, start) -> bool:
-    """Whether who leaves is in the place and of the size of who comes."""
+    """Whether position and size at the end of one row fit the start of another."""
     (last, before), (first, after) = end, start
     a = next((r for r in before if np.isfinite(radius[last, r])), None)
     b = next((r for r in after if np.isfinite(radius[first, r])), None)
@@ -205,10 +210,10 @@ def _goes_on(middle, radius, end, start) -> bool:
     return bool(moved < 0.3 + 0.1 * (first - last) and 0.8 < ratio < 1.25)
 
 
-def _same_place(points, rows_a, rows_b, there) -> bool:
-    """Whether two people are in one place in most of the frames that they share."""
-    shared = there[list(rows_a)].any(0) & there[list(rows_b)].any(0)
-    fewest = min(there[list(rows)].any(0).sum() for rows in (rows_a, rows_b))
+def _same_place(points, rows_a, rows_b, present) -> bool:
+    """Whether two people coincide in most of the frames that they share."""
+    shared = present[list(rows_a)].any(0) & present[list(rows_b)].any(0)
+    fewest = min(present[list(rows)].any(0).sum() for rows in (rows_a, rows_b))
     if shared.sum() <= max(_FEWEST, _OVERLAP * fewest):
         return False
     both = points[shared]
@@ -217,10 +222,10 @@ def _same_place(points, rows_a, rows_b, there) -> bool:
     return bool(near.mean() >= _MOST)
 
 
-def _say_who_is_one(persons, there, warn: Warn) -> None:
+def _say_who_is_one(persons, present, warn: Warn) -> None:
     for person in persons:
         kinds = ("keypoints", person.keypoints), ("bodies", person.bodies)
-        for (what, rows), at in zip(kinds, there, strict=True):
+        for (what, rows), at in zip(kinds, present, strict=True):
             if len(rows) < 2:
                 continue
             twice = int((at[list(rows)].sum(0) > 1).sum())
@@ -231,10 +236,10 @@ def _say_who_is_one(persons, there, warn: Warn) -> None:
             )
 
 
-def _worth_keeping(persons, sequence, posed, apart, there, warn) -> list[Person]:
-    """Without those of whom nothing is there, or whom the image cannot show."""
+def _worth_keeping(persons, sequence, projected, apart, present, warn) -> list[Person]:
+    """Without people who have no data, or are outside the image."""
     width, height = sequence.intrinsics.width, sequence.intrinsics.height
-    seen_at, posed_at = there
+    seen_at, posed_at = present
     for row in range(max(len(seen_at), len(posed_at))):
         if not seen_at[row : row + 1].any() and not posed_at[row : row + 1].any():
             warn(f"person {row} has neither keypoints nor bodies: left out.")
@@ -244,7 +249,7 @@ def _worth_keeping(persons, sequence, posed, apart, there, warn) -> list[Person]
         if person.keypoints or not seen_at.any():
             kept.append(person)
             continue
-        u, v = np.moveaxis(posed[:, rows], -1, 0)
+        u, v = np.moveaxis(projected[:, rows], -1, 0)
         inside = ((u >= 0) & (u < width) & (v >= 0) & (v < height)).any((1, 2))
         share = float((~inside[posed_at[rows].any(0)]).mean())
         who = f"bodies of {in_words(posed_at, rows)}"

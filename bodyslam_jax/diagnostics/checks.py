@@ -1,0 +1,95 @@
+"""Rules by which a result is doubted: checks of figures, reasons, the status.
+
+A result is `failed` if a reason is fatal, `doubtful` if there is any reason, else `ok`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+Status = Literal["ok", "doubtful", "failed"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """A figure and the threshold beyond which it makes a result doubtful."""
+
+    name: str
+    what: str
+    """What the figure is, as the subject of a sentence."""
+    unit: str
+    limit: float
+    advice: str
+    """What to do."""
+    source: str
+    """Where the threshold comes from."""
+    below: bool = False
+    """Whether the limit is a lower bound."""
+
+    def fails(self, figure: float) -> bool:
+        """Whether the figure is beyond the limit; NaN never is."""
+        return figure < self.limit if self.below else figure > self.limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Reason:
+    """Why a result is doubtful or failed: an entry of `reasons` in `summary.json`."""
+
+    name: str
+    message: str
+    """A sentence with the figure and what was expected."""
+    expected: str
+    advice: str
+    figure: float | None = None
+    unit: str = ""
+    person: int | None = None
+    fatal: bool = False
+    """Whether the result as a whole is unusable."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry as written; fields that do not apply are left out."""
+        plain = dataclasses.asdict(self)
+        plain["status"] = "failed" if plain.pop("fatal") else "doubtful"
+        return {k: v for k, v in plain.items() if v is not None and v != ""}
+
+
+def judge(
+    checks: tuple[Check, ...],
+    figures: Mapping[str, float],
+    person: int | None = None,
+) -> list[Reason]:
+    """A reason for each figure beyond its limit.
+
+    Figures that are missing or NaN are not judged; `person` is named in the messages.
+    """
+    found = []
+    for check in checks:
+        figure = float(figures.get(check.name, np.nan))
+        if not check.fails(figure):
+            continue
+        unit = check.unit and f" {check.unit}"
+        bound = "at least" if check.below else "at most"
+        expected = f"{bound} {check.limit:g}{unit}"
+        whose = "" if person is None else f"person {person}: "
+        found.append(
+            Reason(
+                name=check.name,
+                message=f"{whose}{check.what} is {figure:.3g}{unit}, expected "
+                f"{expected}.",
+                expected=expected,
+                advice=check.advice,
+                figure=figure,
+                unit=check.unit,
+                person=person,
+            )
+        )
+    return found
+
+
+def status_of(reasons: list[Reason]) -> Status:
+    """The status of a result with these reasons."""
+    if any(reason.fatal for reason in reasons):
+        return "failed"
+    return "doubtful" if reasons else "ok"

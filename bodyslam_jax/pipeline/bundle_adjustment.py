@@ -1,0 +1,122 @@
+"""Bundle adjustment of all frames and landmarks, and of a guessed focal length.
+
+A guessed focal length is a variable with a wide prior around the guess; parallax and
+rotation that do not fit together determine it. Distortion is not estimated here.
+"""
+
+import dataclasses
+import logging
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import graph, initialisation, solver
+from bodyslam_jax.config import Config, Structure
+from bodyslam_jax.types import Intrinsics, SfmResult
+
+log = logging.getLogger(__name__)
+
+HELD_SIGMA = 1e-6
+"""Relative sigma of a prior that holds the focal length constant."""
+ERROR_PER_SIGMA = 1.18
+"""Median length of a two-dimensional normal error with unit sigma."""
+
+_SAME_FOCAL = 0.005
+"""Relative change of the focal length beyond which the priors of landmarks, which were
+triangulated with the former one, are dropped."""
+_ASPECT_SIGMA = 1e-4
+"""Sigma of the difference of fx and fy, relative to the focal length."""
+_OUTLIER = 10.0
+"""Residuals beyond this many sigmas are outliers."""
+
+
+def adjust(
+    cameras: SfmResult, sigma: float, config: Config, guess: Intrinsics | None
+) -> SfmResult:
+    """Cameras and map at the optimum, with inliers and noise measured anew.
+
+    Args:
+        sigma: standard deviation of the observations, px.
+        guess: the intrinsics that the focal length's prior is centred on; `None` holds
+            all intrinsics constant.
+    """
+    nobody = initialisation.no_people(len(cameras.T_WC))
+    state = initialisation.first_state(
+        cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
+    )
+    # A noise that is set for the joint graph is not that of the observations.
+    weights = dataclasses.replace(config.weights, pixel_sigma=None)
+    factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
+    prior = initialisation.revisit_factor(
+        cameras.prior_mean, cameras.prior_information, sigma
+    )
+    if guess is not None and config.structure.focal_sigma > HELD_SIGMA:
+        # Prior means were triangulated with the focal length that is now a variable.
+        prior = dataclasses.replace(prior, whitening=0 * prior.whitening)
+    path = initialisation.path_factors(cameras.path, cameras.path_known)
+    problem = _problem([factor, prior, *path], state, config.structure, guess)
+    solution = solver.solve(problem, state)
+    before = float(solution.first_cost)
+    log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
+    state = solution.state
+    focal_sigma = float("nan")
+    prior_information = cameras.prior_information
+    if abs(float(state.intrinsics[0]) / cameras.focal - 1) > _SAME_FOCAL:
+        prior_information = np.zeros_like(prior_information)
+    if guess is not None:
+        covariance = solver.marginals(problem, state).intrinsics
+        focal_sigma = float(np.sqrt(config.structure.focal_runs * covariance[0, 0]))
+    error = sigma * np.linalg.norm(np.asarray(_residual(factor, state)), axis=-1)
+    keep = cameras.keep
+    noise = (
+        clipped_sigma(np.median(error[keep]) / ERROR_PER_SIGMA) if keep.any() else 1.0
+    )
+    return dataclasses.replace(
+        cameras,
+        T_WC=np.asarray(state.cameras),
+        landmarks=np.asarray(state.landmarks),
+        intrinsics=np.asarray(state.intrinsics),
+        focal_sigma=focal_sigma,
+        keep=keep & (error < _OUTLIER * noise),
+        prior_information=prior_information,
+        pixel_sigma=noise,
+        costs=(before, float(solution.cost)),
+    )
+
+
+def clipped_sigma(sigma: float) -> float:
+    """A measured noise, px, within the range that the graph allows."""
+    low, high = initialisation.PIXEL_SIGMA_RANGE
+    return float(np.clip(sigma, low, high))
+
+
+_residual = eqx.filter_jit(lambda factor, state: factor.residual(state))
+
+
+def _problem(
+    factors: list[graph.Factor],
+    state: graph.State,
+    structure: Structure,
+    guess: Intrinsics | None,
+) -> graph.Problem:
+    if guess is None:
+        return graph.make_problem(factors, state)
+    params = np.asarray(guess.params, float)
+    focal = params[0]
+    # Errors of a track are temporally correlated, so that `focal_runs` observations
+    # count as one. Multiplying the prior's information by that number has the same
+    # effect on the focal length as dividing that of the observations.
+    sigma = np.full(len(params), HELD_SIGMA * focal)
+    error = guess.focal_sigma or structure.focal_sigma * focal
+    sigma[:2] = min(error, structure.focal_sigma * focal) / np.sqrt(
+        structure.focal_runs
+    )
+    factors = [
+        *factors,
+        graph.IntrinsicsPrior(jnp.asarray(params)[None], jnp.asarray(sigma)[None]),
+        graph.AspectRatioPrior(
+            jnp.asarray([_ASPECT_SIGMA * focal]), ratio=float(focal / params[1])
+        ),
+    ]
+    return graph.make_problem(factors, state, free_intrinsics=True)

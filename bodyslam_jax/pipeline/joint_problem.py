@@ -1,0 +1,319 @@
+"""The joint problem and its start: cameras, people, map and scale in one graph."""
+
+import dataclasses
+import functools
+import logging
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax import graph, initialisation, motion, people
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import PATH_SIGMA, Config, Measured
+from bodyslam_jax.people import PersonState
+from bodyslam_jax.pipeline.motion_prediction import motion_predictor, predict
+from bodyslam_jax.pipeline.solve_stage import solve_stage
+from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
+
+log = logging.getLogger(__name__)
+
+Passengers = dict[int, tuple[float, float]]
+"""People whose steps are no measurement of scale, as something carries them: their
+number -> speeds over the ground as `initialisation.carried` returns them, m/s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A joint problem and where its solution starts."""
+
+    problem: graph.Problem
+    state: graph.State
+    scale: ScaleStart
+    roots: PersonState
+    moving: bool
+    """Whether the camera moves, so that its path has a scale to be estimated."""
+    stages: tuple[dict, ...]
+    """Report entries of the solves made on the way."""
+    warnings: tuple[str, ...] = ()
+    """Lines for the report."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _StartingPeople:
+    """`h` people before the joint problem."""
+
+    roots: PersonState
+    """Start values, with known statures applied."""
+    shape: Float[np.ndarray, "h 10"]
+    """SMPL β that the shape prior is centred on."""
+    fitted: Bool[np.ndarray, " h"]
+    """Whether the bodies were fitted to keypoints, not regressed from images."""
+    statures: dict[int, Measured]
+    """Measured statures and their sigma, m, by person."""
+
+
+def prepare(
+    sequence: Sequence,
+    cameras: SfmResult,
+    bodies: Bodies,
+    body: BodyModel,
+    config: Config,
+    *,
+    body_only_solve: bool = True,
+) -> Prepared:
+    """The body-only solve, the first scale in closed form, then the whole graph.
+
+    Without `body_only_solve` nothing is solved: people start as their bodies are given.
+
+    Body poses are fitted to keypoints before the motion model reads them: a regressor's
+    errors in orientation bias the displacements that are predicted from it.
+
+    **Raises:** `ValueError` if there is neither a moving camera nor a person.
+    """
+    weights, moving = config.weights, cameras.kind == "moving"
+    crowd = _starting_people(sequence, cameras, bodies, body, config)
+    roots = crowd.roots
+    state = initialisation.first_state(
+        cameras.T_WC, cameras.landmarks, roots, cameras.intrinsics
+    )
+    predictor = motion_predictor(sequence, roots, body, config)
+    anybody = len(roots.present) > 0
+    make = functools.partial(
+        _make_problem,
+        cameras=cameras,
+        predictor=predictor if anybody else None,
+        free=None if moving else initialisation.free_people(state),
+    )
+    factors = _camera_factors(cameras, config) if moving else []
+    start, passengers, stages, prediction = ScaleStart(), {}, (), None
+    if anybody:
+        prediction = predict(predictor, state)
+        people_factors, contact = _people_factors(
+            sequence, cameras, crowd, state, prediction, body, config
+        )
+        factors += people_factors
+        present = roots.present & cameras.registered
+        motion_factors = functools.partial(
+            _motion_factors,
+            shared_error=_shared_error(crowd.fitted, config),
+            fps=sequence.fps,
+            body=body,
+            config=config,
+        )
+        if body_only_solve:
+            start_factors = motion_factors(prediction, state, passengers)
+            problem = make([*factors, *start_factors], state)
+            state, stage = solve_body_only(problem, state, config)
+            stages = (stage,)
+            prediction = predict(predictor, state)
+        start, passengers = _start_of_scale(
+            sequence, cameras, crowd, state, prediction, contact, present, config
+        )
+        factors += motion_factors(prediction, state, passengers)
+    elif moving and np.isfinite(cameras.path_scale):
+        start = ScaleStart(
+            path=cameras.path_scale, path_error=PATH_SIGMA * cameras.path_scale
+        )
+    if moving and (anybody or np.isfinite(cameras.path_scale)):
+        state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
+    if not factors:
+        raise ValueError(
+            f"{sequence.name}: no landmarks and no people; expected a camera moving "
+            "before a textured background, or people's keypoints."
+        )
+    problem = make(factors, state)
+    if config.motion_coupling == "frozen":
+        if anybody and weights.posture_predicted:
+            problem = problem.with_prediction({"body_pose": prediction.body_pose})
+        problem = dataclasses.replace(problem, motion=None)
+    warnings = initialisation.lines_of_carried(passengers)
+    return Prepared(problem, state, start, roots, moving, stages, warnings)
+
+
+def solve_body_only(
+    problem: graph.Problem, state: graph.State, config: Config
+) -> tuple[graph.State, dict]:
+    """The body-only solve: people in the camera frame, all else held constant.
+
+    The problem keeps its factors and shapes, so that it shares the compiled program of
+    the joint problem; factors that tie people to the world are disabled.
+    """
+    alone = graph.disable(
+        problem,
+        graph.Reprojection,
+        graph.HumanMotion,
+        graph.RelativeOrientation,
+        graph.RootSmoothness,
+        graph.GroundContact,
+    )
+    rest = ("scale", "cameras", "landmarks", "intrinsics")
+    alone = dataclasses.replace(alone, free=graph.set_constant(alone.free, *rest))
+    solution, stage = solve_stage(alone, state, config, "bodies only")
+    return solution.state, stage
+
+
+def _starting_people(
+    sequence: Sequence,
+    cameras: SfmResult,
+    bodies: Bodies,
+    body: BodyModel,
+    config: Config,
+) -> _StartingPeople:
+    bodies = dataclasses.replace(bodies, present=bodies.present & cameras.within)
+    roots = people.roots_from_bodies(bodies, body)
+    fitted = people.without_bodies(sequence)
+    numbers = config.person or range(len(roots.present))
+    statures = people.statures_of(config.heights(), list(dict.fromkeys(numbers)))
+    shape = roots.shape
+    if statures:
+        unsure = np.where(fitted, 1.0, config.weights.shape_sigma)
+        roots = people.with_statures(roots, statures, body, unsure)
+        # The prior of a fitted shape has a sigma that is smaller than its uncertainty
+        # (`diagnostics.scale_uncertainty`), so it must not pull away from the stature.
+        shape = np.where(fitted[:, None], roots.shape, shape)
+    return _StartingPeople(roots, shape, fitted, statures)
+
+
+def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
+    """Factors of a moving camera: the map, loop closures, a given path."""
+    weights = config.weights
+    sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
+    return [
+        initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights),
+        initialisation.revisit_factor(
+            cameras.prior_mean, cameras.prior_information, sigma
+        ),
+        *initialisation.path_factors(
+            cameras.path, cameras.path_known, cameras.path_scale
+        ),
+    ]
+
+
+def _people_factors(
+    sequence: Sequence,
+    cameras: SfmResult,
+    crowd: _StartingPeople,
+    state: graph.State,
+    prediction: motion.Prediction,
+    body: BodyModel,
+    config: Config,
+) -> tuple[list[graph.Factor], graph.GroundContact | None]:
+    """Factors of people but for their motion, and the one of ground contact, if any,
+    which is among them."""
+    weights, roots = config.weights, crowd.roots
+    predicted = prediction.valid if weights.posture_predicted else None
+    factors = initialisation.people_factors(
+        sequence, roots, weights, body, shape=crowd.shape, predicted=predicted
+    )
+    if crowd.statures:
+        factors.append(
+            initialisation.stature_factor(crowd.statures, roots.present, body)
+        )
+    contact = None
+    if cameras.kind == "moving":
+        contact = initialisation.ground_contact(
+            state, roots, cameras.registered, sequence.keypoints, body, weights
+        )
+    present = roots.present & cameras.registered
+    upright = initialisation.upright_factor(state, present, sequence.fps, weights)
+    factors += [factor for factor in (contact, upright) if factor is not None]
+    return factors, contact
+
+
+def _motion_factors(
+    prediction: motion.Prediction,
+    state: graph.State,
+    passengers: Passengers,
+    *,
+    shared_error: Float[np.ndarray, " h"],
+    fps: float,
+    body: BodyModel,
+    config: Config,
+) -> list[graph.Factor]:
+    """Factors of people's motion in the world."""
+    return [
+        initialisation.motion_factor(
+            prediction,
+            state.shapes,
+            body,
+            config.weights,
+            shared_error=shared_error,
+            without=passengers,
+        ),
+        *initialisation.optional_factors(prediction, fps, config.weights),
+    ]
+
+
+def _start_of_scale(
+    sequence: Sequence,
+    cameras: SfmResult,
+    crowd: _StartingPeople,
+    state: graph.State,
+    prediction: motion.Prediction,
+    contact: graph.GroundContact | None,
+    present: Bool[np.ndarray, "h t"],
+    config: Config,
+) -> tuple[ScaleStart, Passengers]:
+    """The first scale from all cues, and the people whose steps are left out of it.
+
+    Passengers are found by their speed at the scale of the other cues, so only where
+    there are others; a camera that does not move has scale 1.
+    """
+    if cameras.kind != "moving":
+        found = initialisation.carried(state, prediction, present, 1.0, sequence.fps)
+        return ScaleStart(), found
+    shared_error = _shared_error(crowd.fitted, config)
+    somewhere = crowd.roots.present.any(axis=1)
+    estimate = lambda without: initialisation.scale_start(
+        state,
+        prediction,
+        contact,
+        shared_error=float(
+            (shared_error[somewhere] if somewhere.any() else shared_error).min()
+        ),
+        path=cameras.path_scale,
+        without=without,
+    )
+    start, passengers = estimate(()), {}
+    others = start.without_motion()
+    if np.isfinite(others.standard_error):
+        passengers = initialisation.carried(
+            state, prediction, present, others.value, sequence.fps
+        )
+        start = estimate(passengers) if passengers else start
+    log.info(
+        "scale: %.4g ± %.2g (motion %.4g ± %.2g, ground %.4g ± %.2g)",
+        *(start.value, start.standard_error),
+        *(start.motion, start.motion_error),
+        *(start.ground, start.ground_error),
+    )
+    return start, passengers
+
+
+def _shared_error(
+    fitted: Bool[np.ndarray, " h"], config: Config
+) -> Float[np.ndarray, " h"]:
+    """Relative error that all steps of a person have in common."""
+    weights = config.weights
+    return np.where(fitted, weights.fitted_step_error, weights.step_error)
+
+
+def _make_problem(
+    factors: list[graph.Factor],
+    state: graph.State,
+    *,
+    cameras: SfmResult,
+    predictor: graph.MotionPredictor | None,
+    free: graph.Step | None,
+) -> graph.Problem:
+    """The problem, with cameras beyond a cut of the video held constant: no factor
+    determines them."""
+    problem = graph.make_problem(factors, state, motion=predictor, free=free)
+    within = cameras.within
+    if within.all() or cameras.kind != "moving":
+        return problem
+    mask = jnp.zeros_like(problem.free.cameras)
+    mask = mask.at[within].set(graph.gauge(state.cameras[within]))
+    return eqx.tree_at(lambda p: p.free.cameras, problem, mask)

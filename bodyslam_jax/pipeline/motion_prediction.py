@@ -1,0 +1,31 @@
+"""The motion model's predictions for the frames of one sequence."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from bodyslam_jax import graph, motion
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import Config
+from bodyslam_jax.people import PersonState
+from bodyslam_jax.types import Sequence
+
+
+def motion_predictor(
+    sequence: Sequence, roots: PersonState, body: BodyModel, config: Config
+) -> graph.MotionPredictor:
+    """The motion model, resampled to the times of the sequence's frames."""
+    model = motion.load_motion_model(config.motion_model)
+    clock = motion.make_clock(sequence.timestamps, model.fps)
+    present = jnp.asarray(roots.present)
+    return graph.MotionPredictor(motion.predict_between, (model, clock), body, present)
+
+
+def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Prediction:
+    """The motion model's prediction for the people of a state."""
+    # Landmarks have no part in it. Without them the program's shapes are those of the
+    # people alone, so that maps of different sizes share one compilation.
+    none = jnp.zeros((0, 3), state.landmarks.dtype)
+    return _predict(predictor, eqx.tree_at(lambda s: s.landmarks, state, none))
+
+
+_predict = eqx.filter_jit(lambda predictor, state: predictor(state))

@@ -1,0 +1,134 @@
+"""People: found in the images where no keypoints are given, then fitted as bodies."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bodyslam_jax import io, people
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import Config
+from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
+from bodyslam_jax.types import Bodies, Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class Detections:
+    """People found in all images, one frame after the other."""
+
+    count: Int[np.ndarray, " t"]
+    """People in each frame."""
+    points: Float[np.ndarray, "p 25 3"]
+    """BODY_25: u px, v px, confidence"""
+
+    def by_frame(self) -> list[np.ndarray]:
+        """The people of each frame."""
+        return np.split(self.points, np.cumsum(self.count)[:-1])
+
+
+def check_people(sequence: Sequence, config: Config) -> None:
+    """Refuses an input in which nobody can be found, before anything is computed.
+
+    **Raises:** `ValueError` if people are to be estimated, but there are neither
+    keypoints nor bodies, nor images to find them in.
+    """
+    given = sequence.keypoints is not None or sequence.bodies is not None
+    if not config.people or given:
+        return
+    if sequence.frames is not None and config.detect != "none":
+        return
+    raise ValueError(
+        f"{sequence.name}: neither keypoints nor bodies, nor images to find people "
+        "in (or --detect none), so nobody to estimate; give one of them, or leave "
+        "people out with --no-people."
+    )
+
+
+def find_people(
+    sequence: Sequence, config: Config = Config(), cache: Cache = Cache(None)
+) -> Sequence:
+    """The sequence with people found in its images, as `run` finds them.
+
+    **Raises:** as `run`.
+    """
+    return detect(sequence, config, cache, Stopwatch())
+
+
+def detect(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """The sequence with keypoints of the people in its images, if it has none.
+
+    Unchanged where there are no images, and where nobody is to be estimated and given
+    masks or tracks already keep people out of the map.
+    """
+    if config.detect == "none" or sequence.keypoints is not None:
+        return sequence
+    masked = sequence.masks is not None or sequence.tracks is not None
+    if sequence.frames is None or (masked and not config.people):
+        return sequence
+    if config.detect == "yolox":
+        return _detect_per_frame(sequence, config, cache, watch)
+    return _detect_and_track(sequence, config, cache, watch)
+
+
+def _detect_per_frame(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """People of every frame by YOLOX and RTMPose, then associated over time."""
+
+    def compute() -> Detections:
+        found = people.detect_people(
+            io.frames(sequence),
+            config.detection,
+            offline=config.offline,
+            progress=Counter("detection", sequence.num_frames),
+        )
+        count = np.array([len(points) for points in found])
+        return Detections(count, np.concatenate(found))
+
+    key = fingerprint(sequence, config.detection)
+    with watch("detection"):
+        found = cache.stage("detection", key, Detections, compute)
+    return io.with_detections(sequence, found.by_frame(), config.association)
+
+
+def _detect_and_track(
+    sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
+) -> Sequence:
+    """People by the networks that ship, which detect and track in one pass."""
+    compute = lambda: people.find_people_tracked(
+        io.frames(sequence),
+        sequence.fps,
+        config.detection,
+        config.association,
+        Counter("detection", sequence.num_frames),
+    )
+    with watch("detection"):
+        key = fingerprint(sequence, config.detection, config.association)
+        found = cache.stage("detection", key, people.Found, compute)
+    points, person = found.by_frame(sequence.num_frames)
+    sequence = io.with_detections(
+        with_warnings(sequence, found.warnings),
+        points,
+        config.association,
+        person=person,
+        detected=found.detected(),
+    )
+    if sequence.keypoints is None:
+        return sequence
+    keypoints = people.with_depths(sequence.keypoints, found, sequence.intrinsics)
+    return dataclasses.replace(sequence, keypoints=keypoints)
+
+
+def estimate_bodies(sequence: Sequence, body: BodyModel, config: Config) -> Bodies:
+    """Bodies in the camera frame; of nobody where people are not to be estimated."""
+    if not config.people:
+        return people.nobody(sequence.num_frames)
+    return people.estimate_bodies(sequence, body, config.people_fit)
+
+
+def with_warnings(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
+    """The sequence with `warnings` after its own."""
+    return dataclasses.replace(sequence, warnings=(*sequence.warnings, *warnings))

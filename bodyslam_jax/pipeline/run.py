@@ -1,0 +1,142 @@
+"""The whole flow: video -> people -> tracks -> cameras -> bodies -> graph -> result.
+
+Each stage's result is kept in a `Cache` under a fingerprint of all that it depends on.
+"""
+
+import dataclasses
+
+from bodyslam_jax import diagnostics, motion, people, sfm
+from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.config import Config
+from bodyslam_jax.export.summary import summarise
+from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
+from bodyslam_jax.pipeline.default_body import with_compatible_body
+from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.people_stage import with_warnings
+from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
+from bodyslam_jax.pipeline.to_metric import to_metric
+from bodyslam_jax.types import (
+    Bodies,
+    JointEstimate,
+    Result,
+    Sequence,
+    SfmResult,
+    Tracks,
+)
+
+_FEWEST_FRAMES = 3
+
+
+def run(
+    sequence: Sequence, config: Config = Config(), *, cache: Cache = Cache(None)
+) -> Result:
+    """Estimates cameras, people and map in metres; `cache` keeps finished stages.
+
+    **Raises:** `ValueError`, in one line, if the sequence holds nothing that cameras or
+    people can be estimated from.
+    """
+    config, warnings = with_compatible_body(config)
+    return run_stages(with_warnings(sequence, warnings), config, cache)[0]
+
+
+def run_stages(
+    sequence: Sequence, config: Config, cache: Cache
+) -> tuple[Result, SfmResult]:
+    """`run`, and the cameras before the joint estimate.
+
+    **Raises:** as `run`.
+    """
+    _check_length(sequence)
+    watch = Stopwatch()
+    body = load_body_model(config.body_model)
+    model = motion.load_motion_model(config.motion_model)
+    if config.people:  # Before minutes are spent on the stages that need no motion.
+        motion.check_compatible(model, body, model.fps)
+    sequence = people_stage.detect(sequence, config, cache, watch)
+    sequence = diagnostics.reconcile(sequence, body)
+    cameras, bodies = before_joint(sequence, body, config, cache, watch)
+    key = fingerprint(sequence, config)
+    sequence = people.select_people(sequence, config.person)
+    refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+    with watch("joint"):
+        joint = cache.stage(
+            "joint",
+            key,
+            JointEstimate,
+            lambda: joint_stage.estimate(refined, cameras, bodies, body, config),
+        )
+    return assemble(sequence, config, body, cameras, joint, watch.seconds), cameras
+
+
+def before_joint(
+    sequence: Sequence,
+    body: BodyModel,
+    config: Config,
+    cache: Cache = Cache(None),
+    watch: Stopwatch | None = None,
+) -> tuple[SfmResult, Bodies]:
+    """Cameras and map up to scale, and bodies in the camera frame: the start values of
+    the graph.
+
+    **Raises:** as `run`.
+    """
+    watch = watch or Stopwatch()
+    key = fingerprint(sequence, config.tracking)
+    with watch("tracks"):
+        tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
+    key = fingerprint(
+        key, config.structure, config.weights.landmark_loss, config.static_camera
+    )
+    with watch("cameras"):
+        cameras = cache.stage(
+            "cameras",
+            key,
+            SfmResult,
+            lambda: sfm_stage.estimate(sequence, tracks, config),
+        )
+    sequence = people.select_people(sequence, config.person)
+    sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+    model = body_model_file(config.body_model)
+    key = fingerprint(sequence, config.people_fit, config.people, model)
+    with watch("people"):
+        bodies = cache.stage(
+            "people",
+            key,
+            Bodies,
+            lambda: people_stage.estimate_bodies(sequence, body, config),
+        )
+    return cameras, bodies
+
+
+def assemble(
+    sequence: Sequence,
+    config: Config,
+    body: BodyModel,
+    cameras: SfmResult,
+    joint: JointEstimate,
+    seconds: dict[str, float],
+) -> Result:
+    """The joint estimate in metres, judged, with its summary.
+
+    `seconds` are the durations of the stages, for the summary.
+    """
+    result, up = to_metric(sequence, config, body, cameras, joint)
+    verdict = diagnostics.assess(sequence, body, cameras, joint, result, up)
+    summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
+    return dataclasses.replace(result, summary=summary)
+
+
+def _check_length(sequence: Sequence) -> None:
+    if sequence.num_frames < _FEWEST_FRAMES:
+        raise ValueError(
+            f"{sequence.name}: {sequence.num_frames} frames, expected at least "
+            f"{_FEWEST_FRAMES}: size and motion come from what moves."
+        )
+
+
+def _tracks(sequence: Sequence, config: Config) -> Tracks:
+    if sequence.tracks is not None:
+        return sequence.tracks
+    counter = Counter("tracks", sequence.num_frames)
+    return sfm.track(sequence, config.tracking, lambda k, _: counter(k))
