@@ -17,6 +17,7 @@ from test_people_detect import constant_network, raw_output
 from bodyslam_jax import cli, io, people, pipeline, sfm
 from bodyslam_jax.cli import interrupts
 from bodyslam_jax.config import Config
+from bodyslam_jax.pipeline import people_stage
 from bodyslam_jax.pipeline.stage_cache import Cache
 
 NUM = 8
@@ -129,7 +130,7 @@ def test_an_interrupt_that_is_not_noticed_ends_the_process_all_the_same():
 
 def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path):
     cache = Cache(tmp_path, {"name": "a"})
-    kind = pipeline.Detections
+    kind = people_stage.Detections
     value = kind(np.array([1, 0, 2]), np.ones((3, 25, 3)))
     cache.stage("detection", "k", kind, lambda: value)
     (file,) = tmp_path.glob("*.npz")

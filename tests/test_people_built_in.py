@@ -12,6 +12,8 @@ from bodyslam_jax import io, people, pipeline, sfm, simulation
 from bodyslam_jax.config import Config, Detect, Simulation
 from bodyslam_jax.people import blazepose, depths, movenet, networks
 from bodyslam_jax.people import found as found_
+from bodyslam_jax.pipeline import people_stage
+from bodyslam_jax.pipeline.progress import Stopwatch
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.types import Bodies, Intrinsics, Sequence
@@ -162,7 +164,7 @@ def test_given_keypoints_come_first(scene, detect, monkeypatch):
         given = dataclasses.replace(given, keypoints=None)
     given = dataclasses.replace(given, frames=Path("video.mp4"))
     config = Config(detect=detect)
-    found = pipeline._detected(given, config, Cache(None), pipeline.Stopwatch())
+    found = people_stage.detect(given, config, Cache(None), Stopwatch())
     assert found is given
 
 
