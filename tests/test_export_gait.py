@@ -62,23 +62,23 @@ def test_a_walk_is_too_fast_where_its_frame_rate_is_twice_the_true_one(walk):
     seen = diagnostics.gait(walk, 0)
     assert not seen.is_fast_motion()
     hurried = diagnostics.gait(changed(walk, timestamps=walk.timestamps / 2), 0)
-    assert hurried.is_fast_motion() and not hurried.iscadence_warning()
+    assert hurried.is_fast_motion() and not hurried.is_slow_motion()
     (line,) = cadence_warning(0, hurried, 0.05, 60.0)
     assert "60 fps is not the video's frame rate" in line
 
 
 def test_a_walk_is_not_slow_motion_until_it_is_slowed(walk):
     seen = diagnostics.gait(walk, 0)
-    assert 0.75 < seen.slowness < 1.3 and not seen.iscadence_warning()
+    assert 0.75 < seen.slowness < 1.3 and not seen.is_slow_motion()
     slowed = diagnostics.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
     assert slowed.slowness == pytest.approx(2.2 * seen.slowness)
     assert slowed.step == pytest.approx(seen.step)
-    assert slowed.iscadence_warning()
+    assert slowed.is_slow_motion()
     # Steps that may be shorter by half need not be of slow motion.
-    assert not slowed.iscadence_warning(0.5)
+    assert not slowed.is_slow_motion(0.5)
 
 
-def test_size_has_little_to_say_and_the_way_nothing(walk):
+def test_slowness_depends_little_on_size_and_not_on_direction(walk):
     seen = diagnostics.gait(walk, 0)
     taller = diagnostics.gait(changed(walk, joints=1.2 * walk.joints), 0)
     assert taller.step == pytest.approx(seen.step)
@@ -90,7 +90,7 @@ def test_size_has_little_to_say_and_the_way_nothing(walk):
     assert diagnostics.gait(turned, 0).slowness == pytest.approx(seen.slowness)
 
 
-def test_only_while_there(stilts):
+def test_gait_uses_frames_with_the_person_only(stilts):
     partly = stilts.present.copy()
     partly[0, :20] = False
     noise = np.random.default_rng(0).standard_normal((20, 24, 3))
@@ -100,7 +100,7 @@ def test_only_while_there(stilts):
     assert found.frequency == pytest.approx(2 * FPS / PERIOD)
 
 
-def test_who_does_not_walk_has_no_gait(stilts):
+def test_no_gait_without_regular_steps(stilts):
     nobody = np.zeros_like(stilts.present)
     assert diagnostics.gait(changed(stilts, present=nobody), 0) is None
     briefly = nobody.copy()
@@ -115,10 +115,10 @@ def test_who_does_not_walk_has_no_gait(stilts):
     on_the_spot = stilts.joints.copy()
     on_the_spot[..., 2] -= on_the_spot[:, :, :1, 2]
     spot = changed(stilts, joints=on_the_spot, timestamps=9 * stilts.timestamps)
-    assert not diagnostics.gait(spot, 0).iscadence_warning()
+    assert not diagnostics.gait(spot, 0).is_slow_motion()
 
 
-def test_a_line_tells_of_it_as_far_as_metres_are_known(walk):
+def test_a_warning_of_slow_motion_respects_the_error_of_lengths(walk):
     steps = diagnostics.gait(changed(walk, timestamps=2.2 * walk.timestamps), 0)
     (line,) = cadence_warning(1, steps, np.nan, 25.0)
     assert "person 1 takes" in line and "25 fps is not its frame rate" in line
