@@ -18,7 +18,7 @@ from peer_jaxls import Point, solve
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.graph import Frame, Shared, lift, retract_pose, retract_rotation
+from bodyslam_jax.graph import Frame, Shared, retract_pose, retract_rotation
 
 eye, zeros = lambda: jnp.eye(4), lambda *shape: lambda: jnp.zeros(shape)
 
@@ -59,7 +59,7 @@ LOCAL = ("camera", "root", "pose")
 def lifted(factor, residual):
     """Whose squared norm is the robust cost; jaxls has squares only."""
     plain = isinstance(factor.loss, g.Squared)
-    return (residual if plain else lift(factor.loss, residual)).ravel()
+    return (residual if plain else robustify(factor.loss, residual)).ravel()
 
 
 def of_landmarks(factor, state):

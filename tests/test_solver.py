@@ -33,7 +33,7 @@ from bodyslam_jax.solver.gmres import RESTART, gmres
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad
-from bodyslam_jax.solver.second_order import bend, curvature_of, next_share
+from bodyslam_jax.solver.second_order import add_second_order, curvature_of, next_share
 from bodyslam_jax.solver.solve import check_start
 from bodyslam_jax.solver.triangular import invert_lower
 
@@ -149,7 +149,7 @@ def test_gauss_newton_reaches_the_same_optimum():
 def test_last_steps_know_what_keypoints_bend():
     problem, _, start = make(2, people=1, frames=12, noise=5.0)
     robust = g.Reprojection, g.KeypointReprojection
-    # What weights of robust losses bend is left out, and would hide the rest.
+    # What weights of robust losses add_second_order is left out, and would hide the rest.
     factors = tuple(
         dataclasses.replace(f, loss=g.Squared()) if isinstance(f, robust) else f
         for f in problem.factors
@@ -201,7 +201,7 @@ def test_a_share_of_the_curvature_of_all_keypoints_joins_the_equations(dtype):
     assert all(x.dtype == dtype and jnp.any(x != 0) for x in jax.tree.leaves(one))
     assert eqx.tree_equal(two, jax.tree.map(lambda x: 2 * x, one), rtol=1e-5)
     # The share has the state's precision, which blocks may not have.
-    found = bend(lin, one, jnp.asarray(0.25, state.scale.dtype))
+    found = add_second_order(lin, one, jnp.asarray(0.25, state.scale.dtype))
     for key, more in one.blocks.items():
         assert found.blocks[key].dtype == dtype
         assert jnp.allclose(found.blocks[key], 1 + more / 4)
@@ -478,7 +478,7 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
     assert (problem.layout.order is not None) == options.get("again", False)
     jac, _ = dense(problem, state)
     hessian = jac.T @ jac
-    # Away from a minimum what keypoints bend may leave no inverse.
+    # Away from a minimum what keypoints add_second_order may leave no inverse.
     if at == "minimum":
         hessian = hessian + bent(problem, state)
     else:
