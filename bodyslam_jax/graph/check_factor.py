@@ -1,6 +1,7 @@
 """`check_factor`: whether a custom factor is one that the solver can rely on."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -73,7 +74,8 @@ def check_factor(factor: Factor, state: State) -> FactorReport:
 
 
 def _residual(factor: Factor, state: State, name: str) -> Array:
-    residual = factor.residual(state)
+    # Frames are mapped, so that code that cannot be traced fails here already.
+    residual = _traced(name, "jax.vmap", lambda: factor.residual(state))
     if not isinstance(residual, jax.Array) or residual.ndim < 1:
         raise ValueError(
             f"{name}.frame_residual: found {type(residual).__name__} of shape "
@@ -153,19 +155,24 @@ def _check_transformed(factor: Factor, state: State, name: str) -> None:
         "jax.vmap": lambda: eqx.filter_vmap(plain, in_axes=(None, 0))(factor, both),
     }
     for way, cost in ways.items():
-        try:
-            found = np.asarray(cost())
-        except (jax.errors.JAXTypeError, TypeError) as error:
-            line = str(error).splitlines()[0]
-            raise ValueError(
-                f"{name}.frame_residual: cannot be traced by {way} ({line:.120}); "
-                "expected jax.numpy and no `if` on values."
-            ) from error
+        found = np.asarray(_traced(name, way, cost))
         if not np.allclose(found, expected, rtol=_SAME[str(state.scale.dtype)]):
             raise ValueError(
                 f"{name}.frame_residual: the cost is {found.ravel()[0]:.9g} under "
                 f"{way}, expected {expected:.9g} as without it."
             )
+
+
+def _traced(name: str, way: str, call: Callable[[], Any]) -> Any:
+    """What `call` returns, or one line if it does what cannot be traced."""
+    try:
+        return call()
+    except jax.errors.JAXTypeError as error:
+        line = str(error).splitlines()[0]
+        raise ValueError(
+            f"{name}.frame_residual: cannot be traced by {way} ({line:.120}); expected "
+            "jax.numpy, and no `if` on values."
+        ) from error
 
 
 @eqx.filter_jit
