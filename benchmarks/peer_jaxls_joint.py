@@ -18,7 +18,7 @@ from peer_jaxls import Point, solve
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.graph import Frame, Shared, retract_pose, retract_rotation
+from bodyslam_jax.graph import Frame, Shared, retract_pose, retract_rotation, robustify
 
 eye, zeros = lambda: jnp.eye(4), lambda *shape: lambda: jnp.zeros(shape)
 

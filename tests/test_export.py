@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+from pathlib import Path
 
 import jax.numpy as jnp
 import jaxlie
@@ -157,10 +158,11 @@ def test_interrupted_move_does_not_look_whole(tmp_path, result, monkeypatch):
     calls = []
 
     def replace_twice(source, target):
-        calls.append(target)
+        if Path(target).parent == tmp_path:
+            calls.append(target)
         if len(calls) > 2:
             raise KeyboardInterrupt
-        source.rename(target)
+        Path(source).rename(target)
 
     monkeypatch.setattr("os.replace", replace_twice)
     with pytest.raises(KeyboardInterrupt):

@@ -149,7 +149,7 @@ def test_gauss_newton_reaches_the_same_optimum():
 def test_last_steps_know_what_keypoints_bend():
     problem, _, start = make(2, people=1, frames=12, noise=5.0)
     robust = g.Reprojection, g.KeypointReprojection
-    # What weights of robust losses add_second_order is left out, and would hide the rest.
+    # Second derivatives of robust losses are left out, and would hide the rest.
     factors = tuple(
         dataclasses.replace(f, loss=g.Squared()) if isinstance(f, robust) else f
         for f in problem.factors
