@@ -1,9 +1,9 @@
-"""Body model files: found, read, checked, written.
+"""Finds, reads, checks and writes body model files.
 
-SMPL's files have their usual names and forms: the original pickle, and `.npz` with the
-same names of arrays. SMPL-H and SMPL-X have more joints (hands, jaw, eyes), which are
-kept at rest: their skinning weights are added to those of the wrist or head, and the
-body has SMPL's 72 pose parameters.
+SMPL's files are found by their usual names, and read in both usual formats: the
+original pickle, and `.npz` with the same names of arrays. SMPL-H and SMPL-X have more
+joints (hands, jaw, eyes), which are kept at rest: their skinning weights are added to
+those of the wrist or head, and the body has SMPL's 72 pose parameters.
 """
 
 import json
@@ -96,7 +96,9 @@ def load_body_model(
 
 
 def check(path: str | Path, gender: str | None = None) -> str:
-    """A body model file's kind and size in one line; arguments as `load_body_model`.
+    """Describes a body model file in one line: kind of model, size and stature.
+
+    The arguments are those of `load_body_model`.
 
     **Raises:** `ValueError`, one line, if it is not usable as a body model.
     """
@@ -115,11 +117,11 @@ def check(path: str | Path, gender: str | None = None) -> str:
 def write_npz(model: BodyModel, path: str | Path) -> None:
     """Writes SMPL's own layout, 24 joints, so that other tools for SMPL can read it.
 
-    Pose blend shapes that the model lacks are written as zeros. The file appears when
-    it is complete.
+    Pose blend shapes that the model lacks are written as zeros. The file is written
+    atomically.
 
-    **Raises:** `ValueError` if the path has not the suffix `.npz`; `OSError`, naming
-    it, if it cannot be written.
+    **Raises:** `ValueError` if the suffix of the path is not `.npz`; `OSError`, naming
+    the path, if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":

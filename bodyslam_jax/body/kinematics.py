@@ -305,6 +305,6 @@ def _tree_sum(ones, u):
 
 
 def _cross(a, b):
-    """Cross products of (j, 3, n)."""
+    """Cross products of two arrays (j, 3, n) along their middle axis."""
     c = lambda i, j: a[:, i] * b[:, j] - a[:, j] * b[:, i]
     return jnp.stack([c(1, 2), c(2, 0), c(0, 1)], 1)

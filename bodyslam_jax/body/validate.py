@@ -1,4 +1,4 @@
-"""Checks of a body model's arrays: every rule that later stages rely on."""
+"""Checks of a body model's arrays: shapes, types and values that later code assumes."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,10 @@ _NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table",
 
 
 def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The checked arrays in float64 or int64, with `parents` and, if named, `picks`.
+    """Checks the arrays of a body model file, and returns them in float64 or int64.
+
+    `parents` (parent of each joint, -1 for the root) is added, and `picks` (vertices of
+    `SURFACE_POINTS`) if the file has a header that names them.
 
     **Raises:** `ValueError`, one line: the file, what was found, what was expected.
     """

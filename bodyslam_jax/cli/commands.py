@@ -1,4 +1,8 @@
-"""All commands, and the options that `--help` shows of the long ones."""
+"""The table of all commands.
+
+For commands with many options, the table also lists the few that `--help` shows;
+`--help-all` shows all of them.
+"""
 
 import dataclasses
 from collections.abc import Callable

@@ -106,7 +106,8 @@ def _dispatch(argv: list[str]) -> int | None:
 def _command(argv: list[str]) -> tuple[str, list[str]]:
     """The command or group that `argv` names, and its arguments.
 
-    **Raises:** `WrongUsage`, with the closest name, if it names none.
+    **Raises:** `WrongUsage`, which suggests the closest name, if there is no such
+    command.
     """
     first, *rest = argv
     if first in COMMANDS:
@@ -129,7 +130,10 @@ def _unknown(word: str, known: list[str]) -> str:
 
 
 def _check_options(name: str, argv: list[str]) -> None:
-    """Refuses options that the command does not have, with the one that was meant."""
+    """Refuses options that the command does not have.
+
+    **Raises:** `WrongUsage`, which suggests the option of the closest name.
+    """
     flags = {
         other: [flag for one in options(command.function) for flag in one.flags]
         for other, command in COMMANDS.items()

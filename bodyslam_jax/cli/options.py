@@ -41,7 +41,8 @@ class Option:
     name: str
     """As in Python and `config.yaml`, with the stage before a dot."""
     value: str | None
-    """What follows it; `None` for a switch, which has a `--no-` form."""
+    """Placeholder for the option's value; `None` for a switch, which takes no value and
+    has a `--no-` form."""
     default: str | None
     """`None` if there is none, or if the description says what happens instead."""
     about: str
@@ -50,7 +51,7 @@ class Option:
 
     @property
     def flags(self) -> list[str]:
-        """As it is typed; the first is the option, a second switches it off."""
+        """The option as it is typed, and for a switch the form that turns it off."""
         if self.is_positional:
             return []
         stage, dot, name = self.name.replace("_", "-").rpartition(".")
@@ -93,10 +94,10 @@ def options(function: Callable[..., Any]) -> list[Option]:
 
 
 def suggestions(wrong: str, flags: dict[str, list[str]], command: str) -> str:
-    """What a user who typed `wrong` for `command` may have meant.
+    """A hint for a user who typed the unknown option `wrong` after `command`.
 
     Args:
-        flags: those of every command.
+        flags: the options of every command, by the command's name.
     """
     own = flags[command]
     ends = {flag.rpartition(".")[2].removeprefix("--"): flag for flag in own}
@@ -112,7 +113,11 @@ def suggestions(wrong: str, flags: dict[str, list[str]], command: str) -> str:
 
 
 def settings_described(kind: type) -> dict[str, str]:
-    """The line or lines below each field of a dataclass, with those it inherits."""
+    """The description of each field of a dataclass, by the field's name.
+
+    A description is the string literal below the field in the source. Inherited fields
+    are included.
+    """
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         (tree,) = ast.parse(inspect.cleandoc(inspect.getsource(base))).body
@@ -165,7 +170,7 @@ def _value(kind: Any) -> str:
 
 
 def _arguments_described(docstring: str) -> dict[str, str]:
-    """The section `Args:` of a docstring."""
+    """The descriptions in the section `Args:` of a docstring, by argument."""
     found, name = {}, ""
     for line in docstring.partition("Args:\n")[2].splitlines():
         if line.startswith("        "):

@@ -99,9 +99,12 @@ class Known:
             raise ValueError("static_camera and camera_path: expected one of them.")
 
     def heights(self) -> dict[int | None, Measured]:
-        """Statures, m, by the person's number; under `None` that of everybody else.
+        """Statures, m, by the person's number.
 
-        **Raises:** `ValueError` if one is no stature.
+        A stature given without a number applies to all other people; its key is `None`.
+
+        **Raises:** `ValueError` if an entry cannot be parsed, is not between 0.4 and
+        2.8 m, or repeats a person.
         """
         found: dict[int | None, Measured] = {}
         for text in self.height:
@@ -146,7 +149,7 @@ class Known:
 
 
 def _or_share(found: Measured, share: float) -> Measured:
-    """The measurement with a default standard deviation where none was given."""
+    """The measurement, with `share` times the value in place of a NaN sigma."""
     sigma = share * found.value if math.isnan(found.sigma) else found.sigma
     return Measured(found.value, sigma)
 

@@ -1,4 +1,4 @@
-"""What a result lacks: finite numbers, a camera path, people, frames, a scale."""
+"""Checks that a result is finite and has cameras, people, enough frames and a scale."""
 
 import numpy as np
 
@@ -10,7 +10,11 @@ _LEAST_SHARE = 0.5
 
 
 def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
-    """Reasons where there is no result, or only a part of one."""
+    """Reasons to doubt or reject a result that is missing or partial.
+
+    These are values that are not finite, a camera motion that was not found, no people
+    (and no metric camera path), and fewer than half of the video's frames used.
+    """
     found = []
     if not np.isfinite(result.T_WC).all() or not np.isfinite(result.joints).all():
         found.append(
@@ -62,8 +66,10 @@ def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
 def scale_undetermined(
     result: Result, cameras: SfmResult, start: ScaleStart
 ) -> list[Reason]:
-    """Reasons where a moving camera sees people, yet no cue determines the scale, or
-    the scale is not positive."""
+    """Reasons to doubt or reject the scale of a moving camera that sees people.
+
+    Either no cue determines the scale, or the estimated scale is not positive.
+    """
     if cameras.kind != "moving" or not result.present.any():
         return []
     advice = (

@@ -1,7 +1,7 @@
 """Figures of one person's posture, feet and motion, from the joints alone.
 
-All take SMPL's joints in metres in a world whose y axis is up, of frames that follow
-one another.
+All functions take SMPL's joints (t, 24, 3) in consecutive frames, in metres, in a world
+frame whose y axis is up. "Horizontal" is the plane of x and z.
 """
 
 import numpy as np
@@ -45,7 +45,7 @@ def lower_foot_speed(
 def slower_foot_speed(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """Horizontal speed of the slower of the two feet, over `over` seconds, m/s."""
+    """Horizontal speed (mean over `over` seconds) of the slower toe joint, m/s."""
     n = max(1, min(round(over * fps), len(joints) - 1))
     feet = joints[:, list(FEET)][..., _PLAN]
     return _length(feet[n:] - feet[:-n]).min(axis=1) * fps / n
@@ -54,16 +54,20 @@ def slower_foot_speed(
 def joint_acceleration(
     joints: Float[np.ndarray, "t 24 3"], fps: float
 ) -> Float[np.ndarray, " u"]:
-    """Second difference of every joint in the world, m/s², in one row."""
+    """Magnitude of the acceleration of each joint by second differences, m/s².
+
+    One flat array over frames and joints, `u = 24 (t - 2)`.
+    """
     return _length(np.diff(joints, n=2, axis=0)).ravel() * fps**2
 
 
 def turning_rate(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """How fast the line between the hips turns about the vertical, degrees a second.
+    """Absolute yaw rate of the line between the hips, degrees/s.
 
-    It is the turn within `over` seconds, less than half a turn.
+    It is the difference of yaw over an interval of `over` seconds, wrapped to at most
+    180 degrees, divided by the length of the interval.
     """
     side = joints[:, HIPS[0]] - joints[:, HIPS[1]]
     heading = np.arctan2(side[:, 0], side[:, 2])
@@ -78,8 +82,10 @@ def turning_rate(
 def speed_change(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """By how much the pelvis' velocity over the ground changes from one stretch of
-    `over` seconds to the next, m/s."""
+    """Magnitude of the change of the pelvis' horizontal velocity, m/s.
+
+    Velocities are means over two successive intervals of `over` seconds.
+    """
     n = max(1, round(over * fps))
     place = joints[:, PELVIS][:, _PLAN]
     if len(place) <= 2 * n:
@@ -90,7 +96,7 @@ def speed_change(
 def pelvis_speed(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float = 0.5
 ) -> Float[np.ndarray, " u"]:
-    """Of the pelvis over the ground, over `over` seconds, m/s."""
+    """Horizontal speed of the pelvis, mean over `over` seconds, m/s."""
     place = joints[:, PELVIS][:, _PLAN]
     n = max(1, min(round(over * fps), len(place) - 1))
     return _length(place[n:] - place[:-n]) * fps / n

@@ -133,9 +133,10 @@ def umeyama(
 ) -> Similarity:
     """The SE(3), or with `with_scale` Sim(3), that minimises `Σ w |y - s R x - t|²`.
 
-    A weight of zero is a point that does not exist, whatever stands there. With fewer
-    than three points, or collinear ones, one of the many minimisers; with no weight at
-    all, the identity's rotation and scale. The gradient is finite in all of these.
+    Points of weight zero are ignored, even if they are NaN. With fewer than three
+    points, or collinear ones, it is one of many minimisers; if all weights are zero,
+    rotation and scale are those of the identity. The gradient is finite in all of these
+    cases.
     """
     if weights is None:
         weights = jnp.ones_like(target[..., 0])
@@ -174,10 +175,11 @@ def align(
     centre_weights: Float[Array, " t"],
     with_scale: bool = False,
 ) -> tuple[Similarity, Similarity]:
-    """The alignment of the camera and that of one person's centre, by name.
+    """Alignments of the camera trajectory and of one person's centres to the truth.
 
-    Henning et al., ECCV 2022, appendix B, methods 1 to 4 as `"A1"` to `"A4"`. The
-    weights (0 or 1) say which frames count. A4 has no scale: it takes one pose.
+    `alignment` is `"A1"` to `"A4"`, methods 1 to 4 of Henning et al., ECCV 2022,
+    appendix B. Frames of weight 0 are ignored; the others have weight 1. A4 aligns a
+    single pose, which does not determine a scale.
 
     **Raises:** `ValueError` for A4 with scale and for any other name.
     """

@@ -158,13 +158,15 @@ def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array
 def _mean_over_people(
     value: Float[Array, " h"], broken: Bool[Array, " h"]
 ) -> Float[Array, ""]:
-    """Over the people for whom the error exists; NaN if one's input is not finite."""
+    """Mean over the people for whom the error exists; NaN if a person is `broken`, that
+    is, if an input of that person is not finite."""
     exists = ~jnp.isnan(value) | broken
     return metrics.Errors(value, exists).mean()
 
 
 def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether the camera's root mean square distance from its mean is above `STILL`."""
+    """Whether the camera moves: whether the RMS distance of its centres from their mean
+    is above `STILL` (m)."""
     (centre,) = metrics.only(valid, T_WC[:, :3, 3])
     count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
     (apart,) = metrics.only(valid, centre - jnp.sum(centre, 0) / count)
@@ -172,7 +174,10 @@ def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array,
 
 
 def _stands(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether the camera's positions coincide but for rounding, in any unit."""
+    """Whether all camera centres coincide up to rounding errors.
+
+    The tolerance is relative to the centres' mean, so the unit of length is irrelevant.
+    """
     (centre,) = metrics.only(valid, T_WC[:, :3, 3])
     count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
     mean = jnp.sum(centre, 0) / count

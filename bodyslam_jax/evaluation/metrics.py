@@ -71,8 +71,9 @@ def trajectory_error(
     """Distance of each aligned position from the truth, m.
 
     C-ATE with camera centres, H-ATE with the pelvis joint (origin of H); Henning et
-    al., ECCV 2022, section 4. Sturm et al., IROS 2012, call the RMSE "ATE"; TRAM and
-    evo's `mean` the mean. ATE-S (TRAM) is the mean of C-ATE in SE(3).
+    al., ECCV 2022, section 4. "ATE" is the RMSE of these distances in Sturm et al.,
+    IROS 2012, and their mean in TRAM (in evo: `mean`). ATE-S (TRAM) is the mean of
+    C-ATE after SE(3) alignment.
     """
     estimate, truth = only(valid, estimate, truth)
     return Errors(norm(alignment.apply(estimate) - truth), valid)
@@ -84,10 +85,10 @@ def joint_trajectory_error(
     valid: Bool[Array, " t"],
     alignment: Similarity,
 ) -> Errors:
-    """J-ATE: distance of every joint, under the alignment of the human centre, m.
+    """J-ATE: distance of every joint from the truth, m.
 
-    Henning et al., ECCV 2022, table 1, who do not say how joints are aligned: they
-    move with their body here.
+    Henning et al., ECCV 2022, table 1. They do not state how joints are aligned; here
+    `alignment` is that of the human centres (pelvis joints).
     """
     estimate, truth = only(valid, estimate, truth)
     value = norm(alignment.apply(estimate) - truth)

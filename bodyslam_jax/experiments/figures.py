@@ -1,4 +1,7 @@
-"""Figures in the form of the paper's, as PNG; `about`, the data, stands below each."""
+"""Figures in the form of the paper's, as PNG.
+
+`about`, a description of the data, is printed below each figure.
+"""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -54,7 +57,10 @@ def _save(figure, path: Path, about: str) -> None:
 
 
 def log_limits_mm(values: Sequence[float]) -> tuple[float, float]:
-    """Ends of a log axis of errors: from 1 mm, or less where one of them is less."""
+    """Lower and upper limit of a logarithmic axis for errors in mm.
+
+    The lower limit is 1 mm, or the next lower power of ten below the least error.
+    """
     finite = np.array(values, float)
     finite = finite[np.isfinite(finite) & (finite > 0)]
     if not finite.size:
@@ -66,9 +72,10 @@ def log_limits_mm(values: Sequence[float]) -> tuple[float, float]:
 def draw_table(
     path: Path, rows: Sequence[Row], paper: Sequence[Row | None], about: str
 ) -> None:
-    """C-, H- and J-ATE under SE(3) by sequence, and the scale: bars, the paper's dots.
+    """C-, H- and J-ATE after SE(3) alignment, and the scale, for each sequence.
 
-    `paper` has the paper's row for each of ours, or `None`.
+    Our errors are bars, the paper's are dots. `paper` has the paper's row for each of
+    `rows`, or `None`.
     """
     figure = _figure(max(7.0, 1.5 + 0.55 * len(rows)), 7.5)
     axes = figure.subplots(4, 1, sharex=True)
@@ -107,7 +114,8 @@ def draw_table(
 
 
 def draw_paths(path: Path, rows: Sequence[Row], about: str) -> None:
-    """Cameras and human centres from above after SE(3), as the paper's appendix."""
+    """Top views of camera and human centres after SE(3) alignment, as in the paper's
+    appendix."""
     rows = [row for row in rows if row.get("paths")]
     if not rows:
         return
@@ -127,7 +135,11 @@ def draw_paths(path: Path, rows: Sequence[Row], about: str) -> None:
 
 
 def draw_scale(path: Path, rows: Sequence[Row], about: str) -> None:
-    """H-ATE under SE(3), and s over what it should be, after each iteration."""
+    """H-ATE after SE(3) alignment, and the ratio of the estimated to the correct scale,
+    after each iteration.
+
+    The correct scale is the perturbation 1/s'; there is one curve for each.
+    """
     figure = _figure(9.0, 3.0 * len(rows))
     axes = figure.subplots(len(rows), 2, squeeze=False, sharex=True)
     for row, (left, right) in zip(rows, axes, strict=True):
@@ -146,7 +158,8 @@ def draw_scale(path: Path, rows: Sequence[Row], about: str) -> None:
 
 
 def draw_variants(path: Path, rows: Sequence[Row], about: str) -> None:
-    """C- and J-ATE under SE(3), and how far the scale is off, one line a variant."""
+    """C- and J-ATE after SE(3) alignment, and estimated over true scale: one line for
+    each variant."""
     figure = _figure(11.0, max(2.4, 1.2 + 0.28 * len(rows)))
     figure.suptitle(f"{rows[0]['sequence']}, simulated", fontsize=10)
     *errors, scale = figure.subplots(1, 3, sharey=True)
@@ -172,7 +185,8 @@ def draw_variants(path: Path, rows: Sequence[Row], about: str) -> None:
 
 
 def draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
-    """Points about 1; values beyond the axis are printed at its end."""
+    """Draws ratios as deviations from 1; those further than `_FAR` from 1 are printed
+    as numbers at the end of the axis."""
     off = np.abs(ratio - 1)
     near = off <= _FAR
     end = 1.1 * max(off[near].max(initial=0.0), 0.05)
@@ -197,7 +211,8 @@ def draw_ratios(axis, at: np.ndarray, ratio: np.ndarray) -> None:
 def draw_structure(
     path: Path, rows: Sequence[Row], paper: Sequence[Row | None], about: str
 ) -> None:
-    """C-ATE of the perturbed cameras, and after both optimisations."""
+    """C-ATE of the perturbed cameras, and after optimisation without and with
+    landmarks."""
     figure = _figure(max(6.0, 1.5 + 1.1 * len(rows)), 3.4)
     axis = figure.subplots()
     stages = ("perturbed", "no_landmarks", "landmarks")

@@ -49,11 +49,16 @@ JUDGED = {
     for when in ("before", "after")
     for name in ("error", "scale", "j_ate_se3")
 }
-"""What kept rows must have for the reports below, see `row_cache.fits`."""
+"""Fields that cached rows must have for the reports below, as for the other constants
+above; see `row_cache.fits`."""
 
 
 def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Deviation by perturbation, and convergence."""
+    """Writes the scale recovery experiment.
+
+    A table has the deviation of the estimated scale for each perturbation of the
+    cameras' scale; a figure shows convergence.
+    """
     flat = []
     for row in rows:
         for i, p in enumerate(row["perturbation"]):
@@ -98,7 +103,8 @@ def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """C-ATE of perturbed cameras with and without landmarks, beside the paper's."""
+    """Writes the C-ATE of perturbed cameras, optimised with and without landmarks,
+    beside the paper's values."""
     names = ("original", "perturbed", "no_landmarks", "landmarks")
     theirs: list[Row | None] = []
     beside = []
@@ -165,7 +171,7 @@ def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> lis
 
 
 def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Every variant's errors, sequence by sequence."""
+    """Writes the errors of each variant: one table and one figure per sequence."""
     number = functools.partial(
         Column, average=False
     )  # a mean over variants is meaningless
@@ -203,9 +209,10 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Learnt factors, and errors before and after on training and test sequences.
+    """Writes learnt factors, and errors with default and with learnt weights.
 
-    The first row is of the weights, each other one of a sequence.
+    `rows[0]` holds the learnt weights; each further row holds the errors on one
+    training or test sequence.
     """
     found, *judged = rows
     factors = [

@@ -1,4 +1,4 @@
-"""Rows as Markdown and CSV: one table or several, with the data named above them."""
+"""Writes rows as Markdown and CSV tables, below a description of the data."""
 
 import csv
 import dataclasses
@@ -62,9 +62,9 @@ def markdown(
 def to_csv(
     columns: Sequence[Column], rows: Sequence[dict[str, Any]], about: str = ""
 ) -> str:
-    """The same columns in full precision, units as in the titles.
+    """A CSV table with values in full precision, in the units of the columns' titles.
 
-    The last one, `data`, names the data, if given.
+    If `about`, a description of the data, is given, it fills a last column `data`.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -77,7 +77,8 @@ def to_csv(
 
 
 def intro(title: str, about: str, *lines: str) -> str:
-    """Title, what the data are, and `lines` on what follows."""
+    """The head of a Markdown report: `title`, `about` (a description of the data), and
+    `lines` that introduce the tables."""
     return "\n".join([f"# {title}", "", f"{about} {OTHER_DATA}", *lines, "", ""])
 
 

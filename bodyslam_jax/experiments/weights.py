@@ -1,9 +1,9 @@
 """Weights learnt through the solver, for `bodyslam experiment weights`.
 
 The solution depends on the weights by the implicit function theorem (`solver.solve`
-has its derivative), so an error after alignment can be lowered by gradient on training
-sequences. A weight is the logarithm of a factor on a standard deviation, or on a robust
-loss' scale: λ = σ^-2, so log λ falls by twice as much.
+has its derivative), so an error after alignment can be minimised by gradient descent
+on training sequences. A weight is the logarithm of a factor on a standard deviation, or
+on a robust loss' scale: λ = σ^-2, so log λ falls by twice as much.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ PRIOR = 0.02
 
 
 class Trial(eqx.Module):
-    """A problem, a state near its solution, and the truth: one sequence of training."""
+    """One training sequence: a problem, a state near its solution, and ground truth."""
 
     problem: graph.Problem
     state: graph.State
@@ -97,7 +97,7 @@ def make_trial(case: Case, prepared: Prepared, *, hold_cameras: bool) -> Trial:
 
 
 def names_of(problem: graph.Problem) -> tuple[str, ...]:
-    """The weights that a problem has terms for."""
+    """Names of the weights (keys of `WEIGHTS`) whose factor the problem has."""
     kinds = {type(factor) for factor in problem.factors}
     return tuple(name for name, (kind, _) in WEIGHTS.items() if kind in kinds)
 
@@ -152,7 +152,10 @@ def outcome(
 
 
 def training_error(found: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
-    """`(log s / 0.05)² + J-ATE / 0.05 m`, J-ATE after SE(3): smooth in the solution."""
+    """`(log s / 0.05)² + J-ATE / 0.05 m`, a smooth function of the solution.
+
+    `s` is the estimated over the true scale; J-ATE is after SE(3) alignment.
+    """
     return (jnp.log(found["scale"]) / SCALE_UNIT) ** 2 + found["j_ate_se3"] / JOINT_UNIT
 
 
@@ -179,10 +182,11 @@ def learn_weights(
     names: tuple[str, ...] | None = None,
     progress: Path | None = None,
 ) -> Learned:
-    """Adam on the mean training error over `trials`, each solved from its last answer.
+    """Minimises the mean training error over `trials` by Adam.
 
-    The state after each step is kept in the file `progress`: learning that was
-    interrupted continues from there, to the same result.
+    Each solve starts from the trial's solution in the preceding step. The state after
+    each step is stored in the file `progress`, from which interrupted learning resumes
+    with the same result.
 
     **Raises:** `ValueError` if there is no trial, or if `progress` has other weights.
     """
@@ -223,7 +227,8 @@ def _mean_error(
     value: Float[Array, " w"],
     states: Sequence[graph.State],
 ) -> tuple[float, Float[Array, " w"], list[graph.State]]:
-    """The mean training error, its gradient with that of the prior, new solutions."""
+    """The mean training error, its gradient by the log weights `value` (with the
+    prior's gradient added), and each trial's new solution."""
     total, slope, found = 0.0, PRIOR * 2 * value, []
     for k, (trial, state) in enumerate(zip(trials, states, strict=True)):
         error, gradient, state = error_and_gradient(trial, names, value, state)

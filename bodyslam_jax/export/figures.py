@@ -206,7 +206,10 @@ _LIMBS = (
 
 
 def _stick_figures(ax: Axes, result: Result, along: int) -> None:
-    """Stick figures of each person at several frames."""
+    """Draws nine stick figures of each person, evenly spaced over the person's frames.
+
+    Axis `along` of the world (0: x, 2: z) is horizontal in the figure, y vertical.
+    """
     for person, present in enumerate(result.present):
         frames = np.flatnonzero(present)
         if not len(frames):

@@ -35,44 +35,49 @@ _TRUNK_ALONG = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
 sequences gave 1.5 and 3.4 degrees root mean square; of real clips one gave 11."""
 _WORSE_TRUNKS = {False: 0.05, True: 0.15}
 _HOW_MUCH_WORSE = 2.5
-"""Share of people whose trunks are worse, of either kind, and how many times."""
+"""Probability that a person's trunk is a worse measurement, without and with bodies
+fitted to keypoints, and the factor by which its standard deviation is then larger."""
 _LEVEL = 0.7 * _DEGREE
 _SLOPES = (0.25, 4.0 * _DEGREE)
-"""Standard deviation of the slope of what is level; share of grounds that are not, and
-theirs."""
+"""Standard deviation of the slope of level ground; probability that the ground is not
+level, and the standard deviation of its slope in that case."""
 _FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
-"""Errors of the plane through feet and of the map's that more of them do not reduce."""
+"""Standard deviations of the systematic errors of slope, of the plane through feet and
+of the map's plane: more feet or points do not reduce them."""
 _HEIGHT_SIGMA = 0.02
 """Least standard deviation of the height of a foot that stands, m."""
 _SIZE = 0.05
 """Relative standard deviation of a person's size. A person who is estimated too large
 has all stances too low or too high by that share of the camera's height above them."""
 _OFF_THE_PLANE = 0.25
-"""Distance of the median stance from the map's plane, of the camera's height, beyond
-which people do not stand on that plane."""
+"""People do not stand on the map's plane if the median stance is further from it than
+this share of the camera's height."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plane:
-    """How a plane rises along x and z, in a frame whose y axis is nearly up."""
+    """The slope of a plane `y = gradient · (x, z) + const`, in a frame whose y axis is
+    nearly up."""
 
     gradient: Float[np.ndarray, " 2"]
+    """dy/dx and dy/dz."""
     covariance: Float[np.ndarray, "2 2"]
     """Of `gradient`, rad²."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Upright:
-    """Up, in the frame in which the cues were given."""
+    """The estimated up direction, in the frame in which the cues were given."""
 
     up: Float[np.ndarray, " 3"]
     """Unit vector."""
     sigma: float
-    """Standard deviation of its less sure direction, rad; infinite without any cue."""
+    """Standard deviation of `up` along its less certain axis, rad; infinite without any
+    cue."""
     trunks: float
-    """Angle between `up` and where trunks point, rad; NaN without people."""
+    """Angle between `up` and the mean direction of trunks, rad; NaN without people."""
     ground: float
-    """Slope of the ground that explains the cues best, rad; NaN without one."""
+    """Estimated slope of the ground, rad; NaN if no ground plane was found."""
 
 
 def find_upright(
@@ -128,7 +133,8 @@ def _with_measured(trunk_tilt, up):
 
 
 def _trunks(trunks, present, eyes, feet, fps, fitted):
-    """Where trunks point on average, as a small tilt, and its covariance, rad²."""
+    """Mean direction of people's trunks as a tilt (x, z over y), and its covariance,
+    rad²; `None` without upright people."""
     information, total = np.zeros((2, 2)), np.zeros(2)
     for h in np.flatnonzero(present.any(axis=1)):
         frames = present[h]
@@ -167,11 +173,12 @@ def _height_of_camera(eyes, stances) -> float:
 def feet_plane(
     stances: list[Float[np.ndarray, "_ 3"]], person_sigma: float
 ) -> Plane | None:
-    """The plane through standing feet; `None` with fewer than three of them.
+    """Robust least-squares plane through the positions of standing feet, m.
 
-    Each person's feet may be too high or too low by `person_sigma` (m), all alike.
-    Robust: stances are weighted as by a Cauchy distribution of their residuals, whose
-    width is their own.
+    `None` with fewer than three stances. One height offset per person, with the prior
+    standard deviation `person_sigma` (m), is estimated with the plane: a wrong size of
+    a person shifts all of that person's feet alike. Iteratively reweighted with a
+    Cauchy loss, whose scale is estimated from the median absolute residual.
     """
     people = np.concatenate(
         [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
@@ -204,7 +211,10 @@ def map_plane(
     eyes: Float[np.ndarray, "t 3"],
     stances: list[Float[np.ndarray, "_ 3"]],
 ) -> Plane | None:
-    """The ground of the map; `None` without one, or where people do not stand on it."""
+    """The ground plane of the map's landmarks (m).
+
+    `None` if there is none, or if people do not stand on it.
+    """
     up = np.array([0.0, 1.0, 0.0])
     plane = find_ground(landmarks, eyes, up) if len(landmarks) else None
     if plane is None:
@@ -230,8 +240,10 @@ def map_plane(
 
 
 def _fused(planes: list[Plane]) -> Plane | None:
-    """The mean weighted by information; its covariance is enlarged by the Birge ratio
-    where the planes disagree."""
+    """The planes' mean weighted by information (inverse covariance).
+
+    Its covariance is enlarged by the squared Birge ratio where the planes disagree.
+    """
     if not planes:
         return None
     weights = [np.linalg.inv(plane.covariance) for plane in planes]

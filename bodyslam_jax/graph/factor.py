@@ -1,4 +1,4 @@
-"""What a factor of the graph is: measurements, and one `residual` method.
+"""Base classes of the graph's factors: measurements, and one `residual` method.
 
 A residual is prediction minus measurement in standard deviations, so that
 `0.5 * sum(rho(|residual|^2))` is a negative log-likelihood. Missing measurements have
@@ -171,14 +171,16 @@ class FrameFactor(Factor):
         return 1 + max(lag for _, lag in self.keys)
 
     def frame_of_row(self, num_frames: int) -> Int[Array, " t"]:
-        """The frame whose variables stand in each row of `map_frames`."""
+        """The frame whose variables each row of `map_frames` depends on."""
         return jnp.arange(num_frames)
 
     def map_frames(self, function, state: State, extra: Any = None):
-        """`function(data, window, shared, extra)` over frames, and people if any.
+        """Maps `function(data, window, shared, extra)` over frames, and over people if
+        the factor is of people.
 
-        A window repeats the first frame where there is none before; factors carry no
-        weight there. A factor that is counted once is evaluated in the first frame.
+        `window` holds the variables (`Frame`) of this frame and of the `num_lags - 1`
+        frames before it. Before frame 0, frame 0 is repeated; factors must have no
+        weight there. A factor that is counted once is evaluated in frame 0 only.
         """
         if self.once:
             state = eqx.tree_at(

@@ -24,16 +24,21 @@ _SHARE = 0.1
 def choose_long_tracks(
     span: Int[np.ndarray, " l"], num_chunks: int, own: int, reach: int, size: int
 ) -> Int[np.ndarray, " k"]:
-    """The landmarks, in groups of `size`, to be eliminated with the globals.
+    """Indices of the landmarks to be eliminated with the globals, longest first.
+
+    Their number `k` is a multiple of `size`; it is 0 unless this is clearly cheaper.
 
     Args:
-        span: chunks from the first that observes a landmark to the last, both counted,
-            in the order of elimination; before the order is known, the number of chunks
-            that observe it. 0 for landmarks without observations.
-        num_chunks: of the video.
-        own: coordinates of people that remain of each chunk.
-        reach: distance, in the order of elimination, of chunks adjacent in time.
-        size: landmarks in a group.
+        span: number of chunks from the first to the last one that observes each
+            landmark, both included, in the order of elimination; before that order is
+            known, the number of chunks that observe it. 0 for landmarks without
+            observations.
+        num_chunks: number of chunks in the video.
+        own: number of coordinates of people that are left in each chunk after its inner
+            frames are eliminated.
+        reach: largest distance, in the order of elimination, between chunks that are
+            adjacent in time.
+        size: number of landmarks in a group.
     """
     order = np.argsort(-span, kind="stable")
     ranked = span[order].astype(float)
@@ -42,7 +47,8 @@ def choose_long_tracks(
     pivot = own + CAMERAS
 
     def cost(count):
-        """Multiplications of the chain of chunks, of landmarks and of tables."""
+        """Multiplications to factorise the chain of chunks, eliminate the remaining
+        landmarks and build the tables, with `count` long tracks."""
         rest = ranked[count:]
         width = int(max(rest[0] - 1, reach))
         back = np.arange(width)

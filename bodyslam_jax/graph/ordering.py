@@ -1,5 +1,8 @@
 """The order in which chunks of frames are eliminated.
 
+The order of the kinds of variables (landmarks, postures, people and cameras, globals)
+is fixed: see `solver/linear_system.py`.
+
 A landmark connects all chunks that observe it. In the order of time, a loop closure
 connects distant chunks, and the bandwidth of the reduced camera matrix grows to the
 length of the video. Chunks are then sorted by the second eigenvector of the Laplacian
@@ -17,10 +20,11 @@ CHUNK = 10
 CAMERAS = 6 * CHUNK
 """Coordinates of a chunk's cameras."""
 PERSON = 81
-"""Coordinates of a person that remain of a chunk, about."""
+"""Approximate number of a person's coordinates that are left in a chunk after its inner
+frames are eliminated."""
 _GAIN = 0.7
-"""The cost must fall below this share of that in the order of time, as reordering
-needs gathers."""
+"""Chunks are reordered only if the cost falls below this share of the cost in the order
+of time, as reordering needs gathers."""
 _TOGETHER = 4096
 """Landmarks processed at once."""
 _MOST = 2000

@@ -1,8 +1,9 @@
-"""Frames that a factor is given in addition, and that must weigh nothing.
+"""Padding of factors with frames that contribute nothing to the cost.
 
 The solver rounds the number of frames up, so that videos of about the same length share
-a compiled program. A factor says by `padding` with which values of its fields a frame
-weighs nothing; one that does not say is masked, whatever its fields are called.
+a compiled program. A factor's `padding` holds the values of its fields with which a
+frame contributes nothing (such as an infinite sigma). A factor without `padding` is
+masked instead (`Masked`).
 """
 
 import dataclasses
@@ -22,18 +23,19 @@ from bodyslam_jax.graph.state import State
 from bodyslam_jax.graph.tracing import is_traced
 
 _MOVED = 0.01
-"""rad, m and so on: how far from the first state costs are compared, where a residual
-may be 0 by chance."""
+"""Step (rad, m, ...) from the first state to the state at which costs are compared: in
+the first state a residual may be 0 by chance."""
 _SAME = {"float64": 1e-8, "float32": 1e-3}
-"""How much costs may differ, as a share of their own."""
+"""Allowed relative difference of costs."""
 
 
 class Masked(FrameFactor):
-    """A factor of which only some frames count: the residual of the others is 0.
+    """A factor that counts only in some frames: the residual of the others is 0.
 
-    Frames that do not count repeat the last one that does, measurement and variables
-    alike: nothing is evaluated where the factor may not be defined, as where two frames
-    are the same, and derivatives are finite wherever those of the factor are.
+    Measurements and variables of the frames that do not count are replaced by those of
+    the last frame that does. So the factor is never evaluated where it may not be
+    defined, such as at two equal poses, and derivatives are finite wherever those of
+    the factor are.
     """
 
     factor: FrameFactor
@@ -148,10 +150,10 @@ def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
 
 
 def check_padding(factor: FrameFactor, state: State) -> None:
-    """Refuses a factor of one's own that frames which measure nothing would change.
+    """Refuses a custom factor whose cost changes when it is padded with frames.
 
-    What fields are called does not matter, but all arrays over frames must be named.
-    Costs are compared where there are values, which is not within `jit` and `vmap`.
+    All its arrays over frames must be in `time_fields`. Costs with and without padding
+    are compared unless the factor or the state is traced (`jit`, `vmap`).
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """

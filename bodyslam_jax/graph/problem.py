@@ -63,7 +63,8 @@ class Problem(eqx.Module):
     motion: MotionPredictor | None
     layout: Layout
     variables: tuple[str, ...] = eqx.field(static=True, default=VARIABLES)
-    """Groups that may move at all: the blocks of the others are not even formed."""
+    """Groups of variables with at least one free coordinate. Blocks of the Hessian of
+    the other groups are not formed."""
 
     def cost(self, state: State) -> Float[Array, ""]:
         """Negative log-likelihood, up to a constant; predictions as they stand."""
@@ -88,8 +89,9 @@ class Problem(eqx.Module):
     def predict(self, state: State, *, frozen: bool = True) -> Any:
         """What the motion model predicts at a state; `None` without one.
 
-        `frozen`, no gradient flows through the network: people are not drawn to
-        postures for which it happens to predict what the cameras want.
+        With `frozen`, no gradient flows through the network. Otherwise postures would
+        be moved to where the network happens to predict the displacements that the
+        camera poses require.
         """
         if self.motion is None:
             return None
@@ -177,8 +179,11 @@ def _with_prediction(factor, seen):
 
 
 def limbs_of(factors: Sequence[Factor]) -> Limbs:
-    """Joints that factors see together, narrow limbs first; none that only its own
-    measurements and those of other frames tie to anything."""
+    """Groups of joints (limbs) that factors couple within a frame, smallest first.
+
+    Overlapping groups of different factors are merged. A joint that is coupled only to
+    itself in other frames (such as hands without keypoints) is in no limb.
+    """
     found: list[set[int]] = []
     for factor in factors:
         if not isinstance(factor, FrameFactor) or factor.per_joint:
@@ -247,13 +252,13 @@ def make_problem(
 
 
 def _touched(factors: Sequence[Factor]) -> set[str]:
-    """Variables, as factors name them, that factors over frames depend on."""
+    """Names of the variables (as in `Key`) that any `FrameFactor` depends on."""
     over_frames = [f for f in factors if isinstance(f, FrameFactor)]
     return {name for factor in over_frames for name, _ in factor.keys}
 
 
 def _layout_of(factors: Sequence[Factor], sizes: Sizes) -> Layout:
-    """Where the observations of landmarks lie in dense blocks.
+    """The layout of landmark observations in dense blocks, see `graph/layout.py`.
 
     **Raises:** `ValueError` for two `Reprojection`, and for priors of landmarks without
     an observation.
@@ -273,7 +278,10 @@ def _layout_of(factors: Sequence[Factor], sizes: Sizes) -> Layout:
 
 
 def _sample_state(free: Step) -> State:
-    """Some state of a problem's sizes: people stand 3 m in front of the cameras."""
+    """An arbitrary valid state with the array shapes and dtype of `free`, for checks.
+
+    All cameras are at the origin; people and landmarks are 3 m in front of them.
+    """
     eye = lambda x: (
         jnp.zeros((*x.shape[:-1], 4, 4), x.dtype) + jnp.eye(4, dtype=x.dtype)
     )

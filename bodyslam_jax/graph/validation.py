@@ -1,8 +1,8 @@
-"""What the door of a problem refuses: shapes, kinds and values that do not fit.
+"""Checks of a problem's inputs: shapes, dtypes and values of states and factors.
 
-Shapes are those of the fields' annotations: `t` frames, `h` people, `l` landmarks and
-`i` intrinsics are as many as the state has. Shapes are known under `jit` and `vmap`
-too; values are looked at where there are any.
+Shapes must match the fields' annotations, where `t` frames, `h` people, `l` landmarks
+and `i` intrinsics are those of the state. Shapes and dtypes are checked under `jit` and
+`vmap` too; values only where they are not traced.
 """
 
 import equinox as eqx
@@ -30,7 +30,8 @@ Sizes = dict[str, int]
 """Lengths of named axes."""
 
 _ROTATION = 1e-3
-"""How far `C^T C` may be from 1: files have few digits, and single precision drifts."""
+"""Largest allowed entry of `|C^T C - I|`: files have few digits, and rotations drift in
+single precision."""
 _KINDS = {
     Float: (jnp.floating, "floating point"),
     Int: (jnp.integer, "integers"),
@@ -39,10 +40,10 @@ _KINDS = {
 
 
 def check_state(state: State, free: Step | None = None) -> Sizes:
-    """Refuses a state that is none; how long its axes are.
+    """Checks a state, and returns the lengths of its axes.
 
-    With `free`, the mask of a problem, a state of other sizes or another precision is
-    refused, too.
+    With `free`, the mask of a problem, the state must also have the problem's sizes and
+    floating-point precision.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
@@ -111,9 +112,10 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
 
 
 def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
-    """Holds arrays against the annotations of their fields.
+    """Checks the dtype and shape of each array field against its annotation.
 
-    Lengths of axes that are not in `sizes` follow from the first array, and are added.
+    The length of an axis that is not yet in `sizes` is taken from the first array that
+    has this axis, and added to `sizes`.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
@@ -142,9 +144,11 @@ def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
 
 
 def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
-    """Refuses what is known of landmarks other than those of these observations.
+    """Refuses priors on landmarks that have no observation.
 
-    **Raises:** `ValueError` that says how many there are.
+    `landmark` are the landmark indices of all observations.
+
+    **Raises:** `ValueError` that says how many such priors there are.
     """
     if is_traced(factor.whitening):
         return
@@ -158,7 +162,8 @@ def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
 
 
 def _check_frames(factor, name, sizes):
-    """Of factors whose annotations do not say so, too."""
+    """Checks that the leading axes of a factor's `time_fields` are `h t`, or `t` for a
+    camera's factor, even if their annotations do not state it."""
     axes = "ht" if factor.of_people else "t"
     lead = tuple(sizes[axis] for axis in axes)
     for field in factor.time_fields:
@@ -195,7 +200,10 @@ def _check_values(module, name):
 
 
 def _check_precision(state, free):
-    """One for all, and the same as the problem's: else a loop changes it as it goes."""
+    """All arrays of a state must be of one floating-point dtype, that of the problem.
+
+    Otherwise a `lax` loop over states would change the dtype of its carry.
+    """
     expected, like = state.scale.dtype, "state.scale"
     if free is not None:
         expected, like = free.scale.dtype, "the problem"
@@ -209,14 +217,18 @@ def _check_precision(state, free):
 
 
 def _known(sigma):
-    """Where any coordinate is measured; nowhere, if that is not known yet."""
+    """Mask of the measurements with at least one finite `sigma` on the last axis.
+
+    All false if `sigma` is traced, as its values are not known then.
+    """
     if is_traced(sigma):
         return np.zeros(sigma.shape[:-1], bool)
     return np.isfinite(np.asarray(sigma)).any(axis=-1)
 
 
 def _check_rotations(poses, where, known=None):
-    """Poses or rotations; of a pose, the last row too."""
+    """Refuses matrices that are not rotations (3 x 3) or rigid poses (4 x 4, whose last
+    row is checked too); with the mask `known`, only where it is true."""
     if is_traced(poses):
         return
     poses = np.asarray(poses, float)

@@ -1,4 +1,5 @@
-"""Checks of what measurements weigh: losses, precisions, masks, first frames."""
+"""Checks of factors' weights: robust losses, dtype, the mask of free variables, and
+frames without a preceding measurement."""
 
 from typing import Any
 
@@ -32,12 +33,15 @@ _EARLY = (
     (RootSmoothness, "sigma", 2, np.inf),
     (AngularAccelerationPrior, "sigma", 2, np.inf),
 )
-"""How many of the first frames look back to where there is none, and what a field must
-be there: windows repeat the first frame, which would be taken for a measurement."""
+"""Factor, field, number of first frames that depend on frames before frame 0, and the
+value the field must have there, so that they have no weight. Windows of frames repeat
+frame 0 in place of the missing frames, which would otherwise count as a measurement."""
 
 
 def check_precision(factor: Factor, state: State) -> None:
-    """Refuses measurements of more digits than a state has, which would pass them on.
+    """Refuses measurements of a higher floating-point precision than the state's.
+
+    They would promote residuals, and with them the solve, to that precision.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
@@ -53,7 +57,7 @@ def check_precision(factor: Factor, state: State) -> None:
 
 
 def check_mask(free: Step) -> None:
-    """Refuses what is neither free nor held.
+    """Refuses a mask with values other than 1 (free) and 0 (held).
 
     **Raises:** `ValueError` that says where, and what was found.
     """
@@ -67,7 +71,7 @@ def check_mask(free: Step) -> None:
 
 
 def check_loss(loss: Any, where: str) -> None:
-    """Refuses what is no loss, and scales that are no lengths.
+    """Refuses a `loss` that is not a `Loss`, or whose scale is not positive and finite.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
@@ -88,7 +92,7 @@ def check_loss(loss: Any, where: str) -> None:
 
 
 def check_early(factor: Factor, name: str) -> None:
-    """Refuses weights of frames that look back to where there is none.
+    """Refuses weights in first frames whose residual depends on frames before frame 0.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
@@ -109,9 +113,10 @@ def check_early(factor: Factor, name: str) -> None:
 
 
 def check_runs(factor: Factor, name: str) -> None:
-    """Refuses errors that go on from a frame in which nothing was measured.
+    """Refuses an AR(1) correlation with a preceding frame that has no measurement.
 
-    What stands there is not a measurement, and would be compared with.
+    The residual `e_k - ρ e_{k-1}` would use the placeholder stored in frame k-1 as a
+    measurement; ρ must be 0 in frame k.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """

@@ -48,8 +48,12 @@ def motion_factor(
 
 @eqx.filter_jit
 def _whitened_steps(prediction, shapes, body, weights, shared_error):
-    """Displacements in leg lengths or metres, and `W` with `W^T W` the inverse of their
-    covariance."""
+    """Displacements (h, t, 3) in leg lengths or metres, and their whitening matrices
+    `W` (h, t, 3, 3), with `W^T W` the inverse covariance.
+
+    `W` is scaled down such that a relative error `shared_error` common to all steps of
+    a person is accounted for; it is zero in frames without a prediction.
+    """
     valid = prediction.valid
     eye = jnp.eye(3, dtype=prediction.translation.dtype)
     if weights.motion_sigma is None:
@@ -74,7 +78,10 @@ def _whitened_steps(prediction, shapes, body, weights, shared_error):
 def optional_factors(
     prediction: motion.Prediction, fps: float, weights: GraphWeights
 ) -> list[graph.Factor]:
-    """The predicted change of orientation, if `weights.orientation_sigma` is finite."""
+    """A factor of the predicted change of root orientation from frame to frame.
+
+    The list is empty unless `weights.orientation_sigma` (rad, at 30 fps) is finite.
+    """
     sigma = weights.orientation_sigma
     if sigma is None or not math.isfinite(sigma):
         return []

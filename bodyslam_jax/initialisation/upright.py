@@ -27,9 +27,10 @@ def upright_factor(
     fps: float,
     weights: GraphWeights,
 ) -> graph.UprightPrior | None:
-    """Trunks deviate by `upright_sigma` from their mean; `None` if nobody is upright.
+    """The factor that trunks are parallel to up, with `upright_sigma` (rad, at 30 fps).
 
-    The mean is that of the measured trunks, and contains errors common to all.
+    Up is the mean direction of the trunks in `state`, so an error common to all trunks
+    is not corrected. `None` if nobody is upright.
     """
     if weights.upright_sigma is None or not present.any():
         return None

@@ -36,14 +36,14 @@ def frames_of_names(
     complete: bool,
     warn: Warn,
 ) -> dict[str, int]:
-    """The frame that each name means.
+    """The index of the video's frame for each image name in a file.
 
     Args:
-        names: of all images that a file lists, with somebody in them or not.
-        what: is numbered by them, for messages.
-        num_frames: of the video; None if only the names can say.
-        images: names of the video's frames, if it is a folder of images.
-        complete: whether the file lists images with nobody in them, too.
+        names: names of all images that the file lists, with or without people.
+        what: what the names number, for messages.
+        num_frames: number of frames of the video; None if it is not known.
+        images: names of the video's frames, if the video is a folder of images.
+        complete: whether the file also lists images without people.
 
     **Raises:** `InvalidContent` if a name has no number, two mean the same frame, or
     the video is another one.
@@ -96,9 +96,10 @@ def _stem(name: str) -> str:
 
 
 def _numbers(stems: list[str]) -> list[int] | None:
-    """The last number in each name that tells the names apart; None if one has none.
+    """The last number in each name that differs between all names.
 
-    `000012_cam1` is 12 beside `000013_cam1`.
+    For example 12 for `000012_cam1`, if another name is `000013_cam1`. None if a name
+    has no number.
     """
     groups = [re.findall(r"\d+", stem) for stem in stems]
     if not all(groups):

@@ -117,9 +117,12 @@ def _keypoint_evidence(
     sigma: Float[np.ndarray, "f 25"],
     scale: float,
 ) -> tuple[Float[np.ndarray, " f"], float]:
-    """-log likelihood ratio of the rotated body against the given one, and the noise.
+    """Evidence of the keypoints for the given body, and their noise level.
 
-    Left and right of arms and legs are exchanged where that is more probable.
+    **Returns:** for each frame `-log p(keypoints | body rotated by π) + log p(keypoints
+    | body as given)`, and the standard deviation of the residuals over the assumed
+    `sigma`, at least 1. In either case detections of left and right arm, and of left
+    and right leg, may be exchanged, with the prior `_EXCHANGED`.
     """
     detected = np.isfinite(sigma)
     if not detected.any():

@@ -134,7 +134,14 @@ def _fit_person(
     fps: float,
     settings: PeopleFit,
 ) -> tuple[slice, Chain]:
-    """**Returns:** the frames from the first to the last present one, and their fit."""
+    """Fits one shape and the postures of all frames to one person's keypoints.
+
+    `uv` is in px, the standard deviation `sigma` in m of the body, infinite for missing
+    keypoints. `present` marks the frames in which the person gets a body.
+
+    **Returns:** the slice of frames from the first to the last present one, and the fit
+    in these frames.
+    """
     where = np.flatnonzero(present)
     fitted = slice(where[0], where[-1] + 1)
     uv, sigma = uv[fitted], sigma[fitted]

@@ -1,7 +1,8 @@
 """MoveNet MultiPose: up to six people and their 17 keypoints in a part of an image.
 
-The network takes any size whose sides are multiples of 32 and finds people who are
-about 40 to 250 px high in it, so a part of the image is scaled to suit whom it shows.
+The network's input may have any size whose sides are multiples of 32. It finds people
+who are about 40 to 250 px high in its input, so each part of the image is rescaled for
+the size of the people in it.
 """
 
 from typing import Any
@@ -19,9 +20,9 @@ _SHIFT = -0.25
 pixel edges to centres, and a quarter back is the network's own offset, from images and
 their mirror images (five clips, 545 keypoints; -0.27)."""
 _COINCIDENT = 0.05
-"""Distance of two keypoints that are the same one, of the person's size."""
+"""Two keypoints closer than this share of the person's size are the same one."""
 _SHARED = 3
-"""Keypoints that two detections of one person share at least."""
+"""Least number of keypoints that two detections must share to be of one person."""
 
 Region = tuple[int, int, int, int]
 """Left, top, right, bottom of a part of an image, px; the last two are outside it. It
@@ -74,8 +75,12 @@ def letterbox(
 def decode(
     raw: Float[np.ndarray, "6 56"], size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "6 17 3"], Float[np.ndarray, " 6"]]:
-    """Keypoints (x px, y px, score) on the network's input of `size` (rows, columns),
-    and each person's score, from its output (y, x relative to the input, score)."""
+    """Converts the network's output for six people.
+
+    **Returns:** keypoints (x px, y px, score) on the network's input of `size` (rows,
+    columns), and each person's score. In `raw`, keypoints are (y, x, score) with y and
+    x relative to the input's size.
+    """
     yxs = raw[:, : 3 * NUM_KEYPOINTS].reshape(-1, NUM_KEYPOINTS, 3).astype(float)
     rows, columns = size
     x, y = yxs[..., 1] * columns + _SHIFT, yxs[..., 0] * rows + _SHIFT
@@ -93,8 +98,11 @@ def to_image(
 def distinct(
     points: Float[np.ndarray, "n 17 3"], score: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " k"]:
-    """Indices of detections, best first, of which no two are of the same person: who
-    shares three keypoints with a better one is that one again."""
+    """Indices of detections without duplicates of a person, highest score first.
+
+    A detection is a duplicate if it is of the same person (`same_person`) as one with a
+    higher score.
+    """
     kept: list[int] = []
     for index in np.argsort(-score, kind="stable").tolist():
         if all(not same_person(points[index], points[k]) for k in kept):
@@ -103,8 +111,11 @@ def distinct(
 
 
 def same_person(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> bool:
-    """Whether two detections in one image share so many keypoints that they are of one
-    person. The face counts once: its five keypoints are close together."""
+    """Whether two detections in one image are of one person.
+
+    They are if they share at least three keypoints. The face counts as one of them, as
+    its five keypoints are close together.
+    """
     near = np.linalg.norm(a[:, :2] - b[:, :2], axis=1)
     size = max(box_size(a), box_size(b), 1.0)
     shared = (near < _COINCIDENT * size) & sure_points(a) & sure_points(b)
@@ -120,13 +131,14 @@ SURE = 0.15
 
 
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
-    """Left, top, right, bottom (px) of a person's sure keypoints, of all if too few."""
+    """Left, top, right, bottom (px) of a person's keypoints with a score above `SURE`,
+    or of all keypoints if fewer than two have such a score."""
     sure = sure_points(points)
     chosen = points[sure if sure.sum() >= 2 else slice(None), :2]
     return np.concatenate([chosen.min(0), chosen.max(0)])
 
 
 def box_size(points: Float[np.ndarray, "17 3"]) -> float:
-    """Longer side of that box, px."""
+    """Longer side of a person's `box`, px."""
     left, top, right, bottom = box(points)
     return float(max(right - left, bottom - top))

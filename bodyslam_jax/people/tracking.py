@@ -25,7 +25,7 @@ _FADING = 0.5
 _SMOOTHING = 0.1
 """Time constant of the velocity's mean, s."""
 GROWTH = 1.6
-"""Ratio of sizes from which a detection is of another person."""
+"""Ratio of sizes in the image above which a detection is of another person."""
 OTHER_CLOTHES = 30.0
 """Difference of colours (`appearance.difference`) from which it is another person."""
 _RECENT = 45
@@ -35,12 +35,12 @@ _AWHILE = 3
 _FEWEST = 3
 """Keypoints that two detections must have in common to be compared."""
 _TRUNK = 0.3
-"""Length of the trunk, of the height."""
+"""Length of the trunk as a share of the height."""
 
 
 @dataclasses.dataclass
 class Tracklet:
-    """Detections of one person without a longer gap, in order of time."""
+    """Detections of one person, in order of time, with short gaps only."""
 
     number: int
     frames: list[int]
@@ -49,7 +49,7 @@ class Tracklet:
     velocity: Float[np.ndarray, " 2"] = dataclasses.field(
         default_factory=lambda: np.zeros(2)
     )
-    """px a frame, at the last one."""
+    """Smoothed velocity of the keypoints in the last frame, px per frame."""
 
     @property
     def look(self) -> Float[np.ndarray, " d"]:
@@ -80,7 +80,7 @@ class Tracklet:
         self.looks.append(look)
 
     def prepend(self, frame: int, points: np.ndarray, look: np.ndarray) -> None:
-        """Adds what was found in an earlier frame."""
+        """Adds a detection in a frame before the first one."""
         self.frames.insert(0, frame)
         self.points.insert(0, points)
         self.looks.insert(0, look)
@@ -162,7 +162,7 @@ class Tracker:
     def cost_before(
         self, tracklet: Tracklet, points: np.ndarray, look: np.ndarray
     ) -> float:
-        """The same for the frame before a tracklet begins."""
+        """As `cost`, for a detection in the frame before the tracklet's first."""
         first = tracklet.points[0]
         return _unlike(
             displacement(first, points) / _REACH,
@@ -172,8 +172,15 @@ class Tracker:
 
 
 def _unlike(place: float, growth: float, clothes: float) -> float:
-    """A cost below 1 only if all three are within their gates: distance over its gate,
-    ratio of sizes, difference of clothes (NaN is unknown)."""
+    """Weighted cost of assignment; 1000 if any of the three is outside its gate, else
+    below 1.
+
+    Args:
+        place: distance in the image over its gate.
+        growth: ratio of the person's sizes in the image, gate `GROWTH`.
+        clothes: difference of the clothes' colours, gate `OTHER_CLOTHES`; NaN if it is
+            not known.
+    """
     growth = abs(float(np.log(growth))) / np.log(GROWTH)
     clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
     if max(place, growth, clothes) >= 1:

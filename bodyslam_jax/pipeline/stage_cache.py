@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 _EDGE = 1 << 20
 _SOURCE = "source.json"
 _CACHE = ".cache"
-"""The folder of stage results in that of a run."""
+"""Name of the folder of stage results inside a run folder."""
 UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
 UNREADABLE += (zipfile.BadZipFile, zlib.error)
 """Errors that `load` raises for a file that is damaged or of another version."""
@@ -144,7 +144,10 @@ class Cache:
         return result
 
     def owner(self) -> dict[str, Any] | None:
-        """The `source` stored in the folder, `None` if there is none."""
+        """The description of the input for which the folder's results were computed.
+
+        This is the `source` of the cache that wrote them; `None` if there is none.
+        """
         if self.folder is None:
             return None
         try:

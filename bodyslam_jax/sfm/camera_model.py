@@ -25,19 +25,21 @@ _log = logging.getLogger(__name__)
 
 _ROUNDS = 2
 _SIGMAS = 5.0
-"""Standard deviations from which a deviation is believed."""
+"""A deviation from an assumed camera is applied above this many standard deviations."""
 _GIVEN_SIGMAS, _GIVEN_GAIN = 10.0, 0.1
-"""The same, and the part by which errors must fall, against what camera.json says."""
+"""The same for a camera given in camera.json, and the share by which the reprojection
+error must fall as well."""
 _LEAST_ASPECT, _MOST_ASPECT_SIGMA = 0.06, 0.045
-"""Logarithm of the ratio of focal lengths that is no error of tracks, and its standard
-deviation up to which it is used."""
+"""Least |log(fx / fy)| that is not explained by errors of the tracks, and the largest
+standard deviation of its estimate with which it is used."""
 _LEAST_BEND = 0.008
-"""Shift by distortion at the corner, of half the diagonal."""
+"""Least shift by radial distortion at the image's corner that is corrected, as a share
+of half the diagonal."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraModel:
-    """The camera that explains the tracks, and the map that it gives."""
+    """The camera model estimated from the tracks, and the reconstruction with it."""
 
     intrinsics: Intrinsics
     zoom: Float[np.ndarray, " t"] | None
@@ -52,7 +54,7 @@ class CameraModel:
 def find_camera_model(
     tracks: Tracks, intrinsics: Intrinsics, num_frames: int, config: Structure
 ) -> CameraModel:
-    """The given camera, corrected where the tracks contradict it.
+    """Corrects the given camera where the tracks significantly contradict it.
 
     Pixel aspect ratio, one radial coefficient and a zoom are estimated if the camera
     translates; only a zoom if it rotates.
@@ -182,7 +184,11 @@ def _improved(
 
 
 def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
-    """Whether as many observations fit as before, as well as before."""
+    """Whether reconstruction `again` is not worse than `found`.
+
+    It must be of the same kind, register as many frames, and have about as many inlier
+    observations and as small a reprojection error.
+    """
     explained = lambda r: np.count_nonzero(r.inlier)
     return bool(
         again.kind == found.kind

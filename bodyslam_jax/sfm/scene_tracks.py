@@ -1,8 +1,8 @@
-"""Images -> tracks of the scene: overlays and black borders are masked.
+"""Tracks points of the scene through images, with overlays and black borders masked.
 
-Points are tracked once. If some are classified as burnt in, their neighbourhoods are
-masked like people and tracking is repeated: text takes a share of the points, and in a
-dark scene all of them.
+Points are tracked once. If some are classified as burnt in (text or a logo drawn over
+the video), their neighbourhoods are masked like people and tracking is repeated:
+otherwise a share of all points would lie on the overlay, and in a dark scene all.
 """
 
 import dataclasses
@@ -25,12 +25,14 @@ from bodyslam_jax.types import Sequence, Tracks
 
 _MOST_PASSES = 3
 _MANY_STILL = 0.5
-"""Share of observations that stay at their pixel from which text may hide a scene that
-gives no points beside it."""
+"""If more than this share of observations stays at the same pixel, all tracked points
+may lie on an overlay, and the scene may have points only once these are masked."""
 _MOST_HIDDEN = 0.6
-"""Of the image: if what is still covers more, the camera stands still."""
+"""If points that do not move cover more than this share of the image, the camera does
+not move."""
 _LITTLE = 0.3
-"""Of the image: if what is still lies in less, it may be text and no scene."""
+"""If points that do not move cover less than this share of the image, they may be an
+overlay instead of the scene."""
 
 
 def track(
@@ -108,7 +110,14 @@ def _unwanted(
 def _confirmed(
     before: Tracks, after: Tracks, wanted: Bool[np.ndarray, " l"], sequence: Sequence
 ) -> bool:
-    """Whether new points beside the masked ones move against them."""
+    """Whether masked tracks are an overlay: whether points tracked after masking move
+    relative to them.
+
+    Args:
+        before: tracks before masking.
+        after: tracks found with the neighbourhoods of the masked tracks masked.
+        wanted: which landmarks of `before` were masked.
+    """
     these = wanted[before.landmark]
     both = Tracks(
         np.concatenate([before.frame[these], after.frame]),

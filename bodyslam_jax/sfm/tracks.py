@@ -298,10 +298,11 @@ class _Tracker:
             )
 
     def _revive(self, gray: np.ndarray, found: list[cv2.KeyPoint]) -> None:
-        """Goes on with points of older keyframes that are seen again.
+        """Continues lost tracks of older keyframes whose points are visible again.
 
-        The descriptor says where, the image of the keyframe where exactly, and the
-        motion of all points between the two frames whether that can be.
+        Descriptors are matched for a first position, optical flow from the keyframe's
+        image refines it, and matches that are not inliers of the epipolar geometry
+        between the two frames are rejected.
         """
         kept, descriptors = self.brisk.compute(gray, found)
         if not len(kept):

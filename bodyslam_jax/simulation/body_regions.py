@@ -1,4 +1,7 @@
-"""Which part of an outfit covers each vertex of the body's mesh, at rest."""
+"""Assigns a part of the outfit (shirt, skin, hair, ...) to each vertex of a mesh.
+
+All positions are of the rest pose.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,16 +37,18 @@ class Head:
         self.level = self.eyes[:, 1].mean()
 
     def heights(self, p: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-        """Heights over the eyes, in units of `unit`."""
+        """Heights above the eyes, in multiples of `unit`."""
         return (p[:, 1] - self.level) / self.unit
 
     def azimuth(self, p: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-        """From the front (0) over the ears (90) to the back of the head, degrees."""
+        """Azimuth about the head's vertical axis, degrees: 0 in front, 90 at the ears,
+        180 at the back; left and right alike."""
         return np.degrees(np.arctan2(abs(p[:, 0]), p[:, 2] - self.ears[2]))
 
 
 def parts_of(person: Person, outfit: Outfit) -> Int[np.ndarray, " v"]:
-    """Index into `PARTS` of each vertex, by its joint and its position."""
+    """Index into `PARTS` of each vertex, from the joint with the largest skinning
+    weight and the position at rest."""
     p, rest = person.skin, person.rest
     joint = person.weights.argmax(axis=1)
     part = np.full(len(p), SKIN)
@@ -74,7 +79,7 @@ def parts_of(person: Person, outfit: Outfit) -> Int[np.ndarray, " v"]:
 
 
 def _face(person: Person, outfit: Outfit, part: np.ndarray) -> Int[np.ndarray, " v"]:
-    """The same with hair, eyes, brows, lips and a beard."""
+    """Sets hair, eyes, brows, lips and a beard in `part`, in place, and returns it."""
     head, p = Head(person), person.skin
     on_head = person.weights[:, 15] + person.weights[:, 12] > 0.6
     height, azimuth = head.heights(p), head.azimuth(p)

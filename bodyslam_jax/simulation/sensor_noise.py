@@ -306,9 +306,11 @@ def regress_bodies(
 def crop_boxes(
     uv: Float[np.ndarray, "t 25 2"], confidence: Float[np.ndarray, "t 25"]
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
-    """SPIN's crops: mean of the sure keypoints, 1.2 times their larger extent.
+    """Square crops about people, as SPIN makes them.
 
-    The second value tells where there were enough of them.
+    **Returns:** in each frame the crop's centre (u, v; mean of the keypoints of
+    confidence above 0.2) and side (1.2 times their larger extent), px; and whether
+    there are at least six such keypoints.
     """
     sure = confidence > 0.2
     found = sure.sum(axis=1) >= 6

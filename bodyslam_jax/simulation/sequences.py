@@ -64,7 +64,8 @@ class Actor:
 
     @property
     def poses(self) -> Float[np.ndarray, "t 72"]:
-        """True poses; the root turns the body into the world."""
+        """True SMPL poses (axis-angle, rad); the first three numbers are the root's
+        rotation from the body to the world frame."""
         return self.walk.poses.reshape(-1, 72)
 
     @property
@@ -101,7 +102,7 @@ class SimulatedSequence:
     tracks: Tracks
     """Measured tracks of static points."""
     landmarks: Float[np.ndarray, "l 3"]
-    """True places of the tracks' points, world."""
+    """True positions of the tracked points, m, world frame."""
     others: tuple[Actor, ...] = ()
     """Further people."""
 

@@ -1,8 +1,9 @@
-"""Hypotheses of what was done to keypoints or bodies that disagree.
+"""Hypotheses that explain why given keypoints and given bodies disagree.
 
-An explanation predicts the keypoints from the bodies under one hypothesis: turned,
-mirrored and resized images, cameras of another focal length, other units and other
-axes. All are tested. Their effects on size and position in the image distinguish them:
+Each hypothesis is a transformation that may have been applied to one of them before
+they were given: a rotated, mirrored or resized image, another focal length, other units
+or other axes. An `Explanation` predicts the keypoints from the bodies under one
+hypothesis. All are tested; their effects on size and position in the image differ:
 
 - a resized copy scales size and position about the image's corner;
 - another focal length scales both about the principal point;
@@ -51,7 +52,10 @@ class ImageMap:
         return moved[..., SWAPPED, :] if self.swap else moved
 
     def inverse(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Without the swap of sides."""
+        """`A^-1 (q - b)`: pixels of the image of the keypoints -> pixels of the video.
+
+        Left and right are not exchanged back, even if `swap` is set.
+        """
         return (uv - self.b) @ np.linalg.inv(self.A).T
 
 
@@ -70,15 +74,18 @@ class Explanation:
     """Factor of resizing; the bodies' focal length over the camera's; units per m."""
     name: str = ""
     reason: bool = True
-    """Whether the factor is a common one, not merely the measured one."""
+    """Whether `factor` is a common one, such as 1/2 or 1000, not the measured one."""
 
 
 def disagreement(
     detected: Float[np.ndarray, "t k 14 2"], projected: Float[np.ndarray, "t b 14 2"]
 ) -> float:
-    """Median distance, over people and frames, from one kind to the nearest person of
-    the other, in sizes of a person; the smaller of both directions. NaN if there is too
-    little to compare."""
+    """How far detected keypoints and projected bodies are apart, in sizes of a person.
+
+    For each detected person and frame the distance to the nearest projected body is
+    taken, and vice versa; the result is the smaller of the two medians over people and
+    frames. NaN with fewer than three distances in either direction.
+    """
     apart = distances(detected, projected)
     apart = np.where(np.isfinite(apart), apart, np.inf)
     if not apart.size:
@@ -94,7 +101,10 @@ def disagreement(
 
 
 def explanations(people: People) -> Iterator[Explanation]:
-    """All explanations, beginning with agreement; `people` are of a few frames."""
+    """Generates all explanations; the first is that keypoints and bodies agree.
+
+    `people` should hold a few frames only, as each explanation is evaluated on all.
+    """
     camera = people.camera
     plain = lambda p: project(camera, p)
     yield Explanation("agree", plain)
@@ -147,7 +157,8 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
 
 
 def _of_unit(camera, factor):
-    """Only the position is in another unit; the body's size is the model's."""
+    """Forecast if `trans` is in units of `1 / factor` m: the pelvis position is divided
+    by `factor`, while the body keeps the size of the body model."""
 
     def forecast(p):
         pelvis = p[..., 7:8, :]
@@ -157,7 +168,8 @@ def _of_unit(camera, factor):
 
 
 def _moved(detected, projected, ratios, plain) -> Iterator[Explanation]:
-    """Shifts by any constant, at the same size or resized."""
+    """Explanations by a constant shift in the image (median of the residual shift), at
+    the same size (a crop) or resized by one of `ratios` (a copy)."""
     middles = [
         [centred(uv)[0] for uv in in_common(detected[:, k], projected[:, b])]
         for k, b in _pairs(detected, projected)
@@ -173,14 +185,18 @@ def _moved(detected, projected, ratios, plain) -> Iterator[Explanation]:
 
 
 def _pairs(detected, projected) -> list[tuple[int, int]]:
-    """Pairs of rows that may be of one person, likelier ones first."""
+    """Up to 24 pairs (row of keypoints, row of bodies) that may be one person, those of
+    low and equal row numbers first."""
     rows = itertools.product(range(detected.shape[1]), range(projected.shape[1]))
     return sorted(rows, key=lambda pair: (sum(pair), abs(pair[0] - pair[1])))[:24]
 
 
 def _ratios(detected, projected, about_corner: bool = False) -> list[float]:
-    """Ratios of people's size in keypoints and in bodies, or of their distance from the
-    image's corner, by pairs of rows."""
+    """Distinct ratios, other than 1, of a person's size in the keypoints to that in the
+    projected bodies; with `about_corner`, of the distance from the image's corner.
+
+    Each ratio is the median over the frames of one pair of rows.
+    """
     found: list[float] = []
     for k, b in _pairs(detected, projected):
         pair = in_common(detected[:, k], projected[:, b])
@@ -201,7 +217,11 @@ def _ratios(detected, projected, about_corner: bool = False) -> list[float]:
 
 
 def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, bool]]:
-    """The measured ratios, and the common ratios near them."""
+    """The common ratios within `tolerance` (relative) of each measured ratio, with
+    `True`, then the measured ratio itself, with `False`.
+
+    With `inverse`, reciprocals of `reasons` are common ratios too.
+    """
     candidates = [*reasons, *(1 / r for r in reasons)] if inverse else list(reasons)
     for ratio in ratios:
         for reason in candidates:
@@ -259,8 +279,8 @@ def _axes_name(R: Float[np.ndarray, "3 3"]) -> str:
 
 
 def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> People:
-    """Keypoints of some frames beside bodies of others; frames beyond the end have no
-    bodies."""
+    """Pairs the keypoints of `frames` with the bodies of `bodies_at`, to test a shift
+    in time between them. Bodies are NaN where `bodies_at` is outside the video."""
     inside = (bodies_at >= 0) & (bodies_at < len(people.bodies))
     projected = people.bodies[np.where(inside, bodies_at, 0)]
     projected = np.where(inside[:, None, None, None], projected, np.nan)
@@ -268,13 +288,13 @@ def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> Peop
 
 
 def some_frames(people: People, most: int) -> np.ndarray:
-    """Up to `most` frames with both kinds in them, evenly spread."""
+    """Up to `most` evenly spaced frames with both keypoints and bodies."""
     (where,) = np.nonzero(people.both)
     return evenly(where, most)
 
 
 def evenly(where: np.ndarray, most: int) -> np.ndarray:
-    """Up to `most` of these, evenly spread."""
+    """Up to `most` evenly spaced entries of `where`."""
     if len(where) <= most:
         return where
     return where[np.linspace(0, len(where) - 1, most).round().astype(int)]

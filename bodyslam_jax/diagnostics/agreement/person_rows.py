@@ -1,4 +1,4 @@
-"""Rows of keypoints and of bodies -> one row per person."""
+"""Merges rows of keypoints and rows of bodies into one row of each per person."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Person:
-    """Rows of either kind that are one person."""
+    """The rows of keypoints and the rows of bodies that belong to one person."""
 
     keypoints: tuple[int, ...]
     bodies: tuple[int, ...]
@@ -19,7 +19,8 @@ class Person:
 def have_any(
     sequence: Sequence,
 ) -> tuple[Bool[np.ndarray, "k t"], Bool[np.ndarray, "b t"]]:
-    """Frames in which each person has keypoints, and bodies."""
+    """For each row of keypoints, and for each row of bodies, the frames it is present
+    in."""
     nobody = np.zeros((0, sequence.num_frames), bool)
     keypoints, bodies = sequence.keypoints, sequence.bodies
     return (
@@ -29,7 +30,7 @@ def have_any(
 
 
 def in_words(present: Bool[np.ndarray, "h t"], rows) -> str:
-    """The first and last frames of rows, for warnings."""
+    """First and last frame of each of `rows` as text, for warnings."""
     ends = sorted(tuple(np.flatnonzero(present[row])[[0, -1]].tolist()) for row in rows)
     spans = ", ".join(f"{first}-{last}" for first, last in ends[:6])
     more = f" and {len(ends) - 6} more" if len(ends) > 6 else ""
@@ -39,10 +40,14 @@ def in_words(present: Bool[np.ndarray, "h t"], rows) -> str:
 def gathered(
     sequence: Sequence, persons: list[Person], apart: Float[np.ndarray, "t k b"]
 ) -> Sequence:
-    """One row for each of `persons`; the sequence itself if nothing changes.
+    """The sequence with one row of keypoints and of bodies for each of `persons`.
+
+    If this changes nothing, the sequence itself is returned.
 
     Args:
-        apart: how far keypoints and bodies are from each other, in each frame.
+        apart: distance in the image between each row of keypoints and each row of
+            projected bodies, in each frame, in sizes of a person; NaN or infinite where
+            they cannot be compared.
     """
     keypoints, bodies = sequence.keypoints, sequence.bodies
     rows = [len(x.confidence) for x in (keypoints,) if x is not None]
@@ -61,7 +66,11 @@ def gathered(
 
 
 def _keypoints(keypoints: Keypoints, persons: list[Person]) -> Keypoints:
-    """Keypoints joined; of two in one frame those of higher confidence."""
+    """Merges the keypoint rows of each person into one.
+
+    Where several rows have keypoints in the same frame, those of the row with the
+    largest sum of confidences over the video are used.
+    """
     shape = (len(persons), *keypoints.confidence.shape[1:])
     uv, confidence = np.zeros((*shape, 2)), np.zeros(shape)
     sure = keypoints.confidence.sum((1, 2))
@@ -74,8 +83,12 @@ def _keypoints(keypoints: Keypoints, persons: list[Person]) -> Keypoints:
 
 
 def _bodies(bodies: Bodies, persons: list[Person], apart) -> Bodies:
-    """Bodies joined; of two in one frame the one nearer to the keypoints on average,
-    without keypoints the one present for longer."""
+    """Merges the body rows of each person into one.
+
+    Where several rows have a body in the same frame, the row with the smallest mean
+    distance from the person's keypoints over the video is used; for a person without
+    keypoints, the row that is present in most frames.
+    """
     names = ("present", "poses", "shapes", "trans")
     arrays = {name: getattr(bodies, name) for name in names}
     out = {

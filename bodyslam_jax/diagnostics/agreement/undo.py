@@ -1,4 +1,7 @@
-"""Inverse operations on keypoints and bodies: image maps, motions, frame numbers."""
+"""Undoes a transformation that keypoints or bodies have when they are given.
+
+It is a map of the image, a rigid motion of the bodies, or a shift of frame numbers.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,7 +17,8 @@ from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
 def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
-    """Keypoints mapped back from the image that `image` makes of the video's."""
+    """The sequence with its keypoints mapped by the inverse of `image`, to pixels of
+    the video."""
     keypoints = sequence.keypoints
     uv, confidence = image.inverse(keypoints.uv), keypoints.confidence
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
@@ -29,7 +33,8 @@ def with_bodies_moved(
     place: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 3"]],
     R: Float[np.ndarray, "3 3"] | None = None,
 ) -> Sequence:
-    """Bodies with pelvis positions (m) mapped by `place`, rotated about them by `R`."""
+    """The sequence with pelvis positions (m, camera frame) mapped by `place`, and each
+    body rotated about its pelvis by `R`, if given."""
     bodies = sequence.bodies
     at = bodies.present
     J_0 = np.asarray(body.joint_template[0], float)
@@ -46,7 +51,11 @@ def with_bodies_moved(
 def retimed(
     bundle: Keypoints | Bodies, new: Callable[[Int[np.ndarray, " t"]], np.ndarray]
 ):
-    """The arrays with frame k at `new(k)`; frames beyond the end are dropped."""
+    """Moves frame k of every array to frame `new(k)`, with the length unchanged.
+
+    Frames that would lie outside the video are dropped; frames that receive no data are
+    zero, that is, absent.
+    """
     arrays = {k: v for k, v in vars(bundle).items() if isinstance(v, np.ndarray)}
     t = next(iter(arrays.values())).shape[1]
     at = new(np.arange(t))

@@ -1,1 +1,8 @@
-"""The error terms of the graph, one kind of measurement a file."""
+"""The error terms of the graph: one file for each kind of measurement.
+
+A factor is a subclass of `graph.factor.FrameFactor`, except those of landmarks. Factors
+are created from measurements in `initialisation`: those of people in
+`people_factors.py`, of the motion model in `motion_factors.py`, of cameras and
+landmarks in `map_factors.py`, of the ground in `scale.py` and of trunks in
+`upright.py`; those of intrinsics in `pipeline/bundle_adjustment.py`.
+"""

@@ -26,7 +26,8 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
 
     Values that are not finite become NaN; the reader leaves out their bodies.
 
-    **Raises:** `InvalidContent` if there is none of numbers, or its shape is another.
+    **Raises:** `InvalidContent` if `data` has no numeric array `key`, or if that array
+    is of another shape.
     """
     if not isinstance(data, dict) or key not in data:
         raise InvalidContent(f"no `{key}`")
@@ -122,7 +123,10 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
 
 
 def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
-    """Axis-angle (m, 3j) from matrices (m, j, 3, 3) or (j, 3, 3), or as it is."""
+    """Axis-angle (m, 3j), rad, from rotation matrices (m, j, 3, 3) or (j, 3, 3).
+
+    An array that already is axis-angle is returned unchanged.
+    """
     array = np.asarray(array, dtype=np.float64)
     if array.shape[-2:] == (3, 3):
         if joints is not None and array.size % (9 * joints):

@@ -37,7 +37,8 @@ DEFAULT_FOCAL: dict[str, Callable[[Intrinsics], float]] = {
     "GVHMR": diagonal,
     "4D-Humans": lambda camera: 5000 / 256 * max(camera.width, camera.height),
 }
-"""By the tool: focal length (px) for an image of that size, if its file says none."""
+"""The focal length (px) that each tool assumes for an image of the given size. It is
+used if the tool's file has no focal length."""
 
 
 def default_focal(tool: str, video: Video) -> float:

@@ -1,9 +1,10 @@
-"""Training data on the device, and random batches of it that look like estimates.
+"""Training data on the device, and random batches with simulated estimation errors.
 
-A batch is `s` segments of `n + l` frames, each of another person (β drawn at random),
-another speed, perhaps mirrored, with posture errors of another size: a clean share,
-the rest drifting. Errors are drawn along the segment, so that its `l` windows share
-them as they do in a video.
+A batch has `s` segments of `n + l` frames, `n` past frames for the first of `l`
+windows. Each segment has its own random shape β, speed (stride) and mirroring, and
+posture errors of its own standard deviation: a share of segments has no correlated
+errors, the others have AR(1) errors. Errors are drawn once along a segment, so that its
+`l` overlapping windows share them as in a video.
 """
 
 from collections.abc import Sequence
@@ -30,14 +31,15 @@ from bodyslam_jax.motion.prediction import leg_length
 from bodyslam_jax.motion.training.noise import disturb, drift
 
 DENSE = 4
-"""Training data are kept at four times the model's rate: phases and speeds."""
+"""Training data are stored at this multiple of the model's frame rate, so that segments
+can start at any phase and have different speeds."""
 
 _ROOT_SHARE = 0.3
-"""Share of segments in which the root's orientation errs too."""
+"""Probability that a segment has errors of the root's orientation too."""
 
 
 class Corpus(eqx.Module):
-    """All training frames in a row, and where a segment may begin."""
+    """All training frames, concatenated, and the frames where a segment may begin."""
 
     poses: Float[Array, "n 24 3"]
     """Axis-angle, rad."""
@@ -48,7 +50,7 @@ class Corpus(eqx.Module):
     last: Int[Array, " c"]
     """Last frame of the clip that a candidate belongs to."""
     cumulative: Float[Array, " c"]
-    """Sum of the candidates' probabilities so far."""
+    """Cumulative distribution over the candidates."""
 
     @property
     def num_windows(self) -> int:
@@ -62,7 +64,8 @@ class Batch(eqx.Module):
     move: Float[Array, "s l 3"]
     """True displacement in H_{k-1}, leg lengths per step."""
     frame: Float[Array, "s l 3 3"]
-    """True C_{H_0}^T C_{H_{k-1}}: takes the segment's displacements to one frame."""
+    """True C_{H_0}^T C_{H_{k-1}}: rotates displacements in H_{k-1} into H_0, the root
+    frame before the segment's first step."""
     pose: Float[Array, "s l 24 3"]
     """True posture of frame k; row 0 is the rotation vector from k-1 to k."""
     weight: Float[Array, "s l"]
@@ -190,10 +193,13 @@ def _mirrored(
 def _errors(
     keys: Key[Array, " 4"], s: int, frames: int, settings: MotionTraining
 ) -> Float[Array, "s f 24 3"]:
-    """Drift in equal steps from none to `drift_deg` after a clean share of segments.
+    """Errors of joint angles for `s` segments, rad.
 
-    The root, whose error is another one in video, drifts in some of the segments, by
-    a random share.
+    The first `clean_share` of the segments has no AR(1) error; in the others its
+    standard deviation rises linearly with the segment's index, from 0 to nearly
+    `drift_deg`. White noise is added to all but the first 70 % of the former. As the
+    root's error in a video differs from that of the joints, it is a random share of
+    this error in some segments, and zero in the rest.
     """
     clean = settings.clean_share
     place = np.arange(s) / s

@@ -26,13 +26,14 @@ TARGETS = (0.10, 0.13, 0.18)
 def validated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> Float[np.ndarray, " 6"]:
-    """Ratio of error to step at each of `DRIFTS`, then slope at each."""
+    """Mean error over mean step length at each of `DRIFTS`, then the slope (projection
+    of predicted on true displacement) at each."""
     runs = [summary(run_trials(model, body, trials, d)) for d in DRIFTS]
     return np.array([run[k] for k in ("ratio", "slope") for run in runs])
 
 
 def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
-    """The figures of `validated` by name."""
+    """The values that `validated` returns, by name."""
     names = [f"{what} at {d:g}°" for what in ("ratio", "slope") for d in DRIFTS]
     return dict(zip(names, map(float, row), strict=True))
 
@@ -53,9 +54,11 @@ def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
 def calibrated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> MotionModel:
-    """Scales the covariance to a mean square of whitened errors of 1, over all drifts.
+    """Scales the predicted covariance so that the mean squared whitened error per axis
+    (NEES / 3) is 1 over `trials` at all `DRIFTS`.
 
-    The paper's network predicts no covariance; its constant one is measured here.
+    The paper's network predicts no covariance; the covariance of its errors is used as
+    a constant.
     """
     runs = [run_trials(model, body, trials, d) for d in DRIFTS]
     error = np.concatenate([(r.predicted - r.true)[r.valid] for r in runs]).astype(
