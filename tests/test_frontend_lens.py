@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from test_frontend_motion import CAMERA, SIZE, camera_error, scene
 
-from bodyslam_jax.config import Structure
+from bodyslam_jax import simulation
+from bodyslam_jax.config import Simulation, Structure
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion_warning
 from bodyslam_jax.sfm.zoom import without_zoom
@@ -54,6 +55,21 @@ def test_a_camera_that_does_not_zoom_is_left_as_it_is(kind):
     model = model_of(tracks, GUESS)
     assert model.zoom is None and model.warnings == ()
     assert model.intrinsics is GUESS and model.tracks is tracks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "family"), [("D1", "room"), ("E1", "follow")])
+def test_a_long_walk_is_no_zoom(name, family):
+    """Over hundreds of frames pairs were found that a rotation and a zoom explain."""
+    walk = simulation.simulate(Simulation(sequence=name, family=family))
+    sequence = simulation.as_sequence(walk)
+    model = find_camera_model(
+        sequence.tracks, sequence.intrinsics, sequence.num_frames, Structure()
+    )
+    assert model.zoom is None and model.warnings == ()
+    radius = np.linalg.norm(walk.T_WC[:, :3, 3] - walk.T_WC[:, :3, 3].mean(axis=0))
+    radius /= np.sqrt(len(walk.T_WC))
+    assert camera_error(model.found.T_WC, walk.T_WC) < 0.02 * radius
 
 
 @pytest.mark.parametrize("ratio", [0.75, 4 / 3])

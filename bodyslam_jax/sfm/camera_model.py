@@ -67,6 +67,12 @@ def find_camera_model(
     centre = np.asarray(intrinsics.params[2:4], float)
     plain = tracks_without_zoom(tracks, zoom, centre) if zoom.any() else tracks
     found = reconstruct(plain, intrinsics, num_frames, config)
+    if zoom.any() and found.kind == "moving":
+        # A turning zoom supposes a camera that does not translate, and forward motion
+        # scales images too: without a zoom the tracks must fit worse.
+        unzoomed = reconstruct(tracks, intrinsics, num_frames, config)
+        if _no_worse(unzoomed, found):
+            zoom, plain, found = np.zeros(num_frames), tracks, unzoomed
     for turn in range(_ROUNDS):
         lens = _examine(plain, intrinsics, found)
         if lens is None:
