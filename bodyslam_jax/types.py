@@ -9,7 +9,9 @@ from C to W. Axes: `t` frames, `h` people, `l` landmarks, `m` observations.
 """
 
 import dataclasses
+import importlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -349,3 +351,17 @@ class Result:
         if not (isinstance(used, list) and len(used) == 2):
             return np.ones(len(frames), bool)
         return (frames >= used[0]) & (frames <= used[1])
+
+    def export(
+        self,
+        path: Path | str,
+        to: str | tuple[str, ...] | None = None,
+        up: str = "y",
+        person: int | tuple[int, ...] | None = None,
+        **more: Any,
+    ) -> list[Path]:
+        """Writes the result for other programs, in the formats `to` or the one that the
+        suffix of `path` names; all options are those of `export.formats.export`."""
+        # By name: this module is below the one that writes, and imports no JAX.
+        formats = importlib.import_module("bodyslam_jax.export.formats")
+        return formats.export(self, Path(path), to, up, person, **more)

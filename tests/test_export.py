@@ -11,7 +11,6 @@ import pytest
 import trimesh
 import yaml
 from evo.tools import file_interface
-from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import diagnostics, evaluation, export
 from bodyslam_jax.body import joints, load_body_model
@@ -191,48 +190,3 @@ def test_mesh_formats(tmp_path, body):
         )
     with pytest.raises(ValueError, match="'.fbx'"):
         export.write_mesh(tmp_path / "body.fbx", vertices, np.asarray(body.faces))
-
-
-def _read_bvh(text):
-    """Positions of all joints (cm) by name, from nothing but the BVH."""
-    header, motion = text.split("MOTION")
-    parents, names, offsets, stack = [], [], [], []
-    for line in header.splitlines():
-        words = line.split()
-        if words[0] in ("ROOT", "JOINT", "End"):
-            names.append(words[1] if words[0] != "End" else None)
-            parents.append(stack[-1] if stack else -1)
-        elif words[0] == "{":
-            stack.append(len(names) - 1)
-        elif words[0] == "}":
-            stack.pop()
-        elif words[0] == "OFFSET":
-            offsets.append([float(x) for x in words[1:]])
-    rows = [[float(x) for x in line.split()] for line in motion.splitlines()[3:]]
-    rows = np.array(rows)
-    place, turn, column = {}, {}, 3
-    for k, name in enumerate(names):
-        if name is None:
-            continue
-        angles = Rotation.from_euler("ZXY", rows[:, column : column + 3], degrees=True)
-        column += 3
-        p = parents[k]
-        place[k] = rows[:, :3] if p < 0 else place[p] + turn[p].apply(offsets[k])
-        turn[k] = angles if p < 0 else turn[p] * angles
-    return {names[k]: x for k, x in place.items()}
-
-
-def test_bvh_holds_the_joints(tmp_path, result, body):
-    from bodyslam_jax.body import JOINT_NAMES
-
-    export.write_bvh(tmp_path / "a.bvh", result, body, person=1)
-    found = _read_bvh((tmp_path / "a.bvh").read_text())
-    for k, name in enumerate(JOINT_NAMES):
-        np.testing.assert_allclose(found[name] / 100, result.joints[1, :, k], atol=1e-5)
-
-
-def test_trc_holds_the_joints(tmp_path, result):
-    export.write_trc(tmp_path / "a.trc", result)
-    rows = (tmp_path / "a.trc").read_text().splitlines()
-    first = np.array(rows[6].split("\t")[2:], float).reshape(24, 3)
-    np.testing.assert_allclose(first / 1000, result.joints[0, 0], atol=1e-6)

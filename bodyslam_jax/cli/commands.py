@@ -12,6 +12,7 @@ from bodyslam_jax.cli.body import body_check, body_convert, body_show
 from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
 from bodyslam_jax.cli.environment import doctor
 from bodyslam_jax.cli.estimate import demo, evaluate, run
+from bodyslam_jax.cli.export import export
 from bodyslam_jax.cli.make import experiment, simulate, train_motion
 
 
@@ -37,6 +38,7 @@ COMMANDS = {
     ),
     "demo": _command(demo, "out from_pixels preset settings device overlay"),
     "evaluate": _command(evaluate),
+    "export": _command(export),
     "simulate": _command(
         simulate,
         "out sequence family length seed motion noise people hiding render",

@@ -1,0 +1,171 @@
+"""A result into files of other programs, all complete or none."""
+
+import dataclasses
+import importlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.export.formats.observations import Observations
+from bodyslam_jax.export.formats.registry import FORMATS, Format
+from bodyslam_jax.export.formats.scene import Scene, Up, make_scene
+from bodyslam_jax.io import atomic
+from bodyslam_jax.types import Result
+
+log = logging.getLogger(__name__)
+
+_MARK = "bodyslam_export.json"
+_MORE_SUFFIXES = {".usd": "usd", ".usda": "usd"}
+
+
+def export(
+    result: Result,
+    path: Path,
+    to: str | tuple[str, ...] | None = None,
+    up: Up = "y",
+    person: int | tuple[int, ...] | None = None,
+    *,
+    body: BodyModel | None = None,
+    observations: Observations | None = None,
+    video: Path | None = None,
+) -> list[Path]:
+    """Writes a result in one or more formats; all files appear complete or not at all.
+
+    Args:
+        path: File, for one format, or a folder that exists; for several formats, and
+            for those that are folders (COLMAP, nerfstudio), a folder. Where each person
+            has a file, several people's get the person's number before the suffix.
+        to: Names of `FORMATS`; without it what the suffix of `path` says.
+        up: Axis of the world that points up.
+        person: Number of the only person to write, or of several; without it everybody.
+        body: The body model of the result; without it the one of its settings.
+        observations: Of landmarks, for COLMAP; see `read_observations`.
+        video: Video or folder of images, whose frames are written beside COLMAP's and
+            nerfstudio's files.
+
+    Returns the files and folders that were written.
+
+    **Raises:** `ValueError`, in one line, for unknown formats, missing extras, nobody
+    to write, another body model, or a folder whose content is no earlier export.
+    """
+    names = _names(path, to)
+    formats = [FORMATS[name] for name in names]
+    writers = [_writer(format) for format in formats]
+    several = len(formats) > 1
+    if several and path.suffix in {f.suffix for f in FORMATS.values() if f.suffix}:
+        raise ValueError(
+            f"{path}: a file, expected a folder for {len(formats)} formats."
+        )
+    if body is None:
+        body = load_body_model(result.summary.get("settings", {}).get("body_model"))
+    scene = make_scene(result, body, up, person, observations, video)
+    plain = scene if up == "y" else make_scene(result, body, "y", person, observations)
+    inside = several or (path.is_dir() and bool(formats[0].suffix))
+    jobs = []
+    for format, write in zip(formats, writers, strict=True):
+        if up == "z" and not format.turns:
+            log.warning("%s: y is up in it by its specification.", format.name)
+        base = path / format.file if inside else path
+        for target, part in _parts(format, base, scene if format.turns else plain):
+            _check_target(format, target)
+            jobs.append((format, write, target, part))
+    with atomic.hidden_folder(path if inside else path.parent) as partial:
+        places = [partial / f"{k}-{job[2].name}" for k, job in enumerate(jobs)]
+        for place, (format, write, _, part) in zip(places, jobs, strict=True):
+            write(place, part)
+            if not format.suffix:
+                (place / _MARK).write_text(json.dumps(_origin(format, part)) + "\n")
+        for place, (_, _, target, _) in zip(places, jobs, strict=True):
+            _move(place, target)
+    return [job[2] for job in jobs]
+
+
+def _move(place: Path, target: Path) -> None:
+    """Files and folders that were there before under the same names are replaced, what
+    somebody added to an earlier export's folder is kept."""
+    if not target.is_dir():
+        os.replace(place, target)
+        return
+    for part in place.iterdir():
+        if (target / part.name).is_dir():
+            shutil.rmtree(target / part.name)
+        os.replace(part, target / part.name)
+
+
+def _origin(format: Format, scene: Scene) -> dict[str, str]:
+    """What a folder holds, in a file that also tells it from a user's own folder."""
+    return {"format": format.name, "input": scene.name, "up": scene.up, "unit": "m"}
+
+
+def _check_target(format: Format, target: Path) -> None:
+    """**Raises:** `ValueError` if something that is no earlier export would be lost."""
+    if format.suffix and target.is_dir():
+        raise ValueError(f"{target}: a folder, expected a file ({format.suffix}).")
+    if format.suffix or not target.exists():
+        return
+    if not target.is_dir():
+        raise ValueError(f"{target}: a file, expected a folder for {format.name}.")
+    if any(target.iterdir()) and not (target / _MARK).exists():
+        raise ValueError(
+            f"{target}: has files in it that are no earlier export, expected a new "
+            "folder; give another one."
+        )
+
+
+def _names(path: Path, to: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    if to is None:
+        known = {f.suffix: f.name for f in FORMATS.values() if f.suffix}
+        found = (known | _MORE_SUFFIXES).get(path.suffix.lower())
+        if found is None:
+            raise ValueError(
+                f"{path}: suffix {path.suffix!r} names no format, expected one of "
+                f"{', '.join(known)}; or name the format (--to)."
+            )
+        return (found,)
+    names = (to,) if isinstance(to, str) else tuple(dict.fromkeys(to))
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown or not names:
+        raise ValueError(
+            f"--to {' '.join(unknown)}: unknown, expected of {', '.join(FORMATS)}."
+        )
+    return names
+
+
+def _writer(format: Format) -> Callable[[Path, Scene], None]:
+    """**Raises:** `ValueError` that says how to get what is not installed."""
+    module = importlib.import_module(format.module)
+    if format.extra is not None and not module.is_installed():
+        raise ValueError(
+            f"--to {format.name}: not installed, expected the extra `{format.extra}`; "
+            f"pip install 'bodyslam-jax[{format.extra}]'."
+        )
+    return module.write
+
+
+def _parts(format: Format, base: Path, scene: Scene) -> list[tuple[Path, Scene]]:
+    """Files of a format, and what is in each."""
+    if not format.per_person:
+        return [(base, scene)]
+    if not scene.people:
+        raise ValueError(f"--to {format.name}: nobody is in this run, expected people.")
+    found = []
+    for k, number in enumerate(scene.people):
+        fields = ("poses", "trans", "betas", "joints", "present")
+        one = {n: getattr(scene.result, n)[k : k + 1] for n in fields}
+        part = dataclasses.replace(
+            scene,
+            result=dataclasses.replace(scene.result, **one),
+            people=(number,),
+        )
+        if "{}" in base.name:
+            target = base.with_name(base.name.format(number))
+        elif len(scene.people) == 1:
+            target = base
+        else:
+            target = base.with_name(f"{base.stem}_{number}{base.suffix}")
+        found.append((target, part))
+    return found

@@ -1,0 +1,16 @@
+"""KITTI odometry (Geiger et al., CVPR 2012): a camera-to-world 3x4 matrix a line."""
+
+from pathlib import Path
+
+import numpy as np
+
+from bodyslam_jax.export.formats.scene import Scene
+
+
+def write(path: Path, scene: Scene) -> None:
+    """Writes the poses of the frames in which the camera is located, m, row by row.
+
+    The format has no timestamps: line k is the k-th located frame.
+    """
+    poses = scene.result.T_WC[scene.result.located, :3].reshape(-1, 12)
+    np.savetxt(path, poses, fmt="%.9f")

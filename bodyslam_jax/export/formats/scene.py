@@ -1,0 +1,262 @@
+"""What every format is written from: a result in the world that was asked for."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.body import PARENTS, BodyModel, joints, rest_joints
+from bodyslam_jax.export.formats.observations import Observations
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.types import Result
+
+Up = Literal["y", "z"]
+Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation from the run's world (y up) to one whose z axis is up: z becomes -y."""
+COLORS = ((232, 110, 36), (40, 170, 115), (150, 90, 200), (200, 160, 20))
+"""Of people, sRGB, as in report and overlay."""
+_OTHER_BODY = 0.01
+"""Distance between a result's joints and those of the body model, m, from which the
+model cannot be the one that the result was estimated with."""
+_LARGE = 100.0
+"""Length of the ground, m, up to which its grid has a line each metre."""
+_UNEVEN = 0.25
+"""Share of a frame's duration by which timestamps may be off a constant rate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A result with all that a writer needs besides."""
+
+    result: Result
+    """In the world whose axis `up` is up; only the people who are written."""
+    body: BodyModel
+    people: tuple[int, ...]
+    """Their numbers in the run, in the order of the arrays of `result`."""
+    up: Up
+    size: tuple[int, int]
+    """Width and height of the images, px."""
+    observations: Observations | None = None
+    video: Path | None = None
+    """Video or folder of images whose frames are written beside COLMAP's and
+    nerfstudio's files; `None` writes names only."""
+
+    @property
+    def name(self) -> str:
+        """What the run calls its input."""
+        return str(_input(self.result).get("name", "bodyslam"))
+
+    @functools.cached_property
+    def rest(self) -> Float[np.ndarray, "h 24 3"]:
+        """Joints of each person's rest pose, m, pelvis at `J_0(β)`."""
+        shapes = jnp.asarray(self.result.betas, self.body.dtype)
+        return np.asarray(rest_joints(self.body, shapes), np.float64)
+
+    @functools.cached_property
+    def offsets(self) -> Float[np.ndarray, "h 24 3"]:
+        """Rest joints relative to their parents', m; 0 for the pelvis."""
+        offsets = self.rest - self.rest[:, np.array(PARENTS)]
+        offsets[:, 0] = 0.0
+        return offsets
+
+    @property
+    def pelvis(self) -> Float[np.ndarray, "h t 3"]:
+        """Pelvis joints, m."""
+        return self.rest[:, None, 0] + self.result.trans
+
+    @property
+    def focal_factor(self) -> Float[np.ndarray, " t"]:
+        """Focal length of each frame over that of the result's intrinsics."""
+        zoom = None if self.observations is None else self.observations.zoom
+        return np.ones(len(self.result.timestamps)) if zoom is None else zoom
+
+    @property
+    def seconds(self) -> Float[np.ndarray, " t"]:
+        """Times from the first frame, s."""
+        return self.result.timestamps - self.result.timestamps[0]
+
+    @property
+    def ground(self) -> Float[np.ndarray, "4 3"] | None:
+        """Corners of the ground below people and cameras, m, counter-clockwise seen
+        from above, at whole metres; `None` where nobody stands on it."""
+        r = self.result
+        if not r.present.any():
+            return None
+        R = Y_TO_Z if self.up == "z" else np.eye(3)
+        points = [r.T_WC[r.located, :3, 3], r.joints[r.present].reshape(-1, 3)]
+        level = (np.concatenate(points) @ R)[:, [0, 2]]
+        x, z = np.floor(level.min(axis=0)) - 1
+        far_x, far_z = np.ceil(level.max(axis=0)) + 1
+        corners = [[x, 0, far_z], [far_x, 0, far_z], [far_x, 0, z], [x, 0, z]]
+        return np.array(corners) @ R.T
+
+    @property
+    def grid(self) -> Float[np.ndarray, "n 2 3"]:
+        """Segments of a grid on the ground, one each metre, each ten where it is large;
+        none without a ground."""
+        corners = self.ground
+        if corners is None:
+            return np.zeros((0, 2, 3))
+        a, b, c, d = corners
+        lines = []
+        for start, along, across in ((a, b - a, d - a), (a, d - a, b - a)):
+            length = np.linalg.norm(along)
+            step = 1.0 if length <= _LARGE else 10.0
+            for s in np.arange(0.0, length + 1e-6, step):
+                foot = start + s / length * along
+                lines.append([foot, foot + across])
+        return np.array(lines)
+
+    def with_held_poses(self) -> "Scene":
+        """Frames without the person repeat the last pose before them, or the first."""
+        r = self.result
+        at = np.stack([held(there) for there in r.present]) if len(r.present) else None
+        if at is None:
+            return self
+        take = lambda x: np.stack([row[k] for row, k in zip(x, at, strict=True)])
+        fields = {n: take(getattr(r, n)) for n in ("poses", "trans", "joints")}
+        return dataclasses.replace(self, result=dataclasses.replace(r, **fields))
+
+    def vertices(self, h: int) -> Float[np.ndarray, "v 3"]:
+        """The skin of a person's rest pose, m."""
+        template, dirs = (
+            np.asarray(x, np.float64)
+            for x in (self.body.template, self.body.shape_dirs)
+        )
+        return template + dirs @ self.result.betas[h]
+
+
+def make_scene(
+    result: Result,
+    body: BodyModel,
+    up: Up = "y",
+    person: int | tuple[int, ...] | None = None,
+    observations: Observations | None = None,
+    video: Path | None = None,
+) -> Scene:
+    """The people asked for (all who are present at all), in a world with that axis up.
+
+    **Raises:** `ValueError` if there is no such person, or if `body` is not the body
+    model of the result.
+    """
+    seen = np.flatnonzero(result.present.any(axis=1))
+    chosen = np.atleast_1d(seen if person is None else np.array(person, int))
+    if missing := [str(h) for h in chosen if h not in seen]:
+        known = ", ".join(map(str, seen)) or "nobody"
+        raise ValueError(
+            f"--person {' '.join(missing)}: not in this run, expected {known}."
+        )
+    fields = ("poses", "trans", "betas", "joints", "present")
+    few = dataclasses.replace(result, **{n: getattr(result, n)[chosen] for n in fields})
+    _check_body(few, body)
+    if up == "z":
+        few = turned(few, body, Y_TO_Z)
+    source = _input(result)
+    # The centre of an image lies half a pixel before half its size.
+    guess = np.round(2 * result.intrinsics[2:4] + 1)
+    width, height = source.get("width", guess[0]), source.get("height", guess[1])
+    return Scene(
+        few,
+        body,
+        tuple(int(h) for h in chosen),
+        up,
+        (int(width), int(height)),
+        observations,
+        video,
+    )
+
+
+def turned(result: Result, body: BodyModel, R: Float[np.ndarray, "3 3"]) -> Result:
+    """The same result in a world whose points are `R x`."""
+    T_WC = result.T_WC.copy()
+    T_WC[:, :3] = R @ T_WC[:, :3]
+    pelvis = np.asarray(rest_joints(body, jnp.asarray(result.betas, body.dtype)))
+    pelvis = pelvis.astype(np.float64)[:, None, 0]
+    poses = result.poses.copy()
+    poses[..., :3] = so3.log(R @ so3.exp(poses[..., :3]))
+    return dataclasses.replace(
+        result,
+        T_WC=T_WC,
+        landmarks=result.landmarks @ R.T,
+        poses=poses,
+        trans=(pelvis + result.trans) @ R.T - pelvis,
+        joints=result.joints @ R.T,
+    )
+
+
+def at_constant_rate(scene: Scene) -> Scene:
+    """The scene for formats that have a frame rate and no timestamps.
+
+    Timestamps that are off a constant rate, as of a video with gaps, are resampled to
+    their median rate: rotations along the shortest way, positions linearly; a person is
+    present between two frames where present in both.
+    """
+    r = scene.result
+    t = r.timestamps
+    even = t[0] + np.arange(len(t)) / r.fps
+    if len(t) < 2 or np.abs(t - even).max() < _UNEVEN / r.fps:
+        return scene
+    step = float(np.median(np.diff(t)))
+    times = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
+    times = np.minimum(times, t[-1])  # rounding
+    after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+    weight = (times - t[after - 1]) / (t[after] - t[after - 1])
+
+    def linear(x: np.ndarray) -> np.ndarray:
+        w = weight.reshape(-1, *[1] * (x.ndim - 1))
+        return (1 - w) * x[after - 1] + w * x[after]
+
+    slerp = lambda turns: so3.interpolate_path(t, turns, times)
+    T_WC = linear(r.T_WC)
+    T_WC[:, :3, :3] = slerp(r.T_WC[:, :3, :3])
+    num, h = len(times), len(r.poses)
+    poses = np.zeros((h, num, 24, 3))
+    for k, j in np.ndindex(h, 24):
+        turns = so3.exp(r.poses[k].reshape(-1, 24, 3)[:, j])
+        poses[k, :, j] = so3.log(slerp(turns))
+    each = lambda x: np.stack([linear(row) for row in x]) if h else x[:, :1]
+    there = (r.present[:, after - 1] | (weight == 1)) & (
+        r.present[:, after] | (weight == 0)
+    )
+    found = dataclasses.replace(
+        r,
+        timestamps=times,
+        T_WC=T_WC,
+        poses=poses.reshape(h, num, 72),
+        trans=each(r.trans).reshape(h, num, 3),
+        joints=each(r.joints).reshape(h, num, 24, 3),
+        present=there,
+    )
+    return dataclasses.replace(scene, result=found)
+
+
+def held(present: Bool[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
+    """For each frame the last one with the person, before the first the first."""
+    frames = np.where(present, np.arange(len(present)), -1)
+    return np.maximum(np.maximum.accumulate(frames), int(present.argmax()))
+
+
+def _input(result: Result) -> dict[str, Any]:
+    """What the summary says of the video; empty where there is no summary."""
+    found = result.summary.get("input")
+    return found if isinstance(found, dict) else {}
+
+
+def _check_body(result: Result, body: BodyModel) -> None:
+    """Compares joints of a few frames."""
+    for h, there in enumerate(result.present):
+        k = np.flatnonzero(there)[[0, -1]]
+        cast = lambda x: jnp.asarray(x, body.dtype)
+        posed = joints(
+            body, *map(cast, (result.poses[h, k], result.betas[h], result.trans[h, k]))
+        )
+        away = np.linalg.norm(np.asarray(posed) - result.joints[h, k], axis=-1).max()
+        if not away < _OTHER_BODY:
+            raise ValueError(
+                f"body model {body.name}: its joints are {100 * away:.0f} cm off the "
+                "run's, expected the body model of the run; give it by --body-model."
+            )
