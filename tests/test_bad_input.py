@@ -440,7 +440,7 @@ def test_detection_without_what_it_needs(folder, command, tmp_path, monkeypatch)
     assert code == 1 and "onnxruntime is not installed" in err
     monkeypatch.setitem(sys.modules, "onnxruntime", object())
     code, err = command("run", folder, "--detect", "yolox", "--offline", "--out", out)
-    assert code == 1 and "yolox_s.onnx: not there, and offline is set" in err
+    assert code == 1 and "yolox_s.onnx: " in err and "offline" in err
     assert not out.exists()
 
 

@@ -22,7 +22,12 @@ NAN, INF = float("nan"), float("inf")
 @pytest.mark.parametrize(
     ("kind", "name", "value", "expected"),
     [
-        (Config, "solver", "foo", "one of ['structured', 'adam']"),
+        (
+            Config,
+            "solver",
+            "foo",
+            "one of ['structured', 'adam', 'optimistix_lm', 'jaxopt_lm']",
+        ),
         (Config, "smoothing_hz", 0.0, "more than 0, and finite, or nothing"),
         (Config, "smoothing_hz", -3.0, "more than 0, and finite, or nothing"),
         (Config, "overlay", 1, "true or false"),

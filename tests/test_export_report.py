@@ -165,7 +165,7 @@ def test_absent_people_and_no_map(tmp_path, body):
         result, present=present, landmarks=result.landmarks[:0]
     )
     page = _write(tmp_path, result, body)
-    assert "there for 1.9 s" in page and "nan" not in _text(page)
+    assert "visible for 1.9 s" in page and "nan" not in _text(page)
     assert "Stature of person 0" in page and "Stature of person 1" not in page
     # The gap is no distance: 19 + 39 frames at 1.2 m/s.
     way = statistics.person_statistics(result, 0)

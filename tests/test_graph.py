@@ -175,7 +175,7 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
         x for x in vars(g).values() if isinstance(x, type) and issubclass(x, g.Factor)
     }
     classes = {x for x in classes if not inspect.isabstract(x)}
-    assert {type(factor) for factor in factors} == classes, "a class without a test"
+    assert {type(factor) for factor in factors} >= classes, "a class without a test"
     step = jax.tree.map(
         lambda x: jnp.asarray(rng.standard_normal(x.shape)), state.zero_step()
     )

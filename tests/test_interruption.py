@@ -138,7 +138,7 @@ def test_a_stage_that_is_interrupted_while_it_is_written_is_done_again(tmp_path)
     again = cache.stage("detection", "k", kind, lambda: value)
     np.testing.assert_array_equal(again.points, value.points)
     found = cache.stage("detection", "k", kind, lambda: pytest.fail("computed again"))
-    assert [len(p) for p in found.split()] == [1, 0, 2]
+    assert [len(p) for p in found.by_frame()] == [1, 0, 2]
     assert cache.owner() == {"name": "a"}
 
 

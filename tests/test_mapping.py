@@ -21,7 +21,7 @@ import numpy as np
 import scenes
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver.compilation import compiled
-from bodyslam_jax.solver import Stage, over_devices, solve
+from bodyslam_jax.solver import Stage, vmap_over_devices, solve
 """
 
 
@@ -71,7 +71,7 @@ def test_every_device_takes_a_share_of_any_batch(tmp_path):
             return {"sum": jnp.sum(x) * shared["rate"], "device": device, "name": "n"}
 
         for size in (1, 2, 5, 6):
-            spread = over_devices(one, (0, None))
+            spread = vmap_over_devices(one, (0, None))
             x = np.arange(2.0 * size).reshape(size, 2)
             # What is put on a device is as welcome as what is not.
             found = spread(jax.device_put(x, second), {"rate": jnp.array(3.0)})
@@ -149,7 +149,7 @@ def test_solves_on_two_devices_are_single_solves(tmp_path):
         starts = [scenes.perturb(rng, problem, truth, size=0.01) for _ in range(3)]
         one = lambda p, s: solve(p, s, schedule=(Stage(max_steps=6),))
         batch = jax.tree.map(lambda *x: jnp.stack(x), *starts)
-        found = over_devices(one, (None, 0))(problem, batch)
+        found = vmap_over_devices(one, (None, 0))(problem, batch)
         for k, start in enumerate(starts):
             alone = one(problem, start)
             np.testing.assert_allclose(found.cost[k], alone.cost, rtol=1e-8)

@@ -23,6 +23,7 @@ from bodyslam_jax.people import (
     trajectory_fit,
     viterbi,
 )
+from bodyslam_jax.people import fit as fitting
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 FRAMES, FPS = 60, 30.0
@@ -195,7 +196,7 @@ def test_the_skeleton_is_the_body(body):
 
 def test_the_linearisation_is_the_gradient_of_the_cost(body):
     fit, shape = random_fit()
-    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit(limit_sigma=0.2))
+    scene = fitting.make_scene(CAMERA, body, FPS, PeopleFit(limit_sigma=0.2))
     rng = np.random.default_rng(1)
     uv = jnp.asarray(rng.normal([320, 240], 60.0, size=(25, 2)))
     sigma = jnp.full(25, 20.0).at[3].set(jnp.inf)
@@ -225,7 +226,7 @@ def test_the_linearisation_is_the_gradient_of_the_cost(body):
 
 def test_a_guess_weighs_as_much_as_it_is_sure(body):
     fit, shape = random_fit()
-    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    scene = fitting.make_scene(CAMERA, body, FPS, PeopleFit())
     uv, sigma = jnp.zeros((25, 2)), jnp.full(25, 20.0)
     size = len(fit.latent)
     sure = jnp.linspace(0.5, 2.0, size)
@@ -244,7 +245,7 @@ def test_a_guess_is_a_start(body, monkeypatch):
     monkeypatch.setattr(multistart, "_FIRST_STEPS", 0)
     monkeypatch.setattr(multistart, "_LAST_STEPS", 0)
     fit, _ = random_fit()
-    scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
+    scene = fitting.make_scene(CAMERA, body, FPS, PeopleFit())
     _, local = jax.jit(skeleton.place_points)(
         scene.skeleton, scene.prior.angles(fit.latent), jnp.zeros(skeleton.NUM_SHAPE)
     )

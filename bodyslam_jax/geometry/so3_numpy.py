@@ -89,4 +89,5 @@ def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 
 
 
 def _of_vector(vector: np.ndarray) -> Rotation:
-    return Rotation.from_rotvec(vector.reshape(-1, 3))
+    # A copy: SciPy refuses read-only arrays, as those that come from JAX.
+    return Rotation.from_rotvec(np.array(vector.reshape(-1, 3)))

@@ -29,6 +29,10 @@ _SIGMAS = 5.0
 _GIVEN_SIGMAS, _GIVEN_GAIN = 10.0, 0.1
 """The same for a camera given in camera.json, and the share by which the reprojection
 error must fall as well."""
+_ZOOM_SIGMAS = 10.0
+"""The same for a zoom of a camera that translates: its errors are correlated over time
+with the drift of the map, which a zoom absorbs (6 standard deviations on a walk of 600
+frames without a zoom; 24 for a zoom by 1.1 over 60 frames)."""
 _LEAST_ASPECT, _MOST_ASPECT_SIGMA = 0.06, 0.045
 """Least |log(fx / fy)| that is not explained by errors of the tracks, and the largest
 standard deviation of its estimate with which it is used."""
@@ -79,7 +83,9 @@ def find_camera_model(
             break
         _log.debug("lens: %s", lens)
         least = 0.01 if zoom.any() else LEAST_ZOOM
-        better, more, doubts = _improved(lens, intrinsics, given, least)
+        better, more, doubts = _improved(
+            lens, intrinsics, given, least, bool(zoom.any())
+        )
         if turn == 0:
             warnings += doubts
         if better is None and more is None:
@@ -146,7 +152,11 @@ def _examine(
 
 
 def _improved(
-    lens: Lens, intrinsics: Intrinsics, given: Intrinsics, least_zoom: float
+    lens: Lens,
+    intrinsics: Intrinsics,
+    given: Intrinsics,
+    least_zoom: float,
+    zooms_already: bool,
 ) -> tuple[Intrinsics | None, np.ndarray | None, list[str]]:
     """The corrected camera and the zoom to add, where significant (else `None`); and
     messages on deviations that are not applied."""
@@ -158,8 +168,15 @@ def _improved(
     doubts: list[str] = []
     changed = False
     ratio, zooms = params[0] / params[1], None
-    if lens.zoom_range > max(least_zoom, _SIGMAS * lens.zoom_sigma):
+    needed = _SIGMAS if zooms_already else _ZOOM_SIGMAS
+    if lens.zoom_range > max(least_zoom, needed * lens.zoom_sigma):
         zooms = lens.zoom
+    elif lens.zoom_range > max(least_zoom, _SIGMAS * lens.zoom_sigma):
+        doubts.append(
+            f"the tracks indicate a zoom by {np.exp(lens.zoom_range):.2f} (logarithm "
+            f"{lens.zoom_range:.2f} ± {lens.zoom_sigma:.2f}), which drift of the map "
+            "explains as well: not used."
+        )
     if abs(lens.aspect) > max(_LEAST_ASPECT, _SIGMAS * lens.aspect_sigma):
         sure = abs(lens.aspect) > sigmas * lens.aspect_sigma and may
         if sure and lens.aspect_sigma < _MOST_ASPECT_SIGMA:
