@@ -47,6 +47,7 @@ def test_every_joint_turns_keypoints_where_blend_shapes_do_or_the_body_is_traced
     assert told == [g.JOINTS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "layout, without", [("coco17", ()), ("body25", g.KeypointReprojection)]
 )

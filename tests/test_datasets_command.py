@@ -42,6 +42,7 @@ def _write_run(folder, truth):
     return folder
 
 
+@pytest.mark.slow
 def test_evaluate_works_on_every_data_set(tmp_path, bodies, command):
     """One size of sequence, so that the errors are compiled once."""
     world = make_world()

@@ -110,6 +110,7 @@ def test_wrong_scale_shows_where_scale_is_not_aligned():
     np.testing.assert_allclose(found["scale"], 1 / 0.8, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunking", ["wham", "tram"])
 def test_drift_of_a_still_person(chunking):
     """W grows with the chunk; the alignment over all of it halves that at least."""
@@ -274,6 +275,7 @@ def test_feet_slide_only_where_the_truth_stands():
     np.testing.assert_allclose(found.mean(), 0.02)
 
 
+@pytest.mark.slow
 def test_feet_are_toes_and_heels_of_the_body_that_both_have(body):
     """And else the joints of ankles and feet, of which the table tells."""
     rng = np.random.default_rng(0)
@@ -338,6 +340,7 @@ def test_an_estimate_that_is_not_a_number_is_not_perfect(noisy):
             assert np.isnan(value), name
 
 
+@pytest.mark.slow
 def test_one_broken_person_spoils_the_mean_of_all():
     """Whether it is the estimate or the truth that is not a number."""
     estimate, truth = _pair(_truth(2), _truth(2))
@@ -362,6 +365,7 @@ def test_a_camera_that_stands_still_has_no_scale(noisy):
     assert np.isfinite(found["h_ate_se3"]) and np.isfinite(found["h_ate_a3"])
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing(noisy):
     estimate, truth = _pair(*noisy)
     short = [jax.tree.map(_first_frames, x) for x in (estimate, truth)]
@@ -377,6 +381,7 @@ def _first_frames(x):
     return x[:20] if len(x) == NUM else x[:, :20]
 
 
+@pytest.mark.slow
 def test_a_batch_is_one_call(noisy):
     estimate, truth = _pair(*noisy)
     moved = _pair(_truth(), noisy[1])[0]
@@ -402,6 +407,7 @@ def _check_gradient(noisy, names):
         assert np.all(np.isfinite(found.joints)) and np.all(np.isfinite(found.T_WC))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_also_at_the_truth(noisy):
     _check_gradient(noisy, ("c_ate_sim3_rmse", "wa_mpjpe", "rpe_rotation", "rte"))
 
@@ -475,6 +481,7 @@ def test_what_the_truth_lacks_is_nan_and_not_in_the_table():
     assert "h_ate_se3" not in evaluation.evaluate(truth, alone)
 
 
+@pytest.mark.slow
 def test_single_precision_throughout(noisy):
     single = lambda x: jax.tree.map(
         lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, x
@@ -512,6 +519,7 @@ def test_a_piece_of_a_track_does_not_beat_the_whole():
     assert float(result["h_ate_se3"]) > 0.01
 
 
+@pytest.mark.slow
 def test_what_is_compared_is_said():
     truth = _truth(num_people=2)
     present = np.ones((1, NUM), bool)

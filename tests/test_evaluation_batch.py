@@ -53,6 +53,7 @@ def stacked(pairs):
     return bs.stack_pairs(pairs)
 
 
+@pytest.mark.slow
 def test_stacked_errors_are_those_of_each_pair(pairs, stacked):
     found = jax.jit(jax.vmap(bs.evaluate))(*stacked)
     evaluate_unpadded = jax.jit(evaluation.evaluate_trajectories)

@@ -50,6 +50,7 @@ def scene():
     return problem, truth, scenes.perturb(rng, problem, truth)
 
 
+@pytest.mark.slow
 def test_mapped_perturbations_are_single_solves(scene):
     problem, truth, start = scene
     held, bare = experiments.without_map(problem, start, hold_cameras=True)

@@ -450,6 +450,7 @@ def test_rendered_walk_from_its_video():
     assert camera_error(cameras.T_WC, truth) * spread_of_path < 0.02  # m
 
 
+@pytest.mark.slow
 def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
     """The camera comes near a wall, sees 60 points of it, and turns away. Maps that
     start beyond take its way along the wall for a turn of 17°."""

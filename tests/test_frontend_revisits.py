@@ -216,6 +216,7 @@ def test_long_tracks_are_cut_into_pieces_that_know_of_each_other(scene):
     np.testing.assert_allclose(told[7], square[piece == 6].sum(axis=0))
 
 
+@pytest.mark.slow
 def test_a_camera_that_turns_back_keeps_the_size_of_its_map():
     """The same tracks, joined and not: a room filmed for eight seconds."""
     made = simulation.simulate(Simulation(sequence="D1", family="room", length=240))

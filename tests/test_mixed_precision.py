@@ -51,6 +51,7 @@ def test_only_factors_are_in_single_precision():
     assert final.lin.costs.dtype == double
 
 
+@pytest.mark.slow
 def test_slopes_and_costs_are_those_of_double_precision():
     problem, _, state = make(frames=12, people=1)
     problem, state = pad(problem, state)
@@ -87,6 +88,7 @@ def test_the_state_s_own_single_precision_is_left_as_it_is():
     assert float(found.cost) == float(plain.cost)
 
 
+@pytest.mark.slow
 def test_it_maps_over_starts_and_has_the_derivatives_of_double_precision():
     problem, _, start = make()
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), start)

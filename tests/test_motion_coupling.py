@@ -68,6 +68,7 @@ def test_no_derivative_flows_through_a_prediction():
     assert not ravel_pytree(push)[0].any()
 
 
+@pytest.mark.slow
 def test_first_order_steps_follow_what_is_predicted_anew():
     """Each by the gradient of the cost with the prediction at its place, held."""
     problem, start = make(held_to_prediction)

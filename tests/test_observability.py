@@ -152,6 +152,7 @@ def test_a_size_no_better_known_than_before_is_reported():
     assert not any("person" in line for line in sure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
 def test_a_scale_that_nothing_sees_is_unknown_in_any_unit_of_the_map(unit):
     problem, state, _ = make(people=1)

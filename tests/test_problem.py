@@ -231,6 +231,7 @@ def test_a_problem_too_large_for_memory_reports_how_many_frames_fit(monkeypatch)
         g.make_problem([], people_of(int(1.2 * int(fit))))
 
 
+@pytest.mark.slow
 def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
     """As much more as the factorisation keeps for them, or some more."""
 
@@ -434,6 +435,7 @@ def test_a_state_has_one_precision():
         make(half)
 
 
+@pytest.mark.slow
 def test_added_frames_have_no_weight_in_any_factor():
     """Wherever the frames are: they stay where they were as others move."""
     state, factors = fitting()
@@ -450,6 +452,7 @@ def test_added_frames_have_no_weight_in_any_factor():
     assert checked >= 10
 
 
+@pytest.mark.slow
 def test_a_loss_has_one_scale_or_one_for_each_keypoint():
     state, factors = fitting()
     keypoints = factors["KeypointReprojection"]

@@ -68,24 +68,32 @@ def last(monkeypatch, count):
     [
         {"frames": 33, "landmarks": 60, "known": True},
         # Long tracks: a chunk touches five others.
-        {"frames": 53, "landmarks": 60, "length": 50},
+        pytest.param(
+            {"frames": 53, "landmarks": 60, "length": 50}, marks=pytest.mark.slow
+        ),
         # The camera goes there and back: chunks do not stand in the order of time, by
         # which it is held steady.
-        {
-            "frames": 53,
-            "landmarks": 60,
-            "again": True,
-            "steady": True,
-            "free_intrinsics": True,
-        },
+        pytest.param(
+            {
+                "frames": 53,
+                "landmarks": 60,
+                "again": True,
+                "steady": True,
+                "free_intrinsics": True,
+            },
+            marks=pytest.mark.slow,
+        ),
         # Points that are seen all the time go last, with intrinsics and others that do.
-        {
-            "frames": 43,
-            "landmarks": 60,
-            "far": 8,
-            "known": True,
-            "free_intrinsics": True,
-        },
+        pytest.param(
+            {
+                "frames": 43,
+                "landmarks": 60,
+                "far": 8,
+                "known": True,
+                "free_intrinsics": True,
+            },
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"frames": 73, "people": 1, "landmarks": 80, "far": 8, "again": True},
             marks=pytest.mark.slow,
@@ -137,6 +145,7 @@ def test_step_is_that_of_the_dense_normal_equations(options, monkeypatch):
     assert abs(found - expected).max() < 1e-9 * abs(expected).max()
 
 
+@pytest.mark.slow
 def test_gauss_newton_reaches_the_same_optimum():
     problem, _, start = make()
     best = solve(problem, start, schedule=TIGHT)
@@ -146,6 +155,7 @@ def test_gauss_newton_reaches_the_same_optimum():
     assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_last_steps_know_what_keypoints_bend():
     problem, _, start = make(2, people=1, frames=12, noise=5.0)
     robust = g.Reprojection, g.KeypointReprojection
@@ -185,6 +195,7 @@ def test_curvature_comes_in_when_steps_gain_little_and_goes_where_it_has_no_mini
     assert following(0.99, True, 1e-4) == following(1.0, True, 1e-4) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_share_of_the_curvature_of_all_keypoints_joins_the_equations(dtype):
     problem, state, _ = make(people=1, frames=3, noise=5.0)
@@ -211,6 +222,7 @@ def test_a_share_of_the_curvature_of_all_keypoints_joins_the_equations(dtype):
     assert same and all(found.blocks[k] is lin.blocks[k] for k in same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", STOCK)
 def test_all_second_order_solvers_reach_the_same_optimum(solver):
     problem, _, start = make()
@@ -221,6 +233,7 @@ def test_all_second_order_solvers_reach_the_same_optimum(solver):
     assert found.status == "converged" and found.num_steps[1] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", STOCK)
 def test_a_stock_solver_that_is_not_there_yet_says_so(solver):
     problem, _, start = make()
@@ -251,6 +264,7 @@ def test_first_order_steps_end_by_themselves_only_where_the_cost_stays():
     assert found.status == "converged"
 
 
+@pytest.mark.slow
 def test_landmarks_known_besides_reach_the_same_optimum_as_in_stock_solvers():
     problem, _, start = make(known=True)
     found = solve(problem, start, schedule=TIGHT)
@@ -281,6 +295,7 @@ def test_noise_free_scene_is_recovered_and_history_says_how():
     assert jnp.isclose(cost[0], problem.cost(start))
 
 
+@pytest.mark.slow
 def test_a_solve_on_the_clock_is_the_same_solve():
     problem, _, start = make()
     first = Stage(("cameras", "landmarks"), max_steps=3)
@@ -551,6 +566,7 @@ def test_covariances_do_not_depend_on_what_is_eliminated_last(monkeypatch):
         assert (np.abs(one - other) <= 1e-6 * size).all(), name
 
 
+@pytest.mark.slow
 def test_what_is_eliminated_last_serves_every_kind_of_solve(monkeypatch):
     before, _, start = make(landmarks=40, frames=23, far=8)
     last(monkeypatch, 8)

@@ -251,6 +251,7 @@ def test_two_people_are_written_and_read(tmp_path):
     assert len(read_groundtruth(folder, load_body_model()).joints) == 1
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_film_and_another_another():
     settings = dataclasses.replace(SETTINGS, length=3, people=2)
     film = lambda s: np.stack(list(simulation.render(simulation.simulate(s))))

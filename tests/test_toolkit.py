@@ -170,6 +170,7 @@ def test_rescaled_states_have_the_factors_as_leading_axis(built):
     np.testing.assert_array_equal(one.roots, state.roots)
 
 
+@pytest.mark.slow
 def test_a_position_sensor_determines_the_scale(built):
     problem, state = built
     factor = positions(state)
