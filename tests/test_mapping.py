@@ -87,29 +87,6 @@ def test_every_device_takes_a_share_of_any_batch(tmp_path):
     )
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="devices of a CPU")
-def test_programs_of_the_first_device_are_kept_beside_others(tmp_path):
-    in_new_process(
-        tmp_path,
-        f"""
-        import pathlib
-        jax.config.update("jax_compilation_cache_dir", {str(tmp_path / "kept")!r})
-        traced = []
-
-        def twice(x):
-            traced.append(x)
-            return 2 * x
-
-        x = jnp.arange(3.0)
-        for _ in range(2):
-            assert kept(twice, lambda: None)(x).tolist() == [0, 2, 4]
-        assert len(traced) == 1
-        there = kept(twice, lambda: None)(jax.device_put(x, jax.devices()[1]))
-        assert there.devices() == {{jax.devices()[1]}} and len(traced) == 2
-        """,
-    )
-
-
 def test_factorisations_of_two_threads_end(tmp_path):
     """LAPACK's batches do not on two cores: each waits for the other's threads."""
     in_new_process(

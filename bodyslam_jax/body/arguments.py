@@ -1,6 +1,7 @@
 """Shapes of poses, shapes and translations, refused by the argument's name."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 _TAILS = {
@@ -30,7 +31,7 @@ def batch_of(function: str, **arguments: Array) -> tuple[int, ...]:
             )
         leads[name] = shape[: -len(tail)]
     try:
-        return jnp.broadcast_shapes(*leads.values())
+        return np.broadcast_shapes(*leads.values())
     except ValueError:
         found = ", ".join(f"`{name}` {lead}" for name, lead in leads.items())
         raise ValueError(

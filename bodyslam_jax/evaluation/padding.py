@@ -6,6 +6,7 @@ What is added is masked: errors are those of the unpadded trajectories, to round
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 

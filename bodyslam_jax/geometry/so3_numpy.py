@@ -24,7 +24,7 @@ def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
     **Raises:** `ValueError` for matrices whose determinant is not positive.
     """
     flat = rotation.reshape(-1, 3, 3)
-    finite = np.isfinite(flat).all(axis=(1, 2))[:, None]
+    finite = np.asarray(np.isfinite(flat).all(axis=(1, 2)))[:, None]
     safe = np.where(finite[..., None], flat, np.eye(3))
     vector = np.where(finite, Rotation.from_matrix(safe).as_rotvec(), np.nan)
     return vector.reshape(rotation.shape[:-1])

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import typing
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import AbstractArray
@@ -16,7 +17,7 @@ def array_annotations(kind: type[eqx.Module]) -> dict[str, type[AbstractArray]]:
     """
     fields = dataclasses.fields(kind)
     if any(isinstance(field.type, str) for field in fields):
-        types = typing.get_type_hints(kind)
+        types: dict[str, Any] = typing.get_type_hints(kind)
     else:
         types = {field.name: field.type for field in fields}
     return {
