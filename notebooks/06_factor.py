@@ -107,7 +107,7 @@ for name, cost in with_sensor.cost_by_term(both.state).items():
 # %% [markdown]
 # ## How much is it trusted?
 # λ of the new term has a name as all others have. The solution for several of them is one
-# mapped solve, in the program that is compiled already.
+# solve each, in the program that is compiled already.
 
 # %%
 name = "camera_position"
@@ -120,7 +120,7 @@ def scale_of(weight):
     return bs.solve(weighted, state).state.scale
 
 
-scales = jax.vmap(scale_of)(bs.weights(with_sensor)[name] * factors)
+scales = np.array([float(scale_of(w)) for w in bs.weights(with_sensor)[name] * factors])
 plt.figure(figsize=(5, 3))
 plt.semilogx(factors, scales / case.map_scale, "o-", label="people and sensor")
 plt.axhline(float(people_only.state.scale) / case.map_scale, ls="--", label="people only")

@@ -346,22 +346,6 @@ def test_optax_lowers_the_raw_cost(built):
 
 
 @pytest.mark.slow
-def test_the_solution_differentiates_by_and_maps_over_weights(built):
-    problem, state = built
-
-    @jax.jit
-    def scale_of(lam):
-        weighted = bs.with_weights(problem, human_motion=lam)
-        return bs.solve(weighted, state).state.scale
-
-    lam = float(bs.weights(problem)["human_motion"])
-    found = jax.vmap(scale_of)(lam * jnp.array([1.0, 1.1]))
-    assert scale_of._cache_size() <= 1
-    slope = jax.grad(scale_of)(lam)
-    np.testing.assert_allclose(slope, (found[1] - found[0]) / (0.1 * lam), rtol=0.2)
-
-
-@pytest.mark.slow
 def test_solves_from_other_scales_agree(built):
     problem, state = built
     factors = jnp.array([0.5, 2.0])
