@@ -346,16 +346,6 @@ def test_optax_lowers_the_raw_cost(built):
 
 
 @pytest.mark.slow
-def test_solves_from_other_scales_agree(built):
-    problem, state = built
-    factors = jnp.array([0.5, 2.0])
-    solve_all = bs.vmap_over_devices(bs.solve, (None, 0))
-    found = solve_all(problem, bs.rescaled(state, factors))
-    scale = np.asarray(found.state.scale) * np.asarray(factors)
-    np.testing.assert_allclose(scale[0], scale[1], rtol=1e-3)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["adam", "structured"])
 def test_solvers_are_selected_by_name(built, solver):
     problem, state = built
