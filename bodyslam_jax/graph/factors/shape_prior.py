@@ -10,7 +10,7 @@ in each frame with `λ_shape = 1`: `weights.shape_each_frame`.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -22,14 +22,8 @@ class ShapePrior(FrameFactor):
     sigma: Float[Array, "h t 10"]
     """`inf` where not measured."""
     loss: Loss = Squared()
+    keys = (("shape", 0),)
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return (("shape", 0),)
-
-    def data(self):
-        return self.shape, self.sigma
 
     def frame_residual(self, data, window, shared):
         shape, sigma = data

@@ -10,7 +10,7 @@ states (`--height`). Ours.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -26,14 +26,8 @@ class Stature(FrameFactor):
     sigma: Float[Array, "h t"]
     """m; finite in one frame of each person who was measured, `inf` elsewhere."""
     loss: Loss = Squared()
+    keys = (("shape", 0),)
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return (("shape", 0),)
-
-    def data(self):
-        return self.height, self.sigma
 
     def frame_residual(self, data, window, shared):
         height, sigma = data
