@@ -16,10 +16,10 @@ from bodyslam_jax.sfm import incremental, reconstruct, track
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.features import match, spread
 from bodyslam_jax.sfm.incremental import Builder, build_map
+from bodyslam_jax.sfm.missing_poses import fill_missing_poses
 from bodyslam_jax.sfm.multiview import resect
 from bodyslam_jax.sfm.partial_map import PartialMap
 from bodyslam_jax.sfm.person_mask import person_masks
-from bodyslam_jax.sfm.sfm import interpolate_poses
 from bodyslam_jax.simulation import as_sequence, simulate
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence, Tracks
 
@@ -426,7 +426,7 @@ def test_interpolated_poses_lie_between_and_are_held_outside():
     T[5, :3, 3] = [2.0, 0, 0]
     T[5, :3, :3] = Rotation.from_rotvec([0, 0.8, 0]).as_matrix()
     known = np.isin(np.arange(7), [1, 5])
-    filled = interpolate_poses(T, known)
+    filled = fill_missing_poses(T, known)
     np.testing.assert_allclose(filled[3, :3, 3], [1, 0, 0])
     turn = Rotation.from_matrix(filled[3, :3, :3]).as_rotvec()
     np.testing.assert_allclose(turn, [0, 0.4, 0], atol=1e-12)

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.config import Structure
-from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views, errors
 from bodyslam_jax.sfm.camera_motion import (
@@ -19,6 +18,7 @@ from bodyslam_jax.sfm.camera_motion import (
     stillness,
 )
 from bodyslam_jax.sfm.incremental import MIN_SHARED, Builder, build_map
+from bodyslam_jax.sfm.missing_poses import fill_missing_poses
 from bodyslam_jax.sfm.partial_map import PartialMap, Refine
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
@@ -288,7 +288,7 @@ def _moving(
     T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
     T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R0, grown.scene.R_CW)
     T_WC[:, :3, 3] = (grown.scene.centre - c0) @ R0.T / unit
-    T_WC = interpolate_poses(T_WC, registered)
+    T_WC = fill_missing_poses(T_WC, registered)
     views = Views(views.frame, of, views.xy)
     prior_information = information_from_other_tracks(
         grown.scene, views, grown.shown[ids]
@@ -323,7 +323,7 @@ def _fixed(
     k0 = int(np.argmax(solved))
     T_WC = np.tile(np.eye(4), (problem.num_frames, 1, 1))
     T_WC[:, :3, :3] = np.einsum("ij,tkj->tik", R_CW[k0], R_CW)
-    T_WC = interpolate_poses(T_WC, solved)
+    T_WC = fill_missing_poses(T_WC, solved)
     direction = direction @ R_CW[k0].T
     scene = Scene(np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3], direction)
     inlier = within & solved[problem.views.frame]
@@ -382,23 +382,3 @@ def _pack(
         unit=unit,
         warnings=warnings,
     )
-
-
-def interpolate_poses(
-    T_WC: Float[np.ndarray, "t 4 4"], valid: Bool[np.ndarray, " t"]
-) -> Float[np.ndarray, "t 4 4"]:
-    """Interpolates missing poses between neighbours, held before the first and after
-    the last."""
-    at = np.flatnonzero(valid)
-    if not len(at) or valid.all():
-        return T_WC
-    filled = T_WC.copy()
-    time = np.clip(np.arange(len(T_WC)), at[0], at[-1])
-    if len(at) == 1:
-        filled[:] = T_WC[at[0]]
-        return filled
-    filled[:, :3, :3] = so3.interpolate_path(at, T_WC[at, :3, :3], time)
-    for axis in range(3):
-        filled[:, axis, 3] = np.interp(time, at, T_WC[at, axis, 3])
-    filled[at] = T_WC[at]
-    return filled
