@@ -225,14 +225,17 @@ def test_a_camera_on_a_tripod_is_not_looked_for():
     np.testing.assert_array_equal(found.T_WC, np.tile(np.eye(4), (20, 1, 1)))
 
 
-def test_before_a_bare_wall_a_tripod_will_do_and_a_path_is_refused():
+def test_before_a_bare_wall_a_tripod_or_a_path_will_do():
     rows = np.zeros(0, int)
     nothing = Tracks(rows, rows, np.zeros((0, 2)))
     found = sfm.reconstruct(nothing, CAMERA, 5, static=True)
     assert found.kind == "static" and found.registered.all()
     path = CameraPath(poses(5), np.ones(5, bool), True)
-    with pytest.raises(ValueError, match="0 sightings of points in 0 frames"):
-        sfm.reconstruct(nothing, CAMERA, 5, path=path)
+    found = sfm.reconstruct(nothing, CAMERA, 5, path=path)
+    assert found.kind == "moving" and found.registered.all() and found.unit == 1.0
+    expected = np.linalg.inv(path.T_WC[0]) @ path.T_WC
+    np.testing.assert_allclose(found.T_WC, expected, atol=1e-12)
+    assert "was not compared with the images" in found.warnings[0]
 
 
 def a_person(frames=4):

@@ -196,14 +196,16 @@ def _along(
     builder = Builder(problem.views, *size, problem.focal, config, refine)
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
-    if not len(tracked := np.unique(problem.views.frame)) or (
-        not grown.has_point.any() and len(problem.views.frame) < _TESTED
-    ):
-        raise ValueError(
-            f"camera path: {len(problem.views.frame)} sightings of points in "
-            f"{len(tracked)} frames, of which no map can be made along it; expected a "
-            "background with texture."
+    num_seen = len(problem.views.frame)
+    if not num_seen or (not grown.has_point.any() and num_seen < _TESTED):
+        text = (
+            f"camera path: {num_seen} observations of background points, of which no "
+            "map can be made: the given path is used as it is and was not compared "
+            "with the images."
         )
+        nothing = np.zeros(num_seen, dtype=bool)
+        last = problem.num_frames - 1
+        return _moving(problem, grown, nothing, (0, last), (text,))
     share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
     if tested < _TESTED or share >= _EXPLAINED:
         return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
