@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bodyslam_jax.cli.body import body_check, body_convert, body_show
+from bodyslam_jax.cli.completion import completion
 from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
 from bodyslam_jax.cli.environment import doctor
 from bodyslam_jax.cli.estimate import demo, evaluate, run
@@ -32,11 +33,11 @@ def _command(function: Callable[..., Any], shown: str = "") -> Command:
 COMMANDS = {
     "run": _command(
         run,
-        """input out keypoints bodies camera masks preset settings detect device overlay
+        """input out keypoints bodies camera masks preset settings detect device
         height focal fov camera_path camera_path_metric static_camera gravity fps start
-        end person""",
+        end person open""",
     ),
-    "demo": _command(demo, "out from_pixels preset settings device overlay"),
+    "demo": _command(demo, "out from_pixels preset settings device overlay open"),
     "evaluate": _command(evaluate),
     "export": _command(export),
     "simulate": _command(
@@ -59,6 +60,7 @@ COMMANDS = {
     "body-model convert": _command(body_convert),
     "body-model check": _command(body_check),
     "doctor": _command(doctor),
+    "completion": _command(completion),
 }
 """By name; commands of one group share the first word."""
 GROUPS = {

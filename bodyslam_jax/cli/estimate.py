@@ -1,6 +1,7 @@
 """`bodyslam run`, `demo` and `evaluate`."""
 
 import logging
+import webbrowser
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ def run(
     masks: Path | None = None,
     preset: Preset = "default",
     settings: Path | None = None,
+    open: bool = False,
     config: Flat = Config(),
 ) -> int:
     """Estimates cameras, people and map, in metres, from a video or sequence folder.
@@ -43,6 +45,7 @@ def run(
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.
+        open: Open the report in a browser at the end.
         config: Settings of every stage.
     """
     from bodyslam_jax import io, pipeline
@@ -60,7 +63,7 @@ def run(
     )
     out = out or default_folder(sequence)
     _announce(f"run: {input}, {sequence.num_frames} frames", out)
-    return finish(pipeline.run_to_folder(sequence, out, config), out)
+    return finish(pipeline.run_to_folder(sequence, out, config), out, open)
 
 
 def demo(
@@ -69,6 +72,7 @@ def demo(
     from_pixels: bool = False,
     preset: Preset = "default",
     settings: Path | None = None,
+    open: bool = False,
     config: Flat = Config(),
 ) -> int:
     """Renders a walker filmed by a moving camera and runs the whole pipeline on it.
@@ -80,17 +84,18 @@ def demo(
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.
+        open: Open the report in a browser at the end.
         config: Settings of every stage.
     """
     from bodyslam_jax import pipeline
 
     _announce("demo: a rendered walker", out)
-    return finish(pipeline.demo(out, config, from_pixels=from_pixels), out)
+    return finish(pipeline.demo(out, config, from_pixels=from_pixels), out, open)
 
 
-def finish(result: Any, out: Path) -> int:
+def finish(result: Any, out: Path, is_opened: bool = False) -> int:
     """Prints what was found, why it may be doubtful, what was written and the command
-    to look at it; returns the exit code."""
+    to look at it, and opens the report if `is_opened`; returns the exit code."""
     from bodyslam_jax.cli.folders import look_at
 
     for line in result.summary["headline"]:
@@ -104,6 +109,8 @@ def finish(result: Any, out: Path) -> int:
     files = sorted(file.name for file in out.glob("[!.]*") if file.is_file())
     print(f"written to {out}: {', '.join(files)}")
     print(f"look at it: {look_at(out)}")
+    if is_opened and not webbrowser.open((out / "report.html").resolve().as_uri()):
+        log.warning("--open: no browser was found.")
     return 0 if result.summary["status"] == "ok" else 3
 
 

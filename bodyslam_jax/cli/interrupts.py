@@ -17,6 +17,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, NoReturn
 
+from bodyslam_jax.cli.progress import restore_terminal
+
 EXIT_CODE = 130
 """128 + SIGINT, as shells report a process that Ctrl-C ended."""
 GRACE = 1.0
@@ -64,6 +66,7 @@ def deferred() -> Iterator[None]:
 def leave() -> NoReturn:
     """Ends the process without Python's own shutdown, which waits for threads that
     compile."""
+    restore_terminal()
     os.write(2, _MESSAGE)
     os._exit(EXIT_CODE)
 

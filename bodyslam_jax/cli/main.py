@@ -5,7 +5,6 @@
 """
 
 import difflib
-import logging
 import os
 import signal
 import sys
@@ -14,7 +13,7 @@ from typing import NoReturn
 import tyro
 
 import bodyslam_jax
-from bodyslam_jax.cli import interrupts
+from bodyslam_jax.cli import interrupts, progress
 from bodyslam_jax.cli.commands import COMMANDS, GROUPS
 from bodyslam_jax.cli.options import GENERAL, options, suggestions
 from bodyslam_jax.cli.reference import command_help, overview
@@ -35,12 +34,10 @@ def main() -> NoReturn:
         # A closed standard output, as daemons have it: discards what is printed.
         sys.stdout = open(os.devnull, "w")
     argv = sys.argv[1:]
-    level = logging.WARNING if "--quiet" in argv else logging.INFO
-    logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr)
-    logging.getLogger("bodyslam_jax").setLevel(level)
     try:
-        code = _dispatch([arg for arg in argv if arg != "--quiet"])
-        sys.stdout.flush()
+        with progress.handled(argv) as rest:
+            code = _dispatch(rest)
+            sys.stdout.flush()
     except BrokenPipeError:
         # The reader of the output has left, as in `bodyslam ... | head`: no error, and
         # nothing for the interpreter to flush at its end.

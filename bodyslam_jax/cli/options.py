@@ -16,6 +16,7 @@ from typing import Any
 
 GENERAL = {
     "--quiet": "Prints results, warnings and errors only, no progress.",
+    "--json-log": "Progress and warnings as one JSON object a line, on standard error.",
     "--help": "The usual options.",
     "--help-all": "All options.",
 }

@@ -1,0 +1,121 @@
+"""Progress of a run as lines, JSON or a bar, and completion in real shells."""
+
+import io
+import json
+import logging
+import shutil
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import pytest
+from rich.console import Console
+
+from bodyslam_jax.cli import main, progress
+from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+
+PACKAGE = logging.getLogger("bodyslam_jax")
+
+
+@pytest.fixture
+def records():
+    """The package's records of all levels, while a test runs."""
+    found = []
+    handler = logging.Handler()
+    handler.emit = found.append
+    level = PACKAGE.level
+    PACKAGE.addHandler(handler)
+    PACKAGE.setLevel(logging.DEBUG)
+    yield found
+    PACKAGE.removeHandler(handler)
+    PACKAGE.setLevel(level)
+
+
+def a_stage(watch):
+    with watch("cameras"):
+        counter = Counter("cameras", 40)
+        counter(20)
+        time.sleep(0.25)
+        counter(30)
+        counter(40)
+
+
+def test_a_stage_reports_its_frames_time_and_compilation(records):
+    watch = Stopwatch()
+    a_stage(watch)
+    with watch("joint"):
+        jax.jit(lambda x: jnp.cumsum(jnp.sin(x)) @ jnp.tan(x))(jnp.arange(7.0))
+    done = [record.done for record in records if hasattr(record, "done")]
+    assert done == [30, 40]  # The first came within the interval between updates.
+    ends = [record for record in records if hasattr(record, "seconds")]
+    assert [record.stage for record in ends] == ["cameras", "joint"]
+    assert ends[0].seconds >= 0.25 and ends[0].compile_seconds == 0
+    assert 0 < ends[1].compile_seconds <= ends[1].seconds + 0.1
+    assert ends[1].peak_mb is None or ends[1].peak_mb > 10
+
+
+def test_a_json_log_is_one_object_a_line(records):
+    a_stage(Stopwatch())
+    PACKAGE.warning("50 %% of %s", "it")
+    lines = [json.loads(progress.JsonLine().format(record)) for record in records]
+    assert lines[0]["message"] == "cameras ..." and lines[0]["stage"] == "cameras"
+    assert lines[1]["done"] == 30 and lines[1]["total"] == 40
+    assert lines[-2]["seconds"] > 0 and lines[-2]["level"] == "info"
+    assert lines[-1] == lines[-1] | {"message": "50 % of it", "level": "warning"}
+
+
+def test_a_bar_shows_the_stage_and_leaves_its_last_line(records):
+    a_stage(Stopwatch())
+    bar, out = progress.Bar(), io.StringIO()
+    bar._console = Console(file=out, force_terminal=True, width=100)
+    for record in records:
+        bar.handle(record)
+        time.sleep(0.12)
+    bar.close()
+    shown = out.getvalue()
+    assert "30 of 40 frames" in shown and "s left" in shown
+    last = [line for line in shown.splitlines() if "cameras: " in line]
+    assert len(last) == 1 and last[0].rstrip().endswith(" s")
+    assert "\x1b[?25h" in shown  # The cursor is shown again.
+
+
+def test_general_options_are_taken_from_any_place():
+    argv = ["run", "--quiet", "x", "--json-log"]
+    level = PACKAGE.level
+    with progress.handled(argv) as rest:
+        assert rest == ["run", "x"] and PACKAGE.level == logging.WARNING
+    PACKAGE.setLevel(level)
+
+
+@pytest.mark.parametrize(
+    "typed, expected, refused",
+    [
+        ("bodyslam ru", "run", "demo"),
+        ("bodyslam run --keyp", "--keypoints", "--out"),
+        ("bodyslam body-model ", "convert", "--out"),
+        ("bodyslam body-model convert --qu", "--quiet", "--detect"),
+    ],
+)
+def test_bash_completes_commands_and_options(
+    monkeypatch, capsys, typed, expected, refused
+):
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("bash is not installed")
+    monkeypatch.setattr(sys, "argv", ["bodyslam", "completion", "bash"])
+    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
+    with pytest.raises(SystemExit):
+        main()
+    script = capsys.readouterr().out
+    words = typed.split(" ")
+    given = " ".join(f"'{word}'" for word in words)
+    script += (
+        f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _bodyslam; "
+        'printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(
+        [bash, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert expected in done.stdout.split() and refused not in done.stdout.split()
