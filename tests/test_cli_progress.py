@@ -72,7 +72,6 @@ def test_a_bar_shows_the_stage_and_leaves_its_last_line(records):
     bar._console = Console(file=out, force_terminal=True, width=100)
     for record in records:
         bar.handle(record)
-        time.sleep(0.12)
     bar.close()
     shown = out.getvalue()
     assert "30 of 40 frames" in shown and "s left" in shown

@@ -117,7 +117,9 @@ class Bar(logging.Handler):
         rate = done / seconds
         left = (total - done) / rate if rate else 0.0
         text = f"{done} of {total} frames, {rate:.1f}/s, {left:.0f} s left"
-        self._bar.update(self._task, completed=done, total=total, rate=text)
+        self._bar.update(
+            self._task, completed=done, total=total, rate=text, refresh=True
+        )
 
     def close_bar(self) -> None:
         """Takes the bar away; lines above it stay."""
