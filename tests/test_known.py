@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+import zipfile
 
 import cv2
 import jax
@@ -154,6 +155,71 @@ def test_a_trajectory_is_taken_at_the_times_of_frames(tmp_path, footage):
     assert found is not None and found.known.all() and not found.metric
     np.testing.assert_allclose(found.T_WC[:, 0, 3], np.arange(8) / 25, atol=1e-9)
     np.testing.assert_allclose(found.T_WC[:, 2, 3], np.arange(8) / 12.5, atol=1e-9)
+
+
+def write_stray(folder, T_WC):
+    folder.mkdir(exist_ok=True)
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for k, T in enumerate(T_WC):
+        row = [7000 + k / 30, k, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+        lines.append(", ".join(repr(float(value)) for value in row))
+    (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
+    K = "500.0, 0.0, 320.0\n0.0, 510.0, 240.0\n0.0, 0.0, 1.0\n"
+    (folder / "camera_matrix.csv").write_text(K)
+    return folder
+
+
+def write_record3d(folder, T_WC, packed):
+    arkit = T_WC * [1.0, -1.0, -1.0, 1.0]
+    xyzw = Rotation.from_matrix(arkit[:, :3, :3]).as_quat()
+    data = {
+        "w": 640,
+        "h": 480,
+        "fps": 30,
+        "K": [500.0, 0.0, 0.0, 0.0, 510.0, 0.0, 320.0, 240.0, 1.0],
+        "poses": np.concatenate([xyzw, arkit[:, :3, 3]], axis=1).tolist(),
+    }
+    if not packed:
+        folder.mkdir(exist_ok=True)
+        (folder / "metadata.json").write_text(json.dumps(data))
+        return folder
+    with zipfile.ZipFile(folder.with_suffix(".r3d"), "w") as archive:
+        archive.writestr("metadata", json.dumps(data))
+    return folder.with_suffix(".r3d")
+
+
+@pytest.mark.parametrize("kind", ["stray", "record3d", "r3d"])
+def test_recorders_of_arkit_are_read_and_are_metric(tmp_path, footage, kind):
+    T_WC, folder = poses(8), tmp_path / "recording"
+    if kind == "stray":
+        path = write_stray(folder, T_WC)
+    else:
+        path = write_record3d(folder, T_WC, kind == "r3d")
+    known = Known(camera_path=str(path), fps=30.0)
+    sequence = io.read_sequence(footage, camera=path, known=known)
+    expected = [500.0, 510.0, 320.0, 240.0]
+    np.testing.assert_allclose(sequence.intrinsics.params[:4], expected)
+    found = sequence.camera_path
+    assert found is not None and found.metric and found.known.all()
+    np.testing.assert_allclose(found.T_WC, T_WC, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name, content, text",
+    [
+        ("odometry.csv", b"time, x\n0, 1\n", "columns time, x"),
+        ("odometry.csv", b"timestamp, frame\n0, word\n", "not Stray Scanner's"),
+        ("metadata.json", b'{"poses": [[0, 0, 0, 1]], "fps": 30}', "qx qy qz qw"),
+        ("metadata.json", b'{"poses": [[2, 0, 0, 0, 0, 0, 0]], "fps": 3}', "no rot"),
+        ("a.r3d", b"PK", "not Record3D's metadata"),
+    ],
+)
+def test_a_recording_that_is_none_is_named(tmp_path, footage, name, content, text):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=text) as raised:
+        io.read_sequence(footage, known=Known(camera_path=str(path)))
+    assert str(path) in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -168,3 +168,25 @@ def test_what_of_an_image_is_the_mask(tmp_path):
         cv2.imwrite(str(tmp_path / name), image)
         wrong = read_mask(tmp_path / name) != ((gray > 0) & (name != "empty.jpg"))
         assert wrong.mean() < (0.005 if name == "lossy.jpg" else 1e-9), name
+
+
+@pytest.mark.parametrize("people_apart", [False, True])
+def test_masks_of_one_archive_are_those_of_a_folder(tmp_path, people_apart):
+    stack = np.stack([mask(k) for k in range(NUM)])
+    if people_apart:
+        top = np.where(np.arange(HEIGHT)[:, None] < 60, stack, 0)
+        stack = np.stack([top, stack - top], axis=1)
+    np.savez(tmp_path / "masks.npz", masks=stack)
+    found, said = read(tmp_path / "masks.npz")
+    expected, _ = read(write(tmp_path / "masks"))
+    assert said == []
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_an_archive_without_masks_is_named(tmp_path):
+    np.savez(tmp_path / "a.npz", u=np.zeros(3), v=np.zeros(3))
+    with pytest.raises(ValueError, match="a.npz: arrays u, v, expected `masks`"):
+        read(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", masks=np.zeros((20, 5)))
+    with pytest.raises(ValueError, match="b.npz: `masks` float64"):
+        read(tmp_path / "b.npz")

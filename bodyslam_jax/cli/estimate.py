@@ -38,10 +38,11 @@ def run(
         keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
         bodies: Regressed bodies, the result file of a supported tool, if not in the
             input.
-        camera: camera.json, COLMAP cameras.txt or .bin, or nerfstudio transforms.json,
+        camera: camera.json, or a file of COLMAP, nerfstudio, Stray Scanner or Record3D,
             if not in the input.
         tracks: Point tracks (tracks.npz), if not in the input.
-        masks: Folder of person masks (.png, non-zero is a person), if not in the input.
+        masks: Person masks, non-zero is a person: folder of .png, or .npz with `masks`
+            (frames, height, width), if not in the input.
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.

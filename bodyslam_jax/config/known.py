@@ -55,7 +55,8 @@ class Known:
     """Horizontal field of view, degrees, in place of the focal length: `65`, `65±2`."""
     camera_path: str | None = None
     """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `images.bin`,
-    or nerfstudio `transforms.json`. Structure from motion then only makes the map."""
+    nerfstudio `transforms.json`, Stray Scanner or Record3D (these in metres). Structure
+    from motion then only makes the map."""
     camera_path_metric: bool = False
     """Whether that path is in metres, as a visual-inertial tracker's is."""
     static_camera: bool = False

@@ -4,12 +4,14 @@ Some of them are checked when the input is read. Masks that are inverted, of ano
 size, of another video or empty would otherwise only show as a bad map.
 """
 
+import functools
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax.io.archive import open_npz
 from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.video import list_images
@@ -48,7 +50,7 @@ def read_masks(
     bodies: Bodies | None = None,
     warn: Warn,
 ) -> MaskUse:
-    """How the masks in a folder are to be used, after checking some of them.
+    """How the masks in a folder or in one `.npz` are to be used, after checking some.
 
     Masks in which zero marks people are inverted, and masks of another size but the
     same aspect ratio are resized, both with a warning. If masks do not cover the
@@ -58,16 +60,14 @@ def read_masks(
     numbers in their names do not tell which, or if their aspect ratio is not that of
     the images.
     """
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: not a folder of mask images.")
-    names = [path.name for path in list_images(folder)]
+    names = mask_names(folder)
     files, missing = _by_frame(folder, names, num_frames, images, warn)
     present = [k for k in range(num_frames) if k not in missing]
     checked = np.unique(np.linspace(0, len(present) - 1, _NUM_CHECKED).astype(int))
     size = (intrinsics.width, intrinsics.height)
     masks, resized = {}, ""
     for k in (present[i] for i in checked):
-        masks[k] = read_mask(folder / files[k][0])
+        masks[k] = read_named(folder, files[k][0])
         found = (masks[k].shape[1], masks[k].shape[0])
         if found != size:
             masks[k] = resized_to(folder / files[k][0], masks[k], size)
@@ -77,6 +77,48 @@ def read_masks(
     points = _points(people, bodies, intrinsics)
     inverted, covered = _judged(masks, points, warn)
     return MaskUse(tuple(files), inverted, not covered or bool(missing))
+
+
+def mask_names(source: Path) -> list[str]:
+    """Names of the images in a folder, or the numbers of the masks in an `.npz`.
+
+    **Raises:** `ValueError`, naming the file, if it is neither.
+    """
+    if source.is_dir():
+        return [path.name for path in list_images(source)]
+    if source.suffix != ".npz":
+        raise ValueError(f"{source}: neither a folder of mask images nor an .npz.")
+    return [str(k) for k in range(len(_stack(source)))]
+
+
+def read_named(source: Path, name: str) -> Bool[np.ndarray, "y x"]:
+    """One of the masks that `mask_names` lists.
+
+    **Raises:** `ValueError`, naming the file, if it is no image.
+    """
+    return read_mask(source / name) if source.is_dir() else _stack(source)[int(name)]
+
+
+@functools.lru_cache(maxsize=1)
+def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
+    """The masks of an `.npz`: `masks` (t, y, x), or the only array in it; several
+    people's masks (t, h, y, x) become one.
+
+    **Raises:** `ValueError`, naming the file, if there is no such array.
+    """
+    with open_npz(path) as archive:
+        names = archive.files
+        name = "masks" if "masks" in names or len(names) != 1 else names[0]
+        if name not in names:
+            raise ValueError(f"{path}: arrays {', '.join(names)}, expected `masks`.")
+        stack = archive[name]
+    if stack.ndim not in (3, 4) or stack.dtype.kind not in "biuf":
+        raise ValueError(
+            f"{path}: `{name}` {stack.dtype}{stack.shape}, expected numbers (frames, "
+            "height, width) or (frames, people, height, width)."
+        )
+    found = stack > (0 if stack.dtype.kind in "bu" else 0.5)
+    return found.any(axis=1) if found.ndim == 4 else found
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:

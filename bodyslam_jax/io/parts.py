@@ -42,7 +42,7 @@ def find_parts(path: Path) -> Parts:
         bodies=within("bodies.npz"),
         camera=within("camera.json"),
         tracks=within("tracks.npz"),
-        masks=within("masks"),
+        masks=within("masks") or within("masks.npz"),
         groundtruth=within("groundtruth"),
     )
 

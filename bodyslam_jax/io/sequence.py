@@ -60,7 +60,8 @@ def read_sequence(
         bodies: bodies in the camera frame, `bodies.npz` or another tool's result.
         camera: `camera.json`; without one the intrinsics are guessed.
         tracks: point tracks, `.npz`; without them they come from the images.
-        masks: folder of person masks, one image per frame.
+        masks: folder of person masks, one image per frame, or an `.npz` with `masks`
+            (t, height, width).
         known: what the user knows: focal length, camera path, frame rate, interval.
 
     **Raises:** `ValueError`, one line that names the file, what was found and what was
@@ -193,19 +194,20 @@ def _look_at_footage(
 ) -> tuple[Footage | None, Intrinsics | None, float | None]:
     """The video or images, the calibration, and the frame rate (1/s) that was given.
 
-    A video is looked at before the camera file, whose cameras are told apart by the
-    video's size; a folder of images after it, as the file has their frame rate.
+    The footage is looked at before the camera file, whose cameras are told apart by the
+    images' size; a folder of images again after it, at the frame rate of the file.
     """
     footage, intrinsics, fps = None, None, None
-    if parts.footage and not parts.footage.is_dir():
-        footage = look_at(parts.footage)
-        footage = at_rate(footage, known.fps) if known.fps else footage
+    if parts.footage:
+        footage = look_at(parts.footage, known.fps)
+        if known.fps and not parts.footage.is_dir():
+            footage = at_rate(footage, known.fps)
     if parts.camera:
         size = (footage.width, footage.height) if footage else None
         intrinsics, fps = read_camera(parts.camera, size)
-    fps = known.fps or fps
-    if parts.footage and footage is None:
+    if fps and not known.fps and parts.footage and parts.footage.is_dir():
         footage = look_at(parts.footage, fps)
+    fps = known.fps or fps
     return footage, intrinsics, fps
 
 

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from bodyslam_jax.io.masks import read_mask, resized_to
-from bodyslam_jax.io.video import list_images
+from bodyslam_jax.io.masks import mask_names, read_named, resized_to
 from bodyslam_jax.types import DetectedPeople, Keypoints, MaskUse, Sequence
 
 # BODY_25 limbs and their half widths, of the person's height.
@@ -95,14 +94,14 @@ def _given_masks(sequence: Sequence, folder: Path) -> Iterator[Bool[np.ndarray, 
     use = sequence.mask_use
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
     if use is None:
-        use = MaskUse(tuple((path.name,) for path in list_images(folder)))
+        use = MaskUse(tuple((name,) for name in mask_names(folder)))
     files = use.files
     if sequence.picks is not None:
         files = [files[k] for k in sequence.picks]
     for names in files:
         mask = np.zeros(size[::-1], dtype=bool)
         for name in names:
-            found = read_mask(folder / name)
+            found = read_named(folder, name)
             if found.shape != mask.shape:
                 found = resized_to(folder / name, found, size)
             mask |= found != use.inverted

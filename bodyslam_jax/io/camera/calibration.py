@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
 from bodyslam_jax.types import Intrinsics
 
@@ -29,8 +30,9 @@ def read_camera(
     """Reads intrinsics, and the frame rate (1/s) if the file has one.
 
     The file is a `camera.json` (parameters in COLMAP's order, pixel centres at whole
-    numbers), COLMAP's `cameras.txt` or `cameras.bin`, or nerfstudio's
-    `transforms.json`; or a folder with one of these.
+    numbers), COLMAP's `cameras.txt` or `cameras.bin`, nerfstudio's `transforms.json`,
+    Stray Scanner's `camera_matrix.csv` or Record3D's `metadata.json`; or a folder with
+    one of these.
 
     Args:
         size: of the video, px; it selects the camera of a file that holds several.
@@ -39,12 +41,15 @@ def read_camera(
     """
     if path.is_dir():
         names = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
+        names = (*names, *arkit.CAMERA_FILES)
         inside = [p for name in names if (p := path / name).exists()]
         if not inside:
             raise ValueError(f"{path}: none of {', '.join(names)} in this folder.")
         path = inside[0]
     if not path.exists():
         raise ValueError(f"{path}: no such file, expected a camera's.")
+    if arkit.is_camera(path):
+        return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
     if path.suffix in (".txt", ".bin"):
         return _from_cameras(path, read_cameras(path), size), None
     try:

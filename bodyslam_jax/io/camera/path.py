@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import read_poses
 from bodyslam_jax.io.camera.tum import read_tum
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
@@ -25,7 +26,8 @@ def read_camera_path(
     images: tuple[str, ...] = (),
     warn: Warn,
 ) -> CameraPath:
-    """Reads a TUM trajectory, COLMAP's images or nerfstudio's transforms.json.
+    """Reads a TUM trajectory, COLMAP's images, nerfstudio's transforms.json, or the
+    poses that Stray Scanner or Record3D recorded, which are in metres.
 
     A trajectory with as many poses as the video has frames is taken frame by frame, any
     other is interpolated at the frames' `timestamps` (s). Images are matched to frames
@@ -41,14 +43,17 @@ def read_camera_path(
     if not path.exists():
         raise ValueError(f"{path}: no such file, expected a camera path.")
     if path.is_dir():
-        inside = [path / n for n in ("images.bin", "images.txt", "transforms.json")]
+        names = ("images.bin", "images.txt", "transforms.json", *arkit.PATH_FILES)
+        inside = [path / n for n in names]
         path = next((p for p in inside if p.exists()), inside[0])
         if not path.exists():
-            raise ValueError(
-                f"{path.parent}: no images.bin, images.txt in this folder."
-            )
+            raise ValueError(f"{path.parent}: no {', '.join(names)} in this folder.")
     count = len(timestamps)
-    if path.suffix in (".bin", ".json") or path.name == "images.txt":
+    if arkit.is_path(path):
+        metric = True
+        times, poses = arkit.read_arkit_poses(path)
+        T_WC, known = _at_times(times, poses, timestamps)
+    elif path.suffix in (".bin", ".json") or path.name == "images.txt":
         names, poses = read_poses(path)
         try:
             frames = frames_of_names(
