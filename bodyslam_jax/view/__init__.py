@@ -1,5 +1,7 @@
 """Pictures of a result: the overlay video, single frames of it, the page in 3D."""
 
+from bodyslam_jax.view.notebook import NotebookScene as NotebookScene
+from bodyslam_jax.view.notebook import notebook_scene as notebook_scene
 from bodyslam_jax.view.overlay import can_write as can_write
 from bodyslam_jax.view.overlay import write_overlay as write_overlay
 from bodyslam_jax.view.people import coarse_body as coarse_body

@@ -115,8 +115,10 @@ function start() {
     title.textContent = "Runs";
     element("layers").append(title);
     runs.forEach((run, i) => {
-      const text = run.data.name + (run.ghost ? " (faint)" : "");
-      addBox(`run-${i}`, text, true, null, (on) => { run.root.visible = on; view.draw(); });
+      const text = (run.data.label ?? run.data.name) + (run.ghost ? " (faint)" : "");
+      const show = (on) => { run.root.visible = on; view.draw(); };
+      addBox(`run-${i}`, text, !run.data.hidden, null, show);
+      show(!run.data.hidden);
     });
   }
   element("panel").open = window.innerWidth > 640;
@@ -142,7 +144,7 @@ function start() {
   // ---- what was found, in words
 
   const first = data[0], unit = first.metric ? "m" : "units";
-  element("name").textContent = data.map((run) => run.name).join(" and ");
+  element("name").textContent = first.name;
   if (first.status) {
     const badge = document.createElement("span");
     badge.className = `badge ${first.status === "ok" ? "good" : "bad"}`;

@@ -76,8 +76,14 @@ class Run {
     this.plumb = fatLines([0, 0, 0, 0, -1, 0], this.style.camera, 1, 0.5);
     this.layer("camera").add(this.eye, this.plumb);
     this.layer("camera").add(this.path(this.position, this.located, this.style.camera));
-    this.cameraName = label("camera", this.style.camera);
-    this.layer("names").add(this.cameraName);
+    this.cameraName = this.named("camera", this.style.camera);
+  }
+
+  // A name; a run to compare with has none, as its names would cover the others.
+  named(text, color) {
+    const name = label(text, color);
+    if (!this.ghost) this.layer("names").add(name);
+    return name;
   }
 
   // A line through points of frames that follow one another, the future fainter.
@@ -202,8 +208,7 @@ class Run {
     skin.bind(new THREE.Skeleton(bones, inverses), new THREE.Matrix4());
     this.layer("people").add(skin);
     this.layer("paths").add(this.path(pelvis, present, person.color, LIFT));
-    const name = label(`person ${person.number}`, person.color);
-    this.layer("names").add(name);
+    const name = this.named(`person ${person.number}`, person.color);
     const rod = this.rod(person);
     const marks = body.feet.map(() => disc(0.11, person.color, 0.75));
     const prints = person.footprints.map(([frame, x, z]) => {

@@ -34,7 +34,8 @@ class View {
 
   // Extent of everybody's way on the ground, and the direction it mostly has.
   measure() {
-    const places = this.runs.flatMap((run) => run.places());
+    const shown = this.runs.filter((run) => !run.data.hidden);
+    const places = shown.flatMap((run) => run.places());
     if (!places.length) places.push([0, 0, 0]);
     const range = (a) => {
       const all = places.map((p) => p[a]).sort((x, y) => x - y);
