@@ -53,8 +53,9 @@ def run_in_locked_folder(
         result.summary["headline"] += before_after.headline(errors)
     watch = Stopwatch()
     observations = _map_observations(cameras)
+    middle = view.middle_frame(result)
     sampler = view.VideoSampler(
-        sequence.num_frames, observations, len(cameras.landmarks)
+        sequence.num_frames, observations, len(cameras.landmarks), middle
     )
     with export.run_folder(out) as partial:
         if sequence.frames is not None:
@@ -70,7 +71,10 @@ def run_in_locked_folder(
             view.write_scene(partial / "scene.html", result, body, samples)
         result.summary["durations_s"] |= watch.seconds
         export.write_files(partial, result, config)
-        export.write_report(partial / "report.html", result, body)
+        still = None
+        if sampler.whole is not None:
+            still = view.still(sampler.whole, result, body, middle)
+        export.write_report(partial / "report.html", result, body, still)
     return result
 
 

@@ -35,8 +35,18 @@ class VideoSamples:
 class VideoSampler:
     """Collects samples of the images that pass through `watch`."""
 
-    def __init__(self, num_frames: int, tracks: Tracks | None, num_landmarks: int):
-        """`tracks` are observations of the map's landmarks, in pixels of the images."""
+    def __init__(
+        self,
+        num_frames: int,
+        tracks: Tracks | None,
+        num_landmarks: int,
+        whole_frame: int | None = None,
+    ):
+        """`tracks` are observations of the map's landmarks, in pixels of the images;
+        `whole_frame` is the frame whose image is kept as it is."""
+        self.whole: Image | None = None
+        """The image of `whole_frame`, once it has passed."""
+        self._whole_frame = whole_frame
         self._step = max(1, -(-num_frames // _MOST_IMAGES))
         self._images: dict[int, bytes] = {}
         self._tracks = tracks
@@ -50,6 +60,8 @@ class VideoSampler:
     def watch(self, images: Iterable[Image]) -> Iterator[Image]:
         """The images (BGR, one per frame), unchanged; each is sampled as it passes."""
         for frame, image in enumerate(images):
+            if frame == self._whole_frame:
+                self.whole = image.copy()
             if frame % self._step == 0:
                 self._images[frame] = _small(image)
             if self._tracks is not None and frame + 1 < len(self._starts):

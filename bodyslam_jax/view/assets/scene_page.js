@@ -178,6 +178,10 @@ function start() {
   if (wanted.has("view")) look(wanted.get("view"));
   const shown = show(Number(wanted.get("frame")) || 0);
   if (wanted.has("play")) play(true);
+  if (wanted.has("embedded")) { // In a page that says the rest.
+    document.body.classList.add("embedded");
+    element("panel").open = false;
+  }
   window.bodyslam = { state, show, play, look, toggle, runs, view };
   shown.then(() => { state.ready = true; });
 }

@@ -34,6 +34,7 @@ class Run {
     this.times = decode(data.times);
     this.root = new THREE.Group();
     this.layers = {};
+    this.labels = [];
     this.lines = []; // Paths, which grow with time.
     this.aside = new THREE.Vector3(1, 0, 0); // Where the measuring rods stand.
     this.addCamera(data.camera);
@@ -79,9 +80,14 @@ class Run {
     this.cameraName = this.named("camera", this.style.camera);
   }
 
+  label(text, color) {
+    this.labels.push(label(text, color));
+    return this.labels.at(-1);
+  }
+
   // A name; a run to compare with has none, as its names would cover the others.
   named(text, color) {
-    const name = label(text, color);
+    const name = this.label(text, color);
     if (!this.ghost) this.layer("names").add(name);
     return name;
   }
@@ -259,7 +265,7 @@ class Run {
     const points = [0, 0, 0, 0, ends[1], 0];
     for (const y of [...ends, high]) points.push(-0.12, y, 0, 0.12, y, 0);
     rod.add(fatLines(points, person.color, 2, 1));
-    const text = label(`${(100 * high).toFixed(0)} ± ${(100 * sigma).toFixed(0)} cm`, person.color);
+    const text = this.label(`${(100 * high).toFixed(0)} ± ${(100 * sigma).toFixed(0)} cm`, person.color);
     text.position.y = ends[1] + 0.12;
     rod.add(text);
     this.layer("uncertainty").add(rod);
@@ -415,8 +421,7 @@ function label(text, color) {
   const sprite = new THREE.Sprite(new THREE.SpriteMaterial({
     map: texture, sizeAttenuation: false, depthTest: false, transparent: true,
   }));
-  const size = 0.026;
-  sprite.scale.set((size * canvas.width) / height, size, 1);
+  sprite.userData.aspect = canvas.width / height; // The view sets the size.
   sprite.renderOrder = 10;
   return sprite;
 }

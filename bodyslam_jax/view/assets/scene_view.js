@@ -2,6 +2,7 @@
 // The canvas: ground, light, and the viewer's own camera.
 
 const MARGIN = 1.5; // m, of ground around everybody
+const LABEL = 24; // px, of a name's height
 const SHARE = 0.82; // of the canvas that everybody's way may fill
 
 class View {
@@ -209,12 +210,21 @@ class View {
 
   // ---- drawing
 
+  sizeLabels() {
+    const high = 2 / this.camera.projectionMatrix.elements[5]; // of the view at depth 1
+    const size = (LABEL * high) / Math.max(this.canvas.clientHeight, 1);
+    for (const label of this.runs.flatMap((run) => run.labels)) {
+      label.scale.set(size * label.userData.aspect, size, 1);
+    }
+  }
+
   draw() {
     if (this.waiting) return;
     this.waiting = true;
     requestAnimationFrame(() => {
       this.waiting = false;
       if (this.mode === "camera") this.asCamera();
+      this.sizeLabels();
       this.renderer.render(this.scene, this.camera);
     });
   }
