@@ -365,3 +365,9 @@ class Result:
         # By name: this module is below the one that writes, and imports no JAX.
         formats = importlib.import_module("bodyslam_jax.export.formats")
         return formats.export(self, Path(path), to, up, person, **more)
+
+    def view(self, run: Path | str | None = None, **more: Any) -> Any:
+        """The result in 3D, for a notebook; with images of the video if its run folder
+        is given. All options are those of `view.notebook_scene`."""
+        view = importlib.import_module("bodyslam_jax.view")
+        return view.notebook_scene(self, None if run is None else Path(run), **more)

@@ -9,7 +9,8 @@ from scipy.signal import savgol_filter
 
 from bodyslam_jax import export
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.diagnostics import statistics, thresholds
+from bodyslam_jax.export.plain_words import in_plain_words
 from bodyslam_jax.types import Result
 
 
@@ -85,11 +86,17 @@ def test_says_what_was_found(tmp_path, body):
     text = _text(page)
     for words in (
         "doubtful",
-        "moves at 0.62 m/s, expected &lt; 0.4. look at the overlay.",
-        "3.6 m",  # 3 s at 1.2 m/s
-        "1.20 m/s",
+        "Look twice at this result. The feet of the person slide",
+        "What to do: look at the overlay.",
+        "moves at 0.62 m/s, expected &lt; 0.4.",
+        "person 3.6 m",  # 3 s at 1.2 m/s
+        "camera 3.0 m",
+        "person 1.2 m/s",
+        "person: 4.3 km/h",
+        "mean speed, m/s 1.20",
         f"{100 * statistics.stature(body, np.zeros(10)):.0f} ± 2 cm",
-        "known to 2.5 %",
+        "sizes are known to 2 % a metre in here is 0.97 to 1.02 m",
+        "Lengths are known to 2.5 %",
         "estimate 2 0.05",  # the scale itself, among the details
         "focal length guessed &amp; refined",
         "cameras alone joint C-ATE, SE(3), mm – no &lt;scale&gt; 25.1",
@@ -120,7 +127,7 @@ def test_missing_parts_are_left_out(tmp_path, body, result):
     assert "Warnings" not in text and "Error against" not in text
 
 
-def test_a_focal_length_that_was_guessed_has_a_card(tmp_path, body):
+def test_a_focal_length_that_was_guessed_is_stated(tmp_path, body):
     lens = {"guessed": True, "guess_px": 600.0, "focal_px": 512.4}
     card = lambda lens: _text(
         _write(
@@ -131,7 +138,7 @@ def test_a_focal_length_that_was_guessed_has_a_card(tmp_path, body):
     assert "512 ± 10 px" in found and "the guess was 600 px" in found
     kept = card(lens | {"focal_px": 600.0, "focal_sigma_px": None})
     assert "600 px" in kept and "guessed from the image" in kept
-    assert "Focal length" not in card({"guessed": False, "focal_px": 500.0})
+    assert "Focal length:" not in card({"guessed": False, "focal_px": 500.0})
 
 
 def test_the_report_gives_the_difference_of_cues_that_contradict(tmp_path, body):
@@ -151,7 +158,7 @@ def test_without_people_lengths_are_in_units_of_the_map(tmp_path, body):
     scale = {"scale": {"value": 1.0, "sigma": float("inf")}}
     text = _write(tmp_path, dataclasses.replace(_walk(people=0), summary=scale), body)
     cards = text[text.index('class="cards"') : text.index("</section>")]
-    assert "3 units" in cards and "own unit" in cards
+    assert "3 units" in cards and "nobody was found" in cards
     assert "not in metres" in cards and "there are no people" in cards
     assert "m/s" not in cards and "known to" not in cards
 
@@ -165,8 +172,9 @@ def test_absent_people_and_no_map(tmp_path, body):
         result, present=present, landmarks=result.landmarks[:0]
     )
     page = _write(tmp_path, result, body)
-    assert "visible for 1.9 s" in page and "nan" not in _text(page)
-    assert "Stature of person 0" in page and "Stature of person 1" not in page
+    text = _text(page)
+    assert "visible, s 1.9" in text and "nan" not in text
+    assert "person 0" in text and "person 1" not in text
     # The gap is no distance: 19 + 39 frames at 1.2 m/s.
     way = statistics.person_statistics(result, 0)
     np.testing.assert_allclose(way.distance, 1.2 * (19 + 39) / 30, rtol=1e-6)
@@ -232,4 +240,50 @@ def test_scenes_of_any_size_have_a_grid(tmp_path, body, size):
 
 def test_skating_is_told_beside_that_of_a_real_walk(tmp_path, body):
     text = _text(_write(tmp_path, _walk(), body))
-    assert "cm/s (a real walk: about 10 cm/s)" in text
+    assert "lower foot, cm/s 120" in text and "real walk moves at about 10 cm/s" in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("static", "stood still"), ("rotation", "turned on the spot")]
+)
+def test_a_camera_that_stays_in_its_place_has_no_way_and_no_speed(
+    tmp_path, body, kind, words
+):
+    summary = {
+        "camera_motion": kind,
+        "scale": {"sigma": None},
+        "people": [{"stature_m": 1.7, "stature_sigma_m": 0.068}],
+    }
+    result = dataclasses.replace(_walk(), summary=summary)
+    result.T_WC[:, 0, 3] = 0.0
+    page = _write(tmp_path, result, body)
+    text = _text(page)
+    assert f"camera {words}" in text and "camera 0.0" not in text
+    assert "sizes are known to 4 % all of them come from how tall people look" in text
+    speeds = page[page.index('aria-label="Speed over the ground') :]
+    assert "var(--camera)" not in speeds[: speeds.index("</svg>")]
+
+
+def test_every_reason_has_a_plain_sentence():
+    for check in (*thresholds.PERSON_CHECKS, *thresholds.WORLD_CHECKS):
+        reason = {"name": check.name, "message": "the message", "person": 3}
+        assert in_plain_words(reason, 4) != "the message", check.name
+    assert in_plain_words({"name": "new", "message": "the message"}) == "the message"
+    feet = {"name": "standing_foot_speed", "person": 3}
+    assert "of person 3 slide" in in_plain_words(feet, 4)
+
+
+def test_overlay_and_scene_beside_the_report_are_shown(tmp_path, body):
+    plain = _write(tmp_path, _walk(), body)
+    assert "<video" not in plain and "<iframe" not in plain and "<img" not in plain
+    export.write_report(tmp_path / "report.html", _walk(), body, b"jpeg")
+    still = (tmp_path / "report.html").read_text()
+    assert '<img src="data:image/jpeg;base64,anBlZw=="' in still
+    for name in ("overlay.webm", "scene.html"):
+        (tmp_path / name).write_text("")
+    export.write_report(tmp_path / "report.html", _walk(), body, b"jpeg")
+    shown = (tmp_path / "report.html").read_text()
+    assert '<video src="overlay.webm"' in shown and 'poster="data:image' in shown
+    assert '<iframe src="scene.html#embedded"' in shown
+    for name in ("overlay.webm", "scene.html"):
+        assert f'<a href="{name}">' in shown

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from bodyslam_jax import evaluation, export, pipeline, simulation
+from bodyslam_jax import evaluation, export, pipeline, simulation, view
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import before_after
@@ -53,6 +53,7 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     for name in ("camera.tum", "body_0.npz", "landmarks.ply", "config.yaml"):
         assert (out / name).stat().st_size > 0
     assert "<html" in (out / "report.html").read_text().lower()
+    assert len(view.read_runs(out / "scene.html")) == 1
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "ok"
     alone, joint = (

@@ -15,6 +15,7 @@ from bodyslam_jax.cli.environment import doctor
 from bodyslam_jax.cli.estimate import demo, evaluate, run
 from bodyslam_jax.cli.export import export
 from bodyslam_jax.cli.make import experiment, simulate, train_motion
+from bodyslam_jax.cli.view import view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,7 @@ COMMANDS = {
     "demo": _command(demo, "out from_pixels preset settings device overlay open"),
     "evaluate": _command(evaluate),
     "export": _command(export),
+    "view": _command(view),
     "simulate": _command(
         simulate,
         "out sequence family length seed motion noise people hiding render",

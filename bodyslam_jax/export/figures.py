@@ -28,12 +28,12 @@ _VARIABLES = {
     CAMERA: "var(--camera)",
     **{color: f"var(--person-{i})" for i, color in enumerate(_PEOPLE)},
 }
-FULL, HALF = 11.0, 5.4
-"""Widths of figures, inches: across the page, and half of it."""
+_WIDTH = 5.4
+"""Of figures, inches: half of a wide page, all of a phone's."""
 _STYLE: Any = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
-    "font.size": 10,
+    "font.size": 11,
     "text.color": _INK,
     "axes.edgecolor": _GRID,
     "axes.labelcolor": _INK,
@@ -62,7 +62,7 @@ def trajectories(result: Result) -> tuple[str, str]:
     """Camera and people from above and from the side, on a metric grid."""
     low, high = _extent(result)
     size = np.maximum(high - low, 0.5)
-    width = HALF
+    width = _WIDTH
     with matplotlib.rc_context(_STYLE):
         plan_height = float(np.clip(width * size[2] / size[0], 2.6, 6.0))
         plan = Figure((width, plan_height + 0.6), layout="constrained")
@@ -73,11 +73,9 @@ def trajectories(result: Result) -> tuple[str, str]:
         ax.set_ylabel("z, m")
         _legend(ax, result)
         ax.invert_xaxis()  # Seen from above, with z up the page, x runs to the left.
-        side = Figure(
-            (width, float(np.clip(width * size[1] / size[0], 1.8, 5.0)) + 0.5),
-            layout="constrained",
-        )
         along = 0 if size[0] >= size[2] else 2
+        side_height = float(np.clip(width * size[1] / size[along], 1.2, 5.0))
+        side = Figure((width, side_height + 0.6), layout="constrained")
         ax = side.add_subplot()
         _paths(ax, result, (along, 1), low, high)
         if along == 0:
@@ -91,11 +89,10 @@ def over_time(
     times: np.ndarray,
     curves: Mapping[str, tuple[np.ndarray, str]],
     ylabel: str,
-    width: float,
 ) -> str:
     """Curves `name -> (values, colour)` over time, from zero."""
     with matplotlib.rc_context(_STYLE):
-        figure = Figure((width, 2.4), layout="constrained")
+        figure = Figure((_WIDTH, 2.6), layout="constrained")
         ax = figure.add_subplot()
         for name, (values, color) in curves.items():
             ax.plot(times, values, color=color, label=name, linewidth=1.4)
@@ -103,20 +100,20 @@ def over_time(
         top = max((float(v.max()) for v in finite if len(v)), default=1.0)
         ax.set_ylim(0, 1.08 * top if top > 0 else 1)
         ax.set_xlim(times[0], max(times[-1], times[0] + 1e-3))
-        ax.xaxis.set_major_locator(MaxNLocator(int(1.2 * width), steps=[1, 2, 5, 10]))
+        ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         ax.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         ax.grid(axis="y")
         ax.set_xlabel("time, s")
         ax.set_ylabel(ylabel)
         if len(curves) > 1:
-            ax.legend(loc="upper left", bbox_to_anchor=(0, 1.18), ncols=8)
+            ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
         return _svg(figure)
 
 
 def costs(stages: Sequence[Mapping[str, Any]]) -> str:
     """Cost before and after each stage, on a logarithmic axis."""
     with matplotlib.rc_context(_STYLE):
-        figure = Figure((FULL, 0.8 + 0.45 * len(stages)), layout="constrained")
+        figure = Figure((_WIDTH, 0.8 + 0.45 * len(stages)), layout="constrained")
         ax = figure.add_subplot()
         for row, stage in enumerate(stages):
             before, after = float(stage["cost_before"]), float(stage["cost_after"])
@@ -137,13 +134,13 @@ def costs(stages: Sequence[Mapping[str, Any]]) -> str:
 
 
 def speeds(
-    result: Result, camera: PathStatistics, people: Sequence[PathStatistics]
+    result: Result, camera: PathStatistics | None, people: Sequence[PathStatistics]
 ) -> str:
-    """Speed over the ground of camera and people."""
-    curves = {"camera": (camera.speed, CAMERA)}
+    """Speed over the ground of people and of a camera that moves."""
+    curves = {} if camera is None else {"camera": (camera.speed, CAMERA)}
     for person, facts in enumerate(people):
         curves[f"person {person}"] = (facts.speed, person_color(person))
-    return over_time(result.timestamps, curves, "speed, m/s", FULL)
+    return over_time(result.timestamps, curves, "speed, m/s")
 
 
 def _extent(result: Result) -> tuple[np.ndarray, np.ndarray]:
@@ -249,7 +246,7 @@ def _legend(ax: Axes, result: Result) -> None:
     ax.plot([], [], "o", color=_INK, label="start", markersize=5)
     if len(result.landmarks):
         ax.scatter([], [], 6, _POINTS, label="map")
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, columnspacing=1)
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, columnspacing=1)
 
 
 def labelled(svg: str, caption: str) -> str:

@@ -25,7 +25,7 @@ from bodyslam_jax.types import Result
 
 _LAST = "summary.json"
 _OWN = ("result.npz", "camera.tum", "body_*.npz", "landmarks.ply", _LAST, "config.yaml")
-_OWN += ("report.html", "overlay.webm")
+_OWN += ("report.html", "overlay.webm", "scene.html")
 
 
 def check_folder(
@@ -116,10 +116,10 @@ _NOT_WRITABLE = (
 
 
 def write_run(folder: Path, result: Result, config: Any = None) -> None:
-    """Writes the files of the contract except report and overlay; all or none.
+    """Writes the files of the contract that programs read; all or none.
 
-    `config` is the settings as resolved, a dataclass or a dictionary. To add report and
-    overlay, use `run_folder` and `write_files`.
+    `config` is the settings as resolved, a dataclass or a dictionary. To add report,
+    overlay and scene, use `run_folder` and `write_files`.
     """
     with run_folder(folder) as partial:
         write_files(partial, result, config)

@@ -1,5 +1,6 @@
-"""The report: one HTML file that opens offline."""
+"""The report: one HTML file that opens offline, beside the overlay and the scene."""
 
+import base64
 import html
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -16,20 +17,27 @@ from bodyslam_jax.diagnostics.statistics import (
     person_statistics,
 )
 from bodyslam_jax.export import figures
+from bodyslam_jax.export.answers import answers
+from bodyslam_jax.export.expert_figures import focal_length, lengths, people_table
 from bodyslam_jax.export.folder import plain
-from bodyslam_jax.export.summary_cards import cards
-from bodyslam_jax.export.tables import errors_section, folded, table
+from bodyslam_jax.export.plain_words import in_plain_words
+from bodyslam_jax.export.tables import error_tables, folded, table
 from bodyslam_jax.types import Result
 
 
-def write_report(path: Path, result: Result, body: BodyModel) -> None:
-    """Writes the report of a result: no other file, no network, light or dark.
+def write_report(
+    path: Path, result: Result, body: BodyModel, still: bytes | None = None
+) -> None:
+    """Writes the report of a result: no network, no script, light or dark.
 
     Distances and speeds are computed from the result, all else comes from
     `result.summary` (keys as written by `summary.summarise`); parts that it lacks are
     left out. The optional key `errors` maps a name of what was evaluated ("cameras
     alone, arbitrary scale", "joint estimate, in metres") to its errors by the names of
     `evaluation`; a text in place of a number tells why there is no number.
+
+    Overlay and scene are shown if they lie in the folder of `path`. `still` is one
+    frame of the overlay (JPEG), which is part of the report itself.
     """
     summary = plain(result.summary)
     camera = camera_statistics(result)
@@ -37,15 +45,13 @@ def write_report(path: Path, result: Result, body: BodyModel) -> None:
     source = summary.get("input") or {}
     name = source.get("name") if isinstance(source, dict) else str(source)
     sections = [
-        _reasons(summary.get("reasons") or []),
-        cards(result, summary, camera, people, body),
+        answers(result, summary, camera, people, body),
+        _in_short(summary, len(people)),
+        _pictures(path.parent, still),
+        _reasons(summary, len(people)),
+        _plots(result, summary, camera, people),
         _warnings(summary.get("warnings") or []),
-        errors_section(summary.get("errors") or {}),
-        _trajectories(result),
-        _motion(result, camera, people),
-        _stages(summary),
-        _per_frame(result, summary.get("per_frame") or {}),
-        _details(result, summary),
+        _details(result, summary, people, body),
     ]
     style = resources.files("bodyslam_jax.export").joinpath("report.css").read_text()
     path.write_text(
@@ -85,8 +91,9 @@ _PAGE = """<!doctype html>
 
 
 def _status(status: str) -> str:
+    """The badge beside the title."""
     good = status == "ok"
-    text = "ok" if good else html.escape(status)
+    text = "plausible" if good else html.escape(status)
     return f'<span class="badge {"good" if good else "bad"}">{text}</span>'
 
 
@@ -97,7 +104,6 @@ def _subtitle(result: Result, source: Any) -> str:
         words.append(f"{source['width']} × {source['height']} px")
     people = len(result.poses)
     words.append("one person" if people == 1 else f"{people or 'no'} people")
-    words.append(f"{len(result.landmarks):,} landmarks")
     return " · ".join(words)
 
 
@@ -105,71 +111,124 @@ def _warnings(warnings: Sequence[str]) -> str:
     if not warnings:
         return ""
     items = "".join(f"<li>{html.escape(str(w))}</li>" for w in warnings)
-    return f'<section class="warnings"><h2>Warnings</h2><ul>{items}</ul></section>'
+    return f'<section class="notes"><h2>Warnings</h2><ul>{items}</ul></section>'
 
 
-def _reasons(reasons: Sequence[dict[str, Any]]) -> str:
-    """Why the result is doubtful or failed, and what to do about it."""
+def _in_short(summary: Mapping[str, Any], num_people: int) -> str:
+    """What is in doubt, in a line or two; what to do follows further down."""
+    reasons = summary.get("reasons") or []
     if not reasons:
         return ""
-    items = "".join(
-        f"<li>{html.escape(str(r.get('message')))} "
-        f"<em>{html.escape(str(r.get('advice', '')))}.</em></li>"
-        for r in reasons
-    )
-    title = "Why this result is in doubt"
-    return f'<section class="warnings"><h2>{title}</h2><ul>{items}</ul></section>'
-
-
-def _figure(svg: str, caption: str, kind: str = "full") -> str:
-    text, drawn = html.escape(caption), figures.labelled(svg, caption)
-    return f'<figure class="{kind}">{drawn}<figcaption>{text}</figcaption></figure>'
-
-
-def _trajectories(result: Result) -> str:
-    above, side = figures.trajectories(result)
-    from_side = "From the side. The floor is at the height of standing feet."
+    failed = summary.get("status") == "failed"
+    title = "Do not use this result." if failed else "Look twice at this result."
+    text = " ".join(in_plain_words(reason, num_people) for reason in reasons)
     return (
-        '<section><h2>Paths</h2><div class="two">'
-        + _figure(above, "From above. Arrows: where the camera looks.", "half")
-        + _figure(side, from_side, "half")
-        + "</div></section>"
+        f'<p class="warnings"><strong>{title}</strong> {html.escape(text)} '
+        '<a href="#reasons">What to do</a></p>'
     )
 
 
-def _motion(
+def _reasons(summary: Mapping[str, Any], num_people: int) -> str:
+    """Each reason to doubt the result, with its figure and what to do about it."""
+    items = "".join(
+        f"<li><strong>{html.escape(in_plain_words(reason, num_people))}</strong> "
+        f"What to do: {html.escape(str(reason.get('advice', '')))}. "
+        f"<small>{html.escape(str(reason.get('message', '')))}</small></li>"
+        for reason in summary.get("reasons") or []
+    )
+    if not items:
+        return ""
+    title = "Why it is in doubt, and what to do"
+    return (
+        f'<section class="warnings" id="reasons"><h2>{title}</h2><ul>{items}</ul>'
+        "</section>"
+    )
+
+
+def _pictures(folder: Path, still: bytes | None) -> str:
+    """The overlay and the scene of the run, and where they open on their own."""
+    picture = ""
+    if still is not None:
+        picture = "data:image/jpeg;base64," + base64.b64encode(still).decode()
+    parts = []
+    for name in ("overlay.webm", "overlay.mp4"):
+        if (folder / name).exists():
+            poster = f' poster="{picture}"' if picture else ""
+            shown = (
+                f'<video src="{name}" controls muted loop playsinline '
+                f'preload="metadata"{poster}></video>'
+            )
+            words = f'The video with the bodies in it: <a href="{name}">{name}</a>'
+            parts.append((shown, words))
+            break
+    else:
+        if picture:
+            alt = "a frame of the video with the bodies in it"
+            parts.append(
+                (f'<img src="{picture}" alt="{alt}">', "A frame of the video.")
+            )
+    if (folder / "scene.html").exists():
+        frame = (
+            '<iframe src="scene.html#embedded" loading="lazy" title="scene in 3D">'
+            "</iframe>"
+        )
+        words = 'In 3D, to be turned: <a href="scene.html">scene.html</a>'
+        parts.append((frame, words))
+    if not parts:
+        return ""
+    figures_ = "".join(
+        f"<figure>{shown}<figcaption>{words}</figcaption></figure>"
+        for shown, words in parts
+    )
+    return f'<section class="two pictures">{figures_}</section>'
+
+
+def _figure(svg: str, caption: str) -> str:
+    text, drawn = html.escape(caption), figures.labelled(svg, caption)
+    return f"<figure>{drawn}<figcaption>{text}</figcaption></figure>"
+
+
+def _plots(
     result: Result,
+    summary: Mapping[str, Any],
     camera: PathStatistics,
     people: Sequence[PathStatistics],
 ) -> str:
-    if len(result.timestamps) < 2:
-        return ""
-    svg = figures.speeds(result, camera, people)
-    caption = "Speed over the ground, paths smoothed over half a second."
-    return f"<section><h2>Speed</h2>{_figure(svg, caption)}</section>"
+    """Paths from above and from the side, and speeds."""
+    above, side = figures.trajectories(result)
+    beside = _figure(
+        side, "From the side. The floor is at the height of standing feet."
+    )
+    moves = summary.get("camera_motion") not in ("static", "rotation")
+    if len(result.timestamps) > 1 and (moves or people):
+        svg = figures.speeds(result, camera if moves else None, people)
+        caption = "Speed over the ground, paths smoothed over half a second."
+        beside += _figure(svg, caption)
+    return (
+        '<section><h2>Paths and speed</h2><div class="two">'
+        + _figure(above, "From above. Arrows: where the camera looks.")
+        + f"<div>{beside}</div></div></section>"
+    )
 
 
 def _stages(summary: Mapping[str, Any]) -> str:
     stages = summary.get("stages") or []
     durations = summary.get("durations_s") or {}
-    if not stages and not durations:
-        return ""
     drawn = [
         stage
         for stage in stages
         if min(stage.get("cost_before") or 0, stage.get("cost_after") or 0) > 0
     ]
-    parts = ["<section><h2>Stages of the estimate</h2>"]
+    parts = []
     if drawn:
         parts.append(_figure(figures.costs(drawn), "Cost of each stage."))
-    parts.append('<div class="two">')
     if stages:
         columns = list(dict.fromkeys(key for stage in stages for key in stage))
         parts.append(table(columns, [[s.get(c) for c in columns] for s in stages]))
     if durations:
         total = ("total", sum(durations.values()))
         parts.append(table(["step", "seconds"], [*durations.items(), total]))
-    return "".join(parts) + "</div></section>"
+    return "".join(parts)
 
 
 _CURVES = (
@@ -189,7 +248,7 @@ _CURVES = (
 
 
 def _per_frame(result: Result, per_frame: Mapping[str, Sequence[Any]]) -> str:
-    sections = []
+    drawn = []
     for title, ylabel, names, caption in _CURVES:
         colors = (figures.CAMERA, figures.person_color(0))
         curves = {
@@ -197,32 +256,41 @@ def _per_frame(result: Result, per_frame: Mapping[str, Sequence[Any]]) -> str:
             for (key, label), color in zip(names.items(), colors, strict=True)
             if len(per_frame.get(key) or []) == len(result.timestamps)
         }
+        curves = {k: v for k, v in curves.items() if np.isfinite(v[0]).any()}
         if curves:
-            svg = figures.over_time(result.timestamps, curves, ylabel, figures.HALF)
-            sections.append(
-                f"<section><h2>{title}</h2>{_figure(svg, caption, 'half')}</section>"
-            )
-    return '<div class="two">' + "".join(sections) + "</div>" if sections else ""
+            svg = figures.over_time(result.timestamps, curves, ylabel)
+            drawn.append(f"<div><h3>{title}</h3>{_figure(svg, caption)}</div>")
+    return '<div class="two">' + "".join(drawn) + "</div>" if drawn else ""
 
 
-def _details(result: Result, summary: Mapping[str, Any]) -> str:
-    """Scale, intrinsics, counts, versions and settings, folded away."""
+def _details(
+    result: Result,
+    summary: Mapping[str, Any],
+    people: Sequence[PathStatistics],
+    body: BodyModel,
+) -> str:
+    """What only experts need, folded away but for errors against a truth."""
     labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     lens = [
         (label, round(float(value), 5))
         for label, value in zip(labels, result.intrinsics, strict=False)
     ]
-    parts = [folded("Camera intrinsics (px)", table(["parameter", "value"], lens))]
-    parts.append(folded("Scale", _scale_table(result, summary.get("scale") or {})))
-    for title, key in (
-        ("Counts", "counts"),
-        ("Versions", "versions"),
-        ("Settings", "settings"),
-    ):
-        if summary.get(key):
-            text = yaml.safe_dump(summary[key], sort_keys=False)
-            parts.append(folded(title, f"<pre>{html.escape(text)}</pre>"))
-    return f"<section><h2>Details</h2>{''.join(parts)}</section>"
+    scale = summary.get("scale") or {}
+    contents = {
+        "People": people_table(result, summary, people, body),
+        "Scale": lengths(result, scale) + _scale_table(result, scale),
+        "Camera intrinsics (px)": focal_length(summary.get("intrinsics") or {})
+        + table(["parameter", "value"], lens),
+        "Stages of the estimate": _stages(summary),
+        "Errors of each frame": _per_frame(result, summary.get("per_frame") or {}),
+    }
+    for title in ("Counts", "Versions", "Settings"):
+        if found := summary.get(title.lower()):
+            text = yaml.safe_dump(found, sort_keys=False)
+            contents[title] = f"<pre>{html.escape(text)}</pre>"
+    parts = [folded(title, text) for title, text in contents.items() if text]
+    errors = error_tables(summary.get("errors") or {})
+    return f"{errors}<section><h2>For experts</h2>{''.join(parts)}</section>"
 
 
 def _scale_table(result: Result, scale: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from bodyslam_jax import evaluation
 
 
-def errors_section(errors: Mapping[str, Mapping[str, Any]]) -> str:
+def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
     """Errors against the truth, one column per estimate that was evaluated."""
     if not errors:
         return ""

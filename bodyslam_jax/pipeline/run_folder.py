@@ -52,19 +52,29 @@ def run_in_locked_folder(
         result.summary["errors"] = errors
         result.summary["headline"] += before_after.headline(errors)
     watch = Stopwatch()
+    observations = _map_observations(cameras)
+    middle = view.middle_frame(result)
+    sampler = view.VideoSampler(
+        sequence.num_frames, observations, len(cameras.landmarks), middle
+    )
     with export.run_folder(out) as partial:
-        if config.overlay and sequence.frames is not None:
-            with watch("overlay"):
-                view.write_overlay(
-                    partial / "overlay.webm",
-                    _images(sequence, cameras),
-                    result,
-                    body,
-                    _map_observations(cameras),
-                )
+        if sequence.frames is not None:
+            images = sampler.watch(_images(sequence, cameras))
+            with watch("overlay" if config.overlay else "images"):
+                if config.overlay:
+                    file = partial / "overlay.webm"
+                    view.write_overlay(file, images, result, body, observations)
+                for _ in images:  # Those that the overlay did not need.
+                    pass
+        with watch("scene"):
+            samples = sampler.samples()
+            view.write_scene(partial / "scene.html", result, body, samples)
         result.summary["durations_s"] |= watch.seconds
         export.write_files(partial, result, config)
-        export.write_report(partial / "report.html", result, body)
+        still = None
+        if sampler.whole is not None:
+            still = view.still(sampler.whole, result, body, middle)
+        export.write_report(partial / "report.html", result, body, still)
     return result
 
 

@@ -21,6 +21,8 @@ _CELL = 0.025
 """Size of the cells in which vertices are merged, m."""
 _NEAR = 0.05
 """Triangles nearer to the camera's plane than this are not drawn, m."""
+_STILL = 960
+"""Greatest width of a still, px."""
 _CHUNK = 16
 """Frames whose meshes are computed together."""
 
@@ -36,6 +38,23 @@ def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Ima
     coarse = coarse_body(body)
     people = next(meshes(result, coarse, slice(frame, frame + 1)))
     return draw_people(image, people, np.asarray(coarse.faces), np.ones(2))
+
+
+def middle_frame(result: Result) -> int:
+    """Of the frames with the most people, the one nearest to the middle."""
+    number = result.present.sum(axis=0)
+    frames = np.flatnonzero(number == number.max(initial=0))
+    return int(frames[np.abs(frames - (len(number) - 1) / 2).argmin()])
+
+
+def still(image: Image, result: Result, body: BodyModel, frame: int) -> bytes:
+    """`draw_frame` as JPEG, at most 960 px wide."""
+    drawn = draw_frame(image, result, body, frame)
+    height, width = drawn.shape[:2]
+    if width > _STILL:
+        size = (_STILL, round(height * _STILL / width))
+        drawn = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
 
 def coarse_body(body: BodyModel) -> BodyModel:

@@ -1,0 +1,122 @@
+"""The report's first screen: how far, how fast, how tall, how sure."""
+
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.types import Result
+
+_MOST_ROWS = 5
+"""People whom a card names; the table of people has all."""
+_STILL = {"static": "stood still", "rotation": "turned on the spot"}
+
+
+def answers(
+    result: Result,
+    summary: Mapping[str, Any],
+    camera: statistics.PathStatistics,
+    people: Sequence[statistics.PathStatistics],
+    body: BodyModel,
+) -> str:
+    """Four cards, as one section of HTML."""
+    shown = [h for h, present in enumerate(result.present) if present.any()]
+    name = lambda h: "person" if len(people) == 1 else f"person {h}"
+    rows = lambda text: [(f"person-{h % 4}", name(h), text(h)) for h in shown]
+    kind = _STILL.get(str(summary.get("camera_motion")))
+    if shown:
+        far = rows(lambda h: f"{people[h].distance:.1f} m")
+        fast = rows(lambda h: f"{people[h].mean_speed:.1f} m/s")
+        walk = [f"{name(h)}: {3.6 * people[h].mean_speed:.1f} km/h" for h in shown[:1]]
+        tall = rows(lambda h: _stature(result, summary, body, h))
+        moved = kind or f"{camera.distance:.1f} m"
+        pace = "–" if kind else f"{camera.mean_speed:.1f} m/s"
+    else:
+        far, fast, walk, tall = [], [], [], [("", "", "nobody was found")]
+        moved, pace = kind or f"{camera.distance:.2g} units", "–"
+    span = f"in {result.timestamps[-1] - result.timestamps[0]:.1f} s of video"
+    of_camera = lambda value: [("camera", "camera", value)]
+    sure, *notes = sizes(result, summary)
+    cards = (
+        _card("How far?", [*far, *of_camera(moved)], [span]),
+        _card("How fast?", [*fast, *([] if kind else of_camera(pace))], walk),
+        _card("How tall?", tall, ["barefoot"] if shown else []),
+        _card("How sure?", [("", "", sure)], notes),
+    )
+    return f'<section class="cards">{"".join(cards)}</section>'
+
+
+def _stature(
+    result: Result, summary: Mapping[str, Any], body: BodyModel, h: int
+) -> str:
+    tall = statistics.stature(body, result.betas[h])
+    sigma = stature_sigma(summary, h)
+    plus_minus = "" if sigma is None else f" ± {100 * sigma:.0f}"
+    return f"{100 * tall:.0f}{plus_minus} cm"
+
+
+def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
+    """Standard deviation of a person's stature, m, as reported."""
+    reported = (summary.get("people") or [])[h : h + 1]
+    return reported[0].get("stature_sigma_m") if reported else None
+
+
+def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
+    """How well lengths are known, in a few words, and notes on it."""
+    if not result.present.any():
+        return ["not in metres", "there are no people to measure by"]
+    scale = summary.get("scale") or {}
+    sigma = scale.get("sigma")
+    if str(summary.get("camera_motion")) in _STILL:
+        return _sizes_of_stature(result, summary)
+    if sigma is None or not np.isfinite(sigma) or result.scale <= 0:
+        return ["in metres", "how well they are known was not computed"]
+    share = sigma / result.scale
+    if share >= 1:
+        return ["sizes are not known", "distances and statures may be off many times"]
+    notes = [_one_metre(share)]
+    if scale.get("sigma_of_covariance", sigma) < sigma:
+        notes.append("people's steps and the ground tell different sizes")
+    return [f"sizes are known to {_percent(share)}", *notes]
+
+
+def _sizes_of_stature(result: Result, summary: Mapping[str, Any]) -> list[str]:
+    """Where the camera's path gives no size, bodies give all of it."""
+    known = [stature_sigma(summary, h) for h in range(len(result.present))]
+    statures = [(s, p.get("stature_m")) for s, p in zip(known, _people(summary))]
+    shares = [s / m for s, m in statures if s and m]
+    note = "all of them come from how tall people look"
+    if not shares:
+        return ["in metres", note]
+    return [f"sizes are known to {_percent(min(shares))}", note]
+
+
+def _people(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    return summary.get("people") or []
+
+
+def _percent(share: float) -> str:
+    return f"{max(1, round(100 * share))} %"
+
+
+def _one_metre(share: float) -> str:
+    low, high = 1 - share, 1 + share
+    return f"a metre in here is {low:.2f} to {high:.2f} m, in two of three results"
+
+
+def _card(
+    title: str, rows: Sequence[tuple[str, str, str]], notes: Sequence[str]
+) -> str:
+    """Rows are colour, name and value; the only one needs no name but the camera's."""
+    lines = []
+    for color, name, value in rows[:_MOST_ROWS]:
+        dot = f'<i style="background: var(--{color})"></i>' if color else ""
+        label = f"<span>{dot}{html.escape(name)}</span> " if name else ""
+        lines.append(f"<li>{label}<strong>{html.escape(value)}</strong></li>")
+    if len(rows) > _MOST_ROWS:
+        lines.append(f"<li><span>and {len(rows) - _MOST_ROWS} more, below</span></li>")
+    notes_ = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    return f'<div class="card"><h2>{title}</h2><ul>{"".join(lines)}</ul>{notes_}</div>'

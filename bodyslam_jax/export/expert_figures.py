@@ -1,0 +1,99 @@
+"""The report's figures for experts: people, lengths, focal length."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.export.answers import stature_sigma
+from bodyslam_jax.export.tables import table
+from bodyslam_jax.types import Result
+
+
+def people_table(
+    result: Result,
+    summary: Mapping[str, Any],
+    people: Sequence[statistics.PathStatistics],
+    body: BodyModel,
+) -> str:
+    """A column for each person who is present at all."""
+    shown = [h for h, present in enumerate(result.present) if present.any()]
+    columns = []
+    for h in shown:
+        way = people[h]
+        near, far = statistics.distance_to_camera(result, h)
+        sigma = stature_sigma(summary, h)
+        plus_minus = "" if sigma is None else f" ± {100 * sigma:.1f}"
+        columns.append(
+            {
+                "visible, s": f"{way.seconds:.1f}",
+                "distance from the camera, m": f"{near:.1f} to {far:.1f}",
+                "way, m": f"{way.distance:.2f}",
+                "mean speed, m/s": f"{way.mean_speed:.2f}",
+                "stature, cm": f"{100 * statistics.stature(body, result.betas[h]):.1f}"
+                + plus_minus,
+                "lower foot, cm/s": f"{100 * statistics.foot_skating(result, h):.0f}",
+            }
+        )
+    if not columns:
+        return ""
+    rows = [[name, *(column[name] for column in columns)] for name in columns[0]]
+    note = (
+        "<p>Ways are over the ground, smoothed over half a second. The stature is "
+        "barefoot, from the estimated shape. The lower foot (its joint, median) of a "
+        "real walk moves at about 10 cm/s.</p>"
+    )
+    return table(["people", *(f"person {h}" for h in shown)], rows) + note
+
+
+def lengths(result: Result, scale: Mapping[str, Any]) -> str:
+    """How well all lengths are known, and by what."""
+    sigma = scale.get("sigma")
+    known = sigma is not None and np.isfinite(sigma) and result.scale > 0
+    if not known or not result.present.any():
+        return ""
+    of_covariance = scale.get("sigma_of_covariance", sigma)
+    how = "one standard deviation of all lengths, from the covariance of the estimate"
+    if of_covariance < sigma:
+        how = (
+            "half the difference between the cues below; the covariance of the "
+            f"estimate alone gives {100 * of_covariance / result.scale:.1f} %"
+        )
+    text = f"Lengths are known to {100 * sigma / result.scale:.1f} %: {how}."
+    items = "".join(f"<li>{cue}</li>" for cue in _cues(result.scale, scale))
+    return f"<p>{text}</p>" + (f"<ul>{items}</ul>" if items else "")
+
+
+def _cues(value: float, scale: Mapping[str, Any]) -> list[str]:
+    """Size by each cue alone and by the ground, relative to the estimate."""
+    found = []
+    for cue, name in (
+        ("from_motion", "people's motion"),
+        ("from_ground", "the ground under people's feet"),
+    ):
+        if (estimate := scale.get(cue)) is not None:
+            ratio, error = (100 * x / value for x in estimate)
+            found.append(f"{name} alone: {ratio - 100:+.0f} ± {error:.0f} %")
+    if (factor := scale.get("ground_factor")) is not None:
+        found.append(f"feet exactly on the ground: {round(100 * (factor - 1)):+d} %")
+    return found
+
+
+def focal_length(lens: Mapping[str, Any]) -> str:
+    """On a focal length that was guessed."""
+    if not lens.get("guessed"):
+        return ""
+    guess, sigma = lens["guess_px"], lens.get("focal_sigma_px")
+    if sigma is None:
+        text = (
+            f"Focal length: {guess:.0f} px, guessed from the image's size; depths are "
+            "wrong in proportion."
+        )
+    else:
+        text = (
+            f"Focal length: {lens['focal_px']:.0f} ± {sigma:.0f} px, estimated from "
+            f"the camera's path; the guess was {guess:.0f} px."
+        )
+    return f"<p>{text}</p>"

@@ -1,0 +1,65 @@
+"""Reasons why a result is in doubt, in words that need no knowledge of the field."""
+
+from collections.abc import Mapping
+from typing import Any
+
+_PERSON = {
+    "standing_foot_speed": "The feet of {who} slide over the ground while they stand.",
+    "gliding": "{Who} glides: the foot that should stand moves along.",
+    "step_short_of_reach": "{Who} steps, but hardly gets on.",
+    "step_beyond_reach": "{Who} gets on further with each step than legs can reach.",
+    "step_beyond_reach_of_runner": (
+        "{Who} gets on further with each step than a runner does."
+    ),
+    "quick_steps": "{Who} takes steps as quickly as only children do.",
+    "turned_from_body": "{Who} is tilted against the bodies that were given.",
+    "feet_off_ground": "{Who} floats above the ground, or sinks into it.",
+    "ground_slope": "{Who} rises or sinks along the way, as on a steep slope.",
+    "knee": "{Who} walks with knees bent as nobody's are.",
+    "straighter_knee": "{Who} walks without ever stretching a knee.",
+    "hip_over_ankle": "{Who} walks as if crouching.",
+    "trunk_lean": "{Who} leans over more than people who walk do.",
+    "turn_of_walker": "{Who} turns around faster than people who walk can.",
+    "turn": "{Who} turns around faster than people can.",
+    "velocity_jump_of_walker": "{Who} changes speed faster than people who walk can.",
+    "velocity_jump": "{Who} changes speed faster than people can.",
+    "joint_acceleration": "{Who} trembles or jerks.",
+    "speed": "{Who} is faster than people can be.",
+    "stature": "{Who} is too tall for a person.",
+    "short_stature": "{Who} is too short for an adult.",
+    "keypoint_misfit": "The body of {who} is away from the person in the images.",
+}
+_WHOLE = {
+    "floors_apart": "People stand at different heights, as if on different floors.",
+    "up_against_trunks": "The ground is tilted against the people on it.",
+    "up_in_image": "The scene is tilted against the images.",
+    "slope_of_ground": "The ground slopes against the people on it.",
+    "camera_speed": "The camera moves faster than somebody can carry it.",
+    "camera_acceleration": "The camera's way jerks more than a hand can.",
+    "camera_turning": "The camera turns faster than a hand can turn it.",
+    "scale_sigma": "All sizes and distances are hardly known.",
+    "scale_cues_apart": (
+        "People's steps and the ground they stand on disagree about the size of the "
+        "scene."
+    ),
+    "ground_under_feet": "People do not stand on the ground of the map.",
+    "not_finite": "The computation failed.",
+    "camera_motion": "It was not found how the camera moved.",
+    "people": "Nobody was found in the video, so sizes are unknown.",
+    "frames_used": "Only a part of the video could be used.",
+    "scale_sign": "People move against the direction that they walk in.",
+    "scale_unknown": "Nothing in the video tells how large the scene is.",
+}
+
+
+def in_plain_words(reason: Mapping[str, Any], num_people: int = 1) -> str:
+    """A sentence on an entry of `reasons` in `summary.json`; its own message where
+    there is no plainer one."""
+    name = str(reason.get("name"))
+    if name in _WHOLE:
+        return _WHOLE[name]
+    if name not in _PERSON:
+        return str(reason.get("message", name))
+    number = reason.get("person")
+    who = "the person" if number is None or num_people < 2 else f"person {number}"
+    return _PERSON[name].format(who=who, Who=who[0].upper() + who[1:])

@@ -1,0 +1,169 @@
+"""A result as the 3D page reads it: JSON with arrays in base64.
+
+The page skins the bodies itself, so that each person needs the rest mesh and weights
+once, and per frame the rotations of 24 joints and the place of the pelvis: 208 bytes.
+"""
+
+import base64
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
+from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.types import Result
+from bodyslam_jax.view.contacts import feet_on_the_ground
+from bodyslam_jax.view.style import PEOPLE
+from bodyslam_jax.view.video_samples import VideoSamples
+
+_MOST_POINTS = 60_000
+_MILLIMETRE = 1000.0
+_UNIT = 32767
+"""A quaternion's entries are sent as 16-bit integers, of this for 1."""
+
+
+def scene_data(
+    result: Result, body: BodyModel, samples: VideoSamples | None = None
+) -> dict[str, Any]:
+    """What the page shows of one run.
+
+    Args:
+        samples: small images and colours of the map; without them the page shows
+            neither.
+    """
+    summary = result.summary
+    source = summary.get("input")
+    source = source if isinstance(source, dict) else {}
+    return {
+        "name": str(source.get("name") or "run"),
+        "status": summary.get("status"),
+        "times": _array(result.timestamps - result.timestamps[0], np.float32),
+        "metric": bool(result.present.any()),
+        "scale_sigma": _relative_sigma(result),
+        "camera": _camera(result, source),
+        "map": _map(result, samples),
+        "images": _images(samples),
+        "body": _skin(body),
+        "people": [_person(result, body, h) for h in range(len(result.poses))],
+    }
+
+
+def _array(values: np.ndarray, dtype: Any) -> dict[str, Any]:
+    packed = np.ascontiguousarray(values, np.dtype(dtype).newbyteorder("<"))
+    return {
+        "type": np.dtype(dtype).name,
+        "shape": list(packed.shape),
+        "data": base64.b64encode(packed.tobytes()).decode(),
+    }
+
+
+def _rotations(vectors: Float[np.ndarray, "*b 3"]) -> dict[str, Any]:
+    """Unit quaternions (x y z w) of rotation vectors."""
+    return _array(np.round(so3.quaternion(vectors) * _UNIT), np.int16)
+
+
+def _relative_sigma(result: Result) -> float | None:
+    """Relative standard deviation of all lengths; `None` where it is not known."""
+    sigma = (result.summary.get("scale") or {}).get("sigma")
+    if sigma is None or not math.isfinite(sigma) or result.scale <= 0:
+        return None
+    return float(sigma / result.scale)
+
+
+def _camera(result: Result, source: dict[str, Any]) -> dict[str, Any]:
+    fx, fy, cx, cy = (float(x) for x in result.intrinsics[:4])
+    return {
+        "position": _array(result.T_WC[:, :3, 3], np.float32),
+        "rotation": _rotations(so3.log(result.T_WC[:, :3, :3])),
+        "located": _array(result.located, np.uint8),
+        "distance": statistics.camera_statistics(result).distance,
+        "focal": [fx, fy],
+        "centre": [cx, cy],
+        # The centre of an image lies half a pixel before half its size.
+        "size": [
+            int(source.get("width") or round(2 * cx + 1)),
+            int(source.get("height") or round(2 * cy + 1)),
+        ],
+    }
+
+
+def _map(result: Result, samples: VideoSamples | None) -> dict[str, Any]:
+    points = result.landmarks
+    colors: UInt8[np.ndarray, "l 3"] = np.full(points.shape, 140, np.uint8)
+    if samples is not None and len(samples.colors) == len(points):
+        colors = samples.colors
+    chosen = slice(None, None, max(1, -(-len(points) // _MOST_POINTS)))
+    return {
+        "points": _array(points[chosen], np.float32),
+        "colors": _array(colors[chosen], np.uint8),
+    }
+
+
+def _images(samples: VideoSamples | None) -> dict[str, Any]:
+    if samples is None:
+        return {"frame": [], "jpeg": []}
+    jpeg = [base64.b64encode(image).decode() for image in samples.images]
+    return {"frame": samples.frame.tolist(), "jpeg": jpeg}
+
+
+def _skin(body: BodyModel) -> dict[str, Any]:
+    """Triangles and the four largest skinning weights of each vertex: of the default
+    body, the others are at most 3 %."""
+    joint, weight = np.asarray(body.skin_joint), np.asarray(body.skin_weight)
+    order = np.argsort(-weight, axis=1)[:, :4]
+    joint, weight = (np.take_along_axis(x, order, axis=1) for x in (joint, weight))
+    missing = ((0, 0), (0, 4 - weight.shape[1]))
+    joint, weight = np.pad(joint, missing), np.pad(weight, missing)
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    index = np.uint16 if body.num_vertices <= 1 << 16 else np.uint32
+    return {
+        "parents": list(PARENTS),
+        "feet": list(FEET),
+        "faces": _array(np.asarray(body.faces), index),
+        "joints": _array(joint, np.uint8),
+        "weights": _array(np.round(255 * weight), np.uint8),
+    }
+
+
+def _person(result: Result, body: BodyModel, h: int) -> dict[str, Any]:
+    beta = result.betas[h]
+    rest = np.asarray(rest_joints(body, jnp.asarray(beta, body.dtype)), np.float64)
+    template, dirs = (
+        np.asarray(x, np.float64) for x in (body.template, body.shape_dirs)
+    )
+    skin = template + dirs @ beta
+    way = statistics.person_statistics(result, h)
+    reported = (result.summary.get("people") or [])[h : h + 1]
+    blue, green, red = PEOPLE[h % len(PEOPLE)]
+    stands = feet_on_the_ground(result)[h]
+    return {
+        "number": h,
+        "color": f"#{red:02x}{green:02x}{blue:02x}",
+        "present": _array(result.present[h], np.uint8),
+        # Tenths of a millimetre: a body is less than 3 m from its origin.
+        "skin": _array(np.round(skin * 10 * _MILLIMETRE), np.int16),
+        "rest": _array(rest, np.float32),
+        "pelvis": _array(rest[0] + result.trans[h], np.float32),
+        "rotations": _rotations(result.poses[h].reshape(-1, 24, 3)),
+        "stands": _array(stands[:, 0] + 2 * stands[:, 1], np.uint8),
+        "footprints": _footprints(result, h, stands),
+        "stature": statistics.stature(body, beta),
+        "stature_sigma": reported[0].get("stature_sigma_m") if reported else None,
+        "distance": way.distance,
+        "speed": way.mean_speed,
+    }
+
+
+def _footprints(result: Result, h: int, stands: np.ndarray) -> list[list[float]]:
+    """First frame and place (x, z, m) of each stance of a foot."""
+    found = []
+    for foot, joint in enumerate(FEET):
+        for run in statistics.runs(stands[:, foot]):
+            x, _, z = np.median(result.joints[h, run, joint], axis=0)
+            found.append([int(run.start), round(float(x), 3), round(float(z), 3)])
+    return sorted(found)
