@@ -37,10 +37,13 @@ def _missing(factor: Factor, problem: Problem) -> Factor:
         values = {"sigma": jnp.inf}
     elif isinstance(factor, FrameFactor) and factor.padding:
         values = factor.padding
-    else:
+    elif isinstance(factor, FrameFactor):
         free = problem.free
-        lead = free.roots if getattr(factor, "of_people", False) else free.cameras
-        return Masked(factor, jnp.zeros(lead.shape[:-1], bool))
+        lead = free.roots if factor.of_people else free.cameras
+        return Masked(factor=factor, present=jnp.zeros(lead.shape[:-1], bool))
+    else:
+        name = type(factor).__name__
+        raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     for field, value in values.items():
         full = jnp.full_like(getattr(factor, field), value)
         factor = eqx.tree_at(lambda f, n=field: getattr(f, n), factor, full)

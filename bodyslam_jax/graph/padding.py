@@ -53,11 +53,11 @@ class Masked(FrameFactor):
         return self.factor.of_people
 
     @property
-    def per_joint(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def per_joint(self) -> bool:
         return self.factor.per_joint
 
     @property
-    def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def loss(self) -> Loss:
         return self.factor.loss
 
     @property
@@ -117,7 +117,7 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
         return padded
     present = np.ones((*lead[:-1], lead[-1] + frames), bool)
     present[..., lead[-1] :] = False
-    return Masked(padded, jnp.asarray(present))
+    return Masked(factor=padded, present=jnp.asarray(present))
 
 
 def _is_over_frames(factor: FrameFactor) -> bool:

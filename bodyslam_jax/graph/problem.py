@@ -231,9 +231,10 @@ def make_problem(
         check_mask(free)
     layout = _layout_of(factors, sizes)
     check_memory(layout, state)
+    mask: Step
     if free is None:
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
-        free = Step(
+        mask = Step(
             scale=ones.scale * float("scale" in _touched(factors)),
             cameras=gauge(state.cameras),
             roots=ones.roots,
@@ -244,11 +245,11 @@ def make_problem(
         )
     else:
         # `solve` knows a problem's precision by its mask.
-        free = jax.tree.map(lambda x: x.astype(state.scale.dtype), free)
+        mask = jax.tree.map(lambda x: x.astype(state.scale.dtype), free)
     moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
-    movable = jax.tree.map(moves, free)
+    movable = jax.tree.map(moves, mask)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
-    return Problem(factors, free, motion, layout, variables)
+    return Problem(factors, mask, motion, layout, variables)
 
 
 def _touched(factors: Sequence[Factor]) -> set[str]:

@@ -5,6 +5,8 @@ and `i` intrinsics are those of the state. Shapes and dtypes are checked under `
 `vmap` too; values only where they are not traced.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,7 +34,7 @@ Sizes = dict[str, int]
 _ROTATION = 1e-3
 """Largest allowed entry of `|C^T C - I|`: files have few digits, and rotations drift in
 single precision."""
-_KINDS = {
+_KINDS: dict[Any, tuple[Any, str]] = {
     Float: (jnp.floating, "floating point"),
     Int: (jnp.integer, "integers"),
     Bool: (jnp.bool_, "bool"),
@@ -152,8 +154,8 @@ def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
     """
     if is_traced(factor.whitening):
         return
-    known = np.asarray(factor.whitening).any(axis=(1, 2))
-    known = known & ~np.isin(np.arange(len(known)), landmark)
+    known = np.any(np.asarray(factor.whitening), axis=(1, 2))
+    known = known & ~np.isin(np.arange(known.size), landmark)
     if known.any():
         raise ValueError(
             f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
