@@ -1,9 +1,9 @@
-"""What every test stands on: 64-bit, strict promotion, programs shared and dropped.
+"""Settings and fixtures of all tests: 64 bit, strict promotion, little compilation.
 
-Most of the suite's time is compiling. The tests of a file run in one process
-(`--dist loadfile`), so that they share what is traced; processes share machine code
-through JAX's persistent cache; what a file compiled is dropped at its end, which keeps
-each process below 2 GB.
+Most of the suite's time is compiling, so XLA optimises little (`optimised` undoes that
+for a test file). The tests of a file run in one process (`--dist loadfile`) and share
+what is traced; processes share machine code through JAX's persistent cache. Compiled
+programs are dropped at the end of each file, and where a process exceeds `_MEMORY`.
 """
 
 import gc
@@ -23,7 +23,12 @@ if jaxlib.version.__version__.startswith("0.10."):
     flags = ("--xla_cpu_use_fusion_emitters=false", os.environ.get("XLA_FLAGS", ""))
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
+_MEMORY = 1.3e9
+"""Resident memory of a process, bytes, from which compiled programs are dropped after
+a test: two processes stay below 4 GB."""
+
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_disable_most_optimizations", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     folder = Path(__file__).parents[1] / ".pytest_cache" / "jax"
@@ -31,13 +36,37 @@ if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def programs_of_one_module():
-    """Drops compiled programs at the end of each test file: memory stays bounded."""
-    yield
+def drop_programs() -> None:
+    """Frees compiled programs and what was traced for them."""
     eqx.clear_caches()
     jax.clear_caches()
     gc.collect()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def memory_returned():
+    """Freed memory goes back to the system, as in the command."""
+    from bodyslam_jax.cli import memory  # not before XLA's flags are set
+
+    memory.return_memory()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_of_one_module():
+    """Drops compiled programs at the end of each test file."""
+    yield
+    drop_programs()
+
+
+@pytest.fixture(autouse=True)
+def programs_within_memory():
+    """Drops compiled programs after a test where they take too much memory."""
+    yield
+    pages = Path("/proc/self/statm")
+    if pages.exists():
+        resident = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if resident > _MEMORY:
+            drop_programs()
 
 
 @pytest.fixture
@@ -47,15 +76,16 @@ def key() -> jax.Array:
 
 
 @pytest.fixture(scope="module")
-def quick_compilation():
-    """For modules whose programs run once: compiling is what takes their time.
+def optimised():
+    """XLA optimises as usual in this test file: for programs that run for long, or that
+    unoptimised code gets wrong.
 
     With the older emitters, unoptimised code once took the wrong branch of a `where`
-    (jaxlib 0.10.2): where a test fails without sense, leave this out.
+    (jaxlib 0.10.2): use this where a test fails without sense.
     """
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
     jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(scope="module")

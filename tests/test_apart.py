@@ -20,8 +20,6 @@ from bodyslam_jax.solver.apart import solve_apart
 from bodyslam_jax.solver.blocks import Linearisation
 from bodyslam_jax.solver.padding import pad
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.mark.parametrize("layout", ["body25", "coco17", "halpe26"])
 def test_joints_that_turn_keypoints_are_those_with_a_derivative(layout):

@@ -22,8 +22,6 @@ from test_cli import _run
 from bodyslam_jax import evaluation, export
 from bodyslam_jax.evaluation.datasets import read_truth
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture
 def command(monkeypatch, capsys, no_body_models):

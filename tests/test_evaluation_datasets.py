@@ -25,7 +25,7 @@ from bodyslam_jax import evaluation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.evaluation.datasets import read_truth
 
-pytestmark = pytest.mark.usefixtures("quick_compilation", "no_body_models")
+pytestmark = pytest.mark.usefixtures("no_body_models")
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from bodyslam_jax.pipeline import sfm_stage
 from bodyslam_jax.sfm import reconstruct
 from bodyslam_jax.types import Intrinsics, Sequence
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 NUM = 24
 
 

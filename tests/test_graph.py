@@ -21,8 +21,6 @@ from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture
 def rng():

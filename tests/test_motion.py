@@ -40,8 +40,6 @@ from bodyslam_jax.motion.training.measures import Steps, error_correlation
 from bodyslam_jax.motion.yaw_removal import straightened
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 T = 24
 
 

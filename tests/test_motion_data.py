@@ -22,8 +22,6 @@ from bodyslam_jax.motion.capture.clips import (
 from bodyslam_jax.motion.capture.readers import gender
 from bodyslam_jax.motion.training.noise import CORRELATION
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def make_clip(t=50, fps=30.0, seed=0, **changes):
     """A smooth synthetic motion along z."""

@@ -9,8 +9,6 @@ from bodyslam_jax.body import joints, load_body_model, rest_joints
 from bodyslam_jax.motion import read_motion
 from bodyslam_jax.motion.capture.clips import leg_length
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def tall():

@@ -3,12 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from bodyslam_jax import motion
 from bodyslam_jax.body import load_body_model
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_padding_at_the_end_changes_no_prediction():

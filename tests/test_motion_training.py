@@ -31,8 +31,6 @@ from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.training.losses import loss
 from bodyslam_jax.motion.training.sampling import corpus, draw
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 NOISY = MotionTraining(
     past=4,
     width=(16, 8),

@@ -13,8 +13,6 @@ from bodyslam_jax import graph, motion
 from bodyslam_jax.config import GraphWeights, MotionTraining
 from bodyslam_jax.initialisation import motion_factor
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SETTINGS = MotionTraining(
     past=1,
     epochs=3, segments=16, steps=4, learning_rate=0.02, decay=False, averaging=0.0,

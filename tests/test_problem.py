@@ -279,7 +279,7 @@ def test_under_a_transformation_only_shapes_are_checked():
         jax.eval_shape(residual, short, jnp.ones(()))
 
 
-def test_missing_measurements_may_be_zero_and_cost_nothing(quick_compilation):
+def test_missing_measurements_may_be_zero_and_cost_nothing():
     state, factors = fitting()
     missing = {}
     for name in ("CameraPrior", "RootOrientation", "RootPositionPrior"):

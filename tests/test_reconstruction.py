@@ -3,14 +3,12 @@
 import dataclasses
 
 import numpy as np
-import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
 from bodyslam_jax.config import Config, Structure
 from bodyslam_jax.pipeline import sfm_stage
 from bodyslam_jax.types import Sequence
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 NUM = 24
 
 

@@ -10,8 +10,6 @@ from bodyslam_jax.geometry import so3, so3_numpy
 from bodyslam_jax.geometry.so3 import compose, exp, inverse_right_jacobian, log
 from bodyslam_jax.graph import retract_rotation
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 AXES = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1], [2, -1, 2], [-1, 2, 0.5]])
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 ANGLES = [0.0, 1e-12, 1e-5, 1e-3, 1.0, 3.0, np.pi - 1e-6, np.pi]

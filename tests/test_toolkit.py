@@ -16,7 +16,7 @@ FRAMES = 40
 
 
 @pytest.fixture(scope="module")
-def case(quick_compilation):
+def case():
     return bs.simulate_case("M2", frames=FRAMES, family="follow")
 
 

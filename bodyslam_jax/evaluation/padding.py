@@ -3,7 +3,7 @@
 What is added is masked: errors are those of the unpadded trajectories, to rounding.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.core
@@ -32,10 +32,13 @@ def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
     t = trajectories
     if num_frames == t.T_WC.shape[0]:
         return t
-    arrays = padded_frames(
-        (t.T_WC, t.camera_valid, t.joints, t.present, t.feet), num_frames
+    T_WC, camera_valid, joints, present, feet = map(
+        jnp.asarray,
+        padded_frames(
+            (t.T_WC, t.camera_valid, t.joints, t.present, t.feet), num_frames
+        ),
     )
-    return Trajectories(*map(jnp.asarray, arrays), t.fps)
+    return Trajectories(T_WC, camera_valid, joints, present, feet, t.fps)
 
 
 def padded_frames(arrays: tuple[Any, ...], num_frames: int) -> tuple[Any, ...]:
@@ -74,9 +77,11 @@ def to_bucket(trajectories: Trajectories) -> Trajectories:
     return pad_frames(trajectories, bucket(trajectories.T_WC.shape[0]))
 
 
-def _pad(x: Any, axis: int, missing: int, mode: str = "constant") -> Any:
+def _pad(
+    x: Any, axis: int, missing: int, mode: Literal["constant", "edge"] = "constant"
+) -> Any:
     widths = [(0, missing * (i == axis)) for i in range(x.ndim)]
     if isinstance(x, jax.core.Tracer):
         return jnp.pad(x, widths, mode)
     # On the host: `jnp.pad` would be compiled for each shape.
-    return np.pad(np.asarray(x), widths, mode)  # pyright: ignore[reportCallIssue]
+    return np.pad(np.asarray(x), widths, mode)

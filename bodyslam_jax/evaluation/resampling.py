@@ -50,7 +50,8 @@ class Samples:
         arrays = (self.T_WC, self.camera_valid, self.joints, self.present, self.feet)
         if num_frames is not None:
             arrays = padded_frames(arrays, num_frames)
-        return Trajectories(*map(jnp.asarray, arrays), jnp.asarray(fps))
+        T_WC, camera_valid, joints, present, feet = map(jnp.asarray, arrays)
+        return Trajectories(T_WC, camera_valid, joints, present, feet, jnp.asarray(fps))
 
 
 def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:
@@ -117,8 +118,9 @@ def interpolate_poses(
     # What is not finite stays NaN.
     blend = (weight > 0) & (weight < 1) & np.isfinite(found).all(axis=(1, 2))
     if blend.any():
-        ends = (T[frames[blend], :3, :3] for frames in (between.before, between.after))
-        found[blend, :3, :3] = so3.interpolate(*ends, weight[blend])
+        rotation = T[:, :3, :3]
+        start, end = rotation[between.before[blend]], rotation[between.after[blend]]
+        found[blend, :3, :3] = so3.interpolate(start, end, weight[blend])
     return found
 
 

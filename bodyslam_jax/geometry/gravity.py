@@ -193,15 +193,20 @@ def feet_plane(
     )
     # A weak prior (slope of 45 degrees, any height) makes the system regular.
     prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
-    sigma, weight = 5 * _HEIGHT_SIGMA, np.ones(len(x))
-    for _ in range(20):
-        scaled = design * (weight / sigma**2)[:, None]
+
+    def fit(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The weighted least-squares solution, its information matrix first."""
+        scaled = design * weight[:, None]
         information = design.T @ scaled + prior
-        solution = np.linalg.solve(information, scaled.T @ x[:, 1])
+        return information, np.linalg.solve(information, scaled.T @ x[:, 1])
+
+    information, solution = fit(np.full(len(x), (5 * _HEIGHT_SIGMA) ** -2))
+    for _ in range(19):
         residual = x[:, 1] - design @ solution
         spread = 1.4826 * np.median(np.abs(residual))
         sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
-        weight = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
+        cauchy = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
+        information, solution = fit(cauchy / sigma**2)
     covariance = np.linalg.inv(information)[:2, :2] + _FEET_SYSTEMATIC**2 * np.eye(2)
     return Plane(solution[:2], covariance)
 
@@ -264,13 +269,13 @@ def _combined(
     """The tilt of up, the slope of the ground, and the standard deviation of the less
     sure direction of up, rad."""
     unknown = np.full(2, np.nan)
-    if trunk_tilt is None and ground is None:
-        return np.zeros(2), unknown, np.inf
-    if ground is None:
-        return trunk_tilt[0], unknown, _largest(trunk_tilt[1])
     if trunk_tilt is None:
+        if ground is None:
+            return np.zeros(2), unknown, np.inf
         level = ground.covariance + _LEVEL**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
+    if ground is None:
+        return trunk_tilt[0], unknown, _largest(trunk_tilt[1])
     mean, trunk = trunk_tilt
     sloping, steep = _SLOPES
     # Up is `mean + e`, with covariance `trunk`; the ground's gradient is `slope - up`.

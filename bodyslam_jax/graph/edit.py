@@ -1,4 +1,4 @@
-"""Problems and states edited with their shapes kept, so that nothing is recompiled."""
+"""Changes of problems and states that keep all shapes: nothing is recompiled."""
 
 import dataclasses
 
@@ -18,9 +18,9 @@ from bodyslam_jax.graph.state import State, Step
 
 
 def disable(problem: Problem, *kinds: type[Factor]) -> Problem:
-    """The problem with its terms of these kinds weighing nothing.
+    """The problem without the cost of its factors of these classes.
 
-    Their measurements become missing ones.
+    The factors stay, with all their measurements marked as missing.
     """
     factors = tuple(
         _missing(f, problem) if isinstance(f, kinds) else f for f in problem.factors
@@ -37,10 +37,13 @@ def _missing(factor: Factor, problem: Problem) -> Factor:
         values = {"sigma": jnp.inf}
     elif isinstance(factor, FrameFactor) and factor.padding:
         values = factor.padding
-    else:
+    elif isinstance(factor, FrameFactor):
         free = problem.free
-        lead = free.roots if getattr(factor, "of_people", False) else free.cameras
-        return Masked(factor, jnp.zeros(lead.shape[:-1], bool))
+        lead = free.roots if factor.of_people else free.cameras
+        return Masked(factor=factor, present=jnp.zeros(lead.shape[:-1], bool))
+    else:
+        name = type(factor).__name__
+        raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     for field, value in values.items():
         full = jnp.full_like(getattr(factor, field), value)
         factor = eqx.tree_at(lambda f, n=field: getattr(f, n), factor, full)
@@ -48,16 +51,17 @@ def _missing(factor: Factor, problem: Problem) -> Factor:
 
 
 def set_constant(free: Step, *names: str) -> Step:
-    """The same mask with groups of variables held, by their names in `State`."""
+    """The mask with these variables (names of `State`'s fields) held constant."""
     held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
     return dataclasses.replace(free, **held)
 
 
 def rescaled(state: State, factor: Float[Array | np.ndarray, "*f"] | float) -> State:
-    """The map `factor` times as large, with the scale s as it was.
+    """The same state in a map that is `factor` times as large.
 
-    Camera centres and landmarks are multiplied, so that the solution's s is divided by
-    `factor`. Of an array of factors, the states have its axes as leading axes.
+    Camera centres and landmarks are multiplied by `factor`, and the scale s stays, so
+    that lengths in metres grow by it; a solve from there ends with s divided by
+    `factor`. An array of factors gives a batch of states with the array's axes leading.
     """
     by = jnp.asarray(factor, state.scale.dtype)
     one = lambda f: eqx.tree_at(

@@ -34,25 +34,68 @@ _SHARED = ("scale", "shape", "intrinsics")
 
 
 class Frame(eqx.Module):
-    """One frame of one person; people's fields are `None` for a camera's factor."""
+    """The variables of one frame: of the camera, and of one person if the factor has
+    one residual for each person (`FrameFactor.of_people`)."""
 
     camera: Float[Array, "*b 4 4"]
-    root: Float[Array, "*b 4 4"] | None
-    pose: Float[Array, "*b 23 3"] | None
+    """T'_WC"""
+    person_root: Float[Array, "*b 4 4"] | None
+    """`root`, or `None` in a factor of the camera alone; so is `person_pose`."""
+    person_pose: Float[Array, "*b 23 3"] | None
+
+    @property
+    def root(self) -> Float[Array, "*b 4 4"]:
+        """T_CH; `ValueError` in a factor without a variable of a person in `keys`."""
+        return _of_person(self.person_root, "root")
+
+    @property
+    def pose(self) -> Float[Array, "*b 23 3"]:
+        """Joint rotations (axis-angle, rad); `ValueError` as for `root`."""
+        return _of_person(self.person_pose, "pose")
 
 
 class Shared(eqx.Module):
-    """What all frames of one person share."""
+    """The variables that all frames have in common, and the shape of one person."""
 
     scale: Float[Array, ""]
-    shape: Float[Array, " 10"] | None
+    """s, m per unit of the map."""
+    person_shape: Float[Array, " 10"] | None
     intrinsics: Float[Array, " i"]
 
+    @property
+    def shape(self) -> Float[Array, " 10"]:
+        """SMPL β; `ValueError` in a factor without a variable of a person in `keys`."""
+        return _of_person(self.person_shape, "shape")
 
-class Factor(eqx.Module):
+
+def _of_person(value: Array | None, name: str) -> Array:
+    if value is None:
+        raise ValueError(
+            f"{name}: found a factor of the camera alone, expected "
+            f"`({name!r}, 0)` among its `keys`."
+        )
+    return value
+
+
+if TYPE_CHECKING:
+
+    class _Declared:
+        """Attributes that a subclass sets as a field, a class attribute or a property:
+        only of `Any` do type checkers allow all three. `FrameFactor` documents them."""
+
+        loss: Any
+        keys: Any
+        per_joint: Any
+
+else:
+    _Declared = object
+
+
+class Factor(eqx.Module, _Declared):
     """Measurements of one kind, and how far a state is from explaining them."""
 
-    loss: eqx.AbstractVar[Loss]
+    if not TYPE_CHECKING:
+        loss: eqx.AbstractVar[Loss]
 
     @abc.abstractmethod
     def residual(self, state: State) -> Float[Array, "*m d"]:
@@ -102,17 +145,14 @@ class FrameFactor(Factor):
     per_joint = False
     """Whether row j of the residual depends on joint j of the touched poses alone."""
 
-    if TYPE_CHECKING:
-        keys: ClassVar[Any]
-        """The variables: among `camera`, `root`, `pose` with a lag, and `scale`,
-        `shape`, `intrinsics` with lag 0. A class attribute, or a property where they
-        depend on the factor's settings."""
-    else:
+    if not TYPE_CHECKING:
 
         @property
         @abc.abstractmethod
         def keys(self) -> tuple[Key, ...]:
-            """See above."""
+            """The variables: among `camera`, `root`, `pose` with a lag, and `scale`,
+            `shape`, `intrinsics` with lag 0. A class attribute, or a property where
+            they depend on the factor's settings."""
 
     @property
     def of_people(self) -> bool:

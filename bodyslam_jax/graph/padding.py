@@ -22,26 +22,25 @@ from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State
 from bodyslam_jax.graph.tracing import is_traced
 
-_MOVED = 0.01
-"""Step (rad, m, ...) from the first state to the state at which costs are compared: in
-the first state a residual may be 0 by chance."""
-_SAME = {"float64": 1e-8, "float32": 1e-3}
+_PERTURBATION = 0.01
+"""Standard deviation (rad, m, ...) of the random step from the first state to the state
+at which costs are compared: in the first state a residual may be 0 by chance."""
+_RTOL = {"float64": 1e-8, "float32": 1e-3}
 """Allowed relative difference of costs."""
 
 
 class Masked(FrameFactor):
-    """A factor that counts only in some frames: the residual of the others is 0.
+    """A factor that is active only in some frames: the residual of the others is 0.
 
-    Measurements and variables of the frames that do not count are replaced by those of
-    the last frame that does. So the factor is never evaluated where it may not be
-    defined, such as at two equal poses, and derivatives are finite wherever those of
-    the factor are.
+    Inactive frames are evaluated with the measurements and variables of the last active
+    frame. So the factor is never evaluated where it may not be defined, such as at two
+    equal poses, and derivatives are finite wherever those of the factor are.
     """
 
     factor: FrameFactor
     present: Bool[Array, "*h t"]
-    """Which frames count, of each person if it is of people; those that do not are the
-    last."""
+    """The active frames, of each person if the factor is of people; all inactive frames
+    come after them."""
     padding = {"present": False}
 
     @property
@@ -53,11 +52,11 @@ class Masked(FrameFactor):
         return self.factor.of_people
 
     @property
-    def per_joint(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def per_joint(self) -> bool:
         return self.factor.per_joint
 
     @property
-    def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def loss(self) -> Loss:
         return self.factor.loss
 
     @property
@@ -69,36 +68,37 @@ class Masked(FrameFactor):
         return self.factor.limbs
 
     def frame_of_row(self, num_frames):
-        known = self.present.reshape(-1, num_frames).any(axis=0)
-        last = jnp.maximum(known.sum(dtype=int) - 1, 0)
+        active = self.present.reshape(-1, num_frames).any(axis=0)
+        last = jnp.maximum(active.sum(dtype=int) - 1, 0)
         return jnp.minimum(jnp.arange(num_frames), last)
 
     def data(self):
         row = self.frame_of_row(self.present.shape[-1])
         axis = self.present.ndim - 1
-        given = jax.tree.map(lambda x: jnp.take(x, row, axis), self.factor.data())
-        return self.present, given
+        measured = jax.tree.map(lambda x: jnp.take(x, row, axis), self.factor.data())
+        return self.present, measured
 
     def frame_residual(self, data, window, shared):
-        present, given = data
-        return _where(present, self.factor.frame_residual(given, window, shared))
+        present, measured = data
+        residual = self.factor.frame_residual(measured, window, shared)
+        return _zero_unless(present, residual)
 
     def jacobian(self, data, window, shared):
-        present, given = data
-        known = self.factor.jacobian(given, window, shared)
-        if known is None:
+        present, measured = data
+        found = self.factor.jacobian(measured, window, shared)
+        if found is None:
             return None
-        return jax.tree.map(lambda x: _where(present, x), known)
+        return jax.tree.map(lambda x: _zero_unless(present, x), found)
 
 
-def _where(present: Array, x: Array) -> Array:
+def _zero_unless(present: Array, x: Array) -> Array:
     return jnp.where(present, x, jnp.zeros_like(x))
 
 
 def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
-    """The same factor with `frames` more frames than `state` has; they weigh nothing.
+    """The factor with `frames` frames of weight 0 appended to those of `state`.
 
-    A loss whose scale is one for each measurement gets longer, too.
+    A loss with a scale for each measurement is extended, too.
     """
     lead = state.roots.shape[:2] if factor.of_people else state.cameras.shape[:1]
     axis = len(lead) - 1
@@ -117,12 +117,12 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
         return padded
     present = np.ones((*lead[:-1], lead[-1] + frames), bool)
     present[..., lead[-1] :] = False
-    return Masked(padded, jnp.asarray(present))
+    return Masked(factor=padded, present=jnp.asarray(present))
 
 
 def _is_over_frames(factor: FrameFactor) -> bool:
-    """Whether its rows are the frames: not if they are counted once, or if it maps
-    frames in a way of its own."""
+    """Whether each residual belongs to a frame: not if it is counted once, or if the
+    class overrides `map_frames`."""
     return not factor.once and type(factor).map_frames is FrameFactor.map_frames
 
 
@@ -137,9 +137,10 @@ def extend_state(state: State, frames: int) -> State:
 
 
 def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
-    """`count` more entries along an axis, of a value or of the last (`"edge"`).
+    """The array with `count` entries appended along an axis: `fill`, or copies of the
+    last entry if `fill` is `"edge"`.
 
-    Outside jit by NumPy: JAX would compile one small program per shape.
+    Uses NumPy outside of `jit`: JAX would compile one small program per shape.
     """
     widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
     traced = isinstance(x, jax.core.Tracer)
@@ -194,8 +195,8 @@ def check_padding(factor: FrameFactor, state: State) -> None:
             len(state.cameras),
         )
     )
-    same = _SAME[state.scale.dtype.name]
-    if not np.isclose(found, expected, rtol=same, atol=same, equal_nan=True):
+    tolerance = _RTOL[state.scale.dtype.name]
+    if not np.isclose(found, expected, tolerance, tolerance, equal_nan=True):
         raise ValueError(
             f"{name}.padding: with {frames} frames more, which are to measure nothing, "
             f"the cost is {found:.6g}, expected {expected:.6g} as without them; name "
@@ -205,11 +206,11 @@ def check_padding(factor: FrameFactor, state: State) -> None:
 
 @eqx.filter_jit
 def _costs(factor, padded, state, num_frames):
-    """With frames added and without, at a state away from the first."""
+    """Costs with padding and without, at a perturbed state."""
     step = state.zero_step()
     leaves, treedef = jax.tree.flatten(step)
     keys = jax.random.split(jax.random.key(0), len(leaves))
-    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
+    draw = lambda key, x: _PERTURBATION * jax.random.normal(key, x.shape, x.dtype)
     step = treedef.unflatten([draw(k, x) for k, x in zip(keys, leaves, strict=True)])
     moved = state.retract(step)
     cut = dataclasses.replace(

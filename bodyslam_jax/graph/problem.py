@@ -1,6 +1,6 @@
-"""A problem: factors, what may move, and the motion model that predicts.
+"""The optimisation problem: factors, the mask of free variables, the motion model.
 
-`make_problem` is the door: it checks everything that the solver relies on.
+Problems are made by `make_problem`, which checks everything that the solver relies on.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intri
 
 
 class MotionPredictor(eqx.Module):
-    """The motion model as the graph sees it: a state in, predictions out."""
+    """A motion model bound to its parameters and the body: predicts from a state."""
 
     predict: Callable[..., Any] = eqx.field(static=True)
     """`predict(model, body, orientation, body_pose, shape, present)` of one person,
@@ -50,7 +50,7 @@ class MotionPredictor(eqx.Module):
     def __call__(self, state: State) -> Any:
         """Predictions of all people; leading axes `h t`."""
         orientation = state.cameras[:, :3, :3] @ state.roots[..., :3, :3]
-        one = lambda o, p, s, there: self.predict(self.model, self.body, o, p, s, there)
+        one = lambda *person: self.predict(self.model, self.body, *person)
         return jax.vmap(one)(orientation, state.poses, state.shapes, self.present)
 
 
@@ -59,7 +59,7 @@ class Problem(eqx.Module):
 
     factors: tuple[Factor, ...]
     free: Step
-    """1 where a coordinate may move, 0 where it is held."""
+    """1 for coordinates that are estimated, 0 for those that are held constant."""
     motion: MotionPredictor | None
     layout: Layout
     variables: tuple[str, ...] = eqx.field(static=True, default=VARIABLES)
@@ -67,7 +67,10 @@ class Problem(eqx.Module):
     the other groups are not formed."""
 
     def cost(self, state: State) -> Float[Array, ""]:
-        """Negative log-likelihood, up to a constant; predictions as they stand."""
+        """Negative log-likelihood, up to a constant.
+
+        Predictions of the motion model are those stored in the factors (`refresh`).
+        """
         return sum(self.cost_by_term(state).values(), jnp.zeros_like(state.scale))
 
     def cost_by_term(self, state: State) -> dict[str, Float[Array, ""]]:
@@ -77,7 +80,8 @@ class Problem(eqx.Module):
 
     @property
     def names(self) -> list[str]:
-        """Names of the terms: the factors' classes, numbered where one repeats."""
+        """Names of the terms: those of the factors' classes, numbered from the second
+        factor of a class on."""
         names: list[str] = []
         for factor in self.factors:
             inner = factor.factor if isinstance(factor, Masked) else factor
@@ -87,7 +91,7 @@ class Problem(eqx.Module):
         return names
 
     def predict(self, state: State, *, frozen: bool = True) -> Any:
-        """What the motion model predicts at a state; `None` without one.
+        """The motion model's prediction at a state; `None` without a motion model.
 
         With `frozen`, no gradient flows through the network. Otherwise postures would
         be moved to where the network happens to predict the displacements that the
@@ -95,23 +99,23 @@ class Problem(eqx.Module):
         """
         if self.motion is None:
             return None
-        seen = self.motion(jax.lax.stop_gradient(state) if frozen else state)
+        found = self.motion(jax.lax.stop_gradient(state) if frozen else state)
         return {
-            "translation": seen.translation,
+            "translation": found.translation,
             "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
-            "rotation": seen.rotation,
-            "body_pose": seen.body_pose,
+            "rotation": found.rotation,
+            "body_pose": found.body_pose,
         }
 
-    def with_prediction(self, seen: Any) -> "Problem":
-        """The same problem with this prediction in its factors."""
-        if seen is None:
+    def with_prediction(self, prediction: Any) -> "Problem":
+        """The same problem with a prediction (`predict`) in its factors."""
+        if prediction is None:
             return self
-        factors = tuple(_with_prediction(factor, seen) for factor in self.factors)
+        factors = tuple(_with_prediction(f, prediction) for f in self.factors)
         return eqx.tree_at(lambda p: p.factors, self, factors)
 
     def refresh(self, state: State) -> "Problem":
-        """The same problem with the motion predicted anew."""
+        """The same problem with the motion model's prediction at `state`."""
         return self.with_prediction(self.predict(state))
 
     def with_motion_model(
@@ -161,20 +165,23 @@ class Problem(eqx.Module):
             layout = _layout_of(everything, sizes)
             check_memory(layout, sample)
         free, variables = self.free, self.variables
-        if "scale" in _touched(factors) - _touched(self.factors):
+        if "scale" in _variables_of(factors) - _variables_of(self.factors):
             free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
             variables = tuple(v for v in VARIABLES if v in (*variables, "scale"))
         return Problem(everything, free, self.motion, layout, variables)
 
 
-def _with_prediction(factor, seen):
-    if isinstance(factor, HumanMotion) and "translation" in seen:
-        unit = 1 if factor.body is None else seen["leg"]
-        return eqx.tree_at(lambda f: f.translation, factor, seen["translation"] / unit)
-    if isinstance(factor, RelativeOrientation) and "rotation" in seen:
-        return eqx.tree_at(lambda f: f.rotation, factor, seen["rotation"])
-    if isinstance(factor, BodyPosePrior) and factor.predicted and "body_pose" in seen:
-        return eqx.tree_at(lambda f: f.rotation, factor, seen["body_pose"])
+def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
+    """The factor with its predicted measurements replaced, if it has any."""
+    if isinstance(factor, HumanMotion) and "translation" in prediction:
+        unit = 1 if factor.body is None else prediction["leg"]
+        translation = prediction["translation"] / unit
+        return eqx.tree_at(lambda f: f.translation, factor, translation)
+    if isinstance(factor, RelativeOrientation) and "rotation" in prediction:
+        return eqx.tree_at(lambda f: f.rotation, factor, prediction["rotation"])
+    predicted_pose = isinstance(factor, BodyPosePrior) and factor.predicted
+    if predicted_pose and "body_pose" in prediction:
+        return eqx.tree_at(lambda f: f.rotation, factor, prediction["body_pose"])
     return factor
 
 
@@ -205,17 +212,16 @@ def make_problem(
     free_intrinsics: bool = False,
     free: Step | None = None,
 ) -> Problem:
-    """Checks factors against a first state, holds the gauge, and lays out the blocks.
+    """Checks factors against a first state, fixes the gauge, and lays out the blocks.
 
-    `free` replaces the mask that follows from the factors: everything may move but the
-    gauge (first camera, one coordinate of the farthest), intrinsics unless
-    `free_intrinsics`, and s where no factor touches it.
+    By default everything is free except the gauge (the first camera, and one coordinate
+    of the camera farthest from it), the intrinsics unless `free_intrinsics`, and the
+    scale s if no factor depends on it. `free` replaces this mask.
 
-    **Raises:** `ValueError` if shapes or kinds of arrays do not fit, a value is not
-    finite or means nothing (a pose that is not rigid, sigma 0, a correlation of 1, a
-    weight where there is no earlier frame), an index is out of range, a factor of one's
-    own has another cost once frames are added that measure nothing, or the problem does
-    not fit into memory.
+    **Raises:** `ValueError` if shapes or dtypes of arrays do not fit, a value is not
+    finite or not valid (a pose that is not rigid, sigma 0, a correlation of 1, a weight
+    in a frame without an earlier one), an index is out of range, padding changes the
+    cost of a custom factor, or the problem does not fit into memory.
     """
     factors = tuple(factors)
     sizes = check_state(state)
@@ -231,10 +237,11 @@ def make_problem(
         check_mask(free)
     layout = _layout_of(factors, sizes)
     check_memory(layout, state)
+    mask: Step
     if free is None:
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
-        free = Step(
-            scale=ones.scale * float("scale" in _touched(factors)),
+        mask = Step(
+            scale=ones.scale * float("scale" in _variables_of(factors)),
             cameras=gauge(state.cameras),
             roots=ones.roots,
             poses=ones.poses,
@@ -244,14 +251,14 @@ def make_problem(
         )
     else:
         # `solve` knows a problem's precision by its mask.
-        free = jax.tree.map(lambda x: x.astype(state.scale.dtype), free)
+        mask = jax.tree.map(lambda x: x.astype(state.scale.dtype), free)
     moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
-    movable = jax.tree.map(moves, free)
+    movable = jax.tree.map(moves, mask)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
-    return Problem(factors, free, motion, layout, variables)
+    return Problem(factors, mask, motion, layout, variables)
 
 
-def _touched(factors: Sequence[Factor]) -> set[str]:
+def _variables_of(factors: Sequence[Factor]) -> set[str]:
     """Names of the variables (as in `Key`) that any `FrameFactor` depends on."""
     over_frames = [f for f in factors if isinstance(f, FrameFactor)]
     return {name for factor in over_frames for name, _ in factor.keys}

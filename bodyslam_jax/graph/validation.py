@@ -5,6 +5,8 @@ and `i` intrinsics are those of the state. Shapes and dtypes are checked under `
 `vmap` too; values only where they are not traced.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,11 @@ from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
 from bodyslam_jax.graph.factors.upright_prior import UprightPrior
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
-from bodyslam_jax.graph.validation_weights import check_early, check_loss, check_runs
+from bodyslam_jax.graph.validation_weights import (
+    check_correlation,
+    check_first_frames,
+    check_loss,
+)
 
 Sizes = dict[str, int]
 """Lengths of named axes."""
@@ -32,7 +38,7 @@ Sizes = dict[str, int]
 _ROTATION = 1e-3
 """Largest allowed entry of `|C^T C - I|`: files have few digits, and rotations drift in
 single precision."""
-_KINDS = {
+_KINDS: dict[Any, tuple[Any, str]] = {
     Float: (jnp.floating, "floating point"),
     Int: (jnp.integer, "integers"),
     Bool: (jnp.bool_, "bool"),
@@ -89,22 +95,22 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
     if isinstance(factor, FrameFactor):
         _check_frames(factor, name, sizes)
     _check_values(factor, name)
-    check_early(factor, name)
-    check_runs(factor, name)
+    check_first_frames(factor, name)
+    check_correlation(factor, name)
     if isinstance(factor, Reprojection):
         _check_tracks(factor, sizes)
     if isinstance(factor, RootOrientation):
-        known = _known(factor.sigma[..., None])
-        _check_rotations(factor.orientation, f"{name}.orientation", known)
+        measured = _measured(factor.sigma[..., None])
+        _check_rotations(factor.orientation, f"{name}.orientation", measured)
     if isinstance(factor, CameraPrior):
-        known = _known(factor.sigma[:, :3])
-        _check_rotations(factor.cameras, f"{name}.cameras", known)
+        measured = _measured(factor.sigma[:, :3])
+        _check_rotations(factor.cameras, f"{name}.cameras", measured)
     if isinstance(factor, GroundContact):
         _check_unit(factor.plane[:3], f"{name}.plane")
     if isinstance(factor, UprightPrior):
         _check_unit(factor.up, f"{name}.up")
     if isinstance(factor, RootPositionPrior) and not is_traced(factor.position):
-        depth = np.asarray(factor.position)[..., 2][_known(factor.sigma)]
+        depth = np.asarray(factor.position)[..., 2][_measured(factor.sigma)]
         if not (depth > 0).all():
             raise ValueError(
                 f"{name}.position: found a depth of {depth.min()} m, expected above 0."
@@ -152,11 +158,11 @@ def check_prior(factor: LandmarkPrior, landmark: np.ndarray) -> None:
     """
     if is_traced(factor.whitening):
         return
-    known = np.asarray(factor.whitening).any(axis=(1, 2))
-    known = known & ~np.isin(np.arange(len(known)), landmark)
-    if known.any():
+    has_prior = np.any(np.asarray(factor.whitening), axis=(1, 2))
+    unobserved = has_prior & ~np.isin(np.arange(has_prior.size), landmark)
+    if unobserved.any():
         raise ValueError(
-            f"LandmarkPrior: {int(known.sum())} landmarks have a prior and no "
+            f"LandmarkPrior: {int(unobserved.sum())} landmarks have a prior and no "
             "observation; expected both, or a `whitening` of 0."
         )
 
@@ -216,30 +222,30 @@ def _check_precision(state, free):
             )
 
 
-def _known(sigma):
+def _measured(sigma):
     """Mask of the measurements with at least one finite `sigma` on the last axis.
 
-    All false if `sigma` is traced, as its values are not known then.
+    All false if `sigma` is traced: its values are not available then.
     """
     if is_traced(sigma):
         return np.zeros(sigma.shape[:-1], bool)
     return np.isfinite(np.asarray(sigma)).any(axis=-1)
 
 
-def _check_rotations(poses, where, known=None):
+def _check_rotations(poses, where, mask=None):
     """Refuses matrices that are not rotations (3 x 3) or rigid poses (4 x 4, whose last
-    row is checked too); with the mask `known`, only where it is true."""
+    row is checked too); with a `mask`, only where it is true."""
     if is_traced(poses):
         return
     poses = np.asarray(poses, float)
     C = poses[..., :3, :3]
-    away = abs(np.swapaxes(C, -1, -2) @ C - np.eye(3)).max(axis=(-2, -1), initial=0)
-    away = np.where(np.linalg.det(C) > 0, away, np.inf)
+    error = abs(np.swapaxes(C, -1, -2) @ C - np.eye(3)).max(axis=(-2, -1), initial=0)
+    error = np.where(np.linalg.det(C) > 0, error, np.inf)
     if poses.shape[-1] == 4:
-        away = np.maximum(away, abs(poses[..., 3, :] - np.eye(4)[3]).max(axis=-1))
-    if known is not None:
-        away = np.where(known, away, 0)
-    wrong = away > _ROTATION
+        error = np.maximum(error, abs(poses[..., 3, :] - np.eye(4)[3]).max(axis=-1))
+    if mask is not None:
+        error = np.where(mask, error, 0)
+    wrong = error > _ROTATION
     if wrong.any():
         at = tuple(int(i) for i in np.argwhere(wrong)[0])
         what = "poses" if poses.shape[-1] == 4 else "rotations"

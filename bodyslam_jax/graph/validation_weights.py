@@ -22,9 +22,9 @@ from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
 from bodyslam_jax.graph.tracing import is_traced
 
-_EARLY = (
+_FIRST_FRAMES = (
     (HumanMotion, "whitening", 1, 0.0),
-    # Of the first prediction too: the one before has none.
+    # In frame 1, too: frame 0 has no prediction whose error could be correlated.
     (HumanMotion, "correlation", 2, 0.0),
     (BodyPosePrior, "correlation", 1, 0.0),
     (RootOrientation, "correlation", 1, 0.0),
@@ -91,19 +91,19 @@ def check_loss(loss: Any, where: str) -> None:
         raise ValueError(f"{where}.scale: found {values.min()}, expected above 0.")
 
 
-def check_early(factor: Factor, name: str) -> None:
+def check_first_frames(factor: Factor, name: str) -> None:
     """Refuses weights in first frames whose residual depends on frames before frame 0.
 
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
-    for kind, field, count, empty in _EARLY:
+    for kind, field, count, empty in _FIRST_FRAMES:
         value = getattr(factor, field, None)
-        # Not of others made from it, which may look back elsewhere.
+        # Not of subclasses, whose residuals may depend on other frames.
         if type(factor) is not kind or is_traced(value):
             continue
-        early = np.asarray(value)
-        early = early[:, :count] if factor.of_people else early[:count]
-        other = early[early != empty]
+        values = np.asarray(value)
+        first = values[:, :count] if factor.of_people else values[:count]
+        other = first[first != empty]
         if len(other):
             frames = "frame 0" if count == 1 else f"frames 0 to {count - 1}"
             raise ValueError(
@@ -112,7 +112,7 @@ def check_early(factor: Factor, name: str) -> None:
             )
 
 
-def check_runs(factor: Factor, name: str) -> None:
+def check_correlation(factor: Factor, name: str) -> None:
     """Refuses an AR(1) correlation with a preceding frame that has no measurement.
 
     The residual `e_k - ρ e_{k-1}` would use the placeholder stored in frame k-1 as a
@@ -121,19 +121,19 @@ def check_runs(factor: Factor, name: str) -> None:
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
     if isinstance(factor, HumanMotion):
-        weight, known = factor.whitening, lambda x: (x != 0).any(axis=(-1, -2))
+        weight, is_measured = factor.whitening, lambda x: (x != 0).any(axis=(-1, -2))
     elif isinstance(factor, RootOrientation | RootPositionPrior):
-        weight, known = factor.sigma, np.isfinite
+        weight, is_measured = factor.sigma, np.isfinite
     else:
         return
     if is_traced((weight, factor.correlation)):
         return
-    there: np.ndarray = np.asarray(known(np.asarray(weight)))
-    there = np.any(there.reshape(*there.shape[:2], -1), axis=-1)
-    on = np.asarray(factor.correlation)[:, 1:] != 0
-    lost = np.argwhere(on & there[:, 1:] & ~there[:, :-1])
-    if len(lost):
-        person, frame = lost[0]
+    measured: np.ndarray = np.asarray(is_measured(np.asarray(weight)))
+    measured = np.any(measured.reshape(*measured.shape[:2], -1), axis=-1)
+    correlated = np.asarray(factor.correlation)[:, 1:] != 0
+    wrong = np.argwhere(correlated & measured[:, 1:] & ~measured[:, :-1])
+    if len(wrong):
+        person, frame = wrong[0]
         raise ValueError(
             f"{name}.correlation: found {factor.correlation[person, frame + 1]} in "
             f"frame {frame + 1} of person {person}, expected 0.0: the frame before is "

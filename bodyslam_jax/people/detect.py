@@ -52,12 +52,12 @@ POSE = Model(
     134,
 )
 
-_LEAST_SCORE = 0.5
-"""Score of a box that holds a person."""
-_MOST_OVERLAP = 0.45
+_MIN_SCORE = 0.5
+"""Smallest score of a box that counts as a person."""
+_MAX_OVERLAP = 0.45
 """Intersection over union above which two boxes are one person's."""
-_MOST_PEOPLE = 8
-"""People of an image that are looked at, the largest ones first."""
+_MAX_PEOPLE = 8
+"""Number of people per image whose keypoints are estimated, the largest first."""
 _STRIDES = (8, 16, 32)
 _PAD = 114
 _CROP_MARGIN = 1.25
@@ -76,15 +76,15 @@ def detect_people(
 ) -> list[Float[np.ndarray, "p 25 3"]]:
     """Keypoints (u, v in px, confidence) of the people in each image, in BODY_25 order.
 
-    People are in no particular order; who is who over time is for the readers'
-    association to say. One image is in memory at a time.
+    People are in no particular order and are not tracked; `io.keypoints.associate` does
+    that. One image is in memory at a time.
 
     Args:
         offline: never use the network; models must be in the cache, or one's own.
         progress: called with the number of images done.
 
-    **Raises:** `ValueError` if onnxruntime is not installed, a model cannot be had, or
-    is not of the expected kind.
+    **Raises:** `ValueError` if onnxruntime is not installed, or if a model is not
+    available or not of the expected kind.
     """
     detector = _session(settings.detector, DETECTOR, offline)
     pose = _session(settings.pose, POSE, offline)
@@ -99,9 +99,10 @@ def detect_people(
 
 
 def model_path(own: str | None, model: Model, offline: bool) -> Path:
-    """The file of a model: the user's own, or from the cache, fetched if need be.
+    """The file of a model: `own`, the user's, or that in the cache, which is downloaded
+    if it is missing.
 
-    **Raises:** `ValueError` that says what to do where it cannot be had.
+    **Raises:** `ValueError` with what to do if the file is not available.
     """
     if own is not None:
         if not Path(own).is_file():
@@ -143,10 +144,10 @@ def find_boxes(
     at = lambda count: (np.arange(count) + 0.5) / scale - 0.5
     canvas[:rows, :columns] = sample(image, at(columns), at(rows))
     (raw,) = session.run(None, {tensor.name: canvas.transpose(2, 0, 1)[None]})
-    boxes, score = decode_yolox(raw[0], (height, width), _LEAST_SCORE)
-    boxes = boxes[suppress(boxes, score, _MOST_OVERLAP)]
+    boxes, score = decode_yolox(raw[0], (height, width), _MIN_SCORE)
+    boxes = boxes[suppress(boxes, score, _MAX_OVERLAP)]
     area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    return boxes[np.argsort(-area)[:_MOST_PEOPLE]] / scale
+    return boxes[np.argsort(-area)[:_MAX_PEOPLE]] / scale
 
 
 def decode_yolox(
@@ -215,8 +216,12 @@ def find_keypoints(
 def decode_simcc(
     x: Float[np.ndarray, "k w"], y: Float[np.ndarray, "k h"]
 ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-    """Places (px of the crop) and confidences from RTMPose's scores of columns and
-    rows, two bins a pixel: the best bin of each, and the lower of their scores."""
+    """Positions (px of the crop) and confidences of `k` keypoints from RTMPose's scores
+    of columns and rows (SimCC, two bins per pixel).
+
+    The position is the bin with the highest score; the confidence is the lower of the
+    two highest scores.
+    """
     points = np.stack([x.argmax(1), y.argmax(1)], axis=1) / _SIMCC_SPLIT
     confidence = np.minimum(x.max(1), y.max(1)).astype(float)
     return points, np.clip(confidence, 0.0, 1.0)
@@ -225,7 +230,7 @@ def decode_simcc(
 def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
     """BODY_25 from 17 (COCO), 26 (Halpe) or 133 (COCO-WholeBody) keypoints.
 
-    Neck and middle of the hips are the middles of shoulders and hips.
+    The neck is the midpoint of the shoulders, the mid-hip that of the hips.
     """
     count = len(points)
     if count not in (17, 26, 133):

@@ -17,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bodyslam_jax.graph.tracing import is_alone, is_traced
-from bodyslam_jax.solver.compilation import quick_options
+from bodyslam_jax.solver.compilation import quick_jit
 
 
 def sequential_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +66,7 @@ def vmap_over_devices(
 
     @functools.cache
     def compiled():
-        return eqx.filter_jit(program, compiler_options=quick_options())
+        return quick_jit(program)
 
     def call(*args):
         args = jax.tree.map(_as_array, args)

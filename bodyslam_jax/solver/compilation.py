@@ -20,15 +20,19 @@ def compiled(function: F) -> F:
 
     Options belong to whole programs: inside a larger `jit` use `eqx.filter_jit`.
     """
-    program = functools.cache(
-        lambda: eqx.filter_jit(function, compiler_options=quick_options())
-    )
+    program = functools.cache(lambda: quick_jit(function))
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         return program()(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def quick_jit(function: Callable[..., Any]) -> Any:
+    """`eqx.filter_jit` with `quick_options`: called like `function`, with `lower`."""
+    filter_jit: Any = eqx.filter_jit  # its annotation leaves JAX's own options out
+    return filter_jit(function, compiler_options=quick_options())
 
 
 def in_full_precision(function: F) -> F:

@@ -13,7 +13,7 @@ import optimistix as optx
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
-from bodyslam_jax.solver.compilation import in_full_precision, quick_options
+from bodyslam_jax.solver.compilation import in_full_precision, quick_jit
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Stage, check_schedule
@@ -72,18 +72,18 @@ def _trace(problem, state, observe, schedule, damping, mixed):
 @in_full_precision
 def _stage(problem, state, see, stage, damping, mixed):
     method = method_of((stage,), damping, state.scale.dtype, mixed=mixed)
-    start = method.init(lifted, state, problem, {}, None, None, frozenset())
+    start = method.init(_residuals, state, problem, {}, None, None, frozenset())
     arrays, static = eqx.partition(start, eqx.is_array)
 
     def one(carry, _):
         y, arrays, stopped = carry
         loop = eqx.combine(arrays, static)
-        moved, following, _ = method.step(lifted, y, problem, {}, loop, frozenset())
+        moved, following, _ = method.step(_residuals, y, problem, {}, loop, frozenset())
         keep = lambda new, old: jnp.where(stopped, old, new)
         y = jax.tree.map(keep, moved, y)
         after = jax.tree.map(keep, eqx.filter(following, eqx.is_array), arrays)
         done, result = method.terminate(
-            lifted, y, problem, {}, eqx.combine(after, static), frozenset()
+            _residuals, y, problem, {}, eqx.combine(after, static), frozenset()
         )
         ended = stopped | done | (result != optx.RESULTS.successful)
         return (y, after, ended), see(y)
@@ -118,8 +118,9 @@ def clock(
     method = method_of(schedule, damping, dtype, mixed=mixed_precision)
     loop = _begin(method, problem, start)
     arrays, static = eqx.partition(loop, eqx.is_array)
-    program = eqx.filter_jit(_advance, compiler_options=quick_options())
-    program = program.lower(method, problem, start, arrays, static).compile()
+    program = (
+        quick_jit(_advance).lower(method, problem, start, arrays, static).compile()
+    )
     seconds: list[list[float]] = [[] for _ in schedule]
     y = start
     while not bool(arrays.finished):
@@ -129,7 +130,7 @@ def clock(
         seconds[stage].append(time.perf_counter() - before)
     loop = eqx.combine(arrays, static)
     _, _, stats = method.postprocess(
-        lifted, y, None, problem, {}, loop, frozenset(), loop.result
+        _residuals, y, None, problem, {}, loop, frozenset(), loop.result
     )
     solution, _ = outcome(start, y, loop.result, stats)
     solution = eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, t, l))
@@ -138,11 +139,16 @@ def clock(
 
 @eqx.filter_jit
 def _begin(method, problem, state):
-    return method.init(lifted, state, problem, {}, None, None, frozenset())
+    return method.init(_residuals, state, problem, {}, None, None, frozenset())
 
 
 @in_full_precision
 def _advance(method, problem, state, arrays, static):
     loop = eqx.combine(arrays, static)
-    y, loop, _ = method.step(lifted, state, problem, {}, loop, frozenset())
+    y, loop, _ = method.step(_residuals, state, problem, {}, loop, frozenset())
     return y, eqx.filter(loop, eqx.is_array)
+
+
+def _residuals(state, problem):
+    """What optimistix calls a function: residuals, and no further output."""
+    return lifted(state, problem), None

@@ -50,10 +50,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """1 for the groups among `VARIABLES` that a stage moves."""
     limit: Int[Array, " s"]
     """Steps at most; a stage with none is left out."""
-    rtol: Float[Array, " s"]
-    """A stage ends when an undisturbed step lowers the cost by less than this share."""
-    atol: Float[Array, " s"]
-    """Or by less than this."""
+    rtol: Any
+    """Shape (s,): a stage ends when an undisturbed step lowers the cost by less than
+    this share."""
+    atol: Any
+    """Shape (s,): or by less than this. Optimistix declares both as one number."""
     damping: Float[Array, ""]
     """At the first step of a stage; 0 is Gauss-Newton, with step control left to
     `GAIN`."""

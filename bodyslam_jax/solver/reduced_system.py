@@ -58,8 +58,9 @@ def assemble(
     tail = _camera_tail(lin, sizes, dtype)
     corner = _corner(lin, sizes, reduced, damping["globals"])
     people, across = [], []
+    blocks = () if kept is None else kept
     for person in range(sizes.people):
-        part = _parts(kept[person], window)
+        part = _parts(blocks[person], window)
         people.append(part)
         across.append(part["own", "cameras"])
         own = own + part["cameras", "cameras"]

@@ -90,7 +90,8 @@ def triangulate_anew(
         LandmarkPrior: 0.5 * jnp.sum(best[1]),
     }
     new = [
-        costs.get(type(f), old) for f, old in zip(problem.factors, terms, strict=True)
+        costs[type(f)] if type(f) in costs else old
+        for f, old in zip(problem.factors, terms, strict=True)
     ]
     return at(place), jnp.stack(new)
 

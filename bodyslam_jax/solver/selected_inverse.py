@@ -57,19 +57,19 @@ def selected_inverse(
         pairs = [part(pair(apart)) for apart in neighbours or (1,)]
         return part(kept), (pairs, part(band))
 
-    scan = lambda *neighbours: jax.lax.scan(
-        step, start, (factor.half, factor.side, neighbours), reverse=True
-    )
+    def scan(*neighbours):
+        chunks = factor.half, factor.side, neighbours
+        _, (pairs, windows) = jax.lax.scan(step, start, chunks, reverse=True)
+        return pairs, windows
+
     if order is None:
-        _, ((pairs,), windows) = scan()
+        (pairs,), windows = scan()
     else:
         place = jnp.argsort(order)
         follower = jnp.roll(place, -1)
         ahead = follower - place
         near_by = lambda apart: jnp.clip(apart, 1, sizes.reach)[order]
-        _, ((after, before), windows) = scan(
-            near_by(ahead), near_by(-jnp.roll(ahead, 1))
-        )
+        (after, before), windows = scan(near_by(ahead), near_by(-jnp.roll(ahead, 1)))
         turned = jnp.r_[q : 2 * q, 0:q, 2 * q : 2 * q + g]
         before = before[follower][:, turned][:, :, turned]
         pairs = jnp.where((ahead > 0)[:, None, None], after[place], before)
@@ -81,7 +81,7 @@ def selected_inverse(
     alone = alone.at[:, at[:, None], at].set(pairs[:1, own[:, None], own])
     pairs = jnp.concatenate([alone, pairs[:-1]])
     by_chunk = jax.tree.map(lambda x: x.swapaxes(0, 1), roots)
-    with_inner = lambda given: _with_inner(*given, window, sizes)
+    with_inner = lambda given: _with_inner(given[0], given[1], window, sizes)
     return jax.lax.map(with_inner, (pairs, by_chunk)), windows, common
 
 
@@ -95,6 +95,7 @@ def _with_inner(
     q = (len(pair) - g) // 2
     eye = jnp.eye(len(pair), dtype=pair.dtype)
     rows, spread = [], jnp.zeros((0, 0), pair.dtype)
+    halves, sides = ((), ()) if roots is None else (roots.half, roots.side)
     for p in range(sizes.people):
         index = jnp.concatenate(
             [
@@ -105,7 +106,7 @@ def _with_inner(
                 2 * q + own_to_global(sizes, p),
             ]
         )
-        half, side = roots.half[p], roots.side[p]
+        half, side = halves[p], sides[p]
         none = jnp.zeros((len(half), len(pair)), pair.dtype)
         rows.append(none.at[:, index].set(-half.T @ side[:-1].T))
         rows.append(eye[q + (p + 1) * width - last + jnp.arange(last)])

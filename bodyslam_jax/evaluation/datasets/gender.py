@@ -25,8 +25,11 @@ _NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 _NAMES["default"] = "the free body that ships with the package"
 _KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
 """By the number of pose parameters: kinds of body that they fit, best first."""
-_STEMS = {"smpl": ("smpl_", "basicmodel"), "smplh": ("smplh_", "model")}
-_STEMS["smplx"] = ("smplx_",)
+_STEMS: dict[str, tuple[str, ...]] = {
+    "smpl": ("smpl_", "basicmodel"),
+    "smplh": ("smplh_", "model"),
+    "smplx": ("smplx_",),
+}
 """Beginnings of the usual names of files."""
 
 
@@ -101,7 +104,7 @@ def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
 
 def _needed(person: dict[str, np.ndarray]) -> tuple[str, tuple[str, ...]]:
     """Gender of an AMASS file, and which kinds of body it fits; the best first."""
-    width = np.shape(person.get("poses"))[-1:]
+    width = np.shape(person["poses"])[-1:] if "poses" in person else ()
     kinds = _KINDS.get(width[0] if width else 0, ("smpl", "smplh"))
     return gender_of(person.get("gender")) or "neutral", kinds
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -20,14 +20,9 @@ class AngularAccelerationPrior(FrameFactor):
     """rad per frame squared; `inf` where one of the three frames is missing."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return tuple((name, lag) for name in ("camera", "root") for lag in range(3))
-
-    def data(self):
-        return self.sigma
+    keys = tuple((name, lag) for name in ("camera", "root") for lag in range(3))
 
     def frame_residual(self, data, window, shared):
+        (sigma,) = data
         now, before, first = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
-        return (so3.log(before.T @ now) - so3.log(first.T @ before)) / data
+        return (so3.log(before.T @ now) - so3.log(first.T @ before)) / sigma

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -23,13 +23,7 @@ class CameraPrior(FrameFactor):
     """Of rotation (rad) and of centre (units of the map); `inf` where unknown."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return (("camera", 0),)
-
-    def data(self):
-        return self.cameras, self.sigma
+    keys = (("camera", 0),)
 
     def frame_residual(self, data, window, shared):
         measured, sigma = data

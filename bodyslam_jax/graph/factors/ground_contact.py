@@ -42,25 +42,18 @@ class GroundContact(FrameFactor):
     this is its standard deviation times the root of their number."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        frames = (("camera", 0), ("root", 0), ("pose", 0))
-        return (*frames, ("scale", 0), ("shape", 0))
+    keys = (("camera", 0), ("root", 0), ("pose", 0), ("scale", 0), ("shape", 0))
 
     @property
     def limbs(self) -> Limbs:
         return (turning_joints(self.body, "body25", HEELS_AND_TOES),)
 
-    def data(self):
-        return self.sigma
-
     def frame_residual(self, data, window, shared):
-        (frame,) = window
-        return (self._lowest(frame, shared) - SOLE)[None] / data
+        (sigma,), (frame,) = data, window
+        return (self._lowest(frame, shared) - SOLE)[None] / sigma
 
     def jacobian(self, data, window, shared):
-        (frame,) = window
+        (sigma,), (frame,) = data, window
         points = keypoint_jacobian(self.body, frame.pose, shared.shape, "body25", 0.0)
         feet = np.array(HEELS_AND_TOES)
         p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
@@ -81,8 +74,8 @@ class GroundContact(FrameFactor):
             ("scale", 0): (normal @ r_WC + offset)[None],
             ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
         }
-        parts = {key: part[None] / data for key, part in parts.items()}
-        return (_soft_minimum(height) - SOLE)[None] / data, parts
+        parts = {key: part[None] / sigma for key, part in parts.items()}
+        return (_soft_minimum(height) - SOLE)[None] / sigma, parts
 
     def scales(self, state: State) -> Float[Array, "h t"]:
         """The s that would put the feet on the ground, for each person and frame."""

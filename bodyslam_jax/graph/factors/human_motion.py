@@ -102,6 +102,6 @@ class HumanMotion(FrameFactor):
 
 def unit_length(body: BodyModel | None, shared: Shared) -> Float[Array, ""]:
     """The length of the person's leg, m; 1 m without a body."""
-    if body is None or shared.shape is None:
+    if body is None:
         return jnp.ones_like(shared.scale)
     return leg_length(body, shared.shape)

@@ -10,7 +10,7 @@ Ours: the paper's intrinsics are known.
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -18,10 +18,7 @@ class AbstractIntrinsicsFactor(FrameFactor):
     """A factor of the intrinsics alone: one row for the whole video."""
 
     padding = {}  # its one row is no frame
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return (("intrinsics", 0),)
+    keys = (("intrinsics", 0),)
 
     def map_frames(self, function, state, extra=None):
         first = eqx.tree_at(lambda s: s.cameras, state, state.cameras[:1])

@@ -18,11 +18,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import KEYPOINT_NAMES, BodyModel, local_keypoints
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.graph.factor import (
-    FrameFactor,
-    Key,
-    Limbs,
-)
+from bodyslam_jax.graph.factor import FrameFactor, Limbs
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
 from bodyslam_jax.graph.losses import Loss, squared_norm
@@ -42,10 +38,7 @@ class KeypointReprojection(FrameFactor):
     of the body model (`body.DETECTOR_BIAS`)."""
     layout: str = eqx.field(static=True, default="body25")
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0)
+    keys = (("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0))
 
     @property
     def limbs(self) -> Limbs:
@@ -53,9 +46,6 @@ class KeypointReprojection(FrameFactor):
         return tuple(
             turning_joints(self.body, self.layout, (point,)) for point in range(count)
         )
-
-    def data(self):
-        return self.pixel, self.sigma
 
     def residual(self, state: State) -> Float[Array, "h t j 2"]:
         shape = state.shapes[:, None]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -23,13 +23,7 @@ class RelativeOrientation(FrameFactor):
     """Per axis, rad; `inf` where not predicted."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("camera", 0), ("camera", 1), ("root", 0), ("root", 1)
-
-    def data(self):
-        return self.rotation, self.sigma
+    keys = (("camera", 0), ("camera", 1), ("root", 0), ("root", 1))
 
     def frame_residual(self, data, window, shared):
         rotation, sigma = data

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.whitening import innovation
 
@@ -27,10 +27,7 @@ class RootOrientation(FrameFactor):
     """ρ between the errors of k-1 and k; 0 at the start of a run."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf, "correlation": 0.0}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("root", 0), ("root", 1)
+    keys = (("root", 0), ("root", 1))
 
     def data(self):
         previous = jnp.roll(self.orientation, 1, axis=1)

@@ -13,7 +13,7 @@ frames that are more than a second away from any keypoint of the person. Default
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.whitening import innovation
 
@@ -30,10 +30,7 @@ class RootPositionPrior(FrameFactor):
     """ρ between the errors of k-1 and k; 0 at the start of a run."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf, "correlation": 0.0}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("root", 0), ("root", 1)
+    keys = (("root", 0), ("root", 1))
 
     def data(self):
         # A missing measurement may be 0, which has no direction.

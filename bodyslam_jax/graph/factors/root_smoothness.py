@@ -36,12 +36,10 @@ class RootSmoothness(FrameFactor):
             *((("shape", 0),) if self.body is not None else ()),
         )
 
-    def data(self):
-        return self.sigma
-
     def frame_residual(self, data, window, shared):
+        (sigma,) = data
         now, before, first = (
             shared.scale * f.camera[:3, 3] + f.camera[:3, :3] @ f.root[:3, 3]
             for f in window
         )
-        return (now - 2 * before + first) / unit_length(self.body, shared) / data
+        return (now - 2 * before + first) / unit_length(self.body, shared) / sigma

@@ -9,7 +9,7 @@ Used where a camera path in metres is given: `s̃` is metres per unit of the map
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -22,13 +22,7 @@ class ScalePrior(FrameFactor):
     """m per unit of the map; finite in one frame, `inf` in all others."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return (("scale", 0),)
-
-    def data(self):
-        return self.scale, self.sigma
+    keys = (("scale", 0),)
 
     def frame_residual(self, data, window, shared):
         measured, sigma = data

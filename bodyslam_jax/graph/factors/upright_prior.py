@@ -11,7 +11,7 @@ by 0.05 rad). Ours.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -24,15 +24,9 @@ class UprightPrior(FrameFactor):
     """rad; `inf` where the person is absent."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        return ("camera", 0), ("root", 0)
-
-    def data(self):
-        return self.sigma
+    keys = (("camera", 0), ("root", 0))
 
     def frame_residual(self, data, window, shared):
-        (frame,) = window
+        (sigma,), (frame,) = data, window
         trunk = frame.camera[:3, :3] @ frame.root[:3, 1]
-        return (trunk - self.up) / data
+        return (trunk - self.up) / sigma

@@ -1,8 +1,9 @@
 """BVH files with CMU's joint names, as SMPL rotations.
 
-Following how the CMU data of this project were made: SMPL joint k gets `G_j A_k`, G_j
-the capture bone's global rotation from its rest pose, A_k the smallest rotation from
-SMPL's rest bone to the capture's; limb directions are exact, twist is the capture's.
+As in the project's conversion of the CMU data, the global rotation of SMPL joint k is
+`G_j A_k`: `G_j` is the rotation of the capture's bone j from its rest pose, and `A_k`
+the smallest rotation from the direction of SMPL's rest bone to that of the capture's.
+The directions of limbs are exact; their twist is that of the capture.
 """
 
 import dataclasses
@@ -30,7 +31,8 @@ _NAMES = (
     "RightArm,RShoulder LeftForeArm,LElbow RightForeArm,RElbow LeftHand,LWrist "
     "RightHand,RWrist"
 ).split()
-"""For SMPL joints 0 to 21, the BVH joint that turns it; the first one found counts."""
+"""For each of SMPL's joints 0 to 21, names of the BVH joint whose rotation it takes; of
+several names, the first that the file has counts."""
 
 _REST_BONES = {
     1: (4, (0.08, -0.99, -0.01)),
@@ -44,14 +46,15 @@ _REST_BONES = {
     18: (20, (1.0, 0.03, -0.01)),
     19: (21, (-1.0, 0.03, -0.01)),
 }
-"""SMPL's rest bones: joint -> (child, direction); the spine is left as it is."""
+"""Directions of SMPL's bones in the rest pose: joint -> (child, direction). Joints that
+are not listed (spine, neck, collars) need no alignment."""
 
-_PLACES = ("xposition", "yposition", "zposition")
-_TURNS = ("xrotation", "yrotation", "zrotation")
-"""Channels, in lower case: writers of BVH do not agree on capitals."""
+_POSITIONS = ("xposition", "yposition", "zposition")
+_ROTATIONS = ("xrotation", "yrotation", "zrotation")
+"""Names of channels in lower case; files differ in the case of letters."""
 
 _UNITS = (1.0, 0.01, 0.0254, 0.056444, 0.001)
-"""Metres in a unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
+"""Metres per unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
 
 
 @dataclasses.dataclass
@@ -68,8 +71,8 @@ def read_bvh(path: Path) -> Clip:
 
     The unit of length is the one that makes the legs 0.55 to 1.15 m long.
 
-    **Raises:** `ValueError` if the file is no BVH, is cut short, holds NaN, channels
-    or a frame time that cannot be, or lacks a joint of the legs.
+    **Raises:** `ValueError` if the file is not BVH, is truncated, contains NaN, unknown
+    channels or an impossible frame time, or lacks a joint of the legs.
     """
     path = Path(path)
     joints, values, fps = _parse(path)
@@ -86,10 +89,10 @@ def read_bvh(path: Path) -> Clip:
                 f"{path}: no joint {_NAMES[joint].replace(',', ' or ')}; found "
                 f"{', '.join(list(index)[:8])}, ..."
             )
-    turns = padded(lambda rows: _forward(joints, jnp.asarray(rows)), values)
-    channels, where = joints[0].channels, np.zeros((len(values), 3))
-    if set(_PLACES) <= set(channels):
-        where = values[:, [channels.index(place) for place in _PLACES]]
+    global_rotation = padded(lambda rows: _forward(joints, jnp.asarray(rows)), values)
+    channels, position = joints[0].channels, np.zeros((len(values), 3))
+    if set(_POSITIONS) <= set(channels):
+        position = values[:, [channels.index(name) for name in _POSITIONS]]
     rest = np.zeros((len(joints), 3))
     for i, joint in enumerate(joints):
         rest[i] = joint.offset + (rest[joint.parent] if joint.parent >= 0 else 0)
@@ -105,17 +108,18 @@ def read_bvh(path: Path) -> Clip:
         raise ValueError(
             f"{path}: legs {legs:.3g} units long fit no known unit of length."
         )
-    smpl_rest, where = smpl_rest * unit, where * unit
+    smpl_rest, position = smpl_rest * unit, position * unit
     align = np.tile(np.eye(3), (24, 1, 1))
     for k, (child, direction) in _REST_BONES.items():
-        align[k] = _smallest_turn(np.array(direction), smpl_rest[child] - smpl_rest[k])
+        bone = smpl_rest[child] - smpl_rest[k]
+        align[k] = _smallest_rotation(np.array(direction), bone)
     rotation = np.zeros((len(values), 24, 3, 3))
     for k in range(24):
         j = source[k] if k < 22 else None
         if j is None:
             rotation[:, k] = rotation[:, PARENTS[k]]
         else:
-            rotation[:, k] = turns[:, j] @ align[k]
+            rotation[:, k] = global_rotation[:, j] @ align[k]
     local = rotation.copy()
     for k in range(1, 24):
         local[:, k] = np.swapaxes(rotation[:, PARENTS[k]], -1, -2) @ rotation[:, k]
@@ -130,13 +134,13 @@ def read_bvh(path: Path) -> Clip:
         split="",
         fps=fps,
         poses=poses.astype(np.float32),
-        trans=where.astype(np.float32),
+        trans=position.astype(np.float32),
         offsets=offsets.astype(np.float32),
         leg_length=float(leg_length(rest_from_offsets(offsets, PARENTS))),
     )
 
 
-def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _smallest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Smallest rotation matrix that takes one direction to another."""
     start, end = start / np.linalg.norm(start), end / max(np.linalg.norm(end), 1e-9)
     axis, cosine = np.cross(start, end), float(start @ end)
@@ -154,17 +158,20 @@ def _log(matrices: Float[Array, "t j 3 3"]) -> Float[Array, "t j 3"]:
 def _forward(
     joints: list[_Joint], rows: Float[Array, "t c"]
 ) -> Float[Array, "t j 3 3"]:
-    """Global rotations of all joints: in each, the channels in the file's order."""
-    turns, column = [], 0
+    """Global rotations of all joints; the rotations of a joint's channels are composed
+    in the file's order."""
+    found, column = [], 0
     for joint in joints:
-        turn = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (len(rows), 3, 3))
+        rotation = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (len(rows), 3, 3))
         for channel in joint.channels:
-            if channel in _TURNS:
-                axis = jnp.asarray(np.eye(3)[_TURNS.index(channel)], rows.dtype)
-                turn = turn @ so3.exp(jnp.deg2rad(rows[:, column, None]) * axis)
+            if channel in _ROTATIONS:
+                axis = jnp.asarray(np.eye(3)[_ROTATIONS.index(channel)], rows.dtype)
+                rotation = rotation @ so3.exp(jnp.deg2rad(rows[:, column, None]) * axis)
             column += 1
-        turns.append(turns[joint.parent] @ turn if joint.parent >= 0 else turn)
-    return jnp.stack(turns, 1)
+        if joint.parent >= 0:
+            rotation = found[joint.parent] @ rotation
+        found.append(rotation)
+    return jnp.stack(found, 1)
 
 
 def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
@@ -204,7 +211,7 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
                 "numbers."
             )
         for channel in joint.channels:
-            if channel not in (*_PLACES, *_TURNS):
+            if channel not in (*_POSITIONS, *_ROTATIONS):
                 raise ValueError(
                     f"{path}: channel {channel!r} of {joint.name}; expected Xposition, "
                     "Xrotation and the like."

@@ -4,14 +4,14 @@ All derivatives of one frame, those by globals and the residual stand side by si
 Gram matrix a frame then holds every block and every gradient.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import (
-    Frame,
     FrameFactor,
     Problem,
     State,
@@ -57,10 +57,10 @@ def linearise_frames(
     # Postures first: their limbs do not touch each other (`_add_products`).
     local = sorted((t for t in keys if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
     columns = []
-    for touch in local:
-        free = _free_of(problem, *touch, joint)
-        part = parts[touch]
-        if touch[0] == "pose" and not joint:
+    for name, lag in local:
+        free = _free_of(problem, name, lag, joint)
+        part = parts[name, lag]
+        if name == "pose" and not joint:
             part, free = (pick(x, sums.sizes.joints, width=3) for x in (part, free))
         columns.append(rows(part, part.shape[-1]) * free[..., None, :])
     common = [name for name in _COMMON if (name, 0) in keys]
@@ -200,10 +200,10 @@ def _move(frame, name, step, turn):
     """First order in the step, which is all that a derivative at 0 sees."""
     if name == "pose":
         step = jnp.einsum("jab,jb->ja", turn, step.reshape(23, 3))
-        return Frame(frame.camera, frame.root, frame.pose + step)
+        return dataclasses.replace(frame, person_pose=frame.pose + step)
     if name == "root":
-        return Frame(frame.camera, _nudge(frame.root, step), frame.pose)
-    return Frame(_nudge(frame.camera, step), frame.root, frame.pose)
+        return dataclasses.replace(frame, person_root=_nudge(frame.root, step))
+    return dataclasses.replace(frame, camera=_nudge(frame.camera, step))
 
 
 def _nudge(pose, step):
@@ -215,9 +215,10 @@ def _nudge(pose, step):
 
 
 def _move_shared(shared, name, step):
-    changed = getattr(shared, name)
-    changed = changed + (step[0] if name == "scale" else step)
-    return eqx.tree_at(lambda s: getattr(s, name), shared, changed)
+    if name == "shape":
+        return dataclasses.replace(shared, person_shape=shared.shape + step)
+    changed = getattr(shared, name) + (step[0] if name == "scale" else step)
+    return dataclasses.replace(shared, **{name: changed})
 
 
 def _free_of(problem, name, lag, joint):
