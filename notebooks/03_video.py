@@ -65,6 +65,16 @@ for k, image in enumerate(io.frames(sequence)):
 figure.tight_layout()
 
 # %% [markdown]
+# ## From any side
+# The same in 3D: play it, turn it, follow the person, look through the camera. From the
+# side the feet should stand on the floor and the knees bend as knees do; from above the
+# path should be that of a walk. Run the cell to see it: its page, about 2 MB, is not kept
+# in this file.
+
+# %%
+result.view()
+
+# %% [markdown]
 # ## Where everybody went, and how fast
 # The dashed lines are the truth. For the comparison the estimate is moved and turned as
 # a whole, because no video says where north is; its size is left as it was estimated.
