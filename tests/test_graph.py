@@ -128,6 +128,7 @@ def test_keypoint_curvature_is_the_second_derivative(rng):
     assert np.allclose(single[0], turns, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_curvature_of_keypoints_is_the_second_order_term(rng):
     problem, state, _ = make(people=1, frames=3, noise=15.0)
     normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))

@@ -1,4 +1,7 @@
-"""Points as a file lists them -> BODY_25: invalid values, the order, x and y."""
+"""Keypoints as a file lists them -> BODY_25.
+
+Removes invalid values, finds the layout, and exchanges x and y where they are swapped.
+"""
 
 from pathlib import Path
 
@@ -14,23 +17,24 @@ from bodyslam_jax.io.keypoints.lying import lying
 from bodyslam_jax.io.keypoints.names import layout_of
 
 _MAX_LOST = 0.5
-"""Share of the detections without a usable person from which a file is refused."""
+"""A file is refused if at least this share of its detections is not usable."""
 _USABLE = 4
-"""Valid points that make a person usable."""
+"""Least number of valid points of a usable detection."""
 _ALL_LIE = 0.85
-"""Share of the detections that lie on their side from which it is no posture."""
+"""If at least this share of the detections lies sideways, the reason is the image axes,
+not posture."""
 _MIN_MIRRORED = 0.7
-"""Share of the detections that are mirror images from which x and y are exchanged."""
+"""x and y are exchanged where at least this share of the detections is mirrored."""
 _MIN_DETECTIONS = 10
-"""For a decision whether x and y are exchanged."""
+"""Least number of detections for a decision about x and y."""
 
 
 def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "25 3"]]:
-    """For each row of a file its points in BODY_25's order, (u px, v px, confidence).
+    """The keypoints of each row of a file in BODY_25 order: u px, v px, confidence.
 
-    The file's order is known from the names that it gives its points, else from their
-    number, unless the distances between them clearly favour another known order of as
-    many points (`layout_evidence`). Points with a value that is not finite are missing.
+    The file's layout follows from its names of keypoints. Without names it is the usual
+    layout of that number of keypoints, unless the distances between them clearly favour
+    another one (`layout_evidence`). Keypoints with a non-finite value are missing.
 
     **Raises:** `ValueError`, naming the file, if most detections are lost to such
     values, or no known order of as many points fits a body.
@@ -58,7 +62,7 @@ def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "
 
 
 def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
-    """The same, with points of confidence 0 in place of those that are not finite."""
+    """The keypoints, with non-finite ones replaced by keypoints of confidence 0."""
     broken, total, lost = 0, 0, 0
     whole = []
     for points in raw:
@@ -88,7 +92,7 @@ def _in_order(
     listed: Listed,
     warn: Warn,
 ) -> tuple[np.ndarray, list[int]]:
-    """The points in BODY_25's order, and the layout they were in."""
+    """The keypoints in BODY_25 order, and the layout of the file."""
     num = points.shape[1]
     if layout is not None and listed.parts is not None:
         if len(layout) != num:
@@ -101,13 +105,13 @@ def _in_order(
         return to_body25(path, points), list(range(25))
     choice = choose_layout(points, layouts)
     usual = next(iter(layouts))
-    if not choice.known:
+    if not choice.plausible:
         raise ValueError(
             f"{path}: {num} keypoints a person in no known order: as "
             f"{', '.join(layouts)} limbs are too long for a body; give them in "
             f"{usual}'s order, or in a file that names them (`keypoint_names`)."
         )
-    if choice.odd:
+    if choice.poor_fit:
         warn(
             f"keypoints: {num} a person fit a body badly as {usual} (log-likelihood "
             f"{choice.nats[usual]:.1f} a point, usually more than 1): in another order?"
@@ -124,8 +128,8 @@ def _in_order(
 def _right_way_round(
     points: np.ndarray, has_face: bool, from_rows: bool, warn: Warn
 ) -> np.ndarray:
-    """The same, with x and y exchanged if that, and not a rotation of the image, puts
-    people upright.
+    """The keypoints, with x and y exchanged if people lie sideways because the file has
+    (y, x); unchanged, with a warning, if a rotation of the image explains it as well.
 
     Args:
         has_face: whether the layout has nose and eyes.

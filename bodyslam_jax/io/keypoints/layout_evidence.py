@@ -19,21 +19,22 @@ from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, NUM_PARTS, SPINE
 _PRESENT = 0.05
 _SURE = 0.3
 _FEWEST_POINTS = 6
-"""Of a detection that is used."""
+"""Least number of keypoints of a detection that is evaluated."""
 _FEWEST_PEOPLE = 5
 _MANY_POINTS = 12
-"""Points of a detection from which a bad fit is not explained by a half hidden body."""
+"""Detections with at least so many keypoints fit their layout well: they are not of a
+half hidden body."""
 _PLAUSIBLE = 1.1
-"""Nats per point of a layout that is not chance."""
+"""Least log-likelihood of a layout that is chosen, nats per keypoint."""
 _MARGIN = 0.3
-"""Nats per point by which another order must be better than the usual one."""
+"""By how much a layout other than the usual one must be better, nats per keypoint."""
 _AGREED = 0.8
-"""Share of the detections for which it must be better."""
-_NOBODY, _ODD = 0.1, 0.7
-"""Nats per point below which a layout explains nothing (points without any layout have
-0.4), and below which it explains the points badly."""
+"""Least share of the detections for which it must be better."""
+_IMPLAUSIBLE, _POOR = 0.1, 0.7
+"""Log-likelihoods (nats per keypoint) below which keypoints are not those of a body in
+the usual layout (random points have up to 0.4), and below which they fit it poorly."""
 _ALIVE = 0.02
-"""Change of posture, relative to the person's size, of a living person."""
+"""Least change of posture of a moving person, relative to the person's size."""
 _SCALES = (0.15, 0.25, 0.35, 0.5, 0.7)
 """Candidates for the RMS distance of the detected points from their mean, m; a half
 hidden body has less."""
@@ -80,11 +81,11 @@ class Choice:
 
     layout: str
     changed: bool
-    """Whether it is not the usual one of as many keypoints."""
-    known: bool
-    """Whether any layout explains the keypoints."""
-    odd: bool
-    """Whether the layout explains them badly, if better than chance."""
+    """Whether it is not the usual layout of that number of keypoints."""
+    plausible: bool
+    """Whether the keypoints are those of a body in any of the layouts."""
+    poor_fit: bool
+    """Whether the keypoints are plausible, but fit the layout poorly."""
     nats: dict[str, float]
     """Log-likelihood of each layout, nats per point."""
 
@@ -117,9 +118,9 @@ def choose_layout(
         return Choice(best, True, True, False, mean)
     many = present.sum(axis=1) >= _MANY_POINTS
     least = float(nats[first][many].mean()) if many.sum() >= _FEWEST_PEOPLE else np.inf
-    doubtful = least < _ODD and _changes(points[many], present[many])
-    none = doubtful and least < _NOBODY and max(mean.values()) < _PLAUSIBLE
-    return Choice(first, False, not none, doubtful and not none, mean)
+    poor = least < _POOR and _changes(points[many], present[many])
+    implausible = poor and least < _IMPLAUSIBLE and max(mean.values()) < _PLAUSIBLE
+    return Choice(first, False, not implausible, poor and not implausible, mean)
 
 
 def likelihood(

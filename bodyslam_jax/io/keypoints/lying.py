@@ -1,8 +1,8 @@
 """Whether people lie on their side because x and y were exchanged.
 
-(y, x) in place of (x, y) lays everybody down, with the head to the left. So does a
-rotation of the image by 90 degrees, but without mirroring: in an upright image, a
-person who faces the camera has the right side of the body on the left.
+With (y, x) in place of (x, y) everybody lies with the head to the left. So they do if
+the image is rotated by 90 degrees, but then they are not mirrored: in an upright image,
+a person who faces the camera has the right side of the body on the left.
 """
 
 import dataclasses
@@ -21,14 +21,15 @@ _RIGHT, _LEFT = (
 _FEET = (BODY25_TOES_AND_HEELS[:2], BODY25_TOES_AND_HEELS[2:])
 """Toe and heel of either foot."""
 _STEEP = 35.0
-"""degrees between the trunk of a lying person and the image's rows, at most."""
+"""Largest angle between the trunk of a lying person and the image's rows, degrees."""
 _ASIDE = 0.2
-"""Breadth over the trunk's length below which it is a side view, without evidence."""
+"""Ratio of breadth to length of the trunk below which a person is seen from the side,
+and left and right tell nothing."""
 _ALWAYS = 0.99
-"""Share of the detections with a face above which the detector gives everybody one,
-also people seen from behind."""
+"""If more than this share of the detections has a face, the detector gives a face to
+people seen from behind, too."""
 _FEWEST = 5
-"""Detections with evidence."""
+"""Least number of detections for a decision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Lying:
 
 
 def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
-    """How `n` detections lie, given as (u px, v px, confidence) in BODY_25 order.
+    """Whether `n` detections (u px, v px, confidence; BODY_25 order) lie sideways, and
+    whether they are mirrored.
 
     Args:
         has_face: whether the detector's layout has nose and eyes, so that their absence
@@ -65,7 +67,8 @@ def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
     usable &= facing != 0
     if usable.sum() < _FEWEST:
         return Lying(float(flat.mean()), np.nan)
-    # With x and y exchanged, y is to the right: the right side is there at small y.
+    # With x and y exchanged, the right side of a person who faces the camera has the
+    # smaller y.
     fits = np.sign(-breadth[usable]) == np.sign(facing[usable])
     share = float(np.average(fits, weights=np.abs(facing[usable])))
     return Lying(float(flat.mean()), share)
