@@ -461,7 +461,9 @@ def test_single_precision_serves_people_and_covariances_too():
             "far": 8,
             "free_intrinsics": True,
         },
-        {"people": 1, "frames": 12, "some_held": True},
+        pytest.param(
+            {"people": 1, "frames": 12, "some_held": True}, marks=pytest.mark.slow
+        ),
         pytest.param(
             {"people": 1, "frames": 12, "at": "truth"}, marks=pytest.mark.slow
         ),
@@ -910,6 +912,7 @@ def test_watched_solves_refuse_what_a_solve_refuses():
             used(problem, start, schedule=())
 
 
+@pytest.mark.slow
 def test_derivatives_where_landmarks_or_single_coordinates_are_held():
     """Points seen once tell where a camera is if they are held, and what pulls at a
     coordinate that is held turns with the rest."""
