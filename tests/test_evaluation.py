@@ -17,9 +17,6 @@ from bodyslam_jax.body import joints, keypoints, load_body_model
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.types import Result
 
-# Of unoptimised code a distance of exactly 0 is 1 m.
-pytestmark = pytest.mark.usefixtures("optimised")
-
 NUM = 250
 """Frames: two chunks of 100 and a short one."""
 
@@ -91,8 +88,8 @@ def test_truth_against_itself_is_zero():
 
 
 def test_results_are_compared_by_a_program_that_is_right():
-    """Compiled as by the command: unoptimised code of XLA's older emitters gave 1 m
-    where a distance is exactly 0."""
+    """Compiled as by the command: XLA rounds differently where it computes a square
+    twice, and a distance of exactly 0 was 1 m."""
     found = evaluation.evaluate(_truth(), _truth())
     for name in RIGID + SIMILAR + BODY:
         assert float(found[name]) < 1e-10, name

@@ -12,6 +12,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.evaluation.alignment import (
@@ -38,8 +39,7 @@ class Errors(eqx.Module):
 
     def rmse(self) -> Float[Array, ""]:
         """Root of the mean square over the errors that exist; NaN without any."""
-        square = self._average(self.value**2)
-        return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
+        return _sqrt(self._average(self.value**2))
 
     def _average(self, value: Float[Array, "*n"]) -> Float[Array, ""]:
         count = jnp.sum(self.valid).astype(value.dtype)
@@ -51,8 +51,17 @@ def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Length of each vector, with derivative 0 where it is zero."""
     # Written out: XLA on CPU does not vectorise a sum over so short an axis.
     square = sum((x[..., k] ** 2 for k in range(1, x.shape[-1])), x[..., 0] ** 2)
-    # Compared so that NaN stays NaN: a broken estimate must not look perfect.
-    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
+    return _sqrt(square)
+
+
+def _sqrt(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The square root, with a derivative of 0 at 0; NaN stays NaN.
+
+    XLA may compute `square` twice and round differently. Of `where(square == 0, ...)`
+    inside and outside of the root, one could then find 0 and the other not.
+    """
+    tiny = jnp.finfo(square.dtype).tiny
+    return jnp.sqrt(square + tiny) - np.sqrt(tiny)
 
 
 def only(valid: Bool[Array, " t"], *arrays: Float[Array, "t ..."]) -> list[Array]:
