@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import difflib
 import inspect
+import textwrap
 import types
 import typing
 from collections.abc import Callable
@@ -121,7 +122,7 @@ def settings_described(kind: type) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        (tree,) = ast.parse(inspect.cleandoc(inspect.getsource(base))).body
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         if not isinstance(tree, ast.ClassDef):
             continue
         for field, text in zip(tree.body, tree.body[1:], strict=False):
