@@ -264,8 +264,9 @@ def _svg(figure: Figure) -> str:
         ax.set_facecolor("none")
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text[text.index("<svg") :], 1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, 1)
+    text = text[text.index("<svg") :]
+    for name in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {name}="[^"]*"', r"\1", text, count=1)
     for color, variable in _VARIABLES.items():
         text = text.replace(color, variable)
     return text
