@@ -4,6 +4,8 @@ From the inverse of the normal equations where it is needed (`selected_inverse.p
 Coordinates that are held are known exactly.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -90,6 +92,7 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
 
     def spread(arrays):
         problem, state = eqx.combine(arrays, static)
+        problem = dataclasses.replace(problem, layout=problem.layout.all_used())
         return _marginals(problem, state, equations(problem, state))
 
     found, pull = jax.vjp(spread, arrays)
