@@ -11,9 +11,9 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-LENGTHS = (60, 120, 200, 340, 600, 1020)
+LENGTHS = (20, 60, 120, 200, 340, 600, 1020)
 """In frames. A video of 30 to 1,020 frames becomes 1.36 times as long on average (of
-the logarithm of its length), and at most twice as long."""
+the logarithm of its length), and at most twice as long. The first is for examples."""
 
 
 def round_up(count: int, parts: int = 4) -> int:

@@ -17,9 +17,9 @@ class Size(NamedTuple):
     chunks: int
     landmarks: int
     observations: int
-    widths: tuple[int, int]
+    widths: tuple[int, ...]
     """Chunks that narrow and wide tables span: the longest track."""
-    groups: tuple[int, int]
+    groups: tuple[int, ...]
     """Groups of landmarks in narrow and wide tables."""
 
 
@@ -39,13 +39,13 @@ in proportion to the number of chunks and the square of the bandwidth."""
 
 def _size(chunks: int, narrow: int, wide: int) -> Size:
     wide = min(wide, chunks)
-    groups = 5 * chunks, -(-16 * chunks // wide) + 4
+    of_narrow, of_wide = 5 * chunks, -(-16 * chunks // wide) + 4
     return Size(
         chunks=chunks,
         landmarks=LANDMARKS * chunks,
         observations=OBSERVATIONS * chunks,
-        widths=(min(narrow, wide), wide),
-        groups=groups,
+        widths=(narrow, wide) if narrow < wide else (wide,),
+        groups=(of_narrow, of_wide) if narrow < wide else (of_narrow + of_wide,),
     )
 
 
