@@ -51,7 +51,6 @@ def compilations():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_compilation")
 def test_a_second_clip_of_another_length_compiles_nothing_that_takes_long(
     compilations, tmp_path
 ):

@@ -404,6 +404,22 @@ def test_a_cpu_maps_in_turn():
     assert "cond[" not in str(jax.make_jaxpr(at_once)(x))
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="maps all at once")
+def test_mapping_outside_of_jit_calls_the_program_that_is_compiled_already():
+    calls = []
+
+    def program(x, y):
+        calls.append(x)
+        return x + y
+
+    mapped = jax.vmap(sequential_vmap(jnp.add, program), (0, None))
+    given = jnp.array([1.0, -3.0]), jnp.array(0.5)
+    assert mapped(*given).tolist() == [1.5, -2.5]
+    assert len(calls) == 2
+    assert jax.jit(mapped)(*given).tolist() == [1.5, -2.5]
+    assert len(calls) == 2
+
+
 @pytest.mark.slow
 def test_gradients_of_solutions_are_mapped_over():
     problem, _, start = make()

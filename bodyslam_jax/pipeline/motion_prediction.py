@@ -8,6 +8,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry.lengths import padded_length, shortened
 from bodyslam_jax.people import PersonState
+from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.types import Sequence
 
 
@@ -34,4 +35,4 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Pred
     return shortened(found, frames, axis=1)
 
 
-_predict = eqx.filter_jit(lambda predictor, state: predictor(state))
+_predict = compiled(lambda predictor, state: predictor(state))
