@@ -104,7 +104,7 @@ def breakdown(problem, state, mixed, repeats):
     kept = None if people is None else people.kept
     given = lin, sizes, reduced, kept, window, damping, problem.layout.order
     chunks = part("assembly", assemble, *given)
-    factor = part("factorisation", factorise, chunks, sizes)
+    factor = part("factorisation", factorise, chunks, sizes, problem.layout)
     whole = Eliminated(damping, window, people, factor)
     part("back-substitution", solve_step, problem, state, lin, sizes, whole)
 

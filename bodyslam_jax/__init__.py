@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.pipeline import run as run
     from bodyslam_jax.pipeline.case import simulate_case as simulate_case
     from bodyslam_jax.pipeline.problem_builder import build as build
+    from bodyslam_jax.solver import quick_options as quick_options
     from bodyslam_jax.solver import solve as solve
     from bodyslam_jax.solver import vmap_over_devices as vmap_over_devices
     from bodyslam_jax.types import Result as Result
@@ -52,6 +53,7 @@ _HOME = {
     "evaluate": "evaluation",
     "load_body_model": "body",
     "load_motion_model": "motion",
+    "quick_options": "solver",
     "read_sequence": "io",
     "rescaled": "graph",
     "run": "pipeline",

@@ -1,9 +1,13 @@
 """Compiler options belong to whole programs only."""
 
 import jax
+import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from bodyslam_jax import evaluation, pipeline, simulation
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.graph.tracing import is_alone
 from bodyslam_jax.solver import compilation
 
@@ -28,3 +32,39 @@ def test_options_that_xla_does_not_know_are_left_out(monkeypatch):
     assert compilation.quick_options() is None
     monkeypatch.undo()
     compilation.quick_options.cache_clear()
+
+
+@pytest.fixture
+def compilations():
+    """What JAX compiles from here on: the name of each program, and the time, s."""
+    found: list[tuple[str, float]] = []
+
+    def listen(event, seconds, **about):
+        if event.endswith("backend_compile_duration"):
+            found.append((str(about.get("fun_name")), seconds))
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(listen)
+    jax.config.update("jax_enable_compilation_cache", True)
+
+
+@pytest.mark.slow
+def test_a_second_clip_of_another_length_compiles_nothing_that_takes_long(
+    compilations, tmp_path
+):
+    """The whole flow: from measurements to a run folder and errors by the truth."""
+
+    def run(frames):
+        compilations.clear()
+        simulated = simulation.simulate(Simulation(sequence="M2", length=frames))
+        sequence = simulation.as_sequence(simulated)
+        result = pipeline.run_to_folder(sequence, tmp_path / str(frames), Config())
+        evaluation.evaluate(result, simulation.as_truth(simulated))
+        return max(compilations, key=lambda found: found[1])
+
+    name, longest = run(64)
+    assert name == "jit(_run)"
+    # Of what takes 20 s on a quiet machine, 1 s: the machine may be busy.
+    assert run(97)[1] < max(1.0, 0.05 * longest), compilations

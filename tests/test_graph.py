@@ -355,4 +355,4 @@ def test_a_loop_closure_does_not_widen_the_band(rng):
     layout = g.make_layout(frames, landmarks, *seen)
     assert layout.order is None
     assert layout.reach == 1
-    assert layout.bandwidth <= 6
+    assert layout.used_bandwidth <= 6

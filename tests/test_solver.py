@@ -52,10 +52,17 @@ def unpadded(step, state):
     return g.Step(**{**vars(step), **cut})
 
 
+def own_sizes(monkeypatch):
+    """Has problems laid out in sizes of their own, as those are that fit in no common
+    size."""
+    monkeypatch.setattr("bodyslam_jax.graph.sizes.SIZES", ())
+
+
 def last(monkeypatch, count):
     """Has so many of the longest tracks eliminated last, in two groups."""
     if not count:
         return
+    own_sizes(monkeypatch)
     longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
     monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
     monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", count // 2)
@@ -114,6 +121,8 @@ def last(monkeypatch, count):
 )
 def test_step_is_that_of_the_dense_normal_equations(options, monkeypatch):
     options = dict(options)
+    if options.get("again"):
+        own_sizes(monkeypatch)
     last(monkeypatch, options.get("far", 0))
     held, without = options.pop("held", None), options.pop("without", ())
     problem, _, state = make(1, **options)
@@ -395,6 +404,22 @@ def test_a_cpu_maps_in_turn():
     assert "cond[" not in str(jax.make_jaxpr(at_once)(x))
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="maps all at once")
+def test_mapping_outside_of_jit_calls_the_program_that_is_compiled_already():
+    calls = []
+
+    def program(x, y):
+        calls.append(x)
+        return x + y
+
+    mapped = jax.vmap(sequential_vmap(jnp.add, program), (0, None))
+    given = jnp.array([1.0, -3.0]), jnp.array(0.5)
+    assert mapped(*given).tolist() == [1.5, -2.5]
+    assert len(calls) == 2
+    assert jax.jit(mapped)(*given).tolist() == [1.5, -2.5]
+    assert len(calls) == 2
+
+
 @pytest.mark.slow
 def test_gradients_of_solutions_are_mapped_over():
     problem, _, start = make()
@@ -481,6 +506,8 @@ def test_single_precision_serves_people_and_covariances_too():
     ],
 )
 def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
+    if options.get("again"):
+        own_sizes(monkeypatch)
     last(monkeypatch, options.get("far", 0))
     at = options.get("at", "minimum" if "people" in options else "truth")
     scene = {name: value for name, value in options.items() if name != "at"}
@@ -530,6 +557,7 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
 
 @pytest.mark.slow
 def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
+    own_sizes(monkeypatch)
     in_time, state, _ = make(9, frames=63, people=2, landmarks=80)
     assert in_time.layout.order is None
     order = np.array([3, 0, 5, 1, 6, 2, 4])

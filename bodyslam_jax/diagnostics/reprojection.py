@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.geometry.camera import project_rows
+from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 from bodyslam_jax.types import JointEstimate, Sequence, SfmResult
 
 
@@ -23,8 +24,7 @@ def per_frame(
         T = joint.cameras[tracks.frame]
         offset = joint.landmarks[tracks.landmark] - T[:, :3, 3]
         p_C = np.einsum("mji,mj->mi", T[:, :3, :3], offset)
-        intrinsics = jnp.asarray(joint.intrinsics)
-        error = np.asarray(project(intrinsics, jnp.asarray(p_C))) - tracks.uv
+        error = project_rows(joint.intrinsics, p_C) - tracks.uv
         length = np.linalg.norm(error, axis=-1)
         inliers = np.bincount(tracks.frame[keep], minlength=t)
         found["inliers"] = inliers.astype(float).tolist()
@@ -43,10 +43,13 @@ def projected_keypoints(
 ) -> Float[np.ndarray, "h t 25 2"]:
     """Keypoints of the estimated bodies, projected into the images, px."""
     shapes = jnp.asarray(joint.shapes)[:, None]
-    p_H = _keypoints(body, jnp.asarray(joint.poses), shapes)
+    frames = joint.poses.shape[1]
+    poses = lengthened(joint.poses, padded_length(frames), axis=1)
+    p_H = shortened(_keypoints(body, poses, shapes), frames, axis=1)
     turn, move = joint.roots[..., :3, :3], joint.roots[..., None, :3, 3]
-    p_C = jnp.einsum("htij,htkj->htki", jnp.asarray(turn), p_H) + move
-    return np.asarray(project(jnp.asarray(joint.intrinsics), p_C))
+    p_C = np.einsum("htij,htkj->htki", turn, np.asarray(p_H)) + move
+    uv = project_rows(joint.intrinsics, p_C.reshape(-1, 3))
+    return uv.reshape(*p_C.shape[:-1], 2)
 
 
 _keypoints = eqx.filter_jit(local_keypoints)

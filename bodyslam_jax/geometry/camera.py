@@ -11,7 +11,10 @@ and behind the camera plane, where a projection means nothing: mask it out with
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from bodyslam_jax.geometry.lengths import padded_rows
 
 MIN_DEPTH = 1e-3
 """Smallest depth that is divided by, in the unit of the points."""
@@ -36,6 +39,17 @@ def project(
     """
     depth = jnp.maximum(p_C[..., 2:], MIN_DEPTH)
     return _to_pixel(intrinsics, distort(intrinsics, p_C[..., :2] / depth))
+
+
+def project_rows(
+    intrinsics: Float[Array | np.ndarray, " i"], p_C: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "m 2"]:
+    """`project` of a table of points, compiled for few lengths of tables."""
+    count = len(p_C)
+    rows = np.ones((padded_rows(count), 3))
+    rows[:count] = p_C
+    intrinsics = jnp.asarray(intrinsics)
+    return np.asarray(project(intrinsics, jnp.asarray(rows, intrinsics.dtype)))[:count]
 
 
 @jax.jit

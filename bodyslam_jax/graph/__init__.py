@@ -1,5 +1,6 @@
 """What is estimated, and why: state, error terms, problem."""
 
+from bodyslam_jax.geometry.lengths import round_up as round_up
 from bodyslam_jax.graph.check_factor import FactorReport as FactorReport
 from bodyslam_jax.graph.check_factor import check_factor as check_factor
 from bodyslam_jax.graph.edit import disable as disable
@@ -48,7 +49,6 @@ from bodyslam_jax.graph.factors.upright_prior import UprightPrior as UprightPrio
 from bodyslam_jax.graph.keypoint_jacobian import turning_joints as turning_joints
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout
-from bodyslam_jax.graph.layout import round_up as round_up
 from bodyslam_jax.graph.losses import BlakeZisserman as BlakeZisserman
 from bodyslam_jax.graph.losses import Cauchy as Cauchy
 from bodyslam_jax.graph.losses import GemanMcClure as GemanMcClure

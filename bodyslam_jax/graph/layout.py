@@ -4,8 +4,9 @@ Tracks are nearly contiguous in time. Frames are cut into chunks, landmarks are 
 by the chunks that observe them, and each group is a dense table of frames by landmarks
 with empty entries. The reduced camera matrix is then formed by a few matrix products,
 without a list of pairs of observations. With loop closures chunks are eliminated in
-another order than that of time (`ordering.py`). Sizes are rounded up, so that videos of
-similar length share a program. Runs in NumPy when a problem is made.
+another order than that of time (`ordering.py`). Sizes are those of `sizes.py`, so that
+videos of any length share programs; a problem that fits in none of them gets sizes of
+its own. Runs in NumPy when a problem is made.
 """
 
 import dataclasses
@@ -16,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from bodyslam_jax.geometry.lengths import round_up
+from bodyslam_jax.graph import sizes
 from bodyslam_jax.graph.factor import JOINTS, Limbs
 from bodyslam_jax.graph.long_tracks import choose_long_tracks
 from bodyslam_jax.graph.ordering import CHUNK, PERSON, order_chunks
@@ -40,6 +43,8 @@ class Bucket(eqx.Module):
     lasting: bool = eqx.field(static=True, default=False)
     """Whether its landmarks have long tracks, and are eliminated with the globals
     (`long_tracks.py`)."""
+    used: Int[Array, ""] | None = None
+    """Number of groups that hold landmarks, the first ones; `None` for all."""
 
 
 class Layout(eqx.Module):
@@ -57,6 +62,23 @@ class Layout(eqx.Module):
     limbs: Limbs = eqx.field(static=True, default=(JOINTS,))
     """Joints that factors see together, as those of one leg; narrow limbs first. Of
     joints in none, such as hands that no keypoint sees, each is a chain by itself."""
+    num_landmarks: int = eqx.field(static=True, default=1)
+    """Number of landmarks, rounded up: one more at least, for empty entries."""
+    num_observations: int = eqx.field(static=True, default=1)
+    """Number of observations, likewise."""
+    used: Int[Array, ""] | None = None
+    """Number of chunks that hold frames, the first in the order of elimination; `None`
+    for all."""
+    used_bandwidth: Int[Array, ""] | None = None
+    """The bandwidth of these tracks; `None` for `bandwidth`."""
+
+    def all_used(self) -> "Layout":
+        """The same without the numbers of what is in use: loops over all of it are
+        differentiable backwards."""
+        buckets = tuple(dataclasses.replace(b, used=None) for b in self.buckets)
+        return dataclasses.replace(
+            self, buckets=buckets, used=None, used_bandwidth=None
+        )
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -69,15 +91,6 @@ class Layout(eqx.Module):
         return sum(b.landmark.size for b in self.buckets if b.lasting)
 
 
-def round_up(count: int, parts: int = 4) -> int:
-    """The next of a few sizes, each above the one before by at most one in `parts` (a
-    power of 2)."""
-    if count <= parts:
-        return max(count, 1)
-    step = max(2 ** int(np.log2(count)) // parts, 1)
-    return -(-count // step) * step
-
-
 def make_layout(
     num_frames: int,
     num_landmarks: int,
@@ -87,10 +100,82 @@ def make_layout(
     limbs: Limbs = (JOINTS,),
 ) -> Layout:
     """Groups `m` observations of landmarks. Indices are not checked."""
+    for size in sizes.SIZES:
+        found = _in_size(size, num_frames, num_landmarks, frame, landmark, limbs)
+        if found is not None:
+            return found
+    given = num_frames, num_landmarks, frame, landmark, num_people, limbs
+    return _of_own_size(*given)
+
+
+def _in_size(
+    size: sizes.Size,
+    num_frames: int,
+    num_landmarks: int,
+    frame: Int[np.ndarray, " m"],
+    landmark: Int[np.ndarray, " m"],
+    limbs: Limbs,
+) -> Layout | None:
+    """The layout of a problem in tables of a given size; `None` if it does not fit."""
+    count = -(-num_frames // CHUNK)
+    fits = (
+        count <= size.chunks
+        and num_landmarks < size.landmarks
+        and len(frame) < size.observations
+    )
+    if not fits:
+        return None
+    layout = Layout(
+        buckets=(),
+        num_chunks=size.chunks,
+        bandwidth=2,
+        limbs=limbs,
+        num_landmarks=size.landmarks,
+        num_observations=size.observations,
+        used=jnp.asarray(count, jnp.int32),
+        used_bandwidth=jnp.asarray(2, jnp.int32),
+    )
+    if len(frame) == 0:
+        return layout
+    start, span = _spans(num_landmarks, frame, landmark)
+    if span.max() > size.widths[-1]:
+        return None
+    members = np.flatnonzero(span)
+    tracks = start[members], start[members] + span[members]
+    packed = _pack(*tracks, size.widths, size.chunks, size.groups)
+    if packed is None:
+        return None
+    rows = np.lexsort((frame, landmark))
+    begin = np.searchsorted(landmark[rows], np.arange(num_landmarks + 1))
+    buckets = []
+    for (width, chunks, groups), most in zip(packed, size.groups[::-1], strict=True):
+        groups = [members[group] for group in groups]
+        filled = _fill(chunks, groups, width, frame, rows, begin, most)
+        used = jnp.asarray(len(groups), jnp.int32)
+        buckets.append(dataclasses.replace(filled, used=used))
+    return dataclasses.replace(
+        layout,
+        buckets=tuple(buckets),
+        bandwidth=max(size.widths[-1], 2),
+        used_bandwidth=jnp.asarray(max(span.max(), 2), jnp.int32),
+    )
+
+
+def _of_own_size(
+    num_frames: int,
+    num_landmarks: int,
+    frame: Int[np.ndarray, " m"],
+    landmark: Int[np.ndarray, " m"],
+    num_people: int,
+    limbs: Limbs,
+) -> Layout:
+    """The layout of a problem that fits in no common size: many frames or landmarks,
+    or long tracks. Its sizes are rounded up."""
     count = -(-num_frames // CHUNK)
     num_chunks = round_up(count, parts=8)
+    room = round_up(num_landmarks + 1), round_up(len(frame) + 1)
     if len(frame) == 0:
-        return Layout((), num_chunks, 2, limbs=limbs)
+        return Layout((), num_chunks, 2, None, 1, limbs, *room)
     own = num_people * PERSON
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
     # In any order, a landmark's span is at least the number of chunks that observe it.
@@ -128,7 +213,7 @@ def make_layout(
         order = jnp.asarray(order, jnp.int32)
         reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
     bandwidth = max(widths[-1], reach + 1)
-    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs)
+    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs, *room)
 
 
 def _spans(num_landmarks, frame, landmark):
@@ -168,28 +253,37 @@ def _choose_widths(span, num_chunks):
     return best
 
 
-def _pack(start, stop, widths, num_chunks):
+def _pack(start, stop, widths, num_chunks, most=None):
     """Groups of up to `_SIZE` landmarks, the longest tracks first: for each width, the
     first chunk of each group and its members.
 
     A group holds landmarks whose tracks begin and end within it, shorter ones where
     there is room. The number of groups is rounded up, filled with shorter tracks: empty
     entries cost as much as full ones.
+
+    With `most`, the number of groups of each width that there is room for, every width
+    is in the result, and unused groups stay empty; `None` where there is no room.
     """
     order = np.lexsort((stop, start))
     start, stop = start[order], stop[order]
     first = np.searchsorted(start, np.arange(num_chunks + 1))
     free = np.ones(len(order), bool)
     buckets = []
-    for lower, width in zip((*widths[-2::-1], 0), widths[::-1], strict=True):
+    room = (None,) * len(widths) if most is None else most[::-1]
+    for lower, width, limit in zip(
+        (*widths[-2::-1], 0), widths[::-1], room, strict=True
+    ):
         due = stop - start > lower
         chunks, groups = [], []
         while free.any():
             left = free & due
             if not left.any():
-                if len(groups) in (0, round_up(len(groups), parts=2)):
+                full = round_up(len(groups), parts=2) if limit is None else len(groups)
+                if len(groups) in (0, full):
                     break
                 left = free
+            if len(groups) == limit:
+                return None
             chunk = min(int(start[np.argmax(left)]), num_chunks - width)
             near = slice(first[chunk], first[chunk + width])
             fits = free[near] & (stop[near] <= chunk + width)
@@ -200,22 +294,23 @@ def _pack(start, stop, widths, num_chunks):
             free[taken] = False
             chunks.append(chunk)
             groups.append(order[taken])
-        if groups:
+        if groups or limit is not None:
             buckets.append((width, chunks, groups))
     return buckets
 
 
-def _fill(chunks, groups, width, frame, rows, begin):
-    """The tables of one bucket."""
+def _fill(chunks, groups, width, frame, rows, begin, n=None):
+    """The tables of one bucket, of `n` groups or as many as there are, rounded up."""
     num_rows, num_landmarks = len(rows), len(begin) - 1
-    n = round_up(len(groups))
+    n = round_up(len(groups)) if n is None else n
     first_chunk = np.zeros(n, np.int32)
     first_chunk[: len(groups)] = chunks
     table = np.full((n, _SIZE), num_landmarks, np.int32)
-    count = np.array([len(group) for group in groups])
+    count = np.array([len(group) for group in groups], int)
     group = np.repeat(np.arange(len(groups)), count)
-    slot = np.concatenate([np.arange(c) for c in count])
-    members = np.concatenate(groups)
+    none = np.zeros(0, int)
+    slot = np.concatenate([none, *(np.arange(c) for c in count)])
+    members = np.concatenate([none, *groups])
     table[group, slot] = members
     row = np.full((n, width * CHUNK, _SIZE), num_rows, np.int32)
     length = begin[members + 1] - begin[members]

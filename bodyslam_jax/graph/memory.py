@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from bodyslam_jax.geometry.lengths import LENGTHS
 from bodyslam_jax.graph.layout import Layout
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.state import State
@@ -48,8 +49,9 @@ def check_memory(layout: Layout, state: State) -> None:
     """
     need, have = memory_needed(layout, state), memory()
     if need > have:
-        count = len(state.cameras)
+        most = int(layout.num_chunks * CHUNK * have / need)
+        fit = max((x for x in LENGTHS if x <= most), default=most)
         raise ValueError(
-            f"{count} frames need about {need / 2**30:.1f} GiB, found "
-            f"{have / 2**30:.1f} GiB: about {int(count * have / need)} frames fit."
+            f"{len(state.cameras)} frames need about {need / 2**30:.1f} GiB, found "
+            f"{have / 2**30:.1f} GiB: about {fit} frames fit."
         )

@@ -21,7 +21,7 @@ from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
-from bodyslam_jax.graph.padding import Masked, check_padding
+from bodyslam_jax.graph.padding import Masked, check_padding, extend
 from bodyslam_jax.graph.state import State, Step, gauge
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
@@ -32,7 +32,7 @@ from bodyslam_jax.graph.validation import (
     check_state,
 )
 from bodyslam_jax.graph.validation_weights import check_mask, check_precision
-from bodyslam_jax.motion import leg_length
+from bodyslam_jax.motion import Clock, leg_length
 
 VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics")
 
@@ -46,6 +46,15 @@ class MotionPredictor(eqx.Module):
     model: Any
     body: Any
     present: Bool[Array, "h t"]
+
+    def lengthened(self, frames: int) -> "MotionPredictor":
+        """The same for sequences with frames added at the end, in which nobody is
+        present, up to `frames`."""
+        present = extend(self.present, 1, frames - self.present.shape[1], False)
+        of_clock = lambda x: isinstance(x, Clock)
+        stretch = lambda x: x.lengthened(frames) if of_clock(x) else x
+        model = jax.tree.map(stretch, self.model, is_leaf=of_clock)
+        return dataclasses.replace(self, model=model, present=present)
 
     def __call__(self, state: State) -> Any:
         """Predictions of all people; leading axes `h t`."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 
 
 class Step(eqx.Module):
@@ -115,7 +116,6 @@ def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
     return cameras @ state.roots
 
 
-@jax.jit
 def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
     """1 where a camera coordinate is free, 0 where it is held to fix the gauge.
 
@@ -124,6 +124,12 @@ def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
     held exactly, so that no prior is needed and the normal equations have no null
     space.
     """
+    frames = len(cameras)
+    return shortened(_gauge(lengthened(cameras, padded_length(frames))), frames)
+
+
+@jax.jit
+def _gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
     offset = jnp.abs(cameras[:, :3, 3] - cameras[0, :3, 3])
     held = jnp.zeros_like(offset).reshape(-1).at[jnp.argmax(offset)].set(1.0)
     free = jnp.concatenate([jnp.ones_like(offset), 1 - held.reshape(-1, 3)], axis=1)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 
 
 def motion_factor(
@@ -32,9 +33,15 @@ def motion_factor(
         without: people (rows) whose displacements have no weight.
     """
     shared = jnp.broadcast_to(jnp.asarray(shared_error, shapes.dtype), len(shapes))
-    step, whitening = _whitened_steps(
-        prediction, shapes, body, weights, shared[:, None, None, None]
+    frames = prediction.valid.shape[1]
+    more = padded_length(frames) - frames
+    longer = eqx.tree_at(
+        lambda p: p.valid,
+        lengthened(prediction, frames + more, axis=1),
+        graph.extend(prediction.valid, 1, more, False),
     )
+    found = _whitened_steps(longer, shapes, body, weights, shared[:, None, None, None])
+    step, whitening = shortened(found, frames, axis=1)
     if without:
         whitening = whitening.at[np.array(list(without))].set(0.0)
     return graph.HumanMotion(

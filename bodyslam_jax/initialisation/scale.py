@@ -2,18 +2,20 @@
 
 import dataclasses
 from collections.abc import Collection
+from typing import cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Keypoints, ScaleStart
@@ -50,7 +52,7 @@ def scale_start(
     if contact is None:
         return start
     used = np.isfinite(np.asarray(contact.sigma))
-    ground = float(np.median(np.asarray(_scales(contact, state))[used]))
+    ground = float(np.median(_scales(contact, state)[used]))
     # Error of the ground in m, over the camera's height above it in units.
     metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
     units = state.cameras[:, :3, 3] @ contact.plane[:3] + contact.plane[3]
@@ -86,12 +88,24 @@ def ground_contact(
         return None
     sigma = np.where(visible, weights.ground_sigma * np.sqrt(visible.sum()), np.inf)
     contact = graph.GroundContact(body, jnp.asarray(plane), jnp.asarray(sigma))
-    every = np.asarray(_scales(contact, state))[visible]
+    every = _scales(contact, state)[visible]
     low, middle, high = np.quantile(every, [0.25, 0.5, 0.75])
     return contact if low > 0 and high - low < _MAX_SPREAD * middle else None
 
 
-_scales = eqx.filter_jit(lambda contact, state: contact.scales(state))
+def _scales(
+    contact: graph.GroundContact, state: graph.State
+) -> Float[np.ndarray, "h t"]:
+    """The scales that would put people's feet on the ground."""
+    frames = len(state.cameras)
+    more = padded_length(frames) - frames
+    none = jnp.zeros((0, 3), state.landmarks.dtype)
+    longer = graph.extend_state(eqx.tree_at(lambda s: s.landmarks, state, none), more)
+    contact = cast(graph.GroundContact, graph.pad_factor(contact, state, more))
+    return np.asarray(_scales_of_ground(contact, longer))[:, :frames]
+
+
+_scales_of_ground = eqx.filter_jit(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.geometry.lengths import lengthened
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
 
 
@@ -29,6 +30,25 @@ class Clock(eqx.Module):
     """Ticks since the previous frame."""
     same: bool = eqx.field(static=True)
     """Whether frames coincide with ticks, so that nothing is interpolated."""
+
+    def lengthened(self, frames: int) -> "Clock":
+        """For sequences with frames added at the end: these lie at the last tick.
+
+        The number of ticks is rounded up, to half a tick for each frame, so that it
+        depends on the frame rate but hardly on the number of frames.
+        """
+        if frames == len(self.tick):
+            return self
+        if self.same:
+            ticks = frames
+        else:
+            ticks = -(-2 * len(self.frame) // len(self.tick)) * frames // 2
+        # Ticks that are added lie at the last of these frames, where nobody is present.
+        more = ticks - len(self.frame)
+        frame = jnp.pad(self.frame, (0, more), constant_values=frames - 1)
+        between = jnp.pad(self.between, (0, more))
+        of_frames = lengthened((self.tick, self.beyond, self.steps), frames)
+        return Clock(frame, between, *of_frames, self.same)
 
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
@@ -56,14 +76,6 @@ def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
     )
 
 
-def _lengthened(clock: Clock, frames: int) -> Clock:
-    """For postures padded at the end: added frames lie at the last tick."""
-    more = frames - len(clock.tick)
-    fields = (clock.tick, clock.beyond, clock.steps)
-    tick, beyond, steps = (jnp.pad(x, (0, more), mode="edge") for x in fields)
-    return Clock(clock.frame, clock.between, tick, beyond, steps, clock.same)
-
-
 def predict_between(
     model: tuple[MotionModel, Clock],
     body: BodyModel,
@@ -79,7 +91,7 @@ def predict_between(
     network, clock = model
     if clock.same:
         return predict(network, body, orientation, body_pose, shape, present)
-    clock = _lengthened(clock, len(body_pose))
+    clock = clock.lengthened(len(body_pose))
     dtype = body_pose.dtype
     between, beyond = clock.between.astype(dtype), clock.beyond.astype(dtype)
     steps = clock.steps.astype(dtype)

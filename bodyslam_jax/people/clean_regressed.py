@@ -18,6 +18,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
 from bodyslam_jax.people.facing import HALF_TURN, find_turned
 from bodyslam_jax.people.keypoint_errors import (
@@ -43,7 +44,6 @@ from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 _DEPTH_ERROR = 0.05
 """Standard deviation of a regressor's depth, as a share of it."""
-_BUCKET = 64
 _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
 """Regressed shapes are shrunk to the mean, by a factor of 0.5 to 0.8 with an error of
@@ -167,7 +167,7 @@ def _place_person(
     angles = roots.body_pose[person, where, :21].reshape(-1, 63)
     depth_sigma = _DEPTH_ERROR * T_CH[:, 2, 3]
     rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
-    length = -len(where) % _BUCKET
+    length = padded_length(len(where)) - len(where)
     padded = [
         jnp.asarray(np.concatenate([a, np.repeat(a[-1:], length, axis=0)]), dtype)
         for a in rows

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
 from bodyslam_jax.people.keypoint_errors import (
     CORRELATION_TIME,
@@ -32,7 +33,6 @@ from bodyslam_jax.people.skeleton import (
 )
 from bodyslam_jax.types import Intrinsics, Keypoints
 
-_BUCKET = 64
 _ROUNDS = 6
 
 
@@ -65,7 +65,7 @@ def as_body_keypoints(
         shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
         angles = roots.body_pose[h, where, :21].reshape(-1, 63)
         rows = (T_CH[:, :3, :3], T_CH[:, :3, 3], angles, uv[h, where])
-        length = -len(where) % _BUCKET
+        length = padded_length(len(where)) - len(where)
         last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
         silent = np.full((length, 25), np.inf)
         sigma = np.concatenate([sigma * np.sqrt(alike), silent])

@@ -19,6 +19,7 @@ from scipy.ndimage import median_filter
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.depths import depth_costs
 from bodyslam_jax.people.keypoint_errors import (
@@ -46,8 +47,6 @@ from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
 
-_BUCKET = 64
-"""Frames are padded to a multiple of this, so that few shapes are compiled."""
 _START_INTERVAL = 0.1
 """Time between the frames that are fitted from many starts, s."""
 _MOST_STEPS = 30
@@ -154,7 +153,7 @@ def _fit_person(
     sigma_px = in_pixels(sigma, focal / depth)
     frames_alike = max(1.0, CORRELATION_TIME * fps)
     dtype = scene.intrinsics.dtype
-    length = -len(uv) % _BUCKET
+    length = padded_length(len(uv)) - len(uv)
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
     last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
     # Errors of the lifted postures are correlated in time too; padding has none.
@@ -186,7 +185,7 @@ def guess_postures(
     """The lifting network's posture of one person, in C. Standard deviations are
     infinite where it has too few keypoints, and everywhere if not `trusted`."""
     dtype = scene.intrinsics.dtype
-    length = -len(uv) % _BUCKET
+    length = padded_length(len(uv)) - len(uv)
     # Beyond the end the last frame stands still, as for frames beyond the first.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))

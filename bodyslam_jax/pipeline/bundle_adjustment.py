@@ -7,13 +7,14 @@ rotation that do not fit together determine it. Distortion is not estimated here
 import dataclasses
 import logging
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from bodyslam_jax import graph, initialisation, solver
 from bodyslam_jax.config import Config, Structure
-from bodyslam_jax.types import Intrinsics, SfmResult
+from bodyslam_jax.geometry.camera import project_rows
+from bodyslam_jax.types import Intrinsics, SfmResult, Tracks
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ def adjust(
     if guess is not None:
         covariance = solver.marginals(problem, state).intrinsics
         focal_sigma = float(np.sqrt(config.structure.focal_runs * covariance[0, 0]))
-    error = sigma * np.linalg.norm(np.asarray(_residual(factor, state)), axis=-1)
+    error = np.linalg.norm(_pixel_errors(cameras.tracks, state), axis=-1)
     keep = cameras.keep
     noise = (
         clipped_sigma(np.median(error[keep]) / ERROR_PER_SIGMA) if keep.any() else 1.0
@@ -91,7 +92,12 @@ def clipped_sigma(sigma: float) -> float:
     return float(np.clip(sigma, low, high))
 
 
-_residual = eqx.filter_jit(lambda factor, state: factor.residual(state))
+def _pixel_errors(tracks: Tracks, state: graph.State) -> Float[np.ndarray, "m 2"]:
+    """Where landmarks are projected less where they were observed, px."""
+    T_WC = np.asarray(state.cameras)[tracks.frame]
+    offset = np.asarray(state.landmarks)[tracks.landmark] - T_WC[:, :3, 3]
+    p_C = np.einsum("mji,mj->mi", T_WC[:, :3, :3], offset)
+    return project_rows(state.intrinsics, p_C) - tracks.uv
 
 
 def _problem(

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
+from bodyslam_jax.geometry.lengths import padded_length, shortened
 from bodyslam_jax.people import PersonState
+from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.types import Sequence
 
 
@@ -25,7 +27,12 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Pred
     # Landmarks have no part in it. Without them the program's shapes are those of the
     # people alone, so that maps of different sizes share one compilation.
     none = jnp.zeros((0, 3), state.landmarks.dtype)
-    return _predict(predictor, eqx.tree_at(lambda s: s.landmarks, state, none))
+    state = eqx.tree_at(lambda s: s.landmarks, state, none)
+    frames = len(state.cameras)
+    longer = padded_length(frames)
+    state = graph.extend_state(state, longer - frames)
+    found = _predict(predictor.lengthened(longer), state)
+    return shortened(found, frames, axis=1)
 
 
-_predict = eqx.filter_jit(lambda predictor, state: predictor(state))
+_predict = compiled(lambda predictor, state: predictor(state))

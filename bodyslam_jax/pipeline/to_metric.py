@@ -11,6 +11,7 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.gravity import Upright, find_upright
+from bodyslam_jax.geometry.lengths import lengthened, padded_length
 from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
@@ -84,8 +85,10 @@ def _placed(
     poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
     shapes = jnp.asarray(joint.shapes)
     trans = pelvis - np.asarray(body_.rest_joints(body, shapes))[:, None, 0]
-    joints = _joints(body, jnp.asarray(poses), shapes[:, None], jnp.asarray(trans))
-    return poses, trans, np.array(joints)
+    frames = len(T_WC)
+    longer = lengthened((poses, trans), padded_length(frames), axis=1)
+    joints = _joints(body, longer[0], shapes[:, None], longer[1])
+    return poses, trans, np.array(joints)[:, :frames]
 
 
 def floor_height(

@@ -62,37 +62,36 @@ def apart_diagonal(lin: Linearisation) -> Float[Array, "h t _"]:
 def solve_apart(
     lin: Linearisation, damping: Float[Array, "h t _"]
 ) -> Float[Array, "h t _"]:
-    """Steps of these joints, by cyclic reduction: all frames at once are rid of those
-    1, 2, 4, ... before and after them, until they stand alone."""
+    """Steps of these joints: a block-tridiagonal system for each, of 3 x 3 blocks, all
+    joints at once."""
     gradient, own = lin.gradient["apart"], lin.blocks["apart", "apart", 0]
-    shape, frames = own.shape[:-1], own.shape[1]
+    shape = own.shape[:-1]
     eye = jnp.eye(3, dtype=own.dtype)
     own = own + damping.reshape(shape)[..., None] * eye
+    # Of each frame with the one before.
     link = lin.blocks.get(("apart", "apart", 1), jnp.zeros_like(own))
     right = -gradient.reshape(shape)
+    turned = lambda x: x.swapaxes(-1, -2)
 
-    def moved(x, by):
-        """What stands `by` frames before, or after where that is negative."""
-        wide = jnp.pad(x, ((0, 0), (frames, frames)) + ((0, 0),) * (x.ndim - 2))
-        return jax.lax.dynamic_slice_in_dim(wide, frames - by, frames, 1)
+    def forward(before, frame):
+        inverse, known = before
+        own, link, right = frame
+        gain = _times(link, inverse)
+        inverse = _inverse(own - _times(gain, turned(link)))
+        known = right - _along(gain, known)
+        return (inverse, known), (inverse, known)
 
-    def halve(level, known):
-        own, link, right = known
-        far = 2**level
-        # The link of a frame with the earlier one, that of the later one with it, and
-        # how much of their equations is taken from this one's.
-        later = moved(link, -far).swapaxes(-1, -2)
-        inverse = _inverse(own)
-        before = _times(link, moved(inverse, far))
-        after = _times(later, moved(inverse, -far))
-        taken = _times(before, link.swapaxes(-1, -2))
-        taken = taken + _times(after, later.swapaxes(-1, -2))
-        told = _along(before, moved(right, far)) + _along(after, moved(right, -far))
-        return own - taken, -_times(before, moved(link, far)), right - told
+    def backward(pull, frame):
+        inverse, known, link = frame
+        moved = _along(inverse, known - pull)
+        return _along(turned(link), moved), moved
 
-    levels = (frames - 1).bit_length()
-    own, _, right = jax.lax.fori_loop(0, levels, halve, (own, link, right))
-    return _along(_inverse(own), right).reshape(gradient.shape)
+    own, link, right = (jnp.moveaxis(x, 1, 0) for x in (own, link, right))
+    none = jnp.zeros_like(own[0]), jnp.zeros_like(right[0])
+    _, (inverse, known) = jax.lax.scan(forward, none, (own, link, right))
+    given = inverse, known, link
+    _, moved = jax.lax.scan(backward, none[1], given, reverse=True)
+    return jnp.moveaxis(moved, 0, 1).reshape(gradient.shape)
 
 
 def _times(a: Float[Array, "*b 3 3"], b: Float[Array, "*b 3 3"]) -> Array:

@@ -20,9 +20,14 @@ from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.compilation import quick_jit
 
 
-def sequential_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function of pytrees; on a CPU it is mapped one after another, in one
-    program."""
+def sequential_vmap(
+    function: Callable[..., Any], alone: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """The same function of pytrees; on a CPU it is mapped one after another.
+
+    Within `jit` that is a loop in one program. Otherwise `alone`, the function as a
+    compiled program, is called for each, so that mapping compiles nothing more.
+    """
 
     def call(*args):
         if jax.default_backend() != "cpu":
@@ -30,12 +35,33 @@ def sequential_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
         arrays, static = eqx.partition(args, eqx.is_array)
         form = None
 
-        @jax.custom_batching.sequential_vmap
-        def one(arrays):
+        def arrays_of(function, arrays):
             nonlocal form
             found = function(*eqx.combine(arrays, static))
             found, form = eqx.partition(found, eqx.is_array)
             return found
+
+        @jax.custom_batching.custom_vmap
+        def one(arrays):
+            return arrays_of(function, arrays)
+
+        @one.def_vmap
+        def mapped(size, is_mapped, arrays):
+            leaves, treedef = jax.tree.flatten(arrays)
+            rows = [x for x, m in zip(leaves, jax.tree.leaves(is_mapped)) if m]
+
+            def with_rows(row):
+                each = iter(row)
+                flags = zip(leaves, jax.tree.leaves(is_mapped), strict=True)
+                return treedef.unflatten([next(each) if m else x for x, m in flags])
+
+            if alone is None or is_traced(arrays) or not is_alone():
+                found = jax.lax.map(lambda row: one(with_rows(row)), rows)
+            else:
+                row = lambda i: with_rows([x[i] for x in rows])
+                each = [arrays_of(alone, row(i)) for i in range(size)]
+                found = jax.tree.map(lambda *x: jnp.stack(x), *each)
+            return found, jax.tree.map(lambda _: True, found)
 
         found = one(arrays)
         return eqx.combine(found, form)

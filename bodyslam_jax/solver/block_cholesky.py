@@ -8,9 +8,12 @@ are taken as they stand: in the order of time, or of what they see (`Layout.orde
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.graph import Layout
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes
+from bodyslam_jax.solver.loops import row_of, scan_used, with_row
 from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.triangular import half_of
 
@@ -25,47 +28,69 @@ class Factor(eqx.Module):
     corner: Float[Array, "a1 a1"]
 
 
-def factorise(chunks: Chunks, sizes: Sizes) -> Factor:
-    """One chunk after another, less what those before it left on it."""
+def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
+    """One chunk after another, less what those before it left on it.
+
+    Only chunks in use are factorised, over the bandwidth in use.
+    """
     n, r, q = chunks.coupling.shape
     tail = sizes.arrow + 1
     head = q - CAMERAS
     near = sizes.reach * head
     reach = (r - near - tail) // CAMERAS
+    with_people = min(sizes.reach, reach) if head else 0
 
     def step(sides, chunk):
         k, pivot, coupling = chunk
         people, later, common = coupling[:near], coupling[near:-tail], coupling[-tail:]
-        for back in range(1, reach + 1):
-            # What lies before the first chunk is not written yet: zeros.
-            before = jax.lax.dynamic_index_in_dim(sides, (k - back) % n, 0, False)
+        # What lies before the first chunk is not written yet: zeros.
+        side_of = lambda back: row_of(sides, jax.lax.rem(k - back + n, np.int32(n)))
+        for back in range(1, with_people + 1):
+            before = side_of(back)
             first, start = (back - 1) * head, near + (back - 1) * CAMERAS
-            rows = before[start:]
-            if first < near:
-                rows = jnp.concatenate([before[first:near], rows])
+            rows = jnp.concatenate([before[first:near], before[start:]])
             # Of people and of cameras this chunk's come first.
-            mine = head if first < near else 0
-            beside = max(near - first - head, 0)
-            width = mine + CAMERAS
-            own = _without(rows[: width + beside], mine, beside)
+            beside = near - first - head
+            width = head + CAMERAS
+            own = _without(rows[: width + beside], head, beside)
             update = rows @ own.T
-            wide = ((0, 0), (q - width, 0))
             if beside:
-                more = update[mine : mine + beside]
-                people = people - jnp.pad(more, ((0, near - beside), wide[1]))
-                update = _without(update, mine, beside)
-            pivot = pivot - jnp.pad(update[:width], ((q - width, 0), wide[1]))
-            common = common - jnp.pad(update[-tail:], wide)
+                more = update[head : head + beside]
+                people = people - jnp.pad(more, ((0, near - beside), (0, 0)))
+                update = _without(update, head, beside)
+            pivot = pivot - update[:width]
+            common = common - update[-tail:]
             middle = update[width:-tail]
-            below = len(later) - len(middle)
-            later = later - jnp.pad(middle, ((0, below), wide[1]))
+            later = later - jnp.pad(middle, ((0, len(later) - len(middle)), (0, 0)))
+
+        def of_cameras(back, total):
+            before = side_of(back)
+            cameras = jnp.pad(before[near:-tail], ((0, reach * CAMERAS), (0, 0)))
+            start = (back - 1) * CAMERAS
+            cameras = jax.lax.dynamic_slice(
+                cameras,
+                (start, jnp.zeros_like(start)),
+                (reach * CAMERAS, q),
+                allow_negative_indices=False,
+            )
+            rows = jnp.concatenate([cameras, before[-tail:]])
+            return total + rows @ cameras[:CAMERAS].T
+
+        stop = layout.used_bandwidth
+        stop = np.int32(reach + 1) if stop is None else stop
+        total = jnp.zeros((reach * CAMERAS + tail, CAMERAS), pivot.dtype)
+        total = jax.lax.fori_loop(with_people + 1, stop, of_cameras, total)
+        pivot = pivot.at[head:, head:].add(-total[:CAMERAS])
+        middle = jnp.pad(total[CAMERAS:-tail], ((0, CAMERAS), (0, 0)))
+        later = later.at[:, head:].add(-middle)
+        common = common.at[:, head:].add(-total[-tail:])
         half = half_of(pivot)
         side = jnp.concatenate([people, later, common]) @ half.T
-        return jax.lax.dynamic_update_index_in_dim(sides, side, k, 0), half
+        return with_row(sides, side, k), half
 
     sides = jnp.zeros_like(chunks.coupling)
-    each = jnp.arange(n), chunks.pivot, chunks.coupling
-    sides, half = jax.lax.scan(step, sides, each)
+    each = jnp.arange(n, dtype=jnp.int32), chunks.pivot, chunks.coupling
+    sides, half = scan_used(step, sides, each, layout.used)
     ends = sides[:, -tail:].swapaxes(0, 1).reshape(tail, -1)
     return Factor(half, sides, chunks.corner - ends @ ends.T)
 

@@ -4,13 +4,17 @@ From the inverse of the normal equations where it is needed (`selected_inverse.p
 Coordinates that are held are known exactly.
 """
 
+import dataclasses
+import functools
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.graph.tracing import is_alone
+from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.blocks import (
     CAMERAS,
     Linearisation,
@@ -18,7 +22,7 @@ from bodyslam_jax.solver.blocks import (
     own_to_global,
     sizes_of,
 )
-from bodyslam_jax.solver.compilation import in_full_precision
+from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.covariance_vjp import equations
 from bodyslam_jax.solver.elimination.schur import half_inverse
 from bodyslam_jax.solver.front import window_of
@@ -71,7 +75,13 @@ def _differentiable(given: tuple[Problem, State], alone: bool) -> Marginals:
     problem, state = given
     method = method_of((), 0.0, state.scale.dtype, keep=True)
     _, final = run(problem, state, method, alone=alone)
-    return _marginals(problem, state, final)
+    program = _program(alone and not is_traced((problem, state)))
+    return program(problem, state, final)
+
+
+@functools.cache
+def _program(alone: bool) -> Callable[..., Marginals]:
+    return compiled(_marginals) if alone else eqx.filter_jit(_marginals)
 
 
 @_differentiable.def_fwd
@@ -90,6 +100,7 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
 
     def spread(arrays):
         problem, state = eqx.combine(arrays, static)
+        problem = dataclasses.replace(problem, layout=problem.layout.all_used())
         return _marginals(problem, state, equations(problem, state))
 
     found, pull = jax.vjp(spread, arrays)
@@ -102,7 +113,6 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
     return pull(full)[0]
 
 
-@eqx.filter_jit
 @in_full_precision
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)

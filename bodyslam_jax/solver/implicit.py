@@ -40,7 +40,7 @@ def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Pr
     """What a cotangent on the solution is on everything in the (padded) problem."""
     given = problem, state, cotangent
     if is_traced(given):
-        return sequential_vmap(_program(False))(*given)
+        return sequential_vmap(_program(False), _program(True))(*given)
     return _program(is_alone())(*given)
 
 

@@ -116,9 +116,9 @@ def eliminate(
     if sizes.people:
         people = eliminate_people(lin, sizes, window, damping)
     kept = None if people is None else people.kept
-    order = problem.layout.order
-    chunks = assemble(lin, sizes, reduced, kept, window, damping, order)
-    return Eliminated(damping, window, people, factorise(chunks, sizes))
+    layout = problem.layout
+    chunks = assemble(lin, sizes, reduced, kept, window, damping, layout.order)
+    return Eliminated(damping, window, people, factorise(chunks, sizes, layout))
 
 
 @eqx.filter_jit

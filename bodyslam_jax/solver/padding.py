@@ -1,4 +1,4 @@
-"""Rounds a problem's sizes up, so that videos of about the same length compile once.
+"""Pads a problem to the sizes of its layout, so that videos share compiled programs.
 
 What is added has no weight: measurements with `sigma = inf`, variables that may not
 move.
@@ -21,21 +21,21 @@ from bodyslam_jax.graph import (
     extend,
     extend_state,
     pad_factor,
-    round_up,
 )
 
 
 def pad(problem: Problem, state: State) -> tuple[Problem, State]:
     """The same problem with `num_chunks * CHUNK` frames and more landmark slots."""
-    frames = problem.layout.num_chunks * CHUNK - len(state.cameras)
-    landmarks = round_up(len(state.landmarks) + 1) - len(state.landmarks)
+    layout = problem.layout
+    frames = layout.num_chunks * CHUNK - len(state.cameras)
+    landmarks = layout.num_landmarks - len(state.landmarks)
     factors = tuple(
-        _pad_factor(factor, state, frames, landmarks) for factor in problem.factors
+        _pad_factor(factor, state, frames, landmarks, layout.num_observations)
+        for factor in problem.factors
     )
     motion = problem.motion
     if motion is not None:
-        present = extend(motion.present, 1, frames, False)
-        motion = eqx.tree_at(lambda m: m.present, motion, present)
+        motion = motion.lengthened(layout.num_chunks * CHUNK)
     free = problem.free
     free = dataclasses.replace(
         free,
@@ -72,7 +72,7 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
     )
 
 
-def _pad_factor(factor, state, frames, landmarks):
+def _pad_factor(factor, state, frames, landmarks, observations):
     if isinstance(factor, LandmarkPrior):
         return LandmarkPrior(
             position=extend(factor.position, 0, landmarks, 0.0),
@@ -80,7 +80,7 @@ def _pad_factor(factor, state, frames, landmarks):
             loss=factor.loss,
         )
     if isinstance(factor, Reprojection):
-        rows = round_up(len(factor.frame) + 1) - len(factor.frame)
+        rows = observations - len(factor.frame)
         return Reprojection(
             frame=extend(factor.frame, 0, rows, 0),
             landmark=extend(factor.landmark, 0, rows, 0),

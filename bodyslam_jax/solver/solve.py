@@ -146,7 +146,7 @@ def run(
     """
     given = problem, state, method
     if is_traced(given):
-        return sequential_vmap(_program(False))(*given)
+        return sequential_vmap(_program(False), _program(True))(*given)
     return _program(alone)(*given)
 
 

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bodyslam_jax.solver.loops import row_of
+
 LEAF = 12
 """Width of the blocks, at most."""
 
@@ -63,9 +65,10 @@ def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     index = jnp.arange(lower.shape[-1])
 
     def one(k, inverse):
-        column = jax.lax.dynamic_index_in_dim(lower, k, -1)
-        pivot = jax.lax.dynamic_index_in_dim(column, k, -2)
-        row = jax.lax.dynamic_index_in_dim(inverse, k, -2) / pivot
+        last = lower.ndim - 1
+        column = row_of(lower, k, last)[..., None]
+        pivot = row_of(column, k, last - 1)[..., None, :]
+        row = row_of(inverse, k, last - 1)[..., None, :] / pivot
         below = jnp.where((index > k)[:, None], column, 0.0)
         return jnp.where((index == k)[:, None], row, inverse - below * row)
 

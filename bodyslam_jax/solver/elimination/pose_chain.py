@@ -28,6 +28,7 @@ from bodyslam_jax.solver.elimination.limbs import (
     whole,
 )
 from bodyslam_jax.solver.front import Pairs, Window
+from bodyslam_jax.solver.loops import row_of, with_row
 from bodyslam_jax.solver.triangular import half_of
 
 
@@ -111,8 +112,8 @@ def eliminate_postures(
     # axes takes three times as long as with one.
     by_limb = lambda xs: [flat(x.swapaxes(1, 2)) for x in xs]
     own, link = map(by_limb, _pose_blocks(window, limbs, blocks, damping))
-    at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
-    put = jax.lax.dynamic_update_index_in_dim
+    at = lambda x, k: row_of(x, k, 1)
+    put = with_row
     turned = lambda x: x.swapaxes(-1, -2)
     raw = lambda k: [flat(x) for x in _rows(window, blocks, gradient, k)]
 
@@ -193,7 +194,7 @@ def _left(
 def _rows(window: Window, blocks: dict, gradient: Array, k) -> list[Array]:
     """Blocks of frame k of each chunk against the border, `g l b p` for each width; of
     the posture before it, only frame 0 knows."""
-    at = lambda x: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
+    at = lambda x: row_of(x, k, 1)
     dtype = gradient.dtype
     reach = window.reach if window.cross else 0
     common = blocks.get(("pose", "globals", 0))
@@ -209,7 +210,7 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> list[Array]:
             if block is not None:
                 # Frame k against frame k - lag.
                 place = jnp.eye(CHUNK, CHUNK + reach, k=reach - lag, dtype=dtype)
-                place = jax.lax.dynamic_index_in_dim(place, k, 0, keepdims=False)
+                place = row_of(place, k)
                 wide = at(block).swapaxes(-1, -2)[:, None] * place[:, None, None]
                 total = total + wide.reshape(total.shape)
         parts.append(total)
@@ -248,7 +249,7 @@ def _substitute(
         here = -(known[:, None, : solved.shape[1]] @ wide)
         right.append(here.reshape(g * l, -1, p))
     right = jnp.concatenate(right, axis=1)
-    at = lambda x, k: jax.lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
+    at = lambda x, k: row_of(x, k, 1)
 
     def step(i, carry):
         following, steps = carry
@@ -256,7 +257,7 @@ def _substitute(
         back = link_times(at(link, k).swapaxes(-1, -2), following[..., None])
         row = at(right, k)[..., None] - at(half, k) @ back
         here = (at(half, k).swapaxes(-1, -2) @ row)[..., 0]
-        return here, jax.lax.dynamic_update_index_in_dim(steps, here, k, 1)
+        return here, with_row(steps, here, k, 1)
 
     steps = jnp.zeros((g * l, CHUNK, p), last.dtype).at[:, -1].set(flat(last))
     steps = jax.lax.fori_loop(0, CHUNK - 1, step, (flat(last), steps))[1]

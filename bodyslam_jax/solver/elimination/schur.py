@@ -5,6 +5,8 @@ With `V = L L^T` a landmark's own 3 x 3 block, `Y = W L^-T` stacks a group's cam
 one matrix product for all pairs of cameras that share landmarks.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from bodyslam_jax.graph import Problem
 from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes
 from bodyslam_jax.solver.linearise.landmark import frames_of
 from bodyslam_jax.solver.long_tracks import Lasting, lasting_blocks
+from bodyslam_jax.solver.loops import scan_used
 
 
 class ReducedCameras(eqx.Module):
@@ -65,6 +68,13 @@ def eliminate_landmarks(
         half = half_inverse(table, damp)
         width = bucket.width
 
+        slice_of = functools.partial(
+            jax.lax.dynamic_slice, allow_negative_indices=False
+        )
+        with_slice = functools.partial(
+            jax.lax.dynamic_update_slice, allow_negative_indices=False
+        )
+
         def add(carry, group, width=width):
             band, side, corner = carry
             chunk, cross, extra, rows = group
@@ -79,19 +89,20 @@ def eliminate_landmarks(
                 start = (chunk + i, zero, zero)
                 here = slice(i * CAMERAS, (i + 1) * CAMERAS)
                 strip = y[here] @ y[i * CAMERAS :].T
-                known = jax.lax.dynamic_slice(band, start, (1, CAMERAS, rest))
-                band = jax.lax.dynamic_update_slice(band, known - strip[None], start)
+                known = slice_of(band, start, (1, CAMERAS, rest))
+                band = with_slice(band, known - strip[None], start)
             start = (chunk, zero, zero)
-            known = jax.lax.dynamic_slice(side, start, (width, CAMERAS, count + 1))
+            known = slice_of(side, start, (width, CAMERAS, count + 1))
             edge = (y @ e.T).reshape(width, CAMERAS, count + 1)
-            side = jax.lax.dynamic_update_slice(side, known - edge, start)
+            side = with_slice(side, known - edge, start)
             return (band, side, corner - e @ e.T), None
 
         extra = jnp.concatenate(
             [table.cross_intrinsics, -table.gradient[:, None]], axis=1
         )
         groups = (bucket.first_chunk, table.cross, extra, half)
-        (band, side, corner), _ = jax.lax.scan(add, (band, side, corner), groups)
+        start = band, side, corner
+        (band, side, corner), _ = scan_used(add, start, groups, bucket.used)
     return ReducedCameras(
         band,
         side[..., -1],
