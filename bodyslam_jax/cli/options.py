@@ -85,7 +85,7 @@ def options(function: Callable[..., Any]) -> list[Option]:
         default = None if required else argument.default
         one = _option(name, hints[name], default, about[name])
         value = one.value
-        if positional and not value.islower():
+        if positional and not (value and value.islower()):
             value = name.replace("_", "-").upper()
         found.append(
             dataclasses.replace(
