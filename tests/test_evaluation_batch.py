@@ -71,6 +71,7 @@ def test_stacked_errors_are_those_of_each_pair(pairs, stacked):
             assert "of_truth" in name or np.isnan(several[len(values) :]).all(), name
 
 
+@pytest.mark.slow
 def test_gradients_of_stacked_errors_are_finite(stacked):
     estimates, truths = stacked
     names = ("c_ate_sim3_rmse", "wa_mpjpe", "rte", "h_ate_a3")

@@ -31,7 +31,9 @@ def model_of(tracks, camera=CAMERA):
     return find_camera_model(tracks, camera, 60, Structure())
 
 
-@pytest.mark.parametrize("kind", ["sideways", "orbit"])
+@pytest.mark.parametrize(
+    "kind", ["sideways", pytest.param("orbit", marks=pytest.mark.slow)]
+)
 def test_a_zoom_of_a_moving_camera_is_undone(kind):
     tracks, truth = scene(kind, seed=3)
     model = model_of(zoomed(tracks, 1.4))
