@@ -14,6 +14,9 @@ from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion_warni
 from bodyslam_jax.sfm.zoom import without_zoom
 from bodyslam_jax.types import Bodies, Keypoints, Sequence, Tracks
 
+# Bundle adjustment runs for longer than it compiles.
+pytestmark = pytest.mark.usefixtures("optimised")
+
 CENTRE = CAMERA.params[2:4]
 GUESS = dataclasses.replace(CAMERA, is_guess=True)
 

@@ -23,6 +23,9 @@ from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.simulation import as_sequence, simulate
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence, Tracks
 
+# Bundle adjustment runs for longer than it compiles.
+pytestmark = pytest.mark.usefixtures("optimised")
+
 SHARED = Path(__file__).parents[2] / "shared"
 SIZE = (320, 240)
 CAMERA = Intrinsics(np.array([260.0, 260.0, 159.5, 119.5]), *SIZE)

@@ -12,6 +12,9 @@ from bodyslam_jax.sfm.loop_closure import Revisits
 from bodyslam_jax.sfm.relocalise import near, relocate, with_moved
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 
+# Bundle adjustment runs for longer than it compiles.
+pytestmark = pytest.mark.usefixtures("optimised")
+
 PIXEL = 1 / 500
 
 
