@@ -30,6 +30,8 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
     sequence = with_warnings(sequence, warnings)
     cache = stage_cache_of(sequence, out)
     check_people(sequence, config)
+    if config.overlay and config.overlay_video == "mp4":
+        view.check_codec("H264")
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):
         return run_in_locked_folder(sequence, out, config, cache)
@@ -45,7 +47,7 @@ def run_in_locked_folder(
 ) -> Result:
     """`run_to_folder` for a caller that holds the folder's lock."""
     body = load_body_model(config.body_model)
-    result, cameras = run_stages(sequence, config, cache)
+    result, cameras, measured = run_stages(sequence, config, cache)
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         errors = before_after.errors(result, cameras, truth, body)
@@ -62,8 +64,16 @@ def run_in_locked_folder(
             images = sampler.watch(_images(sequence, cameras))
             with watch("overlay" if config.overlay else "images"):
                 if config.overlay:
-                    file = partial / "overlay.webm"
-                    view.write_overlay(file, images, result, body, observations)
+                    shown = config.overlay_measurements
+                    view.write_overlay(
+                        partial / f"overlay.{config.overlay_video}",
+                        images,
+                        result,
+                        body,
+                        observations if shown else None,
+                        codec="H264" if config.overlay_video == "mp4" else "VP8",
+                        keypoints=measured.keypoints if shown else None,
+                    )
                 for _ in images:  # Those that the overlay did not need.
                     pass
         with watch("scene"):
