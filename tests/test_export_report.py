@@ -5,9 +5,10 @@ import re
 
 import numpy as np
 import pytest
+from browser import chromium, until
 from scipy.signal import savgol_filter
 
-from bodyslam_jax import export
+from bodyslam_jax import export, view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.diagnostics import statistics, thresholds
 from bodyslam_jax.export.plain_words import in_plain_words
@@ -287,3 +288,29 @@ def test_overlay_and_scene_beside_the_report_are_shown(tmp_path, body):
     assert '<iframe src="scene.html#embedded"' in shown
     for name in ("overlay.webm", "scene.html"):
         assert f'<a href="{name}">' in shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_cut_off_in_a_browser(tmp_path, body, width):
+    result = dataclasses.replace(_walk(people=2), summary=SUMMARY)
+    view.write_overlay(tmp_path / "overlay.webm", None, result, body)
+    view.write_scene(tmp_path / "scene.html", result, body)
+    export.write_report(tmp_path / "report.html", result, body)
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        heard = []
+        page.on("console", lambda message: heard.append(message.text))
+        page.goto((tmp_path / "report.html").as_uri())
+        page.evaluate("document.querySelectorAll('details').forEach((d) => d.open = 1)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        over = "[...document.querySelectorAll('.wide, figure')]"
+        over += ".map((e) => e.scrollWidth - e.clientWidth)"
+        assert max(page.evaluate(over)) <= 0
+        until(page, "document.querySelector('video').readyState > 0")
+        page.evaluate("document.querySelector('iframe').scrollIntoView()")
+        frame = page.query_selector("iframe").content_frame()
+        until(frame, "!!window.bodyslam && window.bodyslam.state.ready")
+        assert frame.is_hidden("header")
+        page.close()
+    assert heard == []

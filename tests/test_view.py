@@ -10,8 +10,8 @@ import pytest
 
 from bodyslam_jax import view
 from bodyslam_jax.body import joints, keypoints, load_body_model, write_npz
-from bodyslam_jax.types import Result, Tracks
-from bodyslam_jax.view import overlay, top_view
+from bodyslam_jax.types import Keypoints, Result, Tracks
+from bodyslam_jax.view import overlay, top_view, video_file
 
 WIDTH, HEIGHT = 160, 120
 
@@ -133,6 +133,18 @@ def test_the_inset_has_a_grid_for_scenes_of_any_size(body, size):
     assert plan.step >= 1 and plan.side / plan.zoom / plan.step <= 10.001
 
 
+def _pictures(result, body, tracks=None, keypoints=None):
+    """The overlay on black; what is drawn on it stands out against `BLACK`."""
+    size = (WIDTH, HEIGHT)
+    black = [_black()] * len(result.timestamps)
+    args = (tracks, size, np.ones(2), keypoints)
+    return list(overlay.pictures(black, result, body, *args))
+
+
+BLACK = 14
+"""What black becomes by softening."""
+
+
 def _read(path):
     capture = cv2.VideoCapture(str(path))
     images = []
@@ -174,23 +186,15 @@ def test_points_and_their_trails(tmp_path, body):
         np.array([7, 7, 7, 9]),
         np.array([[20.0, 80], [30, 80], [40, 80], [20, 20]]),
     )
-    pictures = list(
-        overlay.pictures(
-            None, iter(()), result, body, tracks, (WIDTH, HEIGHT), np.ones(2)
-        )
-    )
-    assert pictures[2][80, 25].any() and pictures[2][20, 20].any()
-    assert not pictures[0][20, 20].any() and not pictures[3][80, 25].any()
+    pictures = _pictures(result, body, tracks)
+    assert pictures[2][80, 25].max() > 50 and pictures[2][20, 20].max() > 50
+    assert pictures[0][20, 20].max() == pictures[3][80, 25].max() == BLACK
 
 
 def test_the_inset_follows_camera_and_person(body):
     result = _scene(body, num=30)
     result.T_WC[:, 0, 3] = np.linspace(0, 3, 30)
-    moving = list(
-        overlay.pictures(
-            None, iter(()), result, body, None, (WIDTH, HEIGHT), np.ones(2)
-        )
-    )
+    moving = _pictures(result, body)
     corner = np.s_[10:50, -50:-10]
     assert np.abs(moving[29][corner].astype(int) - moving[0][corner]).max() > 60
 
@@ -201,10 +205,111 @@ def test_a_video_cut_short_is_an_error(tmp_path, body):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(OSError, match="frames written; disk full"):
-        overlay.check_length(path, 30)
+        video_file.check_length(path, 30)
 
 
 def test_one_frame_and_nobody(tmp_path, body):
     result = _scene(body, depths=(), num=1)
     view.write_overlay(tmp_path / "o.webm", None, result, body)
     assert len(_read(tmp_path / "o.webm")[0]) == 1
+
+
+def _standing(body, num=12):
+    """Somebody who stands on y = 0, seen by a camera 1.5 m above the ground."""
+    result = _scene(body, num=num)
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    turn[:3, 3] = [0, 1.5, 0]
+    placed = result.joints @ turn[:3, :3].T + turn[:3, 3]
+    down = placed[..., 1].min() - 0.02
+    poses, trans = result.poses.copy(), result.trans @ turn[:3, :3].T + turn[:3, 3]
+    poses[..., 0] = 0.0
+    # The pelvis joint is at J_0 + trans, whatever the rotation.
+    rest = result.joints[:, :, 0] - result.trans
+    trans += rest @ turn[:3, :3].T - rest - [0, down, 0]
+    return dataclasses.replace(
+        result,
+        T_WC=np.tile(turn, (num, 1, 1)),
+        poses=poses,
+        trans=trans,
+        joints=placed - [0, down, 0],
+    )
+
+
+def _seen(result, p_W, frame=0):
+    T = result.T_WC[frame]
+    p = (np.asarray(p_W) - T[:3, 3]) @ T[:3, :3]
+    return np.round(result.intrinsics[0] * p[:2] / p[2] + result.intrinsics[2:4])
+
+
+def test_the_ground_has_a_line_each_metre(body):
+    result = _standing(body)
+    picture = _pictures(result, body)[5]
+    lines, between = [], []
+    for x in (-2, -1, 1, 2):
+        for shift, found in ((0.0, lines), (0.5, between)):
+            u, v = _seen(result, [x + shift, 0.0, -4.4]).astype(int)
+            if 1 < u < WIDTH - 2 and 1 < v < HEIGHT - 2:
+                found.append(picture[v - 1 : v + 2, u - 1 : u + 2].max())
+    assert len(lines) >= 2 and min(lines) > BLACK + 40
+    assert between and max(between) == BLACK
+    gone = dataclasses.replace(result, present=np.zeros_like(result.present))
+    assert _pictures(gone, body)[5][HEIGHT - 40 : HEIGHT - 25, :90].max() == BLACK
+
+
+def test_a_standing_foot_has_a_mark_in_the_persons_colour(body):
+    result = _standing(body)
+    lower = result.joints[0, 0, [10, 11], 1].argmin()
+    place = result.joints[0, 5, [10, 11][lower]] * [1, 0, 1]
+    u, v = _seen(result, place + [0.1, 0, 0.0]).astype(int)
+    blue, green, red = _pictures(result, body)[5][v, u].astype(int)
+    assert red > green > blue and red > 100
+
+
+def test_keypoints_are_drawn_beside_those_of_the_body(body):
+    result = _standing(body)
+    u, v = 30, 50
+    uv = np.full((1, 12, 25, 2), [u, v], float)
+    confidence = np.zeros((1, 12, 25))
+    confidence[0, 5, 0] = 1.0
+    pictures = _pictures(result, body, keypoints=Keypoints(uv, confidence))
+    assert pictures[5][v, u].min() > 200
+    assert pictures[4][v, u].max() == BLACK
+
+
+def test_an_mp4_is_h264(tmp_path, body):
+    av = pytest.importorskip("av")
+    path = tmp_path / "o.mp4"
+    view.write_overlay(path, None, _scene(body), body, codec="H264")
+    with av.open(str(path)) as container:
+        (stream,) = container.streams.video
+        assert stream.codec_context.name == "h264" and stream.frames == 4
+        assert float(stream.average_rate) == pytest.approx(25, abs=0.1)
+    assert _read(path)[0].shape == (4, HEIGHT, WIDTH, 3)
+
+
+def test_mp4_without_its_extra_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'bodyslam-jax\[video\]'"):
+        view.check_codec("H264")
+
+
+def test_noise_of_the_images_costs_no_bytes(tmp_path, body):
+    """Half of what it would cost as it is."""
+    result = _scene(body, depths=(), num=20)
+    rng = np.random.default_rng(0)
+    plain = cv2.resize(rng.normal(128, 30, (6, 8, 3)), (WIDTH, HEIGHT))
+    noise = rng.normal(0, 4, (20, HEIGHT, WIDTH, 3))
+    frames = list(np.clip(plain + noise, 0, 255).astype(np.uint8))
+    view.write_overlay(tmp_path / "o.webm", frames, result, body)
+    video_file.write_video(tmp_path / "as_it_is.webm", frames, (WIDTH, HEIGHT), 25.0)
+    size = lambda name: (tmp_path / name).stat().st_size
+    assert size("o.webm") < 0.5 * size("as_it_is.webm")
+
+
+def test_the_side_view_fits_into_pictures_of_any_size(body):
+    for size, num in (((64, 48), 3), ((48, 400), 3)):
+        result = _standing(body, num)
+        result.T_WC[:, 0, 3] = np.linspace(0, 30, num)
+        black = [np.zeros((size[1], size[0], 3), np.uint8)] * num
+        found = list(overlay.pictures(black, result, body, None, size, np.ones(2)))
+        assert len(found) == num and found[0].shape == (size[1], size[0], 3)

@@ -32,6 +32,12 @@ class Config(Known):
     """Device that computes. Without it JAX's default: a GPU if there is one."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
+    overlay_video: Literal["webm", "mp4"] = "webm"
+    """Format of the overlay: `webm` (VP8), or `mp4` (H.264, smaller), which needs the
+    extra `video`."""
+    overlay_measurements: bool = False
+    """Whether the overlay shows what was measured, too: tracked points of the scene,
+    and keypoints beside those of the bodies."""
     uncertainty: bool = True
     """Whether standard deviations and unobservable directions are computed."""
     detection: Detect = Detect()

@@ -51,8 +51,9 @@ def people_table(
 def lengths(result: Result, scale: Mapping[str, Any]) -> str:
     """How well all lengths are known, and by what."""
     sigma = scale.get("sigma")
-    known = sigma is not None and np.isfinite(sigma) and result.scale > 0
-    if not known or not result.present.any():
+    if sigma is None or not np.isfinite(sigma) or result.scale <= 0:
+        return ""
+    if not result.present.any():
         return ""
     of_covariance = scale.get("sigma_of_covariance", sigma)
     how = "one standard deviation of all lengths, from the covariance of the estimate"

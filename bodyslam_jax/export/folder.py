@@ -25,7 +25,7 @@ from bodyslam_jax.types import Result
 
 _LAST = "summary.json"
 _OWN = ("result.npz", "camera.tum", "body_*.npz", "landmarks.ply", _LAST, "config.yaml")
-_OWN += ("report.html", "overlay.webm", "scene.html")
+_OWN += ("report.html", "overlay.webm", "overlay.mp4", "scene.html")
 
 
 def check_folder(

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from bodyslam_jax.io.video import VIDEO_SUFFIXES, list_images
 
-_OVERLAY = "overlay.webm"
-"""A video that a run writes, possibly into its own input folder."""
+_OVERLAYS = ("overlay.webm", "overlay.mp4")
+"""Videos that a run writes, possibly into its own input folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ def _other_footage(folder: Path) -> Path | None:
         file
         for file in folder.iterdir()
         if file.suffix.lower() in VIDEO_SUFFIXES
-        and file.name != _OVERLAY
+        and file.name not in _OVERLAYS
         and not file.name.startswith(".")
         and file.is_file()
     )

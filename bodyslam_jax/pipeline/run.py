@@ -42,8 +42,9 @@ def run(
 
 def run_stages(
     sequence: Sequence, config: Config, cache: Cache
-) -> tuple[Result, SfmResult]:
-    """`run`, and the cameras before the joint estimate.
+) -> tuple[Result, SfmResult, Sequence]:
+    """`run`, the cameras before the joint estimate, and the input as it was used: with
+    the people who were found, in the order of the result, and without zoom.
 
     **Raises:** as `run`.
     """
@@ -66,7 +67,8 @@ def run_stages(
             JointEstimate,
             lambda: joint_stage.estimate(refined, cameras, bodies, body, config),
         )
-    return assemble(sequence, config, body, cameras, joint, watch.seconds), cameras
+    result = assemble(sequence, config, body, cameras, joint, watch.seconds)
+    return result, cameras, refined
 
 
 def before_joint(

@@ -25,3 +25,14 @@ def write_text(
             width,
             cv2.LINE_AA,
         )
+
+
+def blend_inset(
+    image: Image, inset: UInt8[np.ndarray, "rows columns 3"], corner: tuple[int, int]
+) -> None:
+    """Puts a smaller picture into the image, as far as it fits."""
+    x, y = corner
+    room = image[max(y, 0) :, max(x, 0) :][: inset.shape[0], : inset.shape[1]]
+    inset = inset[: room.shape[0], : room.shape[1]]
+    if room.size:
+        room[:] = cv2.addWeighted(inset, 0.85, room.copy(), 0.15, 0)

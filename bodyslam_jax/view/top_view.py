@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.types import Result, Tracks
-from bodyslam_jax.view.style import CAMERA, PEOPLE, Image, write_text
+from bodyslam_jax.view.style import CAMERA, PEOPLE, Image, blend_inset, write_text
 
 _POINT = (90, 230, 120)
 
@@ -85,8 +85,8 @@ class Plan:
                 paths.append((place, PEOPLE[h % len(PEOPLE)]))
         return paths
 
-    def draw(self, image: Image, frame: int) -> None:
-        """Puts the inset into the upper right corner."""
+    def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
+        """Puts the inset into the image, its upper left corner at `corner`, px."""
         inset = self.background.copy()
         for path, color in self._paths(frame + 1):
             if len(path):
@@ -105,6 +105,4 @@ class Plan:
         wedge = np.concatenate([wedge, [eye + reach * (ahead + 0.5 * right)]])
         cv2.polylines(inset, [self._to_inset(wedge)], True, CAMERA, 2, cv2.LINE_AA, 4)
         write_text(inset, f"grid {self.step:g} m", (6, self.side - 7), 0.4)
-        margin = 10
-        corner = image[margin : margin + self.side, -margin - self.side : -margin]
-        corner[:] = cv2.addWeighted(inset, 0.85, corner, 0.15, 0)
+        blend_inset(image, inset, corner)

@@ -3,7 +3,9 @@
 
 const MARGIN = 1.5; // m, of ground around everybody
 const LABEL = 24; // px, of a name's height
-const SHARE = 0.82; // of the canvas that everybody's way may fill
+const SHARE = 0.88; // of the canvas that everybody's way may fill
+const BAR = 85; // px at the canvas's lower edge that the timeline covers
+const REACH = 0.6; // m, from a person's pelvis to the side
 
 class View {
   constructor(canvas, runs) {
@@ -151,17 +153,19 @@ class View {
     const back = direction.clone().normalize();
     const right = new THREE.Vector3(0, 1, 0).cross(back).normalize();
     const up = back.clone().cross(right);
-    const half = Math.tan((this.camera.fov * Math.PI) / 360) * SHARE;
+    const half = Math.tan((this.camera.fov * Math.PI) / 360);
+    const free = Math.max(0.5, 1 - BAR / Math.max(this.canvas.clientHeight, 1));
     let distance = 2.5;
     const [xs, ys, zs] = this.range;
     for (const x of xs) for (const z of zs) for (const y of [0, Math.max(ys[1], 1.9)]) {
       const p = new THREE.Vector3(x, y, z).sub(target);
-      const aside = Math.abs(p.dot(right)) / this.camera.aspect;
-      const needed = (Math.max(aside, Math.abs(p.dot(up))) + 0.3) / half;
+      const aside = (Math.abs(p.dot(right)) + REACH) / this.camera.aspect;
+      const needed = Math.max(aside, (Math.abs(p.dot(up)) + 0.3) / free) / (half * SHARE);
       distance = Math.max(distance, needed + p.dot(back));
     }
-    this.controls.target.copy(target);
-    this.camera.position.copy(target).addScaledVector(back, distance);
+    // The middle of what is free lies above the middle of the canvas.
+    this.controls.target.copy(target).addScaledVector(up, -distance * half * (1 - free));
+    this.camera.position.copy(this.controls.target).addScaledVector(back, distance);
     this.controls.update();
   }
 

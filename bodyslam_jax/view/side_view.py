@@ -1,0 +1,83 @@
+"""The inset below the plan: camera and people from the side, on the ground."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from bodyslam_jax.types import Result
+from bodyslam_jax.view.style import CAMERA, PEOPLE, Image, blend_inset
+
+_WIDEST = 8.0
+"""m; where everybody's way is longer, the inset moves along with them."""
+_LIMBS = (
+    (15, 12, 9, 6, 3, 0),
+    (0, 1, 4, 7, 10),
+    (0, 2, 5, 8, 11),
+    (22, 20, 18, 16, 13, 9, 14, 17, 19, 21, 23),
+)
+
+
+class SideView:
+    """Seen across the direction in which everybody's way is longest."""
+
+    def __init__(self, result: Result, width: int):
+        """`width` of the inset, px."""
+        self.result, self.width = result, width
+        places = [result.T_WC[result.located, :3, 3]]
+        places.append(result.joints[result.present].reshape(-1, 3))
+        every = np.concatenate(places)
+        level = every[:, [0, 2]] - every[:, [0, 2]].mean(axis=0)
+        self.along = np.zeros(3)
+        self.along[[0, 2]] = np.linalg.svd(level.T @ level)[0][:, 0]
+        # To the right is where the first person, else the camera, goes.
+        ways = [*(j[p, 0] for j, p in zip(result.joints, result.present) if p.any())]
+        way = (ways or [result.T_WC[:, :3, 3]])[0]
+        if (way[-1] - way[0]) @ self.along < 0:
+            self.along = -self.along
+        way = every @ self.along
+        self.centre = (way.min() + way.max()) / 2
+        extent = max(1.15 * (way.max() - way.min()), 3.0)
+        self.moves = extent > _WIDEST
+        self.zoom = width / min(extent, _WIDEST)
+        self.low = min(0.0, float(every[:, 1].min()))
+        high = max(2.1, float(every[:, 1].max()) + 0.15)
+        self.height = int(np.clip(self.zoom * (high - self.low) + 8, 24, width))
+
+    def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
+        """Puts the inset into the image, its upper left corner at `corner`, px."""
+        r = self.result
+        there = np.flatnonzero(r.present[:, frame])
+        eye = r.T_WC[frame, :3, 3]
+        centre = self.centre
+        if self.moves:
+            centre = float(
+                np.mean([eye @ self.along, *(r.joints[there, frame, 0] @ self.along)])
+            )
+        inset = np.full((self.height, self.width, 3), 28, np.uint8)
+        at = lambda points: self._to_inset(points, centre)
+        reach = self.width / self.zoom / 2
+        for metre in np.arange(np.ceil(centre - reach), centre + reach):
+            post = [metre * self.along, metre * self.along + [0, 9.0, 0]]
+            cv2.polylines(inset, [at(np.array(post))], False, (52, 52, 52), 1, 8, 4)
+        floor = np.array([centre - reach, centre + reach])[:, None] * self.along
+        cv2.polylines(inset, [at(floor)], False, (150, 150, 150), 1, 8, 4)
+        for h in there:
+            limbs = [at(r.joints[h, frame, list(limb)]) for limb in _LIMBS]
+            color = PEOPLE[h % len(PEOPLE)]
+            cv2.polylines(inset, limbs, False, color, 2, cv2.LINE_AA, 4)
+        if r.located[frame]:
+            right, down, ahead = r.T_WC[frame, :3, :3].T
+            size = 14 / self.zoom
+            tips = eye + size * np.array(
+                [0 * ahead, ahead - 0.5 * down, ahead + 0.5 * down]
+            )
+            cv2.polylines(inset, [at(tips)], True, CAMERA, 2, cv2.LINE_AA, 4)
+        blend_inset(image, inset, corner)
+
+    def _to_inset(
+        self, p: Float[np.ndarray, "n 3"], centre: float
+    ) -> Int[np.ndarray, "n 2"]:
+        u = self.width / 2 + self.zoom * (p @ self.along - centre)
+        v = self.height - 5 - self.zoom * (p[:, 1] - self.low)
+        uv = np.clip(np.stack([u, v], axis=-1), -2000, 4000)
+        return np.round(uv * 16).astype(np.int32)
