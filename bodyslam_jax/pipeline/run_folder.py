@@ -44,6 +44,7 @@ def run_in_locked_folder(
     sequence: Sequence, out: Path, config: Config, cache: Cache
 ) -> Result:
     """`run_to_folder` for a caller that holds the folder's lock."""
+    export.clear_partial(out)
     body = load_body_model(config.body_model)
     result, cameras = run_stages(sequence, config, cache)
     if sequence.groundtruth is not None:
