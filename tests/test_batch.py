@@ -1,5 +1,6 @@
 """A batch: what is run, what is left out, what is said of failures."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -10,9 +11,13 @@ import batch_stubs
 import pytest
 
 from bodyslam_jax import batch
-from bodyslam_jax.batch import Failure, failures, find_inputs, run_many
+from bodyslam_jax.batch import Failure, failures, find_inputs, grid, run_many
+from bodyslam_jax.batch.engine import attempt
 from bodyslam_jax.batch.inputs import shard
-from bodyslam_jax.config import Config, Distribution, with_options
+from bodyslam_jax.config import Config, Distribution, Experiment, with_options
+from bodyslam_jax.experiments.command import run_experiment
+from bodyslam_jax.experiments.jobs import Job, Plan
+from bodyslam_jax.experiments.plans import PLANS
 
 
 class InProcess:
@@ -290,8 +295,6 @@ def test_collect_makes_one_table_of_all(finished, command):
     assert code == 0
     names = ("table.csv", "table.md", "table.tex", "plots.png", "index.html")
     assert all(str(finished / name) in text for name in names)
-    import csv
-
     with (finished / "table.csv").open() as file:
         rows = {row["clip"]: row for row in csv.DictReader(file)}
     assert list(rows) == ["a", "b<c>", "d", "e", "f"]
@@ -318,3 +321,85 @@ def test_collect_of_a_folder_without_runs_is_refused(tmp_path, command):
     assert code == 1 and "no run folders in it" in text
     code, text = command("collect", Path(tmp_path, "none"))
     assert code == 1 and "no such folder" in text
+
+
+class Rows:
+    """An engine that has the rows of a sweep without computing them."""
+
+    def __init__(self):
+        self.labels = []
+
+    def map(self, function, items, setup):
+        for job in items:
+            self.labels.append(job.label)
+            if job.source.name == "b":
+                yield job, Failure("ValueError: weights: no term 'ground'.")
+                continue
+            rows = []
+            for point in job.points:
+                cost = point["weights.human_motion"] * point["scale"]
+                row = {"name": job.source.name, **job.setting, **point, "cost": cost}
+                rows.append(row | {"status": "converged", "error.c_ate_se3": 0.01})
+            yield job, rows
+
+
+def test_a_sweep_is_one_table_over_its_axes_and_continues(clips, tmp_path):
+    out, inputs = tmp_path / "sweep", [clips / "a.mp4", clips / "b.mp4"]
+    texts = ["weights.human_motion=10,100", "scale=0.5,1,2", "weights.pixel-sigma=1,2"]
+    axes = grid.parse_axes(texts)
+    assert [axis.is_setting for axis in axes] == [False, False, True]
+    for labels in (4, 2):  # the second time, what failed
+        engine = Rows()
+        paths, failed = batch.sweep(
+            inputs, axes, Config(), out, engine, batch_stubs.nothing
+        )
+        assert len(engine.labels) == labels and len(failed) == 2
+        assert "b weights.pixel_sigma=1: ValueError: weights: no term" in failed[0]
+    with (out / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 3 * 2 and {row["clip"] for row in rows} == {"a"}
+    assert {row["λ of human_motion"] for row in rows} == {"10.0", "100.0"}
+    assert {row["weights.pixel_sigma"] for row in rows} == {"1", "2"}
+    assert all(path.stat().st_size for path in paths)
+    # Other settings are other rows.
+    engine = Rows()
+    batch.sweep(inputs[:1], axes, Config(fps=25.0), out, engine, batch_stubs.nothing)
+    assert len(engine.labels) == 2
+
+
+@pytest.mark.parametrize(
+    "texts, message",
+    [
+        ([], "found none, expected NAME=VALUE"),
+        (["scale"], "expected NAME=VALUE"),
+        (["scale=0,1"], "found '0', expected a number above 0"),
+        (["weights.human_motion=much"], "found 'much', expected a number above 0"),
+        (["weights.pixel_sigma=x"], "found 'x', expected a number"),
+        (["nosuch=1"], "no option --nosuch"),
+        (["scale=1", "scale=2"], "given twice"),
+    ],
+)
+def test_axes_that_cannot_be_are_refused(texts, message):
+    with pytest.raises(ValueError, match=message):
+        grid.parse_axes(texts)
+
+
+def test_rows_of_an_experiment_are_computed_by_an_engine(tmp_path, monkeypatch):
+    def plan(experiment, config, stages):
+        def bad():
+            raise ValueError("no motion.")
+
+        compute = {"good": lambda: {"value": 3}, "bad": bad}
+        jobs = [Job(name, (name,), 1.0, one, dict) for name, one in compute.items()]
+        return Plan(jobs, lambda out, rows: [out / f"{len(rows)} rows"])
+
+    class Engine:
+        def map(self, function, items, setup):
+            for item in items:
+                yield item, attempt(function, item)
+
+    monkeypatch.setitem(PLANS, "table1", plan)
+    given = Experiment(), Config(), Engine(), batch_stubs.nothing
+    (written,) = run_experiment("table1", tmp_path, *given)
+    assert written == tmp_path / "1 rows"
+    assert len(list((tmp_path / "rows").glob("*.json"))) == 1

@@ -19,7 +19,7 @@ from bodyslam_jax.batch.job import (
     finished,
     run_job,
 )
-from bodyslam_jax.batch.worker import CallersJax, set_up
+from bodyslam_jax.batch.worker import CallersJax, prepared
 from bodyslam_jax.config import Config, Distribution
 from bodyslam_jax.io import atomic
 
@@ -61,7 +61,7 @@ def run_many(
     if isinstance(engine, Distribution):
         engine = make_engine(engine, Path(out).resolve(), config.device != "cpu")
     setup = setup or CallersJax.read(config.device)
-    return run_jobs(jobs, engine, functools.partial(set_up, setup), estimate)
+    return run_jobs(jobs, engine, prepared(setup), estimate)
 
 
 def plan(

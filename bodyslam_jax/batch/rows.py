@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -23,18 +24,19 @@ MISSING = "not run"
 ORDER = ("ok", "doubtful", "failed", ERROR, MISSING)
 
 
-def columns() -> list[Column]:
-    """All columns; errors are against a ground truth, of the joint estimate."""
-    errors = [
+def error_columns(names: Collection[str]) -> list[Column]:
+    """Columns of errors, by their names in `evaluation`."""
+    return [
         Column(
-            _error_key(key),
-            f"{label}, {unit}".rstrip(", "),
-            3 if not unit else 1,
-            factor,
+            _error_key(key), f"{label}, {unit}".rstrip(", "), 1 if unit else 3, factor
         )
         for key, label, unit, factor in ROWS
-        if key in _ERRORS
+        if key in names
     ]
+
+
+def columns() -> list[Column]:
+    """All columns; errors are against a ground truth, of the joint estimate."""
     return [
         Column("name", "clip"),
         Column("status", "status"),
@@ -47,7 +49,7 @@ def columns() -> list[Column]:
         Column("stature", "stature of the first, cm", 1, 100.0),
         Column("stature_sigma", "its standard error, cm", 1, 100.0),
         Column("speed", "speed of the first, m/s", 2),
-        *errors,
+        *error_columns(_ERRORS),
         Column("seconds", "computed in, s", 0),
         Column("reasons", "reasons", is_wide=True),
     ]

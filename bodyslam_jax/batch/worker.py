@@ -1,7 +1,9 @@
 """How the processes of an engine are prepared."""
 
 import dataclasses
+import functools
 import logging
+import os
 from typing import Any
 
 from bodyslam_jax.batch import program_cache
@@ -42,8 +44,21 @@ class CallersJax:
             jax.config.update(name, value)
 
 
-def set_up(settings: Setup) -> None:
-    """Prepares a process: settings of JAX, and the cache that processes share."""
+def prepared(settings: Setup, each_core_a_device: bool = False) -> Setup:
+    """A `Setup`: settings of JAX, and the cache that processes share.
+
+    Args:
+        each_core_a_device: whether mapped solves use all cores that the process has.
+    """
+    return functools.partial(_prepare, settings, each_core_a_device)
+
+
+def _prepare(settings: Setup, each_core_a_device: bool) -> None:
     logging.getLogger("bodyslam_jax").setLevel(logging.INFO)
     settings()
     program_cache.share()
+    threads = int(os.environ.get("NPROC", "1"))
+    if each_core_a_device and threads > 1:
+        import jax
+
+        jax.config.update("jax_num_cpu_devices", threads)

@@ -27,8 +27,9 @@ def batch(
     settings: Path | None = None,
     config: Flat = Config(),
 ) -> int:
-    """Estimates many clips, each into a run folder of its own; the same command
-    continues a batch and leaves out what is finished.
+    """Estimates many clips, each into a run folder of its own.
+
+    The same command continues a batch and leaves out what is finished.
 
     Args:
         inputs: Sequence folders, videos, folders of them, glob patterns in quotes, or a
@@ -95,3 +96,46 @@ def _refused(error: ValueError) -> int:
     for line in str(error).splitlines():
         print(f"bodyslam: {line}", file=sys.stderr)
     return 1
+
+
+def sweep(
+    inputs: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    *,
+    grid: tyro.conf.UseAppendAction[tuple[str, ...]],
+    out: Path,
+    on: Annotated[Distribution, tyro.conf.arg(name="")] = Distribution(),
+    preset: Preset = "default",
+    settings: Path | None = None,
+    config: Flat = Config(),
+) -> int:
+    """Solves clips over a grid of weights, start scales and settings; one table.
+
+    Args:
+        inputs: Clips, as of `bodyslam batch`.
+        grid: NAME=VALUE,VALUE,... for each axis: weights.TERM (λ of a term of the cost,
+            as weights.human_motion=10,100), scale (of the map that the solve starts
+            from, as scale=0.2,1,5), or any setting.
+        out: Folder for table.csv, table.md, table.tex and plots.png; finished rows are
+            kept there.
+        on: Where clips run.
+        preset: `paper` selects the paper's weights, motion network and solver.
+        settings: Settings file (config.yaml); options override it.
+        config: Settings of every stage.
+    """
+    from bodyslam_jax import batch as batch_
+    from bodyslam_jax.batch.grid import parse_axes
+    from bodyslam_jax.batch.worker import prepared
+
+    try:
+        axes = parse_axes(grid, config)
+        engine = batch_.make_engine(on, out.resolve(), config.device != "cpu")
+        setup = prepared(functools.partial(jax_setup.prepare, config.device), True)
+        paths, failed = batch_.sweep(inputs, axes, config, out, engine, setup)
+    except ValueError as error:
+        return _refused(error)
+    for path in paths:
+        print(path)
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failed else 0

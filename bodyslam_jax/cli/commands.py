@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from bodyslam_jax.cli.batch import batch, collect
+from bodyslam_jax.cli.batch import batch, collect, sweep
 from bodyslam_jax.cli.body import body_check, body_convert, body_show
 from bodyslam_jax.cli.completion import completion
 from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
@@ -52,6 +52,12 @@ COMMANDS = {
         in_workers=True,
     ),
     "collect": _command(collect, in_workers=True),
+    "sweep": _command(
+        sweep,
+        """inputs grid out engine workers ray_address slurm_minutes slurm preset
+        settings detect device height focal fov static_camera fps start end person""",
+        in_workers=True,
+    ),
     "evaluate": _command(evaluate),
     "export": _command(export),
     "view": _command(view),
@@ -65,7 +71,7 @@ COMMANDS = {
     "experiment": _command(
         experiment,
         """name out preset settings sequences family frames noise motion seed
-        motion_models device overlay""",
+        motion_models engine workers ray_address device overlay""",
     ),
     "convert-dataset emdb": _command(emdb),
     "convert-dataset 3dpw": _command(threedpw),

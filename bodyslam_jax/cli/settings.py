@@ -113,7 +113,8 @@ def prepared(
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
         device = getattr(kwargs.get("config"), "device", None)
-        jax_setup.prepare("cpu" if in_workers else device)
+        elsewhere = in_workers or kwargs.get("engine") is not None
+        jax_setup.prepare("cpu" if elsewhere else device)
         return command(*args, **kwargs)
 
     run.__signature__ = signature  # pyright: ignore
