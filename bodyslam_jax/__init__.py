@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
+    from bodyslam_jax.batch import run_many as run_many
     from bodyslam_jax.body import BodyModel as BodyModel
     from bodyslam_jax.body import load_body_model as load_body_model
     from bodyslam_jax.config import Config as Config
@@ -57,6 +58,7 @@ _HOME = {
     "read_sequence": "io",
     "rescaled": "graph",
     "run": "pipeline",
+    "run_many": "batch",
     "simulate_case": "pipeline.case",
     "solve": "solver",
     "stack_pairs": "evaluation",

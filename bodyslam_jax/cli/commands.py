@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from bodyslam_jax.cli.batch import batch, collect, sweep
 from bodyslam_jax.cli.body import body_check, body_convert, body_show
 from bodyslam_jax.cli.completion import completion
 from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
@@ -25,10 +26,14 @@ class Command:
     function: Callable[..., Any]
     shown: frozenset[str] = frozenset()
     """Arguments and settings that `--help` lists; all if empty."""
+    in_workers: bool = False
+    """Whether other processes compute, so that this one must leave the GPU to them."""
 
 
-def _command(function: Callable[..., Any], shown: str = "") -> Command:
-    return Command(function, frozenset(shown.split()))
+def _command(
+    function: Callable[..., Any], shown: str = "", in_workers: bool = False
+) -> Command:
+    return Command(function, frozenset(shown.split()), in_workers)
 
 
 COMMANDS = {
@@ -39,6 +44,20 @@ COMMANDS = {
         end person open""",
     ),
     "demo": _command(demo, "out from_pixels preset settings device overlay open"),
+    "batch": _command(
+        batch,
+        """inputs out shard engine workers retries ray_address slurm_minutes slurm
+        preset settings detect device overlay height focal fov static_camera fps start
+        end person""",
+        in_workers=True,
+    ),
+    "collect": _command(collect, in_workers=True),
+    "sweep": _command(
+        sweep,
+        """inputs grid out engine workers ray_address slurm_minutes slurm preset
+        settings detect device height focal fov static_camera fps start end person""",
+        in_workers=True,
+    ),
     "evaluate": _command(evaluate),
     "export": _command(export),
     "view": _command(view),
@@ -52,7 +71,7 @@ COMMANDS = {
     "experiment": _command(
         experiment,
         """name out preset settings sequences family frames noise motion seed
-        motion_models device overlay""",
+        motion_models engine workers ray_address device overlay""",
     ),
     "convert-dataset emdb": _command(emdb),
     "convert-dataset 3dpw": _command(threedpw),

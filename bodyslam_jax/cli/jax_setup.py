@@ -6,6 +6,7 @@ import logging
 import os
 from pathlib import Path
 
+from bodyslam_jax.batch.program_cache import user_folder
 from bodyslam_jax.cli import interrupts
 from bodyslam_jax.cli.memory import return_memory
 
@@ -32,10 +33,7 @@ def prepare(device: str | None) -> None:
     gc.set_threshold(_COLLECT_AFTER)
     return_memory()
     jax.config.update("jax_enable_x64", True)
-    cache = os.environ.get("BODYSLAM_CACHE") or Path(
-        os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "bodyslam_jax"
-    )
-    jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "compiled"))
+    jax.config.update("jax_compilation_cache_dir", str(user_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     _choose_device(device)

@@ -95,8 +95,11 @@ def _dispatch(argv: list[str]) -> int | None:
         print(command_help(name, "--help-all" in rest))
         return 0
     _check_options(name, rest)
+    command = COMMANDS[name]
     return tyro.cli(
-        prepared(COMMANDS[name].function, rest), prog=f"bodyslam {name}", args=rest
+        prepared(command.function, rest, command.in_workers),
+        prog=f"bodyslam {name}",
+        args=rest,
     )
 
 

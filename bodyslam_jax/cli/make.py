@@ -1,6 +1,7 @@
 """`bodyslam simulate`, `train-motion` and `experiment`."""
 
 import contextlib
+import functools
 import logging
 import os
 import shlex
@@ -10,8 +11,15 @@ from typing import Annotated, Literal
 
 import tyro
 
+from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.cli.types import Flat, Input, Preset
-from bodyslam_jax.config import Config, Experiment, MotionTraining, Simulation
+from bodyslam_jax.config import (
+    Config,
+    Distribution,
+    Experiment,
+    MotionTraining,
+    Simulation,
+)
 
 _Experiment = Literal[
     "table1", "scale", "landmarks", "motion", "ablation", "weights", "video"
@@ -105,6 +113,9 @@ def experiment(
     preset: Preset = "default",
     settings: Path | None = None,
     on: Annotated[Experiment, tyro.conf.arg(name="")] = Experiment(),
+    engine: Literal["local", "ray"] | None = None,
+    workers: int | None = None,
+    ray_address: str | None = None,
     config: Flat = Config(),
 ) -> None:
     """Runs one of the paper's or the project's experiments on simulated sequences.
@@ -115,14 +126,24 @@ def experiment(
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); options override it.
         on: Data that it runs on.
+        engine: Computes rows in processes of this machine or of a Ray cluster, as
+            `bodyslam batch`. Without it, one after another.
+        workers: Rows that are computed at once.
+        ray_address: Address of a running Ray cluster.
         config: Settings of every stage.
     """
-    if name == "scale":
+    if name == "scale" and engine is None:
         _make_each_core_a_device()
-    from bodyslam_jax import experiments
+    from bodyslam_jax import batch, experiments
+    from bodyslam_jax.batch.worker import prepared
 
     log.info("experiment: %s -> %s", name, out)
-    for path in experiments.run_experiment(name, out, on, config):
+    elsewhere, setup = None, None
+    if engine is not None:
+        by = Distribution(engine=engine, workers=workers, ray_address=ray_address)
+        elsewhere = batch.make_engine(by, out.resolve(), config.device != "cpu")
+        setup = prepared(functools.partial(jax_setup.prepare, config.device), True)
+    for path in experiments.run_experiment(name, out, on, config, elsewhere, setup):
         print(path)
 
 

@@ -88,9 +88,15 @@ def _merged(found: Any, base: Any, where: str) -> Any:
         raise ValueError(f"{where}: {error}") from None
 
 
-def prepared(command: Callable[..., Any], argv: list[str]) -> Callable[..., Any]:
+def prepared(
+    command: Callable[..., Any], argv: list[str], in_workers: bool = False
+) -> Callable[..., Any]:
     """The command with JAX set up before it runs, and with the default settings that
-    `--preset` and `--settings` select."""
+    `--preset` and `--settings` select.
+
+    Args:
+        in_workers: whether other processes compute, and this one on the CPU only.
+    """
     signature = inspect.signature(command)
     argument = signature.parameters.get("config")
     if argument is not None:
@@ -106,7 +112,9 @@ def prepared(command: Callable[..., Any], argv: list[str]) -> Callable[..., Any]
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
-        jax_setup.prepare(getattr(kwargs.get("config"), "device", None))
+        device = getattr(kwargs.get("config"), "device", None)
+        elsewhere = in_workers or kwargs.get("engine") is not None
+        jax_setup.prepare("cpu" if elsewhere else device)
         return command(*args, **kwargs)
 
     run.__signature__ = signature  # pyright: ignore

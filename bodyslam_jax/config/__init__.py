@@ -3,6 +3,7 @@
 The command line and `config.yaml` are generated from these classes.
 """
 
+from bodyslam_jax.config.batch import Distribution as Distribution
 from bodyslam_jax.config.front_end import Association as Association
 from bodyslam_jax.config.front_end import Detect as Detect
 from bodyslam_jax.config.front_end import Structure as Structure
@@ -12,6 +13,9 @@ from bodyslam_jax.config.known import PATH_SIGMA as PATH_SIGMA
 from bodyslam_jax.config.known import Known as Known
 from bodyslam_jax.config.known import Measured as Measured
 from bodyslam_jax.config.motion import MotionTraining as MotionTraining
+from bodyslam_jax.config.options import field_names as field_names
+from bodyslam_jax.config.options import with_options as with_options
+from bodyslam_jax.config.options import with_values as with_values
 from bodyslam_jax.config.people import PeopleFit as PeopleFit
 from bodyslam_jax.config.run import Config as Config
 from bodyslam_jax.config.simulation import Experiment as Experiment

@@ -1,10 +1,12 @@
 """`bodyslam experiment`: computes the rows that are missing and writes the report."""
 
+import functools
 import logging
 from pathlib import Path
 
+from bodyslam_jax.batch.engine import Engine, Failure, Setup
 from bodyslam_jax.config import Config, Experiment
-from bodyslam_jax.experiments.jobs import check_files
+from bodyslam_jax.experiments.jobs import Plan, check_files
 from bodyslam_jax.experiments.plans import PLANS
 from bodyslam_jax.experiments.row_cache import Journal, Row
 
@@ -16,6 +18,8 @@ def run_experiment(
     out: Path,
     experiment: Experiment = Experiment(),
     config: Config = Config(),
+    engine: Engine | None = None,
+    setup: Setup | None = None,
 ) -> list[Path]:
     """Computes the rows that `out` lacks and writes tables and figures; their paths.
 
@@ -23,6 +27,10 @@ def run_experiment(
     joint estimate in `out/stages`. Tables are written after every row, so that an
     interrupted experiment leaves those that are finished. A row that cannot be computed
     is left out with a warning.
+
+    Args:
+        engine: computes the rows elsewhere, in processes that `setup` prepares; `out`
+            is then a folder that they see. Without it, this process does.
 
     **Raises:** `ValueError` if there is no such experiment, if `out` cannot be written,
     or if no row could be computed; `ValueError` or `FileNotFoundError`, before anything
@@ -35,6 +43,8 @@ def run_experiment(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+    if engine is not None:
+        out = out.resolve()
     plan = PLANS[name](experiment, config, out / "stages")
     journal = Journal(out / "rows")
     missing = [
@@ -50,9 +60,22 @@ def run_experiment(
         len(plan.jobs) - len(missing),
         minutes,
     )
+    if engine is not None and missing:
+        numbers = [k for k, job in enumerate(plan.jobs) if job in missing]
+        compute = functools.partial(compute_row, name, out, experiment, config)
+        for number, value in engine.map(compute, numbers, setup or _nothing):
+            label = plan.jobs[number].label
+            if isinstance(value, Failure):
+                log.warning("%s %s: left out: %s", name, label, value.message)
+            else:
+                log.info("%s %s: computed", name, label)
     rows: list[Row] = []
     written: list[Path] = []
     for job in plan.jobs:
+        if engine is not None:
+            row = journal.kept(name, job.label, job.key, job.form)
+            rows += [] if row is None else [row]
+            continue
         try:
             rows.append(journal.row(name, job.label, job.key, job.compute, job.form))
         except (FileNotFoundError, ValueError) as error:
@@ -63,3 +86,21 @@ def run_experiment(
     if not rows:
         raise ValueError(f"{name}: no row could be computed; see above.")
     return written or plan.write(out, rows)
+
+
+def compute_row(
+    name: str, out: Path, experiment: Experiment, config: Config, number: int
+) -> None:
+    """Computes one row of an experiment into `out/rows`, in whichever process."""
+    job = _plan(name, out, experiment, config).jobs[number]
+    Journal(out / "rows").row(name, job.label, job.key, job.compute, job.form)
+
+
+@functools.lru_cache(maxsize=1)
+def _plan(name: str, out: Path, experiment: Experiment, config: Config) -> Plan:
+    """The plan, kept for further rows, which share what its jobs have made."""
+    return PLANS[name](experiment, config, out / "stages")
+
+
+def _nothing() -> None:
+    pass

@@ -10,6 +10,7 @@ import errno
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,23 @@ _NOT_WRITABLE = (
     errno.EEXIST,
     errno.ENAMETOOLONG,
 )
+
+
+def clear_run(folder: Path) -> None:
+    """Removes a run's files and stage results, `summary.json` first; keeps others."""
+    (folder / _LAST).unlink(missing_ok=True)
+    for pattern in _OWN:
+        for file in folder.glob(pattern):
+            file.unlink()
+    shutil.rmtree(folder / ".cache", ignore_errors=True)
+
+
+def clear_partial(folder: Path) -> None:
+    """Removes files that killed processes left incomplete; the caller has the lock."""
+    for partial in folder.glob(".partial-*"):
+        shutil.rmtree(partial, ignore_errors=True)
+    for file in folder.glob(".cache/.*.partial*"):
+        file.unlink(missing_ok=True)
 
 
 def write_run(folder: Path, result: Result, config: Any = None) -> None:

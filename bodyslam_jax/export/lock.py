@@ -31,12 +31,16 @@ STALE = 60.0
 _UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL}
 
 
+class FolderInUse(ValueError):
+    """Another process is writing the run folder."""
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Holds the run folder for this process. A folder that was created for it and stays
     empty is removed afterwards.
 
-    **Raises:** `ValueError`, one line that names folder, process and machine, if
+    **Raises:** `FolderInUse`, one line that names folder, process and machine, if
     another process holds it.
     """
     existed = folder.exists()
@@ -144,14 +148,14 @@ def _owner(file: int) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _held(path: Path, owner: dict[str, Any] | None) -> ValueError:
+def _held(path: Path, owner: dict[str, Any] | None) -> FolderInUse:
     who = "another process"
     if owner is not None:
         who = f"process {owner.get('pid')} on {owner.get('host')}"
     advice = "wait for it or give another folder"
     if owner is not None and owner.get("host") != socket.gethostname():
         advice += f"; if it is no more, try again in {STALE:.0f} s"
-    return ValueError(f"{path.parent}: {who} is writing this run; {advice}.")
+    return FolderInUse(f"{path.parent}: {who} is writing this run; {advice}.")
 
 
 def _renew(path: Path, done: threading.Event) -> None:

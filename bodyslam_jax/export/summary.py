@@ -35,6 +35,7 @@ def summarise(
         },
         "intrinsics": lens,
         "camera_motion": cameras.kind,
+        "camera_path_m": verdict.camera.distance,
         "scale": {
             "value": result.scale,
             "sigma": verdict.scale_sigma,

@@ -46,8 +46,21 @@ def estimate(
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
     best = solution.state
     uncertainty = estimate_uncertainty(sequence, cameras, prepared, best, body, config)
+    return of_state(
+        best, prepared, uncertainty, solution.status, (*prepared.stages, stage)
+    )
+
+
+def of_state(
+    state: graph.State,
+    prepared: Prepared,
+    uncertainty: Uncertainty,
+    status: str,
+    stages: tuple[dict, ...],
+) -> JointEstimate:
+    """The estimate that a state of the prepared problem is."""
     return JointEstimate(
-        scale=float(best.scale),
+        scale=float(state.scale),
         start=prepared.scale,
         scale_sigma=uncertainty.scale_sigma,
         shape_covariance=uncertainty.shape_covariance,
@@ -55,15 +68,15 @@ def estimate(
             *prepared.warnings,
             *(f"not well determined: {line}" for line in uncertainty.unobserved),
         ),
-        cameras=np.asarray(best.cameras),
-        roots=np.asarray(best.roots),
-        poses=np.asarray(best.poses),
-        shapes=np.asarray(best.shapes),
-        landmarks=np.asarray(best.landmarks),
-        intrinsics=np.asarray(best.intrinsics),
+        cameras=np.asarray(state.cameras),
+        roots=np.asarray(state.roots),
+        poses=np.asarray(state.poses),
+        shapes=np.asarray(state.shapes),
+        landmarks=np.asarray(state.landmarks),
+        intrinsics=np.asarray(state.intrinsics),
         present=prepared.roots.present,
-        status=solution.status,
-        stages=(*prepared.stages, stage),
+        status=status,
+        stages=stages,
     )
 
 

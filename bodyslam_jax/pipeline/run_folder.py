@@ -43,6 +43,7 @@ def run_in_locked_folder(
 ) -> Result:
     """`run_to_folder` for a caller that holds the folder's lock."""
     check_overlay(config)
+    export.clear_partial(out)
     body = load_body_model(config.body_model)
     result, cameras, measured = run_stages(sequence, config, cache)
     if sequence.groundtruth is not None:

@@ -25,9 +25,8 @@ def solve_stage(
     it.
     """
     start = time.perf_counter()
-    schedule = solver.paper_schedule(config.solver)
+    schedule = schedule_of(config)
     schedule = schedule if name == "joint" else schedule[-1:]
-    schedule = tuple(dataclasses.replace(stage, atol=COST_ATOL) for stage in schedule)
     solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
     before, after = float(solution.first_cost), float(solution.cost)
     steps = sum(int(n) for n in solution.num_steps)
@@ -43,3 +42,9 @@ def solve_stage(
         "seconds": round(time.perf_counter() - start, 2),
         "status": status,
     }
+
+
+def schedule_of(config: Config) -> tuple[solver.Stage, ...]:
+    """The stages of the joint solve."""
+    schedule = solver.paper_schedule(config.solver)
+    return tuple(dataclasses.replace(stage, atol=COST_ATOL) for stage in schedule)

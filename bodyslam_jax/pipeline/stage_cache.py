@@ -139,7 +139,7 @@ class Cache:
         if self.source is not None:
             (self.folder / _SOURCE).write_text(json.dumps(self.source))
         for old in self.folder.glob(f"{name}-*.npz"):
-            old.unlink()
+            old.unlink(missing_ok=True)  # another process may have
         save(path, result)
         return result
 

@@ -1,0 +1,54 @@
+"""`collect`: one table, plots and a page for all run folders in a folder."""
+
+from pathlib import Path
+
+from bodyslam_jax.batch import plots, rows, table
+from bodyslam_jax.batch.index_page import write_index
+from bodyslam_jax.io import atomic
+
+
+def collect(folder: str | Path) -> list[Path]:
+    """Writes `table.csv`, `.md` and `.tex`, `plots.png` and `index.html` into a folder
+    of run folders; returns their paths.
+
+    Clips that failed or have not been run are in the table, with the reason.
+
+    **Raises:** `ValueError` if there are no run folders in it.
+    """
+    folder = Path(folder)
+    found = rows.read_rows(folder)
+    columns = table.present(rows.columns(), found)
+    written = write_tables(folder, columns, found)
+    plots.draw(folder / "plots.png", found, columns)
+    write_index(folder, found, columns, _thumbnails(folder, found))
+    return [*written, folder / "plots.png", folder / "index.html"]
+
+
+def write_tables(
+    folder: Path, columns: list[table.Column], found: list[table.Row]
+) -> list[Path]:
+    """Writes a table in three forms; returns their paths."""
+    forms = {
+        "csv": table.to_csv,
+        "md": table.to_markdown,
+        "tex": table.to_latex,
+    }
+    for suffix, form in forms.items():
+        atomic.write_text(folder / f"table.{suffix}", form(columns, found))
+    return [folder / f"table.{suffix}" for suffix in forms]
+
+
+def _thumbnails(folder: Path, found: list[table.Row]) -> dict[str, str]:
+    """Still images of the overlays, by the clip's name."""
+    from bodyslam_jax.view.thumbnail import write_thumbnail
+
+    made = {}
+    for row in found:
+        name = str(row["name"])
+        film = folder / name / "overlay.webm"
+        if not film.exists():
+            continue
+        (folder / "thumbnails").mkdir(exist_ok=True)
+        if write_thumbnail(film, folder / "thumbnails" / f"{name}.jpg"):
+            made[name] = f"thumbnails/{name}.jpg"
+    return made

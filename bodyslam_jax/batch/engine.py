@@ -1,0 +1,73 @@
+"""What an engine is: it runs a function on many items somewhere, and gives values back.
+
+The function, the items and their values must pickle. An engine knows nothing of clips.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from bodyslam_jax.config import Distribution
+
+Setup = Callable[[], None]
+"""Prepares a new process, once, before its first item."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """Takes the place of a value: the function raised, or its process was lost more
+    often than the engine starts it again."""
+
+    message: str
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Runs a function on items, in other processes."""
+
+    def map(
+        self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
+    ) -> Iterator[tuple[Any, Any]]:
+        """Yields each item with its value, or a `Failure`, as they finish.
+
+        Closing the iterator ends what is running.
+
+        **Raises:** `ValueError` if `setup` fails or the engine is not available.
+        """
+        ...
+
+
+def make_engine(distribution: Distribution, folder: Any, gpu: bool) -> Engine:
+    """The engine that the settings name.
+
+    Args:
+        folder: for the engine's own files, seen by all machines.
+        gpu: whether GPUs are used where there are any.
+    """
+    if distribution.engine == "ray":
+        from bodyslam_jax.batch.ray_engine import RayEngine
+
+        return RayEngine(
+            distribution.workers, distribution.retries, distribution.ray_address, gpu
+        )
+    if distribution.engine == "slurm":
+        from bodyslam_jax.batch.slurm_engine import SlurmEngine
+
+        return SlurmEngine(
+            folder,
+            distribution.workers,
+            distribution.retries,
+            distribution.slurm_minutes,
+            distribution.slurm_parameters(),
+        )
+    from bodyslam_jax.batch.local_engine import LocalEngine
+
+    return LocalEngine(distribution.workers, distribution.retries, gpu)
+
+
+def attempt(function: Callable[[Any], Any], item: Any) -> Any:
+    """The function's value, or a `Failure` with the error that it raised."""
+    try:
+        return function(item)
+    except Exception as error:
+        return Failure(f"{type(error).__name__}: {' '.join(str(error).split())}")

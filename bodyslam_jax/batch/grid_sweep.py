@@ -1,0 +1,114 @@
+"""`sweep`: the joint estimate over a grid of weights, start scales and settings."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from bodyslam_jax.batch import record, sweep_plots
+from bodyslam_jax.batch.collection import write_tables
+from bodyslam_jax.batch.engine import Engine, Failure, Setup
+from bodyslam_jax.batch.grid import Axis, at_point, mapped_points, settings_points
+from bodyslam_jax.batch.inputs import Input, find_inputs
+from bodyslam_jax.batch.rows import error_columns
+from bodyslam_jax.batch.sweep_job import ERRORS, SweepJob, run_sweep
+from bodyslam_jax.batch.table import Column, Row, present
+from bodyslam_jax.config import Config
+from bodyslam_jax.io import atomic
+
+log = logging.getLogger(__name__)
+
+
+def sweep(
+    inputs: Iterable[str | Path] | str | Path,
+    axes: Sequence[Axis],
+    config: Config,
+    out: Path,
+    engine: Engine,
+    setup: Setup,
+) -> tuple[list[Path], list[str]]:
+    """Solves every clip at every point, and writes `table.csv`, `.md`, `.tex` and
+    `plots.png`; returns their paths, and a line for each problem that was not solved.
+
+    A clip at one point of the settings is one job: its weights and scales are solved by
+    one program, and its rows are kept in `out/rows`, so that the same call continues.
+
+    **Raises:** `ValueError` if inputs have mistakes, or nothing could be solved.
+    """
+    try:
+        (out / "rows").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+    jobs = list(_jobs(find_inputs(inputs, config), axes, config, out.resolve()))
+    files = {job.label: _file(out, job) for job in jobs}
+    found = {job.label: _kept(files[job.label]) for job in jobs}
+    missing = [job for job in jobs if found[job.label] is None]
+    log.info("%d problems, %d of them solved", len(jobs), len(jobs) - len(missing))
+    failed = []
+    for job, value in engine.map(run_sweep, missing, setup):
+        if isinstance(value, Failure):
+            failed.append(f"{job.label}: {value.message}")
+            log.warning("%s", failed[-1])
+            continue
+        atomic.write_text(files[job.label], json.dumps(value))
+        found[job.label] = value
+        log.info("%s: %d points", job.label, len(value))
+    rows = [row for job in jobs for row in found[job.label] or []]
+    if not rows:
+        raise ValueError(failed[0] if failed else f"{out}: nothing to solve.")
+    columns = present(_columns(axes), rows)
+    written = write_tables(out, columns, rows)
+    sweep_plots.draw(out / "plots.png", rows, axes, columns)
+    return [*written, out / "plots.png"], failed
+
+
+def _jobs(
+    inputs: Iterable[Input], axes: Sequence[Axis], config: Config, out: Path
+) -> Iterator[SweepJob]:
+    points = tuple(mapped_points(axes))
+    for one in inputs:
+        settings = one.settings(config)
+        for point in settings_points(axes):
+            yield SweepJob(
+                one, at_point(settings, point), point, points, out / "stages" / one.name
+            )
+
+
+def _file(out: Path, job: SweepJob) -> Path:
+    """Where a job's rows are kept; the name has a hash of all that they depend on."""
+    parts = (
+        record.source_hash(job.source, job.config),
+        record.settings_hash(job.config),
+        json.dumps(job.points),
+        json.dumps(job.setting),
+    )
+    mark = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    return out / "rows" / f"{job.source.name}-{mark}.json"
+
+
+def _kept(file: Path) -> list[Row] | None:
+    try:
+        return json.loads(file.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _columns(axes: Sequence[Axis]) -> list[Column]:
+    named = [Column(axis.name, _title(axis)) for axis in axes]
+    return [
+        Column("name", "clip"),
+        *named,
+        Column("status", "status"),
+        Column("cost", "cost", 1),
+        Column("iterations", "steps"),
+        Column("estimate", "scale, m per map unit", 3),
+        Column("camera_path", "camera path, m", 3),
+        *error_columns(ERRORS),
+    ]
+
+
+def _title(axis: Axis) -> str:
+    if axis.is_setting:
+        return axis.name
+    return f"λ of {axis.term}" if axis.term else "start's scale"

@@ -1,0 +1,91 @@
+"""`index.html` of a batch: a sortable table with overlays, which links the reports.
+
+It opens from the disk, without network. Images and overlays are files beside it that
+the browser loads when they come into view or are pointed at.
+"""
+
+import html
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from urllib.parse import quote
+
+from bodyslam_jax.batch.rows import ORDER
+from bodyslam_jax.batch.table import Column, Row
+from bodyslam_jax.io import atomic
+
+
+def write_index(
+    folder: Path,
+    rows: Sequence[Row],
+    columns: Sequence[Column],
+    thumbnails: Mapping[str, str],
+) -> None:
+    """Writes `index.html`.
+
+    Args:
+        thumbnails: paths of still images from `folder`, by the clip's name.
+    """
+    first, *others = columns
+    heads = "".join(_head(column) for column in (first, *others))
+    body = "\n".join(_row(folder, row, first, others, thumbnails) for row in rows)
+    counts = Counter(str(row["status"]) for row in rows)
+    subtitle = ", ".join(f"{counts[name]} {name}" for name in ORDER if counts[name])
+    template = resources.files("bodyslam_jax.batch").joinpath("index.html").read_text()
+    parts = {
+        "TITLE": html.escape(folder.resolve().name),
+        "SUBTITLE": html.escape(f"{len(rows)} clips: {subtitle}"),
+        "HEADS": heads,
+        "ROWS": body,
+    }
+    for name, text in parts.items():
+        template = template.replace(f"<!--{name}-->", text)
+    atomic.write_text(folder / "index.html", template)
+
+
+def _head(column: Column) -> str:
+    return f'<th scope="col"><button>{html.escape(column.title)}</button></th>'
+
+
+def _row(
+    folder: Path,
+    row: Row,
+    first: Column,
+    others: Sequence[Column],
+    thumbnails: Mapping[str, str],
+) -> str:
+    name = str(row["name"])
+    cells = [f"<td>{_preview(folder, name, thumbnails)}</td>"]
+    report = folder / name / "report.html"
+    label = html.escape(name)
+    if report.exists():
+        label = f'<a href="{quote(f"{name}/report.html")}">{label}</a>'
+    elif (folder / "logs" / f"{name}.txt").exists():
+        label += f' <a href="{quote(f"logs/{name}.txt")}">log</a>'
+    cells.append(f'<th scope="row" data-v="{html.escape(name)}">{label}</th>')
+    for column in others:
+        value = column.value(row)
+        text = html.escape(column.text(row))
+        if column.key == "status":
+            kind = html.escape(str(value).replace(" ", "-"))
+            text = f'<span class="badge {kind}">{text}</span>'
+            value = ORDER.index(value) if value in ORDER else len(ORDER)
+        number = isinstance(value, (int, float))
+        kind = ' class="number"' if number and column.key != "status" else ""
+        key = "" if value is None else html.escape(str(value))
+        cells.append(f'<td{kind} data-v="{key}">{text}</td>')
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _preview(folder: Path, name: str, thumbnails: Mapping[str, str]) -> str:
+    """A still image; where there is an overlay, it plays while pointed at."""
+    image = thumbnails.get(name)
+    if image is None:
+        return ""
+    alt = html.escape(f"overlay of {name}")
+    film = quote(f"{name}/overlay.webm")
+    return (
+        f'<div class="preview" data-film="{film}">'
+        f'<img src="{quote(image)}" alt="{alt}" loading="lazy" width="160"></div>'
+    )

@@ -1,0 +1,164 @@
+"""What a batch runs on: folders, globs, files and manifests -> named inputs."""
+
+import dataclasses
+import glob
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from bodyslam_jax.config import Config, with_options
+from bodyslam_jax.io.parts import find_parts
+from bodyslam_jax.io.video import VIDEO_SUFFIXES
+
+MARK = "batch.json"
+"""File by which the folder of a batch is recognised."""
+RESERVED = ("logs", "thumbnails")
+"""Folders of a batch that are no run folders."""
+_RUN = "summary.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Input:
+    """One clip, and what is known about it."""
+
+    name: str
+    """Of its run folder; unique in a batch."""
+    path: Path
+    """Sequence folder, video file or folder of images."""
+    keypoints: Path | None = None
+    bodies: Path | None = None
+    camera: Path | None = None
+    groundtruth: Path | None = None
+    options: str = ""
+    """Settings of this clip alone, as on the command line."""
+
+    def settings(self, config: Config) -> Config:
+        """The settings of this clip.
+
+        **Raises:** `ValueError` for options that do not exist.
+        """
+        return with_options(config, self.options) if self.options else config
+
+
+def find_inputs(
+    sources: Iterable[str | Path] | str | Path, config: Config = Config()
+) -> list[Input]:
+    """All clips of these sources, in their order, each with a name of its own.
+
+    A source is a sequence folder, a video, a folder of images, a folder of such, a glob
+    pattern of such, or a manifest (`.csv`). Run folders and folders of batches are left
+    out. Clips of the same name get the name of their folder in front.
+
+    **Raises:** `ValueError` if a source does not exist or has no clips, or if the
+    manifest has mistakes: a line for each.
+    """
+    from bodyslam_jax.batch.manifest import read_manifest
+
+    if isinstance(sources, (str, Path)):
+        sources = [sources]
+    found: list[Input] = []
+    for source in sources:
+        for path in _matching(source):
+            if path.suffix.lower() == ".csv":
+                found += read_manifest(path, config)
+            else:
+                found += [Input(safe_name(p), p) for p in _clips(path)]
+    if not found:
+        raise ValueError("no inputs: expected folders, videos or a manifest (.csv).")
+    return _distinct(found)
+
+
+def shard(inputs: Sequence[Input], which: str) -> list[Input]:
+    """Part `I/N` of the inputs, I from 1: every N-th, so that parts are alike.
+
+    **Raises:** `ValueError` if it is no such part.
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", which)
+    part, parts = map(int, match.groups()) if match else (0, 0)
+    if not 1 <= part <= parts:
+        raise ValueError(f"--shard {which}: expected I/N with I from 1 to N, as 2/8.")
+    return list(inputs[part - 1 :: parts])
+
+
+def safe_name(path: Path) -> str:
+    """The name of a run folder for this input."""
+    name = path.resolve().name if path.is_dir() else path.stem
+    name = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "clip"
+    return f"{name}-clip" if name in RESERVED else name
+
+
+def _matching(source: str | Path) -> list[Path]:
+    path = Path(source)
+    if path.exists():
+        return [path]
+    if any(letter in str(source) for letter in "*?["):
+        found = [Path(p) for p in sorted(glob.glob(str(source), recursive=True))]
+        clips = [p for p in found if p.is_dir() or _is_video(p) or p.suffix == ".csv"]
+        if clips:
+            return clips
+        raise ValueError(f"{source}: matches no folder, video or manifest.")
+    raise ValueError(f"{source}: no such file or folder.")
+
+
+def _clips(path: Path) -> list[Path]:
+    """The clip that a path is, or those in the folder that it is."""
+    if path.is_file() or _is_clip(path):
+        return [path]
+    children = sorted(p for p in path.iterdir() if not p.name.startswith("."))
+    children = [] if _is_result(path) else children
+    found = [p for p in children if (p.is_dir() and _is_clip(p)) or _is_video(p)]
+    if not found:
+        raise ValueError(
+            f"{path}: no clip, nor a folder of clips: expected videos or sequence "
+            "folders in it."
+        )
+    return found
+
+
+def _is_result(folder: Path) -> bool:
+    return (folder / MARK).exists() or (folder / _RUN).exists()
+
+
+def _is_clip(folder: Path) -> bool:
+    if _is_result(folder):
+        return False
+    try:
+        parts = find_parts(folder)
+    except ValueError:  # several videos
+        return False
+    if parts.footage is None or parts.tracks is not None:
+        return parts.tracks is not None
+    known = (parts.keypoints, parts.bodies, parts.camera, parts.groundtruth)
+    # One video of another name, and nothing about it, is a clip in a folder of clips.
+    loose = parts.footage.is_file() and parts.footage.stem.lower() != "video"
+    return not loose or any(part is not None for part in known)
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def _distinct(inputs: list[Input]) -> list[Input]:
+    """The same with names that differ, also where the file system ignores case."""
+    shared = _repeated(one.name for one in inputs)
+    longer = []
+    for one in inputs:
+        if one.name.lower() in shared:
+            parent = safe_name(one.path.resolve().parent)
+            one = dataclasses.replace(one, name=f"{parent}-{one.name}")
+        longer.append(one)
+    taken: set[str] = set()
+    found = []
+    for one in longer:
+        name, number = one.name, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{one.name}-{number}"
+        taken.add(name.lower())
+        found.append(dataclasses.replace(one, name=name))
+    return found
+
+
+def _repeated(names: Iterable[str]) -> set[str]:
+    seen: set[str] = set()
+    return {n for n in map(str.lower, names) if n in seen or seen.add(n)}

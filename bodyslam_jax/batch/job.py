@@ -1,0 +1,217 @@
+"""A job: one clip and its settings, run into a folder; it depends on nothing else."""
+
+import dataclasses
+import functools
+import logging
+import socket
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from bodyslam_jax.batch import record
+from bodyslam_jax.batch.inputs import Input
+from bodyslam_jax.config import Config
+
+log = logging.getLogger(__name__)
+Status = Literal["ok", "doubtful", "failed", "error"]
+_PATIENCE, _PAUSE = 3600.0, 1.0
+"""Time to wait for another process that writes the same run folder, and between two
+attempts, s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What is computed, and where to."""
+
+    source: Input
+    config: Config
+    """With the options of this clip."""
+    out: Path
+    """Run folder."""
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    name: str
+    status: Status
+    """`ok`, `doubtful` or `failed` as in `summary.json`; `error` if there is no
+    result."""
+    folder: Path
+    """Run folder."""
+    message: str = ""
+    """What went wrong, or makes the result doubtful."""
+    seconds: float = 0.0
+    """Duration, s; 0 for a job that was finished before."""
+    compilations: int = 0
+    """Programs that were compiled for it, not taken from the cache."""
+    machine: str = ""
+    was_finished: bool = False
+    """Whether an earlier run had finished it."""
+
+    @property
+    def is_failure(self) -> bool:
+        return self.status in ("failed", "error")
+
+    def result(self) -> Any:
+        """Reads the `Result` from the run folder."""
+        from bodyslam_jax import evaluation
+
+        return evaluation.read_result(self.folder)
+
+
+Estimate = Callable[[Job], dict[str, Any]]
+"""Runs a job and returns its summary, which is then in its run folder."""
+
+
+def finished(job: Job) -> Outcome | None:
+    """The outcome of a job that is finished, if its files have not been touched since.
+
+    Reads the record and the dates of files, not their content.
+    """
+    found = record.read(job.out)
+    if found is None or found.get("settings") != record.settings_hash(job.config):
+        return None
+    try:
+        stamp = record.stamp(job.source, job.config)
+    except (OSError, ValueError):
+        return None
+    return _recorded(job, found) if found.get("stamp") == stamp else None
+
+
+def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
+    """Runs a job unless its input and settings are those of the run in its folder.
+
+    Errors become the outcome's message, their traceback is in the log of the job,
+    `logs/NAME.txt` beside the run folder. If another process is running the job, waits
+    for it.
+    """
+    start, before = time.monotonic(), _compilations().count
+    try:
+        home = job.out.parent
+        if not home.is_dir():
+            raise ValueError(
+                f"{home}: no such folder on {socket.gethostname()}; expected one that "
+                "all machines share."
+            )
+        with _logged(home / "logs" / f"{job.name}.txt"):
+            try:
+                outcome = _run(job, estimate or estimate_clip)
+            except Exception:
+                log.error("%s", traceback.format_exc())
+                raise
+    except Exception as error:
+        outcome = failure(job, _one_line(error))
+    return dataclasses.replace(
+        outcome,
+        seconds=0.0 if outcome.was_finished else round(time.monotonic() - start, 2),
+        compilations=_compilations().count - before,
+        machine=socket.gethostname(),
+    )
+
+
+def estimate_clip(job: Job) -> dict[str, Any]:
+    """The whole pipeline on the job's clip, as `bodyslam run`."""
+    from bodyslam_jax import io, pipeline
+
+    source = job.source
+    sequence = io.read_sequence(
+        source.path,
+        keypoints=source.keypoints,
+        bodies=source.bodies,
+        camera=source.camera,
+        config=job.config.association,
+        known=job.config,
+    )
+    if source.groundtruth is not None:
+        sequence = dataclasses.replace(sequence, groundtruth=source.groundtruth)
+    return pipeline.run_to_folder(sequence, job.out, job.config).summary
+
+
+def failure(job: Job, message: str) -> Outcome:
+    """The outcome of a job without a result."""
+    return Outcome(job.name, "error", job.out, message)
+
+
+def _run(job: Job, estimate: Estimate) -> Outcome:
+    from bodyslam_jax import export
+
+    until = time.monotonic() + _PATIENCE
+    source = record.source_hash(job.source, job.config)
+    settings = record.settings_hash(job.config)
+    hashes = {"source": source, "settings": settings}
+    while True:
+        found = record.read(job.out)
+        stamp = record.stamp(job.source, job.config)
+        if found is not None and found.items() >= hashes.items():
+            record.finish(job.out, found | {"stamp": stamp})
+            return _recorded(job, found)
+        if record.begun_for(job.out) not in (None, source):
+            with export.locked(job.out):
+                export.clear_run(job.out)
+        start = time.monotonic()
+        try:
+            with record.begun(job.out, source):
+                summary = estimate(job)
+        except export.FolderInUse:
+            if time.monotonic() > until:
+                raise
+            time.sleep(_PAUSE)
+            continue
+        outcome = {
+            "status": summary["status"],
+            "message": _reasons(summary),
+            "seconds": round(time.monotonic() - start, 2),
+        }
+        record.finish(job.out, {**hashes, **outcome, "stamp": stamp})
+        return Outcome(job.name, outcome["status"], job.out, outcome["message"])
+
+
+def _recorded(job: Job, found: dict[str, Any]) -> Outcome:
+    status, message = found["status"], found["message"]
+    return Outcome(job.name, status, job.out, message, was_finished=True)
+
+
+def _reasons(summary: dict[str, Any]) -> str:
+    return " ".join(str(one.get("message")) for one in summary.get("reasons") or [])
+
+
+@functools.cache
+def _compilations() -> Any:
+    from bodyslam_jax.batch.program_cache import Compilations
+
+    return Compilations()
+
+
+class _logged:
+    """Writes the package's log of a block to a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        self.path.parent.mkdir(exist_ok=True)
+        # Opened with the first line: a job that is finished keeps its log.
+        self.handler = logging.FileHandler(self.path, "w", "utf-8", delay=True)
+        self.handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+        logging.getLogger("bodyslam_jax").addHandler(self.handler)
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("bodyslam_jax").removeHandler(self.handler)
+        self.handler.close()
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file'}: {error.strerror}."
+    text = " ".join(str(error).split())
+    if isinstance(error, (OSError, ValueError)) and text:
+        return text
+    return f"{type(error).__name__}: {text[:300]}"

@@ -1,0 +1,113 @@
+"""The record in a run folder by which a finished job is recognised.
+
+It has hashes of the input's content and of settings, models and the package's source,
+and a stamp: a hash of the names, sizes and dates of the input's files. Where the stamp
+is the same, the content is not read again.
+"""
+
+import contextlib
+import functools
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from bodyslam_jax.batch.inputs import Input
+from bodyslam_jax.config import Config
+from bodyslam_jax.io import atomic
+from bodyslam_jax.io.parts import find_parts
+from bodyslam_jax.pipeline.stage_cache import body_model_file, fingerprint
+
+_RECORD = ".job.json"
+_SUMMARY = "summary.json"
+
+
+def read(out: Path) -> dict[str, Any] | None:
+    """The record of a finished run that is as its job left it."""
+    record = _load(out)
+    try:
+        is_kept = record.get("summary") == _hash_of(out / _SUMMARY)
+    except OSError:
+        return None
+    return record if is_kept else None
+
+
+def finish(out: Path, record: dict[str, Any]) -> None:
+    """Records that the run in `out` is finished."""
+    record = record | {"summary": _hash_of(out / _SUMMARY)}
+    atomic.write_text(out / _RECORD, json.dumps(record))
+
+
+@contextlib.contextmanager
+def begun(out: Path, source: str) -> Iterator[None]:
+    """Records the input of a run before it is finished. A run that leaves nothing else
+    leaves no folder."""
+    if _load(out).get("source") != source:
+        out.mkdir(exist_ok=True)
+        atomic.write_text(out / _RECORD, json.dumps({"source": source}))
+    try:
+        yield
+    except Exception:
+        if [entry.name for entry in out.iterdir()] == [_RECORD]:
+            (out / _RECORD).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                out.rmdir()
+        raise
+
+
+def begun_for(out: Path) -> str | None:
+    """The hash of the input that the run in `out` is of; `None` if there is none."""
+    return _load(out).get("source")
+
+
+def source_hash(source: Input, config: Config) -> str:
+    """Of the content of the input's files, and its name."""
+    return fingerprint(source.name, _files(source, config))
+
+
+@functools.lru_cache(maxsize=256)
+def settings_hash(config: Config) -> str:
+    """Of settings, models and the package's source."""
+    return fingerprint(config, body_model_file(config.body_model))
+
+
+def stamp(source: Input, config: Config) -> str:
+    """Of names, sizes and dates of the input's files."""
+    digest = hashlib.sha256()
+    for path in _files(source, config):
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file() and not file.name.startswith("."):
+                state = file.stat()
+                text = f"{file.name} {state.st_size} {state.st_mtime_ns}\n"
+                digest.update(text.encode())
+    return digest.hexdigest()[:16]
+
+
+def _files(source: Input, config: Config) -> list[Path]:
+    """The files and folders that a job reads, but for models."""
+    parts = find_parts(source.path)
+    found = [
+        parts.footage,
+        source.keypoints or parts.keypoints,
+        source.bodies or parts.bodies,
+        source.camera or parts.camera,
+        parts.tracks,
+        parts.masks,
+        source.groundtruth or parts.groundtruth,
+    ]
+    if config.camera_path is not None:
+        found.append(Path(config.camera_path))
+    return [path for path in found if path is not None]
+
+
+def _load(out: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((out / _RECORD).read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _hash_of(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]

@@ -1,0 +1,118 @@
+"""Rows of figures as CSV, Markdown and LaTeX."""
+
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A column: its key in the rows, its title with the unit, its format."""
+
+    key: str
+    title: str
+    digits: int | None = None
+    """Behind the decimal point; `None` for text and whole numbers."""
+    factor: float = 1.0
+    """From the row's unit (SI) to that of the title."""
+    is_wide: bool = False
+    """Whether it is left out of LaTeX: text of any length."""
+
+    def value(self, row: Row) -> Any:
+        """In the unit of the title; `None` if the row has none."""
+        found = row.get(self.key)
+        if isinstance(found, (int, float)) and not isinstance(found, bool):
+            if not math.isfinite(found):
+                return None
+            return found * self.factor if self.factor != 1 else found
+        return found if found != "" else None
+
+    def text(self, row: Row) -> str:
+        found = self.value(row)
+        if found is None:
+            return "–"
+        if self.digits is not None and isinstance(found, (int, float)):
+            return f"{found:.{self.digits}f}"
+        return str(found)
+
+
+def present(columns: Sequence[Column], rows: Sequence[Row]) -> list[Column]:
+    """The columns for which a row has a value."""
+    return [c for c in columns if any(c.value(row) is not None for row in rows)]
+
+
+def to_csv(columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """All digits; columns have their keys as names, and the unit of the title."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([column.title for column in columns])
+    for row in rows:
+        cells = (column.value(row) for column in columns)
+        writer.writerow(["" if cell is None else cell for cell in cells])
+    return out.getvalue()
+
+
+def to_markdown(columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """A table with numbers to the right, and the median of each below."""
+    lines = [[column.title for column in columns]]
+    lines.append(["---:" if c.digits is not None else "---" for c in columns])
+    lines += [[column.text(row) for column in columns] for row in rows]
+    if len(rows) > 2:
+        lines.append(["**median**", *_medians(columns[1:], rows)])
+    escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
+
+
+def to_latex(columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """A `tabular` with rules of the package booktabs."""
+    columns = [column for column in columns if not column.is_wide]
+    form = "".join("r" if column.digits is not None else "l" for column in columns)
+    line = lambda cells: " & ".join(map(_escaped, cells)) + r" \\"
+    body = [line([column.text(row) for column in columns]) for row in rows]
+    if len(rows) > 2:
+        body += [r"\midrule", line(["median", *_medians(columns[1:], rows)])]
+    return "\n".join(
+        [
+            rf"\begin{{tabular}}{{{form}}}",
+            r"\toprule",
+            line([column.title for column in columns]),
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            "",
+        ]
+    )
+
+
+def _medians(columns: Sequence[Column], rows: Sequence[Row]) -> list[str]:
+    found = []
+    for column in columns:
+        values = sorted(v for row in rows if _is_number(v := row.get(column.key)))
+        if column.digits is None or not values:
+            found.append("")
+            continue
+        half = len(values) // 2
+        median = (values[half] + values[-half - 1]) / 2
+        found.append(column.text({column.key: median}))
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)
+
+
+_LATEX = {
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    **{"±": r"$\pm$", "²": r"$^2$", "–": "--", "\\": r"\textbackslash{}"},
+    **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+}
+
+
+def _escaped(text: str) -> str:
+    return "".join(_LATEX.get(letter, letter) for letter in text)

@@ -1,0 +1,127 @@
+"""Settings from text: `--fps 25 --weights.pixel-sigma 0.5`, as on the command line."""
+
+import dataclasses
+import difflib
+import shlex
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+S = TypeVar("S")
+_SWITCH = {"true": True, "yes": True, "false": False, "no": False}
+
+
+def with_options(settings: S, text: str) -> S:
+    """The settings changed by options as the command line has them.
+
+    **Raises:** `ValueError`, one line, for an option or value that does not exist.
+    """
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise ValueError(f"options: found {text!r} ({error}).") from None
+    return with_values(settings, dict(_grouped(words)))
+
+
+def with_values(settings: S, values: Mapping[str, Sequence[str]]) -> S:
+    """The settings with fields changed: `{"weights.pixel_sigma": ["0.5"]}`.
+
+    All change at once, since some are valid beside others only.
+
+    **Raises:** as `with_options`.
+    """
+    changes: dict[str, Any] = {}
+    for name, texts in values.items():
+        *stages, field, value = _parsed_field(settings, name, list(texts))
+        within = changes
+        for stage in stages:
+            within = within.setdefault(stage, {})
+        within[field] = value
+    return _replaced(settings, changes)
+
+
+def field_names(settings: Any, prefix: str = "") -> list[str]:
+    """All fields with the stage before a dot: `fps`, `weights.pixel_sigma`."""
+    found = []
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            found += field_names(value, f"{prefix}{field.name}.")
+        else:
+            found.append(prefix + field.name)
+    return found
+
+
+def _grouped(words: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Each option's name and values."""
+    found: list[tuple[str, list[str]]] = []
+    for word in words:
+        if word.startswith("--"):
+            name, sign, value = word.removeprefix("--").partition("=")
+            found.append((name, [value] if sign else []))
+        elif found:
+            found[-1][1].append(word)
+        else:
+            raise ValueError(f"options: found {word!r}, expected --OPTION VALUE.")
+    return found
+
+
+def _parsed_field(settings: Any, name: str, texts: list[str]) -> list[Any]:
+    """Stages and field that the name of an option is of, and its value."""
+    *stages, field = name.replace("-", "_").split(".")
+    within = settings
+    for stage in stages:
+        within = getattr(within, stage, None)
+    known = (
+        [one.name for one in dataclasses.fields(within)]
+        if dataclasses.is_dataclass(within)
+        else []
+    )
+    if field not in known and field.removeprefix("no_") in known and not texts:
+        field, texts = field.removeprefix("no_"), ["no"]
+    if field not in known or dataclasses.is_dataclass(getattr(within, field)):
+        wrong = ".".join([*stages, field])
+        close = difflib.get_close_matches(wrong, field_names(settings), n=1)
+        hint = f"; did you mean --{close[0].replace('_', '-')}?" if close else "."
+        raise ValueError(f"no option --{name}{hint}")
+    kind = typing.get_type_hints(type(within))[field]
+    return [*stages, field, _parsed(kind, texts, name)]
+
+
+def _replaced(settings: Any, changes: Mapping[str, Any]) -> Any:
+    inner = {
+        name: _replaced(getattr(settings, name), value)
+        if isinstance(value, dict)
+        else value
+        for name, value in changes.items()
+    }
+    return dataclasses.replace(settings, **inner)
+
+
+def _parsed(kind: Any, values: Sequence[str], name: str) -> Any:
+    """Text as a value of the field's type."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if list(values) in (["none"], ["None"]):
+            return None
+        (kind,) = (one for one in arguments if one is not types.NoneType)
+        return _parsed(kind, values, name)
+    if origin is tuple:
+        return tuple(_parsed(arguments[0], [one], name) for one in values)
+    if kind is bool and not values:
+        return True
+    if len(values) != 1:
+        raise ValueError(f"--{name}: found {' '.join(values)!r}, expected one value.")
+    (text,) = values
+    if kind is bool:
+        if text.lower() not in _SWITCH:
+            raise ValueError(f"--{name}: found {text!r}, expected yes or no.")
+        return _SWITCH[text.lower()]
+    if kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise ValueError(f"--{name}: found {text!r}, expected {what}.") from None
+    return text
