@@ -51,6 +51,9 @@ class Keypoints:
     depth: Float[np.ndarray, "h t 25"] | None = None
     """Depth in the camera relative to the middle of the hips, m, positive away from
     the camera, as regressed by a network; 0 where it is missing."""
+    definition: str = "unknown"
+    """What the detector calls a hip or a knee: a name in
+    `body.KEYPOINT_DEFINITIONS`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Motion capture seen by made-up cameras: what `train_lifter.py` learns from.
 
-People of random shape walk before cameras that stand or follow, and are seen with the
-errors of `simulation.NOISE`.
+People of random shape walk before cameras that stand or follow, and are seen by
+detectors of several definitions of keypoints, each person with offsets of their own,
+and with the errors of `simulation.NOISE` or of the detector that ships.
 """
 
 import dataclasses
@@ -11,10 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from lifter_detector import add_errors
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.body import MIRRORED
+from bodyslam_jax.body.skeleton import KNEES
 from bodyslam_jax.people.skeleton import NUM_SHAPE, Skeleton, place_points
 from bodyslam_jax.simulation.sensor_noise import NOISE, detect_keypoints
 
@@ -23,6 +26,8 @@ FRAMES = 320
 CAMERA, SIZE = np.array([1200.0, 1200.0, 640.0, 360.0]), (1280, 720)
 STEEP = 0.3
 """Share of cameras that look up by as much as 30 degrees, or down by 70."""
+_STRAIGHT, _STILL = 0.35, 60
+"""rad, frames."""
 _SHAPE_SPREAD = np.where(np.arange(NUM_SHAPE) < 10, 0.7, 1.0)
 # Keypoints that an edge of the image or a piece of furniture hides together.
 _GROUPS = (
@@ -84,6 +89,21 @@ def mirrored(motion: Motion) -> Motion:
     )
 
 
+def standing(motion: Motion, rng: np.random.Generator) -> Motion | None:
+    """Somebody who stands still in one of the motion's postures with legs all but
+    straight; `None` if there is none."""
+    knees = np.linalg.norm(motion.poses[:, KNEES], axis=-1).max(axis=1)
+    straight = np.flatnonzero(knees < _STRAIGHT)
+    if not len(straight):
+        return None
+    k = rng.choice(straight)
+    still = lambda a: np.repeat(a[k : k + 1], _STILL, axis=0)
+    sway = gaussian_filter1d(rng.standard_normal((_STILL, 24, 3)), 15, axis=0)
+    return dataclasses.replace(
+        motion, poses=still(motion.poses) + 0.1 * sway, trans=still(motion.trans)
+    )
+
+
 def excerpt(motion: Motion, frames: int, rng: np.random.Generator) -> Motion:
     first = rng.integers(0, max(len(motion.poses) - frames, 0) + 1)
     rows = slice(first, first + frames)
@@ -106,9 +126,14 @@ def place(
 
 
 def watch(
-    motion: Motion, skeleton: Skeleton, rng: np.random.Generator, noise: str
+    motion: Motion,
+    skeleton: Skeleton,
+    rng: np.random.Generator,
+    noise: str,
+    built_in: bool = False,
 ) -> View:
-    """By one camera, of a person of one shape, with a detector's errors."""
+    """By one camera, of a person of one shape, with a detector's errors; those of the
+    detector that ships too, if `built_in`."""
     shape = rng.standard_normal(NUM_SHAPE) * _SHAPE_SPREAD
     angles = motion.poses[:, 1:22].reshape(-1, 63)
     joints, points = place(skeleton, angles, shape)
@@ -123,6 +148,8 @@ def watch(
     uv, confidence = detect_keypoints(
         seen(points), seen(joints), CAMERA, SIZE, NOISE[noise], rng
     )
+    if built_in:
+        uv, confidence = add_errors(uv, confidence, seen(points), rng)
     return View(uv, confidence, T_CH, angles, shape)
 
 

@@ -5,6 +5,12 @@ from bodyslam_jax.body.files import check as check
 from bodyslam_jax.body.files import load_body_model as load_body_model
 from bodyslam_jax.body.files import search_paths as search_paths
 from bodyslam_jax.body.files import write_npz as write_npz
+from bodyslam_jax.body.keypoint_definitions import (
+    KEYPOINT_DEFINITIONS as KEYPOINT_DEFINITIONS,
+)
+from bodyslam_jax.body.keypoint_definitions import (
+    definition_offsets as definition_offsets,
+)
 from bodyslam_jax.body.kinematics import joints as joints
 from bodyslam_jax.body.kinematics import keypoints as keypoints
 from bodyslam_jax.body.kinematics import local_joints as local_joints

@@ -8,7 +8,7 @@ without one the default given in the field's docstring is used.
 import dataclasses
 import math
 import re
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, check
 
@@ -32,6 +32,11 @@ RANGES = {
 """Ranges of the numbers."""
 _SIGMA = re.compile(r"±|\+-|\+/-")
 _NARROWEST, _WIDEST = 1.0, 179.0
+
+
+KeypointDefinition = Literal[
+    "unknown", "movenet-blazepose", "coco", "mediapipe", "openpose", "halpe"
+]
 
 
 class Measured(NamedTuple):
@@ -70,6 +75,10 @@ class Known:
     """Start of the part of the video that is used, s."""
     end: float | None = None
     """End of the part of the video that is used, s."""
+    keypoint_definition: KeypointDefinition | None = None
+    """Detector of the given keypoints, which decides where on a body its hips, knees
+    and the others are. Without it, found from the file. `unknown`: at the body's
+    joints."""
     person: tuple[int, ...] = ()
     """Numbers of the people that are estimated; all without it. The others are still
     masked in the map."""

@@ -18,6 +18,7 @@ def with_detections(
     *,
     person: list[np.ndarray] | None = None,
     detected: DetectedPeople | None = None,
+    definition: str = "unknown",
 ) -> Sequence:
     """The sequence with people made of what a detector found in each of its frames.
 
@@ -28,6 +29,7 @@ def with_detections(
         person: for each frame the number of the person that each detection is of, if
             the detector tracks people.
         detected: everybody who is kept out of the map; by default all `detections`.
+        definition: the detector's, a name in `body.KEYPOINT_DEFINITIONS`.
     """
     detected = detected or detected_people(detections)
     sequence = dataclasses.replace(sequence, detected=detected)
@@ -37,6 +39,7 @@ def with_detections(
             text += ": cameras and map only, and these without a unit"
         return _warned(sequence, (f"{text}.",))
     people, warnings = associate(detections, config, sequence.fps, person)
+    people = dataclasses.replace(people, definition=definition)
     bodies = sequence.bodies
     if bodies is not None:
         given = len(bodies.present)
@@ -69,5 +72,6 @@ def _with_body(people: Keypoints, bodies: Bodies) -> tuple[Keypoints, Bodies, in
         return people, bodies, 0
     arrays = {n: getattr(bodies, n) for n in ("present", "poses", "shapes", "trans")}
     bodies = dataclasses.replace(bodies, **{n: a[kept] for n, a in arrays.items()})
-    people = Keypoints(people.uv[kept], people.confidence[kept])
+    uv, confidence = people.uv[kept], people.confidence[kept]
+    people = dataclasses.replace(people, uv=uv, confidence=confidence)
     return people, bodies, int((~kept).sum())

@@ -58,8 +58,10 @@ def pair(
         return out
 
     return (
-        Keypoints(
-            *(spread(a, np.arange(num_k)) for a in (keypoints.uv, keypoints.confidence))
+        dataclasses.replace(
+            keypoints,
+            uv=spread(keypoints.uv, np.arange(num_k)),
+            confidence=spread(keypoints.confidence, np.arange(num_k)),
         ),
         dataclasses.replace(
             bodies,

@@ -129,6 +129,8 @@ def _read_parts(
             warn=warn,
         )
         people, more = associate(detections.points, config, rate, detections.person)
+        definition = known.keypoint_definition or detections.definition
+        people = dataclasses.replace(people, definition=definition)
         warnings += more
         detected = detected_people(detections.points)
     bodies = None

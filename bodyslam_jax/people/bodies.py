@@ -10,7 +10,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people.clean_regressed import prepare_bodies
 from bodyslam_jax.people.fit import fit_bodies
 from bodyslam_jax.people.sides import correct_left_right
-from bodyslam_jax.types import Bodies, Keypoints, Sequence
+from bodyslam_jax.types import Bodies, Sequence
 
 
 def estimate_bodies(
@@ -30,7 +30,12 @@ def estimate_bodies(
     if keypoints is None or not len(others):
         return found
     depth = None if keypoints.depth is None else keypoints.depth[others]
-    remaining = Keypoints(keypoints.uv[others], keypoints.confidence[others], depth)
+    remaining = dataclasses.replace(
+        keypoints,
+        uv=keypoints.uv[others],
+        confidence=keypoints.confidence[others],
+        depth=depth,
+    )
     fitted = fit_bodies(remaining, camera, body, fps, settings)
     for name in ("present", "poses", "shapes", "trans"):
         getattr(found, name)[others] = getattr(fitted, name)
@@ -57,7 +62,12 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
     index = list(dict.fromkeys(people))
     if keypoints is not None:
         depth = None if keypoints.depth is None else keypoints.depth[index]
-        keypoints = Keypoints(keypoints.uv[index], keypoints.confidence[index], depth)
+        keypoints = dataclasses.replace(
+            keypoints,
+            uv=keypoints.uv[index],
+            confidence=keypoints.confidence[index],
+            depth=depth,
+        )
     if bodies is not None:
         bodies = dataclasses.replace(
             bodies,

@@ -83,7 +83,8 @@ def prepare_bodies(
     regressor's depth as a measurement. Person h of `bodies` is person h of `keypoints`.
     """
     roots = roots_from_bodies(bodies, body)
-    skeleton = make_skeleton(body, 0.0)
+    definition = "unknown" if keypoints is None else keypoints.definition
+    skeleton = make_skeleton(body, 0.0, definition)
     prepared = PersonState(
         present=roots.present.copy(),
         T_CH=roots.T_CH.copy(),

@@ -1,9 +1,10 @@
 """Offsets between a detector's keypoints and the joints of the body model.
 
 Every detector has its own definition of hip or knee, the same in all frames of a
-person. The fit estimates the offsets with the shape (`skeleton`: fixed to bones). They
-must be removed before keypoints are compared with the model's joints: a leg that seems
-5 % too short bends the knee by 36 degrees.
+person. What is common to all people is known (`body.keypoint_definitions`); the fit
+estimates the rest with the shape (`skeleton`: fixed to bones). Both must be removed
+before keypoints are compared with the model's joints: a leg that seems 5 % too short
+bends the knee by 36 degrees.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ from bodyslam_jax.people.skeleton import (
     NUM_SHAPE,
     Skeleton,
     make_skeleton,
+    place_points,
     pose_points,
 )
 from bodyslam_jax.types import Intrinsics, Keypoints
@@ -44,23 +46,32 @@ def as_body_keypoints(
     body: BodyModel,
     fps: float,
 ) -> Keypoints:
-    """Keypoints with the detector's offsets removed, for the people `chosen`.
+    """Keypoints moved from where the detector puts them to the joints of the body.
 
-    Their bodies were fitted to these keypoints; other people and frames without a body
-    are unchanged. Offsets are estimated by robust linear regression on the reprojection
-    residuals, with the priors of `skeleton`; frames within the correlation time of the
-    errors count once.
+    The bodies of the people `chosen` were fitted to these keypoints. What their offsets
+    differ by from the detector's definition is estimated by robust linear regression on
+    the reprojection residuals, with the priors of `skeleton`; frames within the
+    correlation time of the errors count once. Of other people only the definition is
+    removed. Frames without a body are unchanged.
     """
     uv = keypoints.uv.copy()
-    skeleton = make_skeleton(body, 0.0)  # the graph's
+    graphs = make_skeleton(body, 0.0)
+    skeleton = graphs
+    if keypoints.definition != "unknown":
+        skeleton = make_skeleton(body, 0.0, keypoints.definition)
     camera = jnp.asarray(intrinsics.params, skeleton.offset.dtype)
     focal = float(np.mean(intrinsics.params[:2]))
-    for h in np.flatnonzero(chosen & roots.present.any(axis=1)):
+    defined = graphs is not skeleton
+    for h in np.flatnonzero((chosen | defined) & roots.present.any(axis=1)):
         where = np.flatnonzero(roots.present[h])
         T_CH = roots.T_CH[h, where]
         depth = np.maximum(T_CH[:, 2, 3], DEPTH_FLOOR)
         sigma = keypoint_sigma(keypoints, intrinsics, int(h))[where]
-        sigma = in_pixels(sigma, focal / depth)
+        sigma = (
+            in_pixels(sigma, focal / depth)
+            if chosen[h]
+            else np.full_like(sigma, np.inf)
+        )
         alike = max(1.0, CORRELATION_TIME * fps)
         shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
         angles = roots.body_pose[h, where, :21].reshape(-1, 63)
@@ -71,13 +82,14 @@ def as_body_keypoints(
         sigma = np.concatenate([sigma * np.sqrt(alike), silent])
         numbers = (*map(last, rows), sigma, shape, ROBUST_SCALE)
         arrays = (jnp.asarray(a, skeleton.offset.dtype) for a in numbers)
-        shift = np.asarray(_shift(skeleton, camera, *arrays), float)
+        shift = np.asarray(_shift(graphs, skeleton, camera, *arrays), float)
         uv[h, where] -= shift[: len(where)]
-    return dataclasses.replace(keypoints, uv=uv)
+    return dataclasses.replace(keypoints, uv=uv, definition="unknown")
 
 
 @eqx.filter_jit
 def _shift(
+    graphs: Skeleton,
     skeleton: Skeleton,
     intrinsics: Float[Array, " i"],
     orientation: Float[Array, "t 3 3"],
@@ -88,15 +100,20 @@ def _shift(
     shape: Float[Array, " s"],
     scale: Float[Array, ""],
 ) -> Float[Array, "t 25 2"]:
-    """How far the detector's definitions move each keypoint in the image, px."""
+    """How far the detector's definitions move each keypoint in the image, px: from
+    those of the skeleton `graphs` to those of `skeleton`, and on by what is estimated.
+    """
 
     def frame(R, p, angles):
+        plain = place_points(graphs, angles, shape)[1] @ R.T + p
         points = pose_points(skeleton, angles, shape)
         p_C = points.keypoints @ R.T + p
         view = jax.vmap(jax.jacfwd(lambda x: project(intrinsics, x)))(p_C)
-        return project(intrinsics, p_C), view @ R @ points.by_shape[..., 10:]
+        predicted = project(intrinsics, p_C)
+        defined = predicted - project(intrinsics, plain)
+        return predicted, defined, view @ R @ points.by_shape[..., 10:]
 
-    predicted, jac = jax.vmap(frame)(orientation, position, angles)
+    predicted, defined, jac = jax.vmap(frame)(orientation, position, angles)
     residual = (uv - predicted) / sigma[..., None]
     whitened = jac / sigma[..., None, None]
 
@@ -109,4 +126,4 @@ def _shift(
         return jnp.linalg.solve(hessian + jnp.eye(len(right)), right)
 
     start = jnp.zeros(jac.shape[-1], jac.dtype)
-    return jac @ jax.lax.fori_loop(0, _ROUNDS, fit, start)
+    return defined + jac @ jax.lax.fori_loop(0, _ROUNDS, fit, start)

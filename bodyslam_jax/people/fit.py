@@ -85,7 +85,7 @@ def fit_bodies(
         np.zeros((people, frames, 23, 3)),
         np.zeros((people, 10)),
     )
-    scene = make_scene(intrinsics, body, fps, settings)
+    scene = make_scene(intrinsics, body, fps, settings, keypoints.definition)
     for h in range(people):
         sigma = keypoint_sigma(keypoints, intrinsics, h)
         present = find_present(sigma, fps, settings)
@@ -109,12 +109,17 @@ def fit_bodies(
 
 
 def make_scene(
-    intrinsics: Intrinsics, body: BodyModel, fps: float, settings: PeopleFit
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    fps: float,
+    settings: PeopleFit,
+    definition: str = "unknown",
 ) -> Scene:
+    """`definition`: the detector's, one of `body.KEYPOINT_DEFINITIONS`."""
     dtype = body.joint_template.dtype
     number = lambda value: jnp.asarray(value, dtype)
     return Scene(
-        make_skeleton(body, 0.0),
+        make_skeleton(body, 0.0, definition),
         load_posture_prior(fps, dtype),
         number(intrinsics.params),
         number(ROBUST_SCALE),

@@ -14,8 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import PARENTS, BodyModel, local_keypoints, rest_joints
+from bodyslam_jax.body.keypoint_definitions import definition_offsets
 from bodyslam_jax.body.skeleton import LEVELS
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.people.stature import linear_stature
 
 # Bone that carries each BODY_25 keypoint: SMPL's joint of that name, the head for the
 # face, the toe joint for toes, the ankle for heels.
@@ -90,11 +92,19 @@ def _at_rest(body: BodyModel, bias: Array) -> Float[Array, "11 49 3"]:
     return jnp.concatenate([joints - joints[:, :1], keypoints], axis=1)
 
 
-def make_skeleton(body: BodyModel, bias: float) -> Skeleton:
-    """`bias` as `body.local_keypoints` has it: 0 SMPL's joints, 1 COCO detectors'."""
+def make_skeleton(
+    body: BodyModel, bias: float, definition: str = "unknown"
+) -> Skeleton:
+    """`bias` as `body.local_keypoints` has it: 0 SMPL's joints, 1 COCO detectors'.
+    Keypoints are moved by the offsets of `definition` as well, if this is the default
+    body."""
     dtype = body.joint_template.dtype
     rest = np.asarray(_at_rest(body, jnp.asarray(bias, dtype)), float)
     offset = rest - np.where(_CARRIER[:, None] >= 0, rest[:, _CARRIER], 0.0)
+    if body.kind == "default":
+        linear = linear_stature(body)
+        stature = linear.template + np.append(0.0, linear.slope)
+        offset[:, 24:] += stature[:, None, None] * definition_offsets(definition)
     by_shape = np.zeros((49, 3, NUM_SHAPE))
     by_shape[..., :10] = np.moveaxis(offset[1:] - offset[0], 0, -1)
     for column, (points, axis, sigma) in enumerate(_OFFSETS, start=10):

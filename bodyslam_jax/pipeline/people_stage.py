@@ -91,7 +91,9 @@ def _detect_per_frame(
     key = fingerprint(sequence, config.detection)
     with watch("detection"):
         found = cache.stage("detection", key, Detections, compute)
-    return io.with_detections(sequence, found.by_frame(), config.association)
+    return io.with_detections(
+        sequence, found.by_frame(), config.association, definition="coco"
+    )
 
 
 def _detect_and_track(
@@ -115,6 +117,7 @@ def _detect_and_track(
         config.association,
         person=person,
         detected=found.detected(),
+        definition="movenet-blazepose",
     )
     if sequence.keypoints is None:
         return sequence

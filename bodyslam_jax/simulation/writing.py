@@ -283,6 +283,6 @@ def _write_keypoints(folder: Path, simulated: SimulatedSequence) -> None:
             flat = [round(float(x), 3) for x in rows.ravel()]
             if confidence[k].any():
                 people.append({"person_id": [-1], "pose_keypoints_2d": flat})
-        content = {"version": 1.3, "people": people}
+        content = {"version": 1.3, "detector": "simulated", "people": people}
         path = folder / f"{simulated.name}_{k:012d}_keypoints.json"
         path.write_text(json.dumps(content))

@@ -24,7 +24,8 @@ def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
     if image.swap:
         uv, confidence = uv[:, :, BODY25_MIRRORED], confidence[:, :, BODY25_MIRRORED]
-    return dataclasses.replace(sequence, keypoints=Keypoints(uv, confidence))
+    keypoints = dataclasses.replace(keypoints, uv=uv, confidence=confidence, depth=None)
+    return dataclasses.replace(sequence, keypoints=keypoints)
 
 
 def with_bodies_moved(

@@ -37,6 +37,8 @@ class Listed:
     """Whether the tool writes (y, x)."""
     size: Size | None = None
     """Of the images that the points are in, px, if the file declares it."""
+    detector: str | None = None
+    """The detector's name, if the file has it."""
 
 
 def read_openpose(folder: Path) -> Listed:
@@ -50,7 +52,8 @@ def read_openpose(folder: Path) -> Listed:
     rows = []
     for file in files:
         rows += [(file.name, *found) for found in _read_openpose_frame(file)]
-    return Listed(rows, [f.name for f in files])
+    first = _load_json(files[0])
+    return Listed(rows, [f.name for f in files], detector=_detector(first))
 
 
 def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
@@ -127,7 +130,11 @@ def _read_coco(path: Path, data: Any) -> Listed:
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: incomplete COCO annotations ({error}).") from None
     return Listed(
-        rows, list(name.values()), parts=_parts(data), size=size_in(path, data)
+        rows,
+        list(name.values()),
+        parts=_parts(data),
+        size=size_in(path, data),
+        detector=_detector(data),
     )
 
 
@@ -148,7 +155,13 @@ def _read_mmpose(path: Path, data: Any) -> Listed:
                 rows.append((names[-1], points, who))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: incomplete MMPose result ({error!r}).") from None
-    return Listed(rows, names, parts=_parts(data), size=size_in(path, data))
+    return Listed(
+        rows,
+        names,
+        parts=_parts(data),
+        size=size_in(path, data),
+        detector=_detector(data),
+    )
 
 
 def _is_by_frame(data: Any) -> bool:
@@ -170,12 +183,24 @@ def _read_by_frame(path: Path, data: Any) -> Listed:
         parts=_parts(data),
         row_first=True,
         size=size_in(path, data),
+        detector=_detector(data) or "vitpose",
     )
 
 
 def _parts(data: Any) -> tuple[str, ...] | None:
     found = names_in(data)
     return None if found is None else tuple(found)
+
+
+def _detector(data: Any) -> str | None:
+    """The detector's name in a file's header."""
+    if not isinstance(data, dict):
+        return None
+    for key in ("meta_info", "dataset_meta", "metadata", "meta", "info"):
+        if (found := _detector(data.get(key))) is not None:
+            return found
+    value = data.get("detector", data.get("dataset_name"))
+    return value if isinstance(value, str) else None
 
 
 def _has(*keys: str) -> Callable[[Any], bool]:
@@ -229,6 +254,7 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
         [str(k) for k in range(points.shape[1])],
         parts=_parts(header),
         size=size_in(path, header),
+        detector=_detector(header),
     )
 
 

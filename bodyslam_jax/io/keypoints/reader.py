@@ -13,6 +13,7 @@ import numpy as np
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
+from bodyslam_jax.io.keypoints.detector import UNKNOWN, definition_of
 from bodyslam_jax.io.keypoints.files import read_json, read_npz, read_openpose
 from bodyslam_jax.io.keypoints.turned import turned_back
 
@@ -33,6 +34,9 @@ class Detected:
     person: list[np.ndarray] | None = None
     """For each frame the numbers (n,) of its `n` people, the same for the same person;
     `None` if the file does not track people."""
+    definition: str = UNKNOWN
+    """What the detector calls a hip or a knee: a name in
+    `body.KEYPOINT_DEFINITIONS`."""
 
 
 def read_detections(
@@ -87,7 +91,12 @@ def read_detections(
     points = [np.array([p for p, _ in f]).reshape(-1, 25, 3) for f in by_frame]
     person = [np.array([who for _, who in f], dtype=np.int64) for f in by_frame]
     person = _checked(person, warn)
-    return _to_pixels(path, points, person, (width, height), listed.size, warn)
+    found = _to_pixels(path, points, person, (width, height), listed.size, warn)
+    counts = {len(points) for _, points, _ in listed.rows}
+    count = counts.pop() if len(counts) == 1 else 0
+    every = np.concatenate([np.zeros((0, 25, 3)), *found.points])
+    definition = definition_of(every, count, listed.detector)
+    return dataclasses.replace(found, definition=definition)
 
 
 def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:

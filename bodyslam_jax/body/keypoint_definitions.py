@@ -1,0 +1,96 @@
+"""Where each detector puts its keypoints, relative to the joints of the default body.
+
+Every detector has its own definition of a hip or a knee, which its training images were
+annotated by. A definition is an offset of each keypoint of BODY_25, in the axes of the
+joint that the keypoint moves with (at rest x left, y up, z forward), as a share of the
+stature. It is what all frames of all people have in common; the rest of a person's
+offset is estimated (`people.skeleton`, `people.definitions`).
+
+How the offsets were calibrated, and on what: `benchmarks/keypoints.md`. They hold for
+the default body only; with another body model all of them are 0.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body.skeleton import KEYPOINT_NAMES
+
+_Offsets = dict[str, tuple[float, float, float]]
+"""By name without its side: out (away from the body's middle plane; to the left for a
+point on it), up, forward, in % of the stature."""
+
+_KNEE = (0.0, -1.3, -0.3)
+"""Detectors put knees 1.0 to 1.2 % of the stature below the default body's, and these
+are 1.5 % higher than people's: 0.300 of the stature over the sole, 0.285 by Drillis and
+Contini (1966). So this is the body's offset rather than a detector's."""
+_COCO: _Offsets = {
+    "eye": (-0.2, 0.4, -0.9),
+    "ear": (-0.8, -0.1, -0.2),
+    "nose": (0.0, 0.2, -1.0),
+    "neck": (0.0, -3.8, -0.4),
+    "mid_hip": (0.0, 0.5, 0.3),
+    "shoulder": (-1.3, -0.3, -0.5),
+    "elbow": (-0.5, 0.4, 0.8),
+    "wrist": (0.0, 0.4, 0.0),
+    "hip": (-1.0, 1.2, 0.9),
+    "knee": _KNEE,
+    "ankle": (0.0, 1.3, 0.6),
+}
+_FEET_OF_BLAZEPOSE: _Offsets = {
+    "big_toe": (2.9, 0.0, -3.7),
+    "heel": (0.0, 0.3, 2.0),
+}
+_MEDIAPIPE: _Offsets = {
+    "eye": (0.0, 0.3, -1.5),
+    "ear": (-0.8, 0.2, 0.8),
+    "nose": (0.0, 0.5, -1.2),
+    "neck": (0.0, -3.9, -0.1),
+    "mid_hip": (0.0, -1.5, 0.5),
+    "shoulder": (-0.8, -0.3, -0.1),
+    "elbow": (0.9, 1.0, 0.5),
+    "wrist": (1.4, -0.2, 0.2),
+    "hip": (-1.2, -0.7, 1.1),
+    "knee": _KNEE,
+    "ankle": (-0.4, 1.2, 1.1),
+    **_FEET_OF_BLAZEPOSE,
+}
+_OPENPOSE: _Offsets = {
+    "neck": (0.0, -3.8, 0.0),
+    "mid_hip": (0.0, -0.8, 0.5),
+    "shoulder": (-1.2, 0.3, -0.3),
+    "hip": (-0.9, 0.0, 0.9),
+    "knee": _KNEE,
+}
+"""Not measured: the mean of COCO's offsets here and of those in `DETECTOR_BIAS`."""
+
+_OFFSETS: dict[str, _Offsets] = {
+    "unknown": {},
+    "movenet-blazepose": {**_COCO, **_FEET_OF_BLAZEPOSE},
+    "coco": _COCO,
+    "mediapipe": _MEDIAPIPE,
+    "openpose": _OPENPOSE,
+    "halpe": _COCO,
+}
+KEYPOINT_DEFINITIONS: tuple[str, ...] = tuple(_OFFSETS)
+"""Names of the definitions. `unknown` has keypoints at the joints, as projected bodies
+have them."""
+
+
+def definition_offsets(definition: str) -> Float[np.ndarray, "25 3"]:
+    """From the joint or vertex of each keypoint of BODY_25 to where a detector puts it,
+    in the axes of the joint that it moves with, as a share of the stature.
+
+    **Raises:** `ValueError` for a name that is not in `KEYPOINT_DEFINITIONS`.
+    """
+    if definition not in _OFFSETS:
+        names = ", ".join(KEYPOINT_DEFINITIONS)
+        raise ValueError(
+            f"keypoint definition {definition!r}, expected one of {names}."
+        )
+    out = np.zeros((25, 3))
+    for k, name in enumerate(KEYPOINT_NAMES["body25"]):
+        side, _, part = name.partition("_")
+        sided = side in ("left", "right")
+        offset = _OFFSETS[definition].get(part if sided else name, (0.0, 0.0, 0.0))
+        out[k] = np.multiply(offset, [-1.0 if side == "right" else 1.0, 1.0, 1.0])
+    return out / 100
