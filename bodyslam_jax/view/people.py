@@ -180,7 +180,7 @@ def draw_people(
     drawn = image.copy()
     for triangle, shade in zip(triangles, shades, strict=True):
         cv2.fillConvexPoly(drawn, triangle, shade, cv2.LINE_8, 4)
-    return cv2.addWeighted(drawn, 0.8, image, 0.2, 0)
+    return cv2.addWeighted(drawn, 0.72, image, 0.28, 0)
 
 
 _LIGHT = np.array([-0.5, -0.62, -0.6])

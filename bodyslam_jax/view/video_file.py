@@ -16,7 +16,7 @@ import cv2
 from bodyslam_jax.view.style import Image
 
 Codec = Literal["VP8", "VP9", "H264"]
-_QUALITY = "27"
+_QUALITY = "24"
 """H.264's constant rate factor: smaller is better and larger; 18 to 28 is usual."""
 
 

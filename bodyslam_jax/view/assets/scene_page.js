@@ -19,6 +19,8 @@ function start() {
   const times = runs[0].times, last = times.length - 1;
   const state = { frame: 0, playing: false, speed: 1, ready: false };
 
+  const first = data[0], unit = first.metric ? "m" : "units";
+
   // ---- time
 
   function show(frame) {
@@ -106,7 +108,7 @@ function start() {
   for (const [name, text] of Object.entries(LAYERS)) {
     if (!group(name).some((g) => g.children.length)) continue;
     const on = !OFF_AT_FIRST.includes(name);
-    const words = name === "ground" ? `${text}, ${view.step} m` : text;
+    const words = name === "ground" ? `${text}, ${view.step} ${unit}` : text;
     addBox(name, words, on, null, (checked) => toggle(name, checked));
     toggle(name, on);
   }
@@ -143,7 +145,6 @@ function start() {
 
   // ---- what was found, in words
 
-  const first = data[0], unit = first.metric ? "m" : "units";
   element("name").textContent = first.name;
   if (first.status) {
     const badge = document.createElement("span");
