@@ -199,7 +199,7 @@ def _of_own_size(
     tracks = start[members], start[members] + span[members]
     buckets = [
         _fill(chunks, [members[group] for group in groups], width, frame, rows, begin)
-        for width, chunks, groups in _pack(*tracks, widths, num_chunks)
+        for width, chunks, groups in _pack(*tracks, widths, num_chunks) or ()
     ]
     if len(lasting):
         lasting = lasting[np.argsort(start[lasting], kind="stable")]

@@ -39,7 +39,7 @@ in proportion to the number of chunks and the square of the bandwidth."""
 
 def _size(chunks: int, narrow: int, wide: int) -> Size:
     wide = min(wide, chunks)
-    of_narrow, of_wide = 5 * chunks, -(-16 * chunks // wide) + 4
+    of_narrow, of_wide = 4 * chunks + 4, -(-12 * chunks // wide) + 4
     return Size(
         chunks=chunks,
         landmarks=LANDMARKS * chunks,

@@ -5,6 +5,8 @@ summed to a path, and the path is interpolated at the times of the frames.
 """
 
 import equinox as eqx
+import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -45,10 +47,20 @@ class Clock(eqx.Module):
             ticks = -(-2 * len(self.frame) // len(self.tick)) * frames // 2
         # Ticks that are added lie at the last of these frames, where nobody is present.
         more = ticks - len(self.frame)
-        frame = jnp.pad(self.frame, (0, more), constant_values=frames - 1)
-        between = jnp.pad(self.between, (0, more))
+        last = np.full(more, frames - 1, self.frame.dtype)
+        none = np.zeros(more, self.between.dtype)
+        joined = np.concatenate
+        if isinstance(self.frame, jax.core.Tracer):
+            joined = jnp.concatenate
         of_frames = lengthened((self.tick, self.beyond, self.steps), frames)
-        return Clock(frame, between, *of_frames, self.same)
+        return Clock(
+            frame=jnp.asarray(joined([self.frame, last])),
+            between=jnp.asarray(joined([self.between, none])),
+            tick=of_frames[0],
+            beyond=of_frames[1],
+            steps=of_frames[2],
+            same=self.same,
+        )
 
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
