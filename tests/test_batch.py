@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -10,11 +11,17 @@ from pathlib import Path
 import batch_stubs
 import pytest
 
-from bodyslam_jax import batch
+from bodyslam_jax import batch, simulation
 from bodyslam_jax.batch import Failure, failures, find_inputs, grid, run_many
 from bodyslam_jax.batch.engine import attempt
 from bodyslam_jax.batch.inputs import shard
-from bodyslam_jax.config import Config, Distribution, Experiment, with_options
+from bodyslam_jax.config import (
+    Config,
+    Distribution,
+    Experiment,
+    Simulation,
+    with_options,
+)
 from bodyslam_jax.experiments.command import run_experiment
 from bodyslam_jax.experiments.jobs import Job, Plan
 from bodyslam_jax.experiments.plans import PLANS
@@ -403,3 +410,29 @@ def test_rows_of_an_experiment_are_computed_by_an_engine(tmp_path, monkeypatch):
     (written,) = run_experiment("table1", tmp_path, *given)
     assert written == tmp_path / "1 rows"
     assert len(list((tmp_path / "rows").glob("*.json"))) == 1
+
+
+@pytest.mark.slow
+def test_real_clips_a_good_and_a_bad_one(tmp_path):
+    clips, out = tmp_path / "clips", tmp_path / "out"
+    settings = Simulation(sequence="M1", family="follow", length=40)
+    simulation.write_sequence(clips / "walk", simulation.simulate(settings))
+    shutil.copytree(clips / "walk", clips / "cut")
+    (clips / "cut" / "tracks.npz").write_bytes(b"PK cut off")
+
+    class Here(InProcess):
+        def map(self, function, items, setup):
+            yield from ((item, function(item)) for item in items)
+
+    config = Config(overlay=False, uncertainty=False)
+    found = {o.name: o for o in run_many(clips, config, Here(), out=out)}
+    assert found["walk"].status in ("ok", "doubtful")
+    assert found["walk"].result().joints.shape[1] == 40
+    assert found["cut"].status == "error" and "tracks.npz" in found["cut"].message
+    batch.collect(out)
+    with (out / "table.csv").open() as file:
+        rows = {row["clip"]: row for row in csv.DictReader(file)}
+    assert float(rows["walk"]["C-ATE, SE(3), mm"]) < 500
+    assert rows["cut"]["status"] == "error"
+    again = {o.name: o for o in run_many(clips, config, Here(), out=out)}
+    assert again["walk"].was_finished and again["cut"].status == "error"

@@ -218,3 +218,19 @@ def test_a_requeued_share_continues(tmp_path):
 def test_tasks_of_an_array_that_die_are_submitted_again(tmp_path):
     engine = SlurmEngine(tmp_path, 3, retries=1, cluster="local")
     _battery(engine, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not WITH_RAY, reason="needs ray")
+@pytest.mark.filterwarnings("ignore")
+def test_actors_that_die_are_restarted_by_ray_and_their_items_run_again(
+    tmp_path, monkeypatch
+):
+    from bodyslam_jax.batch.ray_engine import RayEngine
+
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([here, *sys.path]))
+    _battery(RayEngine(workers=2, retries=1), tmp_path)
+    engine = RayEngine(workers=1)
+    with pytest.raises(ValueError, match="JAX finds no GPU"):
+        list(engine.map(batch_stubs.twice, [1, 2], batch_stubs.refuse))

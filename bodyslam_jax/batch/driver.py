@@ -100,18 +100,21 @@ def run_jobs(
     """Outcomes of jobs: those that are finished first, the others as they finish."""
     missing = []
     folder = jobs[0].out.parent if jobs else None
+    listed = {line.get("name") for line in failures.read(folder)} if folder else set()
     for job in jobs:
         outcome = finished(job)
         if outcome is None:
             missing.append(job)
-        else:
-            yield outcome
+            continue
+        if outcome.is_failure and job.name not in listed:
+            failures.add(job.out.parent, outcome)
+        yield outcome
     if folder is None or not missing:
         return
     log.info("%d clips, %d of them done", len(jobs), len(jobs) - len(missing))
     failures.forget(folder, {job.name for job in missing})
     function = functools.partial(run_job, estimate=estimate)
-    with contextlib.closing(engine.map(function, missing, setup)) as values:  # pyright: ignore[reportArgumentType]
+    with contextlib.closing(engine.map(function, missing, setup)) as values:
         for job, value in values:
             if isinstance(value, Failure):
                 # Its process may have been lost after it had finished.

@@ -4,13 +4,15 @@ The function, the items and their values must pickle. An engine knows nothing of
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from bodyslam_jax.config import Distribution
 
 Setup = Callable[[], None]
 """Prepares a new process, once, before its first item."""
+Values = Generator[tuple[Any, Any], None, None]
+"""Items with their values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,10 +29,10 @@ class Engine(Protocol):
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
-    ) -> Iterator[tuple[Any, Any]]:
+    ) -> Values:
         """Yields each item with its value, or a `Failure`, as they finish.
 
-        Closing the iterator ends what is running.
+        Closing the generator ends what is running.
 
         **Raises:** `ValueError` if `setup` fails or the engine is not available.
         """

@@ -1,5 +1,6 @@
 """`sweep`: the joint estimate over a grid of weights, start scales and settings."""
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -46,14 +47,15 @@ def sweep(
     missing = [job for job in jobs if found[job.label] is None]
     log.info("%d problems, %d of them solved", len(jobs), len(jobs) - len(missing))
     failed = []
-    for job, value in engine.map(run_sweep, missing, setup):
-        if isinstance(value, Failure):
-            failed.append(f"{job.label}: {value.message}")
-            log.warning("%s", failed[-1])
-            continue
-        atomic.write_text(files[job.label], json.dumps(value))
-        found[job.label] = value
-        log.info("%s: %d points", job.label, len(value))
+    with contextlib.closing(engine.map(run_sweep, missing, setup)) as values:
+        for job, value in values:
+            if isinstance(value, Failure):
+                failed.append(f"{job.label}: {value.message}")
+                log.warning("%s", failed[-1])
+                continue
+            atomic.write_text(files[job.label], json.dumps(value))
+            found[job.label] = value
+            log.info("%s: %d points", job.label, len(value))
     rows = [row for job in jobs for row in found[job.label] or []]
     if not rows:
         raise ValueError(failed[0] if failed else f"{out}: nothing to solve.")

@@ -11,12 +11,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from bodyslam_jax.batch.devices import cores, gpus, memory
-from bodyslam_jax.batch.engine import Failure, Setup, attempt
+from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 
 MEMORY = 3 << 30
 """Memory that a process may need, bytes; measured in benchmarks/batch.md."""
@@ -35,7 +35,7 @@ class LocalEngine:
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
-    ) -> Iterator[tuple[Any, Any]]:
+    ) -> Values:
         """As `Engine.map`."""
         devices = gpus() if self.gpu else []
         most = len(devices) or max(1, min(len(cores()), memory() // MEMORY))

@@ -7,10 +7,10 @@ is lost is restarted by Ray where there is room; its item goes to the next free 
 import collections
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from bodyslam_jax.batch.engine import Failure, Setup, attempt
+from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 
 _READY = object()
 """Stands for an item where an actor is being prepared."""
@@ -30,7 +30,7 @@ class RayEngine:
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
-    ) -> Iterator[tuple[Any, Any]]:
+    ) -> Values:
         """As `Engine.map`."""
         ray = _import_ray()
         started = not ray.is_initialized()
@@ -53,7 +53,7 @@ class RayEngine:
         function: Callable[[Any], Any],
         items: Sequence[Any],
         setup: Setup,
-    ) -> Iterator[tuple[Any, Any]]:
+    ) -> Values:
         make = self._actor_class(ray)
         count = min(self.workers or _devices(ray, self.gpu), len(items))
         actors = [make.remote(function, setup) for _ in range(count)]

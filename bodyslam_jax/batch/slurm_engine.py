@@ -13,11 +13,11 @@ import pickle
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bodyslam_jax.batch.engine import Failure, Setup, attempt
+from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 
 log = logging.getLogger(__name__)
 TASKS = 16
@@ -45,7 +45,7 @@ class SlurmEngine:
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
-    ) -> Iterator[tuple[Any, Any]]:
+    ) -> Values:
         """As `Engine.map`."""
         todo = [(number, 0) for number in range(len(items))]
         home = Path(self.folder, ".slurm", uuid.uuid4().hex[:8])
@@ -81,7 +81,7 @@ class SlurmEngine:
         items: Sequence[Any],
         numbers: Sequence[int],
         setup: Setup,
-    ) -> Iterator[tuple[int, Any]]:
+    ) -> Generator[tuple[int, Any], None, None]:
         """Submits an array for these items; yields values by number, and `_LOST` for
         the item that a lost task was working on."""
         executor = self._executor(home)
