@@ -155,6 +155,7 @@ def _wait_longer_for_nodes() -> None:
     import ray._private.services as services
 
     os.environ.setdefault("RAY_worker_register_timeout_seconds", "600")
+    os.environ.setdefault("RAY_worker_niceness", "0")
     look = services.get_node
 
     def patient(*args):

@@ -9,7 +9,7 @@ import numpy as np
 from bodyslam_jax.batch.rows import ORDER
 from bodyslam_jax.batch.table import Column, Row
 
-_COLOURS = dict(
+_COLOURS: dict[str, str] = dict(
     zip(ORDER, ("#4c956c", "#e0a030", "#c4553b", "#7a3b2e", "#b0b0b0"), strict=True)
 )
 _NOT_DRAWN = ("frames", "people")

@@ -155,7 +155,7 @@ def share() -> None:
         caches.append(ProgramCache(path))
         return caches[-1], path
 
-    def on_compiled(event: str, seconds: float, **_: object) -> None:
+    def on_compiled(event: str, duration_secs: float, **_: str | int) -> None:
         if event == _COMPILED:
             for cache in caches:
                 cache.release()

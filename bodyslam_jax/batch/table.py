@@ -93,7 +93,11 @@ def to_latex(columns: Sequence[Column], rows: Sequence[Row]) -> str:
 def _medians(columns: Sequence[Column], rows: Sequence[Row]) -> list[str]:
     found = []
     for column in columns:
-        values = sorted(v for row in rows if _is_number(v := row.get(column.key)))
+        values: list[float] = sorted(
+            v
+            for row in rows
+            if _is_number(v := row.get(column.key))  # pyright: ignore
+        )
         if column.digits is None or not values:
             found.append("")
             continue
