@@ -52,15 +52,15 @@ def compilations():
 
 @pytest.mark.slow
 def test_a_second_clip_of_another_length_compiles_nothing_that_takes_long(
-    compilations, tmp_path
+    compilations,
 ):
-    """The whole flow: from measurements to a run folder and errors by the truth."""
+    """The whole flow: from measurements to a result and its errors."""
 
     def run(frames):
         compilations.clear()
         simulated = simulation.simulate(Simulation(sequence="M2", length=frames))
         sequence = simulation.as_sequence(simulated)
-        result = pipeline.run_to_folder(sequence, tmp_path / str(frames), Config())
+        result = pipeline.run(sequence, Config())
         evaluation.evaluate(result, simulation.as_truth(simulated))
         return max(compilations, key=lambda found: found[1])
 
