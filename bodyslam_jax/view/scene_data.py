@@ -159,7 +159,7 @@ def _person(result: Result, body: BodyModel, h: int) -> dict[str, Any]:
     }
 
 
-def _footprints(result: Result, h: int, stands: np.ndarray) -> list[list[float]]:
+def _footprints(result: Result, h: int, stands: np.ndarray) -> list[list[int | float]]:
     """First frame and place (x, z, m) of each stance of a foot."""
     found = []
     for foot, joint in enumerate(FEET):
