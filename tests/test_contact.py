@@ -10,13 +10,17 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
-from bodyslam_jax import initialisation, motion
+from bodyslam_jax import initialisation, motion, simulate_case
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import ContactTraining, GraphWeights
+from bodyslam_jax.evaluation.plausibility import posture_figures
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.stances import find_stances
+from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.contact_network import windows_within
+from bodyslam_jax.pipeline import joint_problem
+from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.simulation import sequences
 
 WALKS = str(sequences.ASSETS / "walking.npz")
@@ -175,3 +179,35 @@ def test_stances_are_where_the_network_finds_toes_standing():
     np.testing.assert_allclose(places[:, 1], 0.0, atol=1e-9)
     (none,) = find_stances(feet, there, 30.0, np.zeros_like(stands)[None])
     assert len(none) == 0
+
+
+@pytest.mark.slow
+def test_standing_feet_stop_sliding_and_nothing_else_changes():
+    """From a regressor's bodies: the speed of the lower foot falls, to the truth's."""
+    case = simulate_case("E2", frames=60, family="follow")
+    prepared = joint_problem.prepare(
+        case.sequence,
+        case.cameras,
+        case.bodies,
+        case.body,
+        case.config,
+        body_only_solve=False,
+    )
+    start = prepared.state
+    found = hold_standing_feet(
+        prepared, start, case.sequence, case.cameras, case.body, case.config
+    )
+    for name in ("scale", "cameras", "shapes", "landmarks", "intrinsics"):
+        assert eqx.tree_equal(getattr(found.state, name), getattr(start, name))
+    speed = lambda state: float(
+        posture_figures(
+            case.trajectories(state).joints[0],
+            case.truth.present[0],
+            jnp.asarray(mean_up(state, np.asarray(case.truth.present))),
+            case.truth.fps,
+        )["foot_speed"]
+    )
+    assert speed(found.state) < 0.2 < speed(start)
+    moved = found.state.roots[..., :3, 3] - start.roots[..., :3, 3]
+    assert float(jnp.abs(moved).max()) < 0.15
+    assert found.probability.shape == (1, 60, 4)

@@ -123,7 +123,7 @@ class ContactTraining:
     """Frames before and after the one that is judged."""
     width: tuple[int, ...] = (256, 128)
     """Units of the hidden layers."""
-    updates: int = 6000
+    updates: int = 4000
     """Steps of the optimiser."""
     segments: int = 64
     """Segments in a batch, each of another person, speed and noise level."""

@@ -12,8 +12,8 @@ model, so that its standing points move forward by κ = 3 % of the pelvis' displ
 Shape β̂ and scale ŝ are constants, those of the optimum without this factor: steps of
 estimated postures err by some per cent, all alike, and thousands of standing points
 would make people or world grow or shrink by as much (2 to 3 % where they are free).
-Default: `weights.contact_sigma` = 0.012 legs at 30 fps, twice the true slip because its
-error lasts; Cauchy. Ours.
+Default: `weights.contact_sigma` = 0.02 legs at 30 fps, four times the true slip, as it
+is correlated over a stance; Cauchy. Ours.
 """
 
 import jax
