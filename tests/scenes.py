@@ -213,7 +213,7 @@ def extra_factors(rng, state, seen=None):
         StillFeet(body=body, sigma=late(h, t, 4, skip=1)),
         g.FootContact(
             body=body,
-            shape=0.3 * normal(h, t, 10),
+            shape=0.3 * normal(h, 1, 10) + jnp.zeros((h, t, 1)),
             scale=jnp.full((h, t), 1.5),
             sigma=late(h, t, 4, skip=1),
         ),

@@ -20,7 +20,7 @@ from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.contact_network import windows_within
 from bodyslam_jax.pipeline import joint_problem
-from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
+from bodyslam_jax.pipeline.contact_stage import hold_standing_feet, stand_on_plane
 from bodyslam_jax.simulation import sequences
 
 WALKS = str(sequences.ASSETS / "walking.npz")
@@ -179,6 +179,32 @@ def test_stances_are_where_the_network_finds_toes_standing():
     np.testing.assert_allclose(places[:, 1], 0.0, atol=1e-9)
     (none,) = find_stances(feet, there, 30.0, np.zeros_like(stands)[None])
     assert len(none) == 0
+
+
+def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
+    state = scenes.truth(rng, frames=20, people=1, landmarks=4)
+    plane = jnp.array([0.0, -1.0, 0.0, 2.0])
+    sigma = jnp.full((1, 20), 0.3).at[0, 0].set(jnp.inf)
+    contact = g.GroundContact(scenes.body_model(), plane, sigma)
+    stands = np.ones((1, 20, 4))
+    stands[0, 5] = 0.0
+    height = lambda factor, state: np.asarray(
+        g.residual_of(eqx.tree_at(lambda f: f.sigma, factor, jnp.ones((1, 20))), state)
+    )[0, :, 0]
+    found = stand_on_plane(contact, state, stands, 30.0)
+    used = np.isfinite(np.asarray(found.sigma[0]))
+    assert not used[[0, 5]].any() and used.sum() > 12
+    assert abs(np.median(height(found, state)[used])) < 0.02
+    # Feet of half of the frames are a step higher: the plane has less weight.
+    C_CW = jnp.swapaxes(state.cameras[:, :3, :3], 1, 2)
+    raised = 0.4 * (np.arange(20) % 2)
+    up = jnp.asarray(raised)[:, None] * (C_CW @ plane[:3])
+    stairs = eqx.tree_at(lambda s: s.roots, state, state.roots.at[0, :, :3, 3].add(up))
+    rough = stand_on_plane(contact, stairs, stands, 30.0)
+    weight = lambda f: float((np.asarray(f.sigma) ** -2.0).sum())
+    assert weight(rough) < 0.2 * weight(found)
+    nobody = stand_on_plane(contact, state, 0 * stands, 30.0)
+    assert eqx.tree_equal(nobody, contact)
 
 
 @pytest.mark.slow

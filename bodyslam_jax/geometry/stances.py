@@ -48,9 +48,9 @@ def find_stances(
     stands by `standing_feet`.
     """
     if standing is None:
-        standing = np.stack(
-            [_standing(*one, fps) for one in zip(feet, present, strict=True)]
-        ).reshape(*feet.shape[:3])
+        standing = np.zeros(feet.shape[:3], bool)
+        for h, one in enumerate(present):
+            standing[h] = _standing(feet[h], one, fps)
     frames = max(2, _SHORTEST_STANCE * fps)
     return [
         _stances(f, s & p[:, None], frames)

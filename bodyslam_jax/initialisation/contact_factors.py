@@ -29,7 +29,7 @@ def contact_factor(
     """
     assert weights.contact_sigma is not None
     both = probability * _before(probability)
-    both = both * jnp.asarray(present & np.asarray(_before(present)))[..., None]
+    both = jnp.where((present & np.asarray(_before(present)))[..., None], both, 0.0)
     leg = motion.leg_length(body, state.shapes)[:, None, None]
     sigma = weights.contact_sigma * np.sqrt(30.0 / fps) * leg
     stands = both > _LEAST
