@@ -2,7 +2,8 @@
 
 Which points of the feet stand is read from the postures of the joint estimate
 (`motion.contact_network`). Then people's roots and poses are estimated once more with
-the same factors and the one of standing points (`graph.FootContact`). Cameras, map,
+the same factors, the one of standing points (`graph.FootContact`), and a larger weight
+of their height over the map's plane. Cameras, map,
 scale and shapes are constants: thousands of landmarks and the size of the person
 determine them, and steps would stretch them by the errors of postures. The problem has
 no landmarks, so that videos of about the same length share its program.
