@@ -23,7 +23,7 @@ from bodyslam_jax.pipeline.case import Case, truth_of
 from bodyslam_jax.pipeline.contact_stage import Standing, hold_standing_feet
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.joint_problem import Prepared
-from bodyslam_jax.pipeline.joint_stage import Uncertainty, as_estimate
+from bodyslam_jax.pipeline.joint_stage import Uncertainty, of_state
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 
@@ -49,7 +49,8 @@ def make_case(name: str, frames: int, keypoints: bool) -> Case:
 def figures(case: Case, prepared: Prepared, standing: Standing) -> dict[str, float]:
     """Errors (mm, degrees), speeds (m/s) and heights (mm) of a result."""
     unknown = Uncertainty(np.nan, np.full((len(standing.state.shapes), 10, 10), np.nan))
-    estimate = as_estimate(prepared, standing, unknown, "converged", ())
+    best, chance = standing.state, standing.probability
+    estimate = of_state(best, prepared, unknown, "converged", (), chance)
     result, _ = to_metric(case.sequence, case.config, case.body, case.cameras, estimate)
     found = evaluation.evaluate_trajectories(
         evaluation.Trajectories(
