@@ -309,6 +309,9 @@ class JointEstimate:
     """Of the solver, as in `solver.Solution.status`."""
     stages: tuple[dict, ...]
     """Costs, iterations and durations of each stage, for the summary."""
+    contacts: Float[np.ndarray, "h t 4"] | None = None
+    """Probability that left toe, left heel, right toe, right heel stand; `None` if it
+    was not estimated."""
 
 
 @dataclasses.dataclass(frozen=True)

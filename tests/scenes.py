@@ -211,6 +211,12 @@ def extra_factors(rng, state, seen=None):
             correlation=g.ar1_correlation(there, 0.9),
         ),
         StillFeet(body=body, sigma=late(h, t, 4, skip=1)),
+        g.FootContact(
+            body=body,
+            shape=0.3 * normal(h, 1, 10) + jnp.zeros((h, t, 1)),
+            scale=jnp.full((h, t), 1.5),
+            sigma=late(h, t, 4, skip=1),
+        ),
         g.UprightPrior(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
             body=body,

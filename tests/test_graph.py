@@ -203,6 +203,7 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
         g.HumanMotion,
         g.BodyPosePrior,
         g.GroundContact,
+        g.FootContact,
     }
 
 

@@ -113,3 +113,38 @@ class MotionTraining:
             mirror=False,
             sliding=False,
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactTraining:
+    """Training of the contact network."""
+
+    half: int = 8
+    """Frames before and after the one that is judged."""
+    width: tuple[int, ...] = (256, 128)
+    """Units of the hidden layers."""
+    updates: int = 4000
+    """Steps of the optimiser."""
+    segments: int = 64
+    """Segments in a batch, each of another person, speed and noise level."""
+    steps: int = 12
+    """Successive windows in a segment."""
+    learning_rate: float = 2e-3
+    """Adam's learning rate after warming up; it falls to 0 along a cosine."""
+    drift_deg: float = 10.0
+    """Largest standard deviation of the correlated error of joint angles, degrees."""
+    clean_share: float = 0.2
+    """Share of segments without correlated errors, 0 to 1."""
+    run_weight: float = 2.0
+    """Weight with which windows of running are drawn, relative to walking."""
+    other_weight: float = 0.3
+    """The same for all other motion."""
+    seed: int = 0
+    """Random seed."""
+
+    def __post_init__(self):
+        ranges = {"clean_share": SHARE, "seed": (-(2**63), 2**63 - 1)}
+        ranges |= dict.fromkeys(
+            ("drift_deg", "run_weight", "other_weight"), NOT_NEGATIVE
+        )
+        check(self, ranges)

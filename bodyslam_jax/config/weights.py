@@ -90,6 +90,10 @@ class GraphWeights:
     """Standard deviation of the pelvis' acceleration, m per squared frame of 1/30 s;
     not constrained without it. Real ones are 0.006; that tight, a camera that follows
     the person is estimated to move less and the world to be smaller."""
+    contact_sigma: float | None = 0.02
+    """Standard deviation of the displacement in a frame of 1/30 s of a toe or heel that
+    stands, in lengths of the person's leg: four times the true slip (0.005), which is
+    correlated over a stance. Without it, standing feet may slide."""
     ground_sigma: float | None = 0.04
     """Standard deviation of the height between the map's ground and the ground that
     people stand on, m: one error for the whole sequence. Without it, people need not
@@ -132,5 +136,6 @@ class GraphWeights:
             root_sigma=None,
             root_turning=None,
             root_smoothness=None,
+            contact_sigma=None,
             ground_sigma=None,
         )

@@ -17,6 +17,7 @@ from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.experiments.scoring import NAMES
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.pipeline.case import Case, trajectories
+from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 
 METHODS = {
@@ -46,7 +47,9 @@ def compare_methods(case: Case) -> dict[str, Any]:
     if not prepared.moving:
         raise ValueError(f"{case.name}: the camera does not move; nothing to compare.")
     solution, stage = solve_stage(prepared.problem, alone, case.config, "joint")
-    full = solution.state
+    full = hold_standing_feet(
+        prepared, solution.state, case.sequence, case.cameras, case.body, case.config
+    ).state
     fixed, bare = without_map(prepared.problem, alone, hold_cameras=True)
     moved, _ = solve_stage(fixed, bare, case.config, "scale only")
     raw = people.roots_from_bodies(case.bodies, case.body)

@@ -89,6 +89,7 @@ def find_upright(
     fps: float,
     fitted: Bool[np.ndarray, " h"],
     measured_up: Float[np.ndarray, " 3"] | None = None,
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
 ) -> Upright:
     """Up from all available cues, in a frame whose y axis is roughly up.
 
@@ -99,9 +100,10 @@ def find_upright(
         landmarks: points of the map, m; none where the camera did not move.
         fitted: whether a person's body was fitted to keypoints, not regressed.
         measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
+        standing: toes that stand; without it, by their speed (`find_stances`).
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
-    stances = find_stances(feet, present, fps)
+    stances = find_stances(feet, present, fps, standing)
     height = _height_of_camera(eyes, stances)
     planes = [feet_plane(stances, _SIZE * height)]
     planes.append(map_plane(landmarks, eyes, stances))

@@ -3,8 +3,6 @@
 A foot stands while its toe joint is slow. Positions are of toe joints, m.
 """
 
-import itertools
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -38,23 +36,47 @@ def standing_feet(
 
 
 def find_stances(
-    feet: Float[np.ndarray, "h t 2 3"], present: Bool[np.ndarray, "h t"], fps: float
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    fps: float,
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Stances of each person: the median position of the standing toe joint, one for
-    each stance, m, in a frame whose y axis is roughly up."""
-    return [_stances(*one, fps) for one in zip(feet, present, strict=True)]
+    each stance, m, in a frame whose y axis is roughly up.
+
+    `standing` are the toes that stand, if a contact network estimated them; else a foot
+    stands by `standing_feet`.
+    """
+    if standing is None:
+        standing = np.zeros(feet.shape[:3], bool)
+        for h, one in enumerate(present):
+            standing[h] = _standing(feet[h], one, fps)
+    frames = max(2, _SHORTEST_STANCE * fps)
+    return [
+        _stances(f, s & p[:, None], frames)
+        for f, s, p in zip(feet, standing, present, strict=True)
+    ]
 
 
-def _stances(feet, present, fps) -> Float[np.ndarray, "s 3"]:
-    found = []
+def _standing(feet, present, fps) -> Bool[np.ndarray, "t 2"]:
+    """By the speed of the lower foot, in each run of present frames."""
+    found = np.zeros(feet.shape[:2], bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
     for start, stop in edges.reshape(-1, 2):
         stands, lower = standing_feet(feet[start:stop], np.array([0.0, 1.0, 0.0]), fps)
-        place = feet[start + np.arange(stop - start), lower]
-        # A change of foot ends a stance too.
-        label = np.where(stands, 1 + lower, 0)
-        ends = np.flatnonzero(np.diff(label, prepend=0, append=0))
-        for a, b in itertools.pairwise(ends):
-            if label[a] and b - a >= max(2, _SHORTEST_STANCE * fps):
-                found.append(np.median(place[a:b], axis=0))
-    return np.array(found).reshape(-1, 3)
+        found[start + np.arange(stop - start), lower] = stands
+    return found
+
+
+def _stances(feet, standing, frames) -> Float[np.ndarray, "s 3"]:
+    """Median positions of both feet while they stand, in the order of time."""
+    found = []
+    for foot in range(2):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, foot], [0]])))
+        for start, stop in edges.reshape(-1, 2):
+            if stop - start >= frames:
+                place = np.median(feet[start:stop, foot], axis=0)
+                found.append((start, place))
+    return np.array([place for _, place in sorted(found, key=lambda s: s[0])]).reshape(
+        -1, 3
+    )

@@ -21,6 +21,7 @@ from bodyslam_jax.graph.factors.aspect_ratio_prior import (
 )
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior as BodyPosePrior
 from bodyslam_jax.graph.factors.camera_prior import CameraPrior as CameraPrior
+from bodyslam_jax.graph.factors.foot_contact import FootContact as FootContact
 from bodyslam_jax.graph.factors.ground_contact import HEELS_AND_TOES as HEELS_AND_TOES
 from bodyslam_jax.graph.factors.ground_contact import GroundContact as GroundContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion

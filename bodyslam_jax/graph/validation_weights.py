@@ -13,6 +13,7 @@ from bodyslam_jax.graph.factors.angular_acceleration_prior import (
     AngularAccelerationPrior,
 )
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
+from bodyslam_jax.graph.factors.foot_contact import FootContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
 from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.root_orientation import RootOrientation
@@ -30,6 +31,7 @@ _FIRST_FRAMES = (
     (RootOrientation, "correlation", 1, 0.0),
     (RootPositionPrior, "correlation", 1, 0.0),
     (RelativeOrientation, "sigma", 1, np.inf),
+    (FootContact, "sigma", 1, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
     (AngularAccelerationPrior, "sigma", 2, np.inf),
 )

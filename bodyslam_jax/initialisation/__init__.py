@@ -9,6 +9,9 @@ from bodyslam_jax.initialisation.carried_people import carried as carried
 from bodyslam_jax.initialisation.carried_people import (
     lines_of_carried as lines_of_carried,
 )
+from bodyslam_jax.initialisation.contact_factors import (
+    contact_factor as contact_factor,
+)
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,
 )

@@ -11,6 +11,10 @@ from bodyslam_jax.motion.capture.clips import split as split
 from bodyslam_jax.motion.capture.readers import read_motion as read_motion
 from bodyslam_jax.motion.capture.retarget import fit_shape as fit_shape
 from bodyslam_jax.motion.capture.retarget import place as place
+from bodyslam_jax.motion.contact_network import ContactModel as ContactModel
+from bodyslam_jax.motion.contact_network import predict_contact as predict_contact
+from bodyslam_jax.motion.contact_weights import load_contact_model as load_contact_model
+from bodyslam_jax.motion.contact_weights import save_contact_model as save_contact_model
 from bodyslam_jax.motion.continuation import Rollout as Rollout
 from bodyslam_jax.motion.continuation import rollout as rollout
 from bodyslam_jax.motion.network import Guess as Guess
@@ -23,11 +27,14 @@ from bodyslam_jax.motion.prediction import check_compatible as check_compatible
 from bodyslam_jax.motion.prediction import leg_length as leg_length
 from bodyslam_jax.motion.prediction import predict as predict
 from bodyslam_jax.motion.resampling import Clock as Clock
+from bodyslam_jax.motion.resampling import contact_between as contact_between
 from bodyslam_jax.motion.resampling import make_clock as make_clock
 from bodyslam_jax.motion.resampling import predict_between as predict_between
 from bodyslam_jax.motion.scale import Scale as Scale
 from bodyslam_jax.motion.scale import scale_from_motion as scale_from_motion
 from bodyslam_jax.motion.training.command import train_from_data as train_from_data
+from bodyslam_jax.motion.training.contact import train_contact as train_contact
+from bodyslam_jax.motion.training.contact_figures import judge_contact as judge_contact
 from bodyslam_jax.motion.training.evaluation import evaluate_model as evaluate_model
 from bodyslam_jax.motion.training.figures import compare as compare
 from bodyslam_jax.motion.training.figures import draw_errors as draw_errors

@@ -79,7 +79,7 @@ def sequence_windows(
     )
 
 
-Arrays = TypeVar("Arrays", MotionModel, BodyModel)
+Arrays = TypeVar("Arrays", bound=eqx.Module)
 
 
 def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.lengths import lengthened
+from bodyslam_jax.motion.contact_network import ContactModel, predict_contact
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
 
 
@@ -105,18 +106,8 @@ def predict_between(
         return predict(network, body, orientation, body_pose, shape, present)
     clock = clock.lengthened(len(body_pose))
     dtype = body_pose.dtype
-    between, beyond = clock.between.astype(dtype), clock.beyond.astype(dtype)
-    steps = clock.steps.astype(dtype)
-    following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
-
-    def at_ticks(angles: Array) -> Array:
-        share = between.reshape(-1, *(1,) * (angles.ndim - 1))
-        step = so3.between(angles[clock.frame], angles[following])
-        return so3.compose(angles[clock.frame], share * step)
-
-    C = so3.exp(at_ticks(so3.log(orientation)))
-    pose = at_ticks(body_pose)
-    at_tick = present[clock.frame] & (present[following] | (between == 0))
+    beyond, steps = clock.beyond.astype(dtype), clock.steps.astype(dtype)
+    C, pose, at_tick = _at_ticks(clock, orientation, body_pose, present)
     ticks = predict(network, body, C, pose, shape, at_tick)
 
     before = jnp.concatenate([C[:1], C[:-1]])
@@ -141,3 +132,44 @@ def predict_between(
         rotation=ticks.rotation[end] * steps[:, None],
         valid=valid,
     )
+
+
+def contact_between(
+    model: tuple[ContactModel, Clock],
+    body: BodyModel,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    shape: Float[Array, " 10"],
+    present: Bool[Array, " t"],
+) -> Float[Array, "t 4"]:
+    """`predict_contact` at the frames of a `Clock`, interpolated between ticks."""
+    network, clock = model
+    if clock.same:
+        return predict_contact(network, body, orientation, body_pose, shape, present)
+    clock = clock.lengthened(len(body_pose))
+    C, pose, at_tick = _at_ticks(clock, orientation, body_pose, present)
+    ticks = predict_contact(network, body, C, pose, shape, at_tick)
+    last = jnp.minimum(clock.tick + 1, len(ticks) - 1)
+    beyond = clock.beyond.astype(ticks.dtype)[:, None]
+    found = ticks[clock.tick] + beyond * (ticks[last] - ticks[clock.tick])
+    return jnp.where(present[:, None], found, 0.0)
+
+
+def _at_ticks(
+    clock: Clock,
+    orientation: Float[Array, "t 3 3"],
+    body_pose: Float[Array, "t 23 3"],
+    present: Bool[Array, " t"],
+) -> tuple[Float[Array, "g 3 3"], Float[Array, "g 23 3"], Bool[Array, " g"]]:
+    """Orientations, postures and presence at the ticks of a clock."""
+    between = clock.between.astype(body_pose.dtype)
+    following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
+
+    def interpolated(angles: Array) -> Array:
+        share = between.reshape(-1, *(1,) * (angles.ndim - 1))
+        step = so3.between(angles[clock.frame], angles[following])
+        return so3.compose(angles[clock.frame], share * step)
+
+    C = so3.exp(interpolated(so3.log(orientation)))
+    at_tick = present[clock.frame] & (present[following] | (between == 0))
+    return C, interpolated(body_pose), at_tick

@@ -38,6 +38,8 @@ class Prepared:
     """Report entries of the solves made on the way."""
     warnings: tuple[str, ...] = ()
     """Lines for the report."""
+    passengers: tuple[int, ...] = ()
+    """People (rows) whom something carries."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +131,9 @@ def prepare(
             problem = problem.with_prediction({"body_pose": prediction.body_pose})
         problem = dataclasses.replace(problem, motion=None)
     warnings = initialisation.lines_of_carried(passengers)
-    return Prepared(problem, state, start, roots, moving, stages, warnings)
+    return Prepared(
+        problem, state, start, roots, moving, stages, warnings, tuple(passengers)
+    )
 
 
 def solve_body_only(

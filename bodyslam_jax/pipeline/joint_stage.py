@@ -1,4 +1,7 @@
-"""The joint estimate: cameras, people, map and scale in one problem (section 3.6)."""
+"""The joint estimate: cameras, people, map and scale in one problem (section 3.6).
+
+Then standing feet are held (`contact_stage.py`).
+"""
 
 import dataclasses
 
@@ -12,6 +15,7 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
 )
+from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
@@ -46,8 +50,14 @@ def estimate(
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
     best = solution.state
     uncertainty = estimate_uncertainty(sequence, cameras, prepared, best, body, config)
+    standing = hold_standing_feet(prepared, best, sequence, cameras, body, config)
     return of_state(
-        best, prepared, uncertainty, solution.status, (*prepared.stages, stage)
+        standing.state,
+        prepared,
+        uncertainty,
+        solution.status,
+        (*prepared.stages, stage, *standing.stages),
+        standing.probability,
     )
 
 
@@ -57,8 +67,10 @@ def of_state(
     uncertainty: Uncertainty,
     status: str,
     stages: tuple[dict, ...],
+    contacts: Float[np.ndarray, "h t 4"] | None = None,
 ) -> JointEstimate:
-    """The estimate that a state of the prepared problem is."""
+    """The estimate that a state of the prepared problem is, `contacts` those of the
+    contact stage."""
     return JointEstimate(
         scale=float(state.scale),
         start=prepared.scale,
@@ -77,6 +89,7 @@ def of_state(
         present=prepared.roots.present,
         status=status,
         stages=stages,
+        contacts=contacts,
     )
 
 

@@ -1,5 +1,7 @@
 """The motion model's predictions for the frames of one sequence."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -22,8 +24,19 @@ def motion_predictor(
     return graph.MotionPredictor(motion.predict_between, (model, clock), body, present)
 
 
-def predict(predictor: graph.MotionPredictor, state: graph.State) -> motion.Prediction:
-    """The motion model's prediction for the people of a state."""
+def contact_predictor(
+    sequence: Sequence, roots: PersonState, body: BodyModel
+) -> graph.MotionPredictor:
+    """The contact network, resampled to the times of the sequence's frames."""
+    model = motion.load_contact_model()
+    clock = motion.make_clock(sequence.timestamps, model.fps)
+    present = jnp.asarray(roots.present)
+    return graph.MotionPredictor(motion.contact_between, (model, clock), body, present)
+
+
+def predict(predictor: graph.MotionPredictor, state: graph.State) -> Any:
+    """The predictor's result for the people of a state: a `motion.Prediction` of the
+    motion model, or probabilities `h t 4` of the contact network."""
     # Landmarks have no part in it. Without them the program's shapes are those of the
     # people alone, so that maps of different sizes share one compilation.
     none = jnp.zeros((0, 3), state.landmarks.dtype)

@@ -16,6 +16,9 @@ from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
+_STANDS = 0.7
+"""Probability above which a toe is taken to stand, for gravity and the floor."""
+
 
 def to_metric(
     sequence: Sequence,
@@ -32,6 +35,7 @@ def to_metric(
     T_WC[:, :3, 3] *= joint.scale
     joints = _placed(sequence, config, body, joint, T_WC)[2]
     landmarks = joint.scale * joint.landmarks
+    standing = toes_standing(joint.contacts)
     turn, up = level(
         T_WC,
         T_WC @ joint.roots,
@@ -41,12 +45,15 @@ def to_metric(
         sequence.fps,
         people.without_bodies(sequence),
         config.gravity,
+        standing,
     )
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
     poses, trans, joints = _placed(sequence, config, body, joint, T_WC)
     if joint.present.any():
-        floor = floor_height(body, joint.shapes, joints, joint.present, sequence.fps)
+        floor = floor_height(
+            body, joint.shapes, joints, joint.present, sequence.fps, standing
+        )
         for points in (T_WC[:, :3, 3], trans, joints, landmarks):
             points[..., 1] -= floor
     result = Result(
@@ -97,18 +104,26 @@ def floor_height(
     joints: Float[np.ndarray, "h t 24 3"],
     present: Bool[np.ndarray, "h t"],
     fps: float,
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
 ) -> float:
     """Height of the floor under standing feet, m; if none stand, under the lowest.
 
     `joints` are in a world whose y axis is up, m.
     """
     sole = np.median([sole_height(body, shape) for shape in shapes])
-    stances = find_stances(joints[:, :, list(FEET)], present, fps)
+    stances = find_stances(joints[:, :, list(FEET)], present, fps, standing)
     heights = np.concatenate([places[:, 1] for places in stances])
     if len(heights):
         return float(np.median(heights) - sole)
     lowest = joints[present][:, list(FEET), 1].min(axis=1)
     return float(np.quantile(lowest, 0.05) - sole)
+
+
+def toes_standing(
+    contacts: Float[np.ndarray, "h t 4"] | None,
+) -> Bool[np.ndarray, "h t 2"] | None:
+    """Left and right toes that stand, by the contact network's probabilities."""
+    return None if contacts is None else contacts[..., ::2] > _STANDS
 
 
 def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
@@ -141,6 +156,7 @@ def level(
     fps: float,
     fitted: Bool[np.ndarray, " h"],
     gravity: tuple[float, ...] = (),
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
     """The rigid motion to a world whose y axis is up, and the cues it is based on.
 
@@ -164,6 +180,7 @@ def level(
         fps,
         fitted,
         np.array([0.0, 1.0, 0.0]) if gravity else None,
+        standing,
     )
     return upright(rough @ T_WC, found.up) @ rough, found
 

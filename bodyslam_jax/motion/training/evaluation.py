@@ -94,7 +94,7 @@ def run_trials(
     estimated = poses
     if drift_deg > 0:
         estimated = np.asarray(
-            _disturbed(
+            disturbed(
                 jnp.asarray(poses),
                 jax.random.split(jax.random.key(seed), len(trials)),
                 jnp.deg2rad(jnp.float32(drift_deg)),
@@ -118,7 +118,7 @@ def run_trials(
 
 
 @jax.jit
-def _disturbed(poses, keys, sigma, white, root):
+def disturbed(poses, keys, sigma, white, root):
     noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
     return disturb(poses, noise.at[:, :, 0].multiply(root))
 

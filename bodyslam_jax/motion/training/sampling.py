@@ -133,9 +133,9 @@ def draw(
     frames = jnp.minimum(frames, data.last[row, None])
     poses, path = data.poses[frames], data.path[frames]
     if settings.mirror:
-        poses, path = _mirrored(jax.random.bernoulli(keys[2], 0.5, (s,)), poses, path)
+        poses, path = mirrored(jax.random.bernoulli(keys[2], 0.5, (s,)), poses, path)
     shape = settings.shape_sigma * jax.random.normal(keys[3], (s, 10), jnp.float32)
-    noise = _errors(keys[4:8], s, past + l, settings)
+    noise = posture_errors(keys[4:8], s, past + l, settings)
     estimated = disturb(poses, noise)
 
     true = so3.exp(poses[:, :, 0])
@@ -174,7 +174,7 @@ def _windows(rotation, joints, body_pose, past):
     )
 
 
-def _mirrored(
+def mirrored(
     which: Bool[Array, " s"],
     poses: Float[Array, "s f 24 3"],
     path: Float[Array, "s f 3"],
@@ -190,7 +190,7 @@ def _mirrored(
     )
 
 
-def _errors(
+def posture_errors(
     keys: Key[Array, " 4"], s: int, frames: int, settings: MotionTraining
 ) -> Float[Array, "s f 24 3"]:
     """Errors of joint angles for `s` segments, rad.

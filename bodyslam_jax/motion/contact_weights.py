@@ -1,0 +1,69 @@
+"""The contact network in one `.npz`: a JSON header, then plain arrays.
+
+Layers are kept in float16, in half the space; read without pickle.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from zipfile import BadZipFile
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax.io import atomic
+from bodyslam_jax.motion.contact_network import ContactModel
+
+_FORMAT = "bodyslam-contact-1"
+_SHIPPED = Path(__file__).parent / "assets" / "contact.npz"
+
+
+def save_contact_model(path: Path | str, model: ContactModel) -> None:
+    """Writes a model atomically."""
+    path = Path(path)
+    header = {
+        "format": _FORMAT,
+        "width": [layer.weight.shape[1] for layer in model.layers[:-1]],
+        "half": model.half,
+        "body": model.body,
+        "fps": model.fps,
+        "about": json.loads(model.about),
+    }
+    kind = lambda x: np.float16 if x.ndim == 2 else np.float32
+    leaves = jax.tree.leaves(model)
+    arrays = {f"array_{i}": np.asarray(x, kind(x)) for i, x in enumerate(leaves)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_npz(path, {"header": np.array(json.dumps(header)), **arrays})
+
+
+def load_contact_model(path: Path | str | None = None) -> ContactModel:
+    """Reads a contact network (float32); without a path, the one that ships.
+
+    **Raises:** `FileNotFoundError`; `ValueError` if the file holds none.
+    """
+    path = _SHIPPED if path is None else Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such contact network.")
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
+        if header.get("format") != _FORMAT:
+            raise ValueError(f"format {header.get('format')!r}, expected {_FORMAT!r}")
+        half, width = int(header["half"]), tuple(header["width"])
+        init = lambda key: ContactModel.init(
+            key, header["body"], float(header["fps"]), half, width
+        )
+        like = eqx.filter_eval_shape(init, jax.random.key(0))
+        expected = [leaf.shape for leaf in jax.tree.leaves(like)]
+        if expected != [array.shape for array in arrays]:
+            raise ValueError("arrays do not fit the header's sizes")
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise ValueError("NaN or infinite weights")
+    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path}: not a contact network ({error}).") from None
+    leaves = [jnp.asarray(array, jnp.float32) for array in arrays]
+    model = jax.tree.unflatten(jax.tree.structure(like), leaves)
+    return dataclasses.replace(model, about=json.dumps(header["about"]))

@@ -1,0 +1,204 @@
+"""Training of the contact network on motion capture.
+
+Postures get the errors that the motion model is trained with (`noise.py`), bodies are
+of random shape. Labels are those of the exact motion on the subject's own shape.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bodyslam_jax.body import BodyModel, keypoints, local_joints, rest_joints
+from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
+from bodyslam_jax.config import ContactTraining, MotionTraining
+from bodyslam_jax.geometry import so3
+from bodyslam_jax.motion.capture.clips import FPS, Clip, interleave, padded, resample
+from bodyslam_jax.motion.capture.contact_labels import standing_points
+from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.contact_network import (
+    ContactModel,
+    contact_features,
+)
+from bodyslam_jax.motion.network import normalisation
+from bodyslam_jax.motion.prediction import in_dtype, leg_length
+from bodyslam_jax.motion.training.noise import disturb
+from bodyslam_jax.motion.training.sampling import DENSE, mirrored, posture_errors
+
+_FEET = np.array(BODY25_TOES_AND_HEELS)
+_MEASURED = 16
+"""Batches from which means and standard deviations are taken."""
+
+
+class ContactCorpus(eqx.Module):
+    """All training frames, and where a segment may begin."""
+
+    poses: Float[Array, "n 24 3"]
+    stands: Float[Array, "n 4"]
+    """1 where a point stands, else 0."""
+    start: Int[Array, " c"]
+    last: Int[Array, " c"]
+    """Last frame of the clip that a candidate belongs to."""
+    cumulative: Float[Array, " c"]
+    """Cumulative distribution over the candidates."""
+
+
+def foot_points(body: BodyModel, trial: Trial) -> Float[np.ndarray, "t 4 3"]:
+    """Heels and toes of a captured motion on the body model, in leg lengths."""
+    shape = np.asarray(trial.shape)
+    origin = np.asarray(rest_joints(body, jnp.asarray(shape)))[0]
+    wide = lambda poses, trans: keypoints(
+        body,
+        poses.reshape(-1, 72),
+        jnp.broadcast_to(jnp.asarray(shape, poses.dtype), (len(poses), 10)),
+        trans - jnp.asarray(origin, trans.dtype),
+    )
+    dtype = body.template.dtype
+    points = padded(
+        wide, trial.clip.poses.astype(dtype), np.asarray(trial.trans).astype(dtype)
+    )
+    return points[:, _FEET] / float(leg_length(body, jnp.asarray(shape, dtype)))
+
+
+def contact_corpus(
+    clips: Sequence[Clip], body: BodyModel, settings: ContactTraining
+) -> ContactCorpus:
+    """Gathers clips, at `DENSE` times the model's rate, with their labels."""
+    share = {"walk": 1.0, "run": settings.run_weight}
+    dense = resample(interleave(list(clips)), FPS * DENSE)
+    span = DENSE * (2 * settings.half + settings.steps)
+    poses, stands, starts, lasts, weights, offset = [], [], [], [], [], 0
+    for trial in place(body, dense):
+        t = len(trial.trans)
+        points = foot_points(body, trial)
+        poses.append(trial.clip.poses)
+        stands.append(standing_points(points, trial.clip.fps))
+        first = np.arange(0, max(t - span, 1)) + offset
+        starts.append(first)
+        lasts.append(np.full(len(first), offset + t - 1))
+        weight = share.get(trial.clip.motion, settings.other_weight)
+        weights.append(np.full(len(first), weight))
+        offset += t
+    weight = np.concatenate(weights)
+    return ContactCorpus(
+        poses=jnp.asarray(np.concatenate(poses), jnp.float32),
+        stands=jnp.asarray(np.concatenate(stands), jnp.float32),
+        start=jnp.asarray(np.concatenate(starts), jnp.int32),
+        last=jnp.asarray(np.concatenate(lasts), jnp.int32),
+        cumulative=jnp.asarray(np.cumsum(weight) / weight.sum(), jnp.float32),
+    )
+
+
+def draw_contacts(
+    key: PRNGKeyArray, data: ContactCorpus, body: BodyModel, settings: ContactTraining
+) -> tuple[Float[Array, "s l d"], Float[Array, "s l 4"], Float[Array, "s l"]]:
+    """Features, labels and weights of `s` segments of `l` windows."""
+    s, l, half = settings.segments, settings.steps, settings.half
+    noise = MotionTraining(
+        drift_deg=settings.drift_deg, clean_share=settings.clean_share
+    )
+    keys = jax.random.split(key, 10)
+    at = jax.random.uniform(keys[0], (s,), jnp.float32)
+    row = jnp.minimum(jnp.searchsorted(data.cumulative, at), len(data.start) - 1)
+    strides = jnp.asarray(noise.strides, jnp.int32)
+    stride = strides[jax.random.randint(keys[1], (s,), 0, len(strides))]
+    count = jnp.arange(2 * half + l, dtype=jnp.int32)
+    frames = data.start[row, None] + stride[:, None] * count
+    inside = frames <= data.last[row, None]
+    frames = jnp.minimum(frames, data.last[row, None])
+    poses, stands = data.poses[frames], data.stands[frames]
+    flip = jax.random.bernoulli(keys[2], 0.5, (s,))
+    poses, _ = mirrored(flip, poses, jnp.zeros((*poses.shape[:2], 3), poses.dtype))
+    swapped = stands[..., np.array([2, 3, 0, 1])]
+    stands = jnp.where(flip[:, None, None], swapped, stands)
+    shape = noise.shape_sigma * jax.random.normal(keys[3], (s, 10), jnp.float32)
+    errors = posture_errors(keys[4:8], s, len(count), noise)
+    seen = disturb(poses, errors)
+    joints = local_joints(body, seen[:, :, 1:], shape[:, None])
+    joints = joints / leg_length(body, shape)[:, None, None, None]
+    rows = np.arange(l)[:, None] + np.arange(2 * half + 1)
+    rows = jnp.broadcast_to(jnp.asarray(rows, jnp.int32), (s, l, 2 * half + 1))
+    # Some windows end early, as at the first and last frames of a person.
+    cut = jax.random.randint(keys[8], (s, l, 2), 0, 4 * half, jnp.int32)
+    cut = jnp.minimum(cut, half)
+    middle = rows[..., half]
+    low, high = middle - cut[..., 0], middle + cut[..., 1]
+    rows = jnp.clip(rows, low[..., None], high[..., None])
+    features = jax.vmap(contact_features)(so3.exp(seen[:, :, 0]), joints, rows)
+    return (
+        features,
+        stands[:, half : half + l],
+        inside[:, 2 * half :].astype(seen.dtype),
+    )
+
+
+def _loss(model: ContactModel, batch) -> Float[Array, ""]:
+    features, stands, weight = batch
+    logits = model.logits(features)
+    entropy = optax.sigmoid_binary_cross_entropy(logits, stands).mean(-1)
+    return jnp.sum(weight * entropy) / jnp.sum(weight)
+
+
+def train_contact(
+    clips: Sequence[Clip],
+    body: BodyModel,
+    settings: ContactTraining = ContactTraining(),
+    report=None,
+) -> ContactModel:
+    """A contact network for this body, trained on captured motion.
+
+    Takes some minutes on one processor; `report(step, loss)` is called now and then.
+    Clips are trained on as they are given: hold subjects out by `split`.
+    """
+    body32 = in_dtype(body, jnp.float32)
+    data = contact_corpus(clips, body, settings)
+    key = jax.random.key(settings.seed)
+    model = ContactModel.init(key, body.kind, FPS, settings.half, settings.width)
+    sample = eqx.filter_jit(draw_contacts)
+    samples = [
+        np.asarray(sample(jax.random.fold_in(key, i), data, body32, settings)[0])
+        for i in range(_MEASURED)
+    ]
+    flat = np.concatenate(samples).reshape(-1, samples[0].shape[-1])
+    model = eqx.tree_at(lambda m: m.inputs, model, normalisation(flat))
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, settings.learning_rate, 100, settings.updates
+    )
+    update = optax.adamw(rate, weight_decay=1e-3)
+    state = update.init(model.layers)
+
+    @eqx.filter_jit
+    def run(layers, state, average, first, data, body32, inputs):
+        def step(carry, number):
+            layers, state, average = carry
+            one = jax.random.fold_in(jax.random.fold_in(key, 7), number)
+            batch = draw_contacts(one, data, body32, settings)
+            given = eqx.tree_at(lambda m: m.inputs, model, inputs)
+            of = lambda x: _loss(eqx.tree_at(lambda m: m.layers, given, x), batch)
+            value, gradient = jax.value_and_grad(of)(layers)
+            with jax.numpy_dtype_promotion("standard"):
+                change, state = update.update(gradient, state, layers)
+            layers = optax.apply_updates(layers, change)
+            mix = lambda a, b: 0.998 * a + 0.002 * b
+            return (layers, state, jax.tree.map(mix, average, layers)), value
+
+        return jax.lax.scan(
+            step, (layers, state, average), first + jnp.arange(_CHUNK, dtype=jnp.int32)
+        )
+
+    layers, average = model.layers, model.layers
+    for first in range(0, settings.updates, _CHUNK):
+        (layers, state, average), values = run(
+            layers, state, average, jnp.int32(first), data, body32, model.inputs
+        )
+        if report is not None:
+            report(first + _CHUNK, float(values.mean()))
+    return eqx.tree_at(lambda m: m.layers, model, average)
+
+
+_CHUNK = 100
+"""Updates between two reports."""
