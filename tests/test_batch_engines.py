@@ -215,7 +215,9 @@ def test_a_requeued_share_continues(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not WITH_SLURM, reason="needs submitit")
-def test_tasks_of_an_array_that_die_are_submitted_again(tmp_path):
+def test_tasks_of_an_array_that_die_are_submitted_again(tmp_path, monkeypatch):
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([here, *sys.path]))
     engine = SlurmEngine(tmp_path, 3, retries=1, cluster="local")
     _battery(engine, tmp_path)
 
