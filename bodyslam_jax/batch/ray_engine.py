@@ -128,7 +128,7 @@ def _import_ray() -> Any:
     # No report about this machine is sent to Ray's makers, unless asked for.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError(
             "--engine ray: Ray is not installed; pip install 'bodyslam-jax[ray]'."

@@ -215,7 +215,7 @@ def _raise_setup_error(job: Any) -> None:
 
 def _import_submitit() -> Any:
     try:
-        import submitit
+        import submitit  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError(
             "--engine slurm: submitit is not installed; pip install "

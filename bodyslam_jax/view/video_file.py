@@ -75,7 +75,7 @@ def _opencv(path: Path, size: tuple[int, int], fps: float, codec: Codec) -> Iter
 
 @contextlib.contextmanager
 def _h264(path: Path, size: tuple[int, int], fps: float, _: Codec) -> Iterator:
-    import av
+    import av  # pyright: ignore[reportMissingImports]
 
     options = {"movflags": "+faststart"}
     with av.open(str(path), "w", container_options=options) as container:
