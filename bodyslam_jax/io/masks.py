@@ -117,7 +117,7 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
             f"{path}: `{name}` {stack.dtype}{stack.shape}, expected numbers (frames, "
             "height, width) or (frames, people, height, width)."
         )
-    found = stack > (0 if stack.dtype.kind in "bu" else 0.5)
+    found = np.asarray(stack > (0 if stack.dtype.kind in "bu" else 0.5))
     return found.any(axis=1) if found.ndim == 4 else found
 
 
