@@ -118,7 +118,7 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
             "height, width) or (frames, people, height, width)."
         )
     found = np.asarray(stack > (0 if stack.dtype.kind in "bu" else 0.5))
-    return found.any(axis=1) if found.ndim == 4 else found
+    return np.asarray(found.any(axis=1)) if found.ndim == 4 else found
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
