@@ -13,6 +13,7 @@ from typing import Any, Literal
 from bodyslam_jax.batch import record
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.config import Config
+from bodyslam_jax.io.error_line import error_line
 
 log = logging.getLogger(__name__)
 Status = Literal["ok", "doubtful", "failed", "error"]
@@ -108,7 +109,7 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
                 log.error("%s", traceback.format_exc())
                 raise
     except Exception as error:
-        outcome = failure(job, _one_line(error))
+        outcome = failure(job, error_line(error))
     return dataclasses.replace(
         outcome,
         seconds=0.0 if outcome.was_finished else round(time.monotonic() - start, 2),
@@ -206,12 +207,3 @@ class _logged:
     def __exit__(self, *_: object) -> None:
         logging.getLogger("bodyslam_jax").removeHandler(self.handler)
         self.handler.close()
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'file'}: {error.strerror}."
-    text = " ".join(str(error).split())
-    if isinstance(error, (OSError, ValueError)) and text:
-        return text
-    return f"{type(error).__name__}: {text[:300]}"

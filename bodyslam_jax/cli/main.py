@@ -49,15 +49,17 @@ def main() -> NoReturn:
         print(f"bodyslam: {error}", file=sys.stderr)
         sys.exit(2)
     except Exception as error:
+        from bodyslam_jax.io.error_line import error_line
+
         if interrupts.arrived():
             _leave_interrupted()
         if os.environ.get("BODYSLAM_DEBUG"):
             raise
         if isinstance(error, (OSError, ValueError)):
-            sys.exit(f"bodyslam: {_one_line(error)}")
+            sys.exit(f"bodyslam: {error_line(error)}")
         # Memory, the linear algebra library, a bug: no fault of the input.
         print(
-            f"bodyslam: failed: {_one_line(error)}; run it with BODYSLAM_DEBUG=1 for "
+            f"bodyslam: failed: {error_line(error)}; run it with BODYSLAM_DEBUG=1 for "
             "the traceback",
             file=sys.stderr,
         )
@@ -150,12 +152,3 @@ def _check_options(name: str, argv: list[str]) -> None:
 def _leave_interrupted() -> NoReturn:
     print("bodyslam: interrupted; the same command continues it", file=sys.stderr)
     sys.exit(interrupts.EXIT_CODE)
-
-
-def _one_line(error: BaseException) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'file'}: {error.strerror}."
-    text = " ".join(str(error).split())
-    if isinstance(error, (OSError, ValueError)) and text:
-        return text
-    return f"{type(error).__name__}: {text[:300]}"
