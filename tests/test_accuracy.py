@@ -66,6 +66,7 @@ def _cameras(kind: str = "moving") -> SfmResult:
     )
 
 
+@pytest.mark.slow
 def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
     found = before_after.errors(result, _cameras(), truth, BODY)

@@ -21,6 +21,7 @@ from bodyslam_jax.solver.blocks import Linearisation
 from bodyslam_jax.solver.padding import pad
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["body25", "coco17", "halpe26"])
 def test_joints_that_turn_keypoints_are_those_with_a_derivative(layout):
     rng = np.random.default_rng(0)
@@ -97,6 +98,7 @@ def test_chains_of_single_joints_are_solved_exactly():
     np.testing.assert_allclose(by_joint(step), expected[..., 0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_limbs_are_what_factors_see_together():
     rng = np.random.default_rng(0)
     state = scenes.truth(rng, frames=4, people=1, landmarks=8)
@@ -114,6 +116,7 @@ def test_limbs_are_what_factors_see_together():
     assert g.limbs_of([f for f in factors if f.per_joint]) == ()
 
 
+@pytest.mark.slow
 def test_factors_put_in_later_that_see_more_joints_are_refused():
     problem, _, start = make(frames=12, people=1)
     bare = [f for f in problem.factors if not isinstance(f, g.KeypointReprojection)]

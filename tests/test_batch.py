@@ -229,6 +229,7 @@ print(count.count - before)
 """
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_compile_a_program_once(tmp_path):
     start = [sys.executable, "-c", _COMPILE, tmp_path]
     processes = [

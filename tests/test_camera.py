@@ -36,6 +36,7 @@ def test_projects_like_opencv_and_back(intrinsics):
     np.testing.assert_allclose(ray, p_C / p_C[:, 2:], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_keeps_its_dtype_and_broadcasts(dtype):
     intrinsics = jnp.asarray(DISTORTED, dtype)

@@ -88,6 +88,7 @@ def test_general_options_are_taken_from_any_place():
     PACKAGE.setLevel(level)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "typed, expected, refused",
     [

@@ -82,6 +82,7 @@ def test_the_network_reads_contacts_of_subjects_that_it_was_not_trained_on(walks
     assert abs(noisy["probability"] - noisy["share"]) < 0.1
 
 
+@pytest.mark.slow
 def test_contacts_depend_neither_on_heading_nor_on_world_nor_on_frame_rate(rng):
     model, body = motion.load_contact_model(), load_body_model()
     (clip, *_) = motion.read_motion(WALKS)
@@ -181,6 +182,7 @@ def test_stances_are_where_the_network_finds_toes_standing():
     assert len(none) == 0
 
 
+@pytest.mark.slow
 def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
     state = scenes.truth(rng, frames=20, people=1, landmarks=4)
     plane = jnp.array([0.0, -1.0, 0.0, 2.0])

@@ -114,6 +114,7 @@ def best_scale(state, place, weight):
     return (weight * path * place).sum() / (weight * path**2).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, trust",
     [
@@ -159,6 +160,7 @@ def test_a_problem_made_within_jit_is_the_same():
     np.testing.assert_allclose(found, best_scale(state, place, WEIGHT), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_factor_is_not_evaluated_in_added_frames():
     """Values and derivatives of all that it is made of are numbers."""
     state, _, free = made_up()

@@ -469,6 +469,7 @@ def test_people_are_told_apart():
     np.testing.assert_allclose(fit, true.joints, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_the_truth_lacks_is_nan_and_not_in_the_table():
     truth = _truth(num_frames=20)
     blind = dataclasses.replace(truth, summary={"has_camera": False})
@@ -505,6 +506,7 @@ def test_trajectories_and_results_do_not_mix():
         evaluation.evaluate(pair[0], truth)
 
 
+@pytest.mark.slow
 def test_a_piece_of_a_track_does_not_beat_the_whole():
     truth = _truth()
     rng = np.random.default_rng(1)
@@ -580,6 +582,7 @@ def test_poses_beyond_a_cut_are_not_compared():
         assert odd.located.all()
 
 
+@pytest.mark.slow
 def test_nothing_is_a_difference_across_missing_frames():
     truth = _truth()
     keep = np.r_[0:100, 140:NUM]
@@ -598,6 +601,7 @@ def test_nothing_is_a_difference_across_missing_frames():
     assert float(evaluation.evaluate(late, late)["jitter"]) < 1.1 * expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.1, 0.7, 1 / 3), (9.0, -70, 3)])
 @pytest.mark.parametrize(
     "dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)]

@@ -54,6 +54,7 @@ def test_batches_like_a_loop(key):
             np.testing.assert_allclose(a[i], b, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivative_is_that_of_finite_differences(key):
     target, source = _points(key)
     fit = lambda *args: _fit(*map(jnp.asarray, args))
@@ -64,6 +65,7 @@ _jacobian = jax.jit(jax.jacrev(_fit, (0, 1)))
 _LINE = jnp.arange(12.0)[:, None] * jnp.array([1.0, 2.0, -1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "target, source",
     [
@@ -106,6 +108,7 @@ def _scene(key):
     return cameras, human, move
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alignment", ["A1", "A2", "A3", "A4"])
 def test_every_alignment_undoes_a_change_of_world(key, alignment):
     cameras, human, move = _scene(key)
@@ -118,6 +121,7 @@ def test_every_alignment_undoes_a_change_of_world(key, alignment):
     np.testing.assert_allclose(person.apply(moved), human, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_alignments_differ_where_the_appendix_says_so(key):
     """The person alone is displaced: only A1 hides it; A3 shares it out."""
     cameras, human, _ = _scene(key)
@@ -133,6 +137,7 @@ def test_alignments_differ_where_the_appendix_says_so(key):
     assert 0.01 < errors["A3"] < 0.3
 
 
+@pytest.mark.slow
 def test_a4_takes_the_first_pose_that_counts(key):
     cameras, human, move = _scene(key)
     estimate = (move @ cameras).at[0].set(jnp.eye(4))

@@ -88,6 +88,7 @@ def test_gradients_of_stacked_errors_are_finite(stacked):
     assert all(np.isfinite(x).all() and np.any(x) for x in gradient)
 
 
+@pytest.mark.slow
 def test_another_length_is_not_compiled_again():
     evaluation.evaluate(*_pair(40, 2))
     traced = []

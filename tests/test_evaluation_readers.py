@@ -183,6 +183,7 @@ def test_a_place_between_two_frames_needs_both(tmp_path, body):
     assert np.all(abs(found.trans[found.present]) < 1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not WALK.exists(), reason="the shared example is not here")
 def test_the_rendered_example_is_its_own_truth(body):
     truth = read_groundtruth(WALK, body)

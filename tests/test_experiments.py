@@ -78,6 +78,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     np.testing.assert_allclose(states.scale[2] * 3, states.scale[1], rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_variants_leave_out_and_add_what_they_say(scene):
     problem, _, start = scene
     predictor = g.MotionPredictor(
@@ -435,6 +436,7 @@ def undrawn(monkeypatch):
         monkeypatch.setattr(figures, name, lambda *given: None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "text", ["null", "[]", "{}", '{"sequence": "E1-room"}', '{"a": ', "of M2"]

@@ -91,6 +91,7 @@ def test_difficulty_of_the_scenes_and_rows_of_the_plan(tmp_path):
     assert (hard.people, hard.hiding) == (2, True) and hard.readout > 0
 
 
+@pytest.mark.slow
 def test_tables_have_means_with_standard_errors(simulated, tmp_path):
     truth = simulation.as_truth(simulated)
     pair = evaluation.associate(truth, truth, load_body_model())

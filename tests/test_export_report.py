@@ -117,6 +117,7 @@ def test_opens_offline_and_runs_nothing(tmp_path, body):
     assert "var(--camera)" in page and "#0a0b0c" not in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "result",
     [_walk(), _walk(people=0), _walk(num=1), _walk(num=2), _walk(people=6)],

@@ -20,6 +20,7 @@ def sequence(tracks, factor: float, num: int) -> Sequence:
     return Sequence("a", None, np.arange(num) / 30, guess, tracks=tracks)
 
 
+@pytest.mark.slow
 def test_a_guess_off_by_a_fifth_is_corrected():
     """Where the camera goes round something; the standard deviation says how well."""
     tracks, truth = scene("orbit", num=NUM)

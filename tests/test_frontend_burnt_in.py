@@ -34,6 +34,7 @@ def with_text(tracks, num, share, rng, shown=None):
     ), first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sideways", "forward", "pan", "turn"])
 @pytest.mark.parametrize("share", [0.15, 0.55])
 def test_points_that_stay_at_their_pixel_are_left_out(kind, share):

@@ -34,6 +34,7 @@ def model_of(tracks, camera=CAMERA):
     return find_camera_model(tracks, camera, 60, Structure())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["sideways", pytest.param("orbit", marks=pytest.mark.slow)]
 )
@@ -75,6 +76,7 @@ def test_a_long_walk_is_no_zoom(name, family):
     assert camera_error(model.found.T_WC, walk.T_WC) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.75, 4 / 3])
 def test_pixels_that_are_not_square_are_seen_in_the_tracks(ratio):
     tracks, truth = scene("orbit", seed=3)
@@ -85,12 +87,14 @@ def test_pixels_that_are_not_square_are_seen_in_the_tracks(ratio):
     assert any("fx/fy" in text for text in model.warnings)
 
 
+@pytest.mark.slow
 def test_what_camera_json_says_of_the_pixels_is_doubted_aloud():
     tracks, _ = scene("orbit", seed=3)
     model = model_of(about_centre(tracks, np.array([0.75, 1.0])))
     assert any("fx/fy" in text for text in model.warnings)
 
 
+@pytest.mark.slow
 def test_a_fisheye_is_given_distortion():
     tracks, truth = scene("orbit", seed=3)
     r = np.linalg.norm((tracks.uv - CENTRE) / CAMERA.params[0], axis=-1)[:, None]
@@ -151,6 +155,7 @@ def with_traffic(tracks, count):
     )
 
 
+@pytest.mark.slow
 def test_traffic_is_warned_of_and_a_scene_alone_is_not():
     tracks, _ = scene("turn", seed=3)
     both = with_traffic(tracks, 120)
@@ -160,6 +165,7 @@ def test_traffic_is_warned_of_and_a_scene_alone_is_not():
     assert "move together" in (second_motion_warning(both, crowded, CAMERA) or "")
 
 
+@pytest.mark.slow
 def test_a_cut_within_one_scene_is_said():
     tracks, _ = scene("sideways", seed=3)
     # The same points are seen beyond the cut, as after it they are found again.

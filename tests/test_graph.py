@@ -27,6 +27,7 @@ def rng():
     return np.random.default_rng(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi, 3.2])
 def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
     start = angle * jnp.array([0.6, 0.0, 0.8])
@@ -39,6 +40,7 @@ def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
     check_grads(retract, (step,), order=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss",
     [g.Squared(), g.Cauchy(1.5), g.GemanMcClure(2.0), g.BlakeZisserman(3.5)],
@@ -71,6 +73,7 @@ def test_blake_zisserman_ignores_outliers(dtype):
     assert weight[4] == pytest.approx(0.5, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("c", [0.3, 1.5, 4.5, 9.0])
 def test_costs_of_small_errors_are_exact_in_single_precision(c):
     s = jnp.array([0, 1e-12, 1e-6, 1e-4, 0.1, 0.9999, 1.0, 1.1, 30.0, 3e38])
@@ -102,6 +105,7 @@ def test_keypoint_jacobian_is_that_of_the_keypoints(rng):
     assert jnp.allclose(found[2], by_shape, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_keypoint_curvature_is_the_second_derivative(rng):
     body = scenes.body_model()
     pose = jnp.asarray(0.4 * rng.standard_normal((23, 3)))
@@ -253,6 +257,7 @@ def test_posture_residual_of_correlated_errors_is_white(rng):
     assert abs(jnp.mean(whitened[0, 1:] * whitened[0, :-1])) < 0.01
 
 
+@pytest.mark.slow
 def test_a_missing_joint_does_not_affect_the_next_frame(rng):
     """Neither its placeholder nor, in derivatives, its infinite sigma does."""
     state = scenes.truth(rng, 4, 1, 2)
@@ -287,6 +292,7 @@ def test_correlation_is_zero_after_a_gap():
     assert g.ar1_correlation(there, 0.9).tolist() == [[0.0, 0.9, 0.0, 0.0, 0.9]]
 
 
+@pytest.mark.slow
 def test_motion_residual_is_linear_in_scale_and_invariant_to_the_world(rng):
     state = scenes.truth(rng, frames=4, people=1, landmarks=8)
     factor = scenes.person_factors(rng, state)[1]
@@ -304,6 +310,7 @@ def test_gauge_holds_seven_numbers(rng):
     assert not free[0].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize(
     "frames, landmarks, far", [(3, 5, 0), (47, 60, 0), (230, 400, 0), (230, 400, 20)]

@@ -52,6 +52,7 @@ def scene(factor: float = 1.0, tilt: float = 0.0, num: int = 40) -> Result:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 @pytest.mark.parametrize("factor", [1.0, 1.8, 0.6])
 def test_ground_scale_is_the_factor_by_which_the_map_is_too_small(factor, tilt):
@@ -98,6 +99,7 @@ def contact(state: graph.State, units: float = 1.0) -> graph.GroundContact:
     return graph.GroundContact(scenes.body_model(), plane, sigma)
 
 
+@pytest.mark.slow
 def test_the_scale_that_contact_asks_for_puts_the_feet_on_the_ground():
     state = scenes.truth(np.random.default_rng(2), frames=3, landmarks=5)
     ground = contact(state)
@@ -106,6 +108,7 @@ def test_the_scale_that_contact_asks_for_puts_the_feet_on_the_ground():
         np.testing.assert_allclose(ground.residual(moved)[0, frame], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_map_does_not_matter_to_contact():
     state = scenes.truth(np.random.default_rng(3), frames=3, landmarks=5)
     factor = 3.0
@@ -136,6 +139,7 @@ def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():
         assert not scale_uncertainty.discrepancy_warning(start)
 
 
+@pytest.mark.slow
 def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():
     frames, share = 200, 0.25
     step = jnp.array([0.04, 0.0, 0.001])

@@ -66,6 +66,7 @@ def unsolved(monkeypatch):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fitted", "share"), [(False, 0.07), (True, 0.31)])
 def test_steps_share_the_error_of_where_their_bodies_came_from(
     monkeypatch, unsolved, fitted, share
@@ -237,6 +238,7 @@ def test_frames_that_are_used_are_those_of_the_shot():
     assert lost.within.all()
 
 
+@pytest.mark.slow
 def test_variances_of_fitted_shapes_are_those_of_the_untightened_prior():
     body = load_body_model(dtype=jnp.float64)
     tight, scale = 0.16 * jnp.eye(10)[None], jnp.asarray(2.0)
@@ -264,6 +266,7 @@ def test_variances_of_fitted_shapes_are_those_of_the_untightened_prior():
     np.testing.assert_array_equal(unchanged, 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [None, 5.0])
 def test_keypoints_that_err_alike_count_less_but_outliers_are_as_far(pixels):
     """What a keypoint counts falls with the inflation, at which distance from the
@@ -318,6 +321,7 @@ def _tracked() -> SfmResult:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("weights", "expected"),
     [
@@ -372,6 +376,7 @@ def _prediction(step, valid):
     return jax.tree.map(lambda x: x[None], of_one)
 
 
+@pytest.mark.slow
 def test_displacements_of_the_papers_preset_are_in_metres():
     body = load_body_model(dtype=jnp.float64)
     step = jnp.array([0.1, 0.0, 0.05])
@@ -395,6 +400,7 @@ def test_displacements_of_the_papers_preset_are_in_metres():
     assert ("shape", 0) in make(GraphWeights(), state.shapes).keys
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["frozen", "refreshed"])
 def test_postures_are_held_to_predictions_only_where_there_are_any(
     monkeypatch, unsolved, coupling

@@ -67,6 +67,7 @@ def test_an_unknown_definition_is_refused(body):
         make_skeleton(body, 0.0, "kinect")
 
 
+@pytest.mark.slow
 def test_offsets_grow_with_the_stature(body):
     stature = people.linear_stature(body)
     offset = definition_offsets("movenet-blazepose")
@@ -79,6 +80,7 @@ def test_offsets_grow_with_the_stature(body):
         np.testing.assert_allclose(moved, height * offset, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_definition_is_removed_before_keypoints_are_compared_with_joints(body):
     _, wanted = people_seen(body, "unknown")
     roots, uv = people_seen(body, "mediapipe")
@@ -119,6 +121,7 @@ def test_the_detector_is_found_from_the_keypoints(body, tmp_path):
     assert written(tmp_path / "mediapipe", uv, missing=small_toes) == "mediapipe"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("named", "definition"),
     [

@@ -87,6 +87,7 @@ def test_every_device_takes_a_share_of_any_batch(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_factorisations_of_two_threads_end(tmp_path):
     """LAPACK's batches do not on two cores: each waits for the other's threads."""
     in_new_process(

@@ -21,6 +21,7 @@ def mixed(problem, state, schedule=TIGHT):
     return solve(problem, state, schedule=schedule, mixed_precision=True)
 
 
+@pytest.mark.slow
 def test_it_ends_where_double_precision_ends():
     problem, _, start = make()
     best = solve(problem, start, schedule=TIGHT)
@@ -37,6 +38,7 @@ def test_it_ends_where_double_precision_ends():
     assert slope(found.state) < 1e-4 * slope(start)
 
 
+@pytest.mark.slow
 def test_only_factors_are_in_single_precision():
     problem, _, start = make()
     problem, start = pad(problem, start)
@@ -77,6 +79,7 @@ def test_products_are_of_all_bits_where_a_gpu_would_leave_some_out():
     assert "precision=None" not in program
 
 
+@pytest.mark.slow
 def test_the_state_s_own_single_precision_is_left_as_it_is():
     problem, _, start = make()
     to_single = lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x
@@ -121,6 +124,7 @@ def test_on_the_clock_and_watched_it_is_the_same_solve():
     assert float(costs[-1]) == pytest.approx(float(plain.cost), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_baseline_has_one_precision():
     problem, _, start = make()
     with pytest.raises(ValueError, match="mixed_precision: adam has one precision"):

@@ -133,6 +133,7 @@ def test_single_precision_agrees(model, body, walk):
     np.testing.assert_allclose(found.translation, expected.translation, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_where_rotations_are_singular(model, body, walk):
     orientation, body_pose, shape, present = walk
 
@@ -372,6 +373,7 @@ def test_a_rollout_stays_a_motion(model, body, walk):
     np.testing.assert_allclose(turned.trans, found.trans @ world.T, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_evaluation_of_a_perfect_and_a_shrunken_model(body, model):
     clips = [make_clip(60), make_clip(60, seed=1, motion="run")]
     found = evaluate_model(model, body, clips, 0.0)

@@ -56,6 +56,7 @@ def held_to_prediction(factors):
     return [change(f) for f in factors]
 
 
+@pytest.mark.slow
 def test_no_derivative_flows_through_a_prediction():
     problem, state = make()
 

@@ -343,6 +343,7 @@ def test_drift_has_the_stated_size_and_memory(key):
     assert float(both) == pytest.approx(CORRELATION, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, jnp.pi])
 def test_disturb_has_finite_derivatives(angle):
     poses = jnp.zeros((1, 24, 3)).at[0, :, 0].set(angle)

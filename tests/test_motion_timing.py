@@ -3,11 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from bodyslam_jax import motion
 from bodyslam_jax.body import load_body_model
 
 
+@pytest.mark.slow
 def test_padding_at_the_end_changes_no_prediction():
     """As the solver pads: 23 frames at 24 a second, then 7 without the person."""
     model, body = motion.load_motion_model(), load_body_model(dtype=jnp.float64)

@@ -105,6 +105,7 @@ class Killed(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_killed_training_continues_to_the_same_weights(
     tmp_path, body, clips, validation, trained
 ):
@@ -139,6 +140,7 @@ def test_a_killed_training_continues_to_the_same_weights(
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_the_command_trains_the_same_for_the_same_seed(
     monkeypatch, capsys, tmp_path, data, trained
 ):

@@ -37,6 +37,7 @@ def seen_exactly(problem, state):
     return eqx.tree_at(lambda f: f.pixel, factor, pixel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [True, False])
 def test_a_moving_camera_leaves_nothing_unknown_but_its_unit(size):
     problem, truth, _ = make(noise=0.0, known=size)
@@ -108,6 +109,7 @@ def test_focal_length_of_fronto_parallel_motion_is_reported(turns):
         assert lines == [f"focal length: known to 7% only; {why}."], report
 
 
+@pytest.mark.slow
 def test_why_the_scale_is_not_known_is_said():
     _, truth, _ = make()
     rng = np.random.default_rng(0)
@@ -172,6 +174,7 @@ def test_a_scale_that_nothing_sees_is_unknown_in_any_unit_of_the_map(unit):
     assert [line for line in report if line.startswith("scale: not known")]
 
 
+@pytest.mark.slow
 def test_cameras_that_see_nothing_are_reported():
     problem, state, _ = make()
     factor = problem.factors[0]

@@ -33,6 +33,7 @@ def own(body, **changes):
     return motion.make_motion_model(stride, parameters, body=body)
 
 
+@pytest.mark.slow
 def test_parameters_are_trained():
     body = scenes.body_model()
     clips = [make_clip(t, seed=t) for t in (40, 50)]
@@ -48,6 +49,7 @@ def test_parameters_are_trained():
         motion.save_motion_model("own.npz", model)
 
 
+@pytest.mark.slow
 def test_the_scale_follows_predicted_displacements():
     body = scenes.body_model()
     state = scenes.truth(np.random.default_rng(0), frames=6, landmarks=8)

@@ -150,6 +150,7 @@ def test_fit_without_any_keypoint(body):
     assert np.isfinite(found.poses).all() and np.isfinite(found.trans).all()
 
 
+@pytest.mark.slow
 def test_fit_of_keypoints_that_are_all_in_one_place(body):
     here = np.full((1, 8, 25, 2), 200.0)
     found = people.fit_bodies(Keypoints(here, np.ones((1, 8, 25))), CAMERA, body, FPS)
@@ -194,6 +195,7 @@ def test_the_skeleton_is_the_body(body):
     np.testing.assert_allclose(found[1][1:15], skinned[1:15], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_linearisation_is_the_gradient_of_the_cost(body):
     fit, shape = random_fit()
     scene = fitting.make_scene(CAMERA, body, FPS, PeopleFit(limit_sigma=0.2))

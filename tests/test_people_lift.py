@@ -150,6 +150,7 @@ def seen(walk):
     return Keypoints(uv[None], confidence[None])
 
 
+@pytest.mark.slow
 def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
     sigma = people.keypoint_sigma(seen, CAMERA, 0)
     guess = predict(seen.uv[0], sigma)[0].latent[:, :5]
@@ -166,6 +167,7 @@ def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
     assert away(0.0) < 0.8 * away(5.0)
 
 
+@pytest.mark.slow
 def test_legs_of_who_walks_away_swing(walk, seen, body):
     """Along the line of sight, where a single image says nothing."""
     _, joints, _ = walk

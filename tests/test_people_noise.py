@@ -89,6 +89,7 @@ def estimated(truth: Sequence, bodies, keypoints, body) -> Bodies:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lasting", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("jitter", [0.5, 1.0, 2.0, 4.0, 8.0])
 def test_nobody_is_turned_round_by_jitter(truth, body, jitter, lasting):
@@ -157,6 +158,7 @@ def test_a_regressor_that_takes_front_for_back_is_put_right(truth, body, wrong, 
         assert heading_error(found, truth.bodies).max() < 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frames",
     [
@@ -236,6 +238,7 @@ def test_of_forty_jittery_sequences_nobody_is_turned_round(body, jitter):
         assert np.mean(heading_error(found, wanted) > 90) < 0.02
 
 
+@pytest.mark.slow
 def test_a_detectors_own_idea_of_hips_and_knees_is_found(truth, body):
     """Hips 4 cm lower and knees 6 cm: MediaPipe's, on a man seen by four cameras."""
     arrays = (truth.bodies.poses, truth.bodies.shapes, truth.bodies.trans)

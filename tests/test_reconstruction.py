@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from test_frontend_motion import CAMERA, camera_error, scene
 
 from bodyslam_jax.config import Config, Structure
@@ -12,6 +13,7 @@ from bodyslam_jax.types import Sequence
 NUM = 24
 
 
+@pytest.mark.slow
 def test_long_tracks_are_cut_only_after_they_have_shown_the_path():
     """Pieces that are adjusted by themselves leave the path as it was before."""
     tracks, truth = scene("orbit", num=NUM)

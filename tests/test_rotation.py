@@ -32,6 +32,7 @@ def test_the_logarithm_undoes_the_exponential(dtype):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("angle", ANGLES)
 def test_a_further_turn_changes_it_as_the_jacobian_says(dtype, angle):
@@ -64,6 +65,7 @@ def test_there_and_back_is_the_identity_with_its_derivative():
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", range(len(AXES)))
 def test_a_step_at_half_a_turn_moves_along_the_axis_too(axis):
     start = jnp.asarray(np.pi * AXES[axis])

@@ -210,6 +210,7 @@ def test_a_camcorders_video_is_found_in_its_folder(tmp_path, name):
         read_sequence(folder)
 
 
+@pytest.mark.slow
 def test_alarms_of_slow_compilation_stay_off_the_terminal(tmp_path):
     """XLA's, which it prints of a constant that it takes more than a second to fold."""
     program = """

@@ -326,6 +326,7 @@ def test_person_and_scale_are_recovered_from_ten_times_off_either_way():
     assert np.allclose(scales, float(truth.scale), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_order_of_landmarks_does_not_matter():
     problem, _, start = make()
     count = len(start.landmarks)
@@ -342,6 +343,7 @@ def test_order_of_landmarks_does_not_matter():
     assert jnp.abs(moved).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_inliers_count_as_if_there_were_no_outliers():
     problem, _, start = make(noise=0.5)
     factor = problem.factors[0]
@@ -447,6 +449,7 @@ def test_triangular_matrices_of_any_width_are_inverted():
         assert np.allclose(inverse @ lower, np.eye(n), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_single_precision_reaches_the_same_optimum():
     problem, _, start = make()
     half = lambda tree: jax.tree.map(
@@ -475,6 +478,7 @@ def test_single_precision_serves_people_and_covariances_too():
     assert 0.5 < float(spread.scale) / float(exact.scale) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -619,6 +623,7 @@ def test_what_is_eliminated_last_serves_every_kind_of_solve(monkeypatch):
     assert np.allclose(slope(after), slope(before), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_marginal_covariances_are_mapped_over():
     problem, _, start = make(known=True)
     states = [start, solve(problem, start, schedule=TIGHT).state]
@@ -987,6 +992,7 @@ def test_derivatives_where_landmarks_or_single_coordinates_are_held():
         assert slope == pytest.approx(numeric, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("people", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_marginal_covariances_are_differentiable(people):
     problem, _, start = make(people=people, known=True)

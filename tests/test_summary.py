@@ -14,6 +14,7 @@ from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.types import ScaleStart
 
 
+@pytest.mark.slow
 def test_cues_that_contradict_bound_the_scale_sigma_from_below():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
@@ -47,6 +48,7 @@ def test_cues_that_contradict_bound_the_scale_sigma_from_below():
         assert part in line
 
 
+@pytest.mark.slow
 def test_pixel_noise_is_reported_only_where_it_was_measured():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()
@@ -58,6 +60,7 @@ def test_pixel_noise_is_reported_only_where_it_was_measured():
         assert found["pixel_sigma"] == expected
 
 
+@pytest.mark.slow
 def test_the_summary_names_people_and_frames_that_are_left_out():
     made = simulation.simulate(Simulation(sequence="M1", length=15))
     sequence, body, config = simulation.as_sequence(made), load_body_model(), Config()

@@ -156,6 +156,7 @@ def test_images_have_corners_for_a_front_end(renderer, posed):
     assert len(cells) >= 40  # of 48
 
 
+@pytest.mark.slow
 def test_who_is_nearer_hides_who_is_behind(room, person, posed):
     vertices = posed[0]
     both = [naked(person), naked(person)]
@@ -171,6 +172,7 @@ def test_who_is_nearer_hides_who_is_behind(room, person, posed):
         assert 0 < (who == 3 - first).sum() < 0.7 * alone.sum()
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_are_seen_from_where_the_camera_is_then(
     room, person, posed
 ):
@@ -203,6 +205,7 @@ def test_rows_of_a_rolling_shutter_are_seen_from_where_the_camera_is_then(
     assert differs > 60  # and an ideal camera sees something else
 
 
+@pytest.mark.slow
 def test_motion_blur_is_as_long_as_the_motion_during_the_exposure(room, person, posed):
     bright = dataclasses.replace(
         naked(person), colours=np.full((len(person.skin), 3), 600.0)

@@ -76,6 +76,7 @@ def test_truth_is_the_body_models(family):
     )
 
 
+@pytest.mark.slow
 def test_noise_changes_nothing_that_is_true():
     a, b = simulated(noise="none"), simulated(noise="real")
     for name in ("T_WC", "joints", "poses"):
@@ -108,6 +109,7 @@ def test_camera_in_a_room_stays_within_a_metre_and_keeps_the_person(sequence):
     assert inside.mean() > 0.97
 
 
+@pytest.mark.slow
 def test_difficult_cameras_move_and_shake_more():
     def motion(sequence):
         T = simulated(sequence=sequence, noise="none").T_WC
@@ -130,6 +132,7 @@ def test_following_camera_goes_with_the_person():
     assert 2.0 < distance.min() and distance.max() < 6.0
 
 
+@pytest.mark.slow
 def test_regressed_postures_err_as_networks_do():
     """About 60 mm after alignment; accelerations as published, by a slow error's steps.
 
@@ -252,6 +255,7 @@ def test_motion_of_ones_own_and_bad_motion(tmp_path):
         simulation.simulate(Simulation(length=1))
 
 
+@pytest.mark.slow
 def test_a_second_person_is_true_and_measured_and_changes_nothing_of_the_first():
     one, two = simulated(noise="low"), simulated(noise="low", people=2)
     np.testing.assert_array_equal(one.joints, two.joints)

@@ -261,6 +261,7 @@ def test_the_same_seed_gives_the_same_film_and_another_another():
     assert abs(first.astype(int) - other).mean() > 5
 
 
+@pytest.mark.slow
 def test_a_film_has_no_measurements_and_is_kept(simulated, tmp_path):
     short = simulation.simulate(dataclasses.replace(SETTINGS, length=3))
     measured = simulation.write_sequence(tmp_path / "a", short)

@@ -127,6 +127,7 @@ def test_weights_are_inverse_variances_by_term(built):
     assert after["RootSmoothness"] == before["RootSmoothness"] > 0
 
 
+@pytest.mark.slow
 def test_weights_of_the_papers_preset_are_the_papers(case):
     weights = bs.weights(bs.build(case, bs.Config.paper())[0])
     np.testing.assert_allclose(weights["landmarks"], 64 / 2.25**2)
@@ -148,6 +149,7 @@ def test_weights_that_cannot_be_are_refused(built, weights, message):
         bs.with_weights(built[0], **weights)
 
 
+@pytest.mark.slow
 def test_the_cost_by_term_is_a_differentiable_sum(built):
     problem, state = built
     terms = problem.cost_by_term(state)
@@ -184,6 +186,7 @@ def test_a_position_sensor_determines_the_scale(built):
     np.testing.assert_allclose(solution.state.scale, 2.0, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_known_stature_is_counted_once(case, built):
     _, state = built
     factor = stature(case.body, state)
@@ -203,6 +206,7 @@ def test_a_known_stature_decides_the_shape(case, built):
     np.testing.assert_allclose(np.ptp(np.asarray(rest)), 1.8, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_factor_that_sees_a_scale_without_evidence_frees_it(built):
     problem, state = built
     shape = [f for f in problem.factors if type(f).__name__ == "ShapePrior"]
@@ -241,6 +245,7 @@ class WrongPadding(CameraPosition):
     padding = {"sigma": 1.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, message",
     [

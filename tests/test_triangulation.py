@@ -81,6 +81,7 @@ def test_one_outlier_among_a_few_sightings_does_not_carry_a_landmark_away():
     assert error[known].max() < 0.3
 
 
+@pytest.mark.slow
 def test_cost_never_rises_and_what_is_held_or_says_nothing_stays():
     problem, truth = make(noise=1.0, prior=True)
     start = lose(truth, truth.landmarks[LOST] + 3.0)
@@ -100,6 +101,7 @@ def test_cost_never_rises_and_what_is_held_or_says_nothing_stays():
     assert (same.landmarks == start.landmarks).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_maps_and_has_finite_gradients(dtype):
     problem, truth = make(noise=0.5)
@@ -120,6 +122,7 @@ def test_maps_and_has_finite_gradients(dtype):
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", PLACES)
 def test_a_solve_brings_lost_landmarks_back(where):
     problem, truth = make(noise=0.5)

@@ -16,6 +16,7 @@ from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.statistics import camera_statistics
 from bodyslam_jax.pipeline import before_joint, joint_stage, people_stage
+from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.progress import Stopwatch
@@ -68,7 +69,14 @@ def run_sweep(job: SweepJob) -> list[Row]:
     for k, point in enumerate(job.points):
         one = jax.tree.map(lambda x: x[k], found)
         status = str(np.asarray(found.status)[k])
-        result = _result(job.config, clip, cameras, body, prepared, one.state, status)
+        weighted = {term: weight[k] for term, weight in weights.items()}
+        same = dataclasses.replace(
+            prepared, problem=graph.with_weights(prepared.problem, **weighted)
+        )
+        standing = hold_standing_feet(same, one.state, clip, cameras, body, job.config)
+        result = _result(
+            job.config, clip, cameras, body, prepared, standing.state, status
+        )
         rows.append(
             {
                 "name": job.source.name,

@@ -36,41 +36,41 @@ PERSON_CHECKS: tuple[Check, ...] = (
         0.4,
         "positions from frame to frame are not to be trusted: better keypoints, a "
         "known focal length, or a regressor's bodies (--bodies) help",
-        "given; motion capture, who does not run: median 0.09, 99 % below 0.36",
+        "given; motion capture of people who do not run: median 0.09, 99 % below 0.36",
     ),
     Check(
         "gliding",
-        "speed of the foot that should stand, while the person gets on,",
+        "speed of the foot that should stand, while the person advances,",
         "% of the person's",
         50.0,
         _CARRIED,
-        _MOCAP + ", who gets on: at most 19",
+        _MOCAP + " of people who advance: at most 19",
     ),
     Check(
         "step_short_of_reach",
-        "way that a step carries the person, over how far it reaches,",
+        "distance that a step carries the person, over how far it reaches,",
         "",
         0.6,
-        "the person steps and hardly gets on: on a treadmill or on the spot that is "
+        "the person steps and hardly advances: on a treadmill or on the spot that is "
         "right, and steps tell no size. Otherwise scale or frame rate are off",
-        _MOCAP + ", who strides: at least 0.7",
+        _MOCAP + " of people who stride: at least 0.7",
         below=True,
     ),
     Check(
         "step_beyond_reach",
-        "way that a step carries the person, over how far it reaches,",
+        "distance that a step carries the person, over how far it reaches,",
         "",
         1.4,
         _CARRIED,
-        _MOCAP + ", who walks: at most 1.23",
+        _MOCAP + " of people who walk: at most 1.23",
     ),
     Check(
         "step_beyond_reach_of_runner",
-        "way that a runner's step carries the person, over how far it reaches,",
+        "distance that a runner's step carries the person, over how far it reaches,",
         "",
         2.2,
         _CARRIED,
-        _MOCAP + ", who runs: 1.6 to 1.86",
+        _MOCAP + " of people who run: 1.6 to 1.86",
     ),
     Check(
         "quick_steps",
@@ -80,7 +80,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "children step so quickly: a child's body is given or fitted as an adult's, "
         "and every length is too large by as much; give the stature (--height). For "
         "an adult the frame rate is off",
-        _MOCAP + ", who walks: at most 2.22",
+        _MOCAP + " of people who walk: at most 2.22",
     ),
     Check(
         "turned_from_body",
@@ -98,15 +98,15 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m",
         0.12,
         "the person floats or sinks: " + _GROUND,
-        _MOCAP + ", who walks: 99 % below 0.07, on uneven terrain 0.15",
+        _MOCAP + " of people who walk: 99 % below 0.07, on uneven terrain 0.15",
     ),
     Check(
         "ground_slope",
         "slope of the ground under standing feet",
         "degrees",
         6.0,
-        "the person rises or sinks along the way: " + _GROUND,
-        _MOCAP + ", who walks: at most 5; streets rarely exceed 6",
+        "the person rises or sinks along the path: " + _GROUND,
+        _MOCAP + " of people who walk: at most 5; streets rarely exceed 6",
     ),
     Check(
         "knee",
@@ -114,7 +114,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         52.0,
         "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
-        _MOCAP + ", who walks: 98 % below 48, soccer 51",
+        _MOCAP + " of people who walk: 98 % below 48, soccer 51",
     ),
     Check(
         "straighter_knee",
@@ -122,7 +122,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         44.0,
         "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
-        _MOCAP + ", who walks: 98 % below 40, soccer 43",
+        _MOCAP + " of people who walk: 98 % below 40, soccer 43",
     ),
     Check(
         "hip_over_ankle",
@@ -130,7 +130,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "",
         0.84,
         "people crouch who do not: " + _FIT,
-        _MOCAP + ", who walks: at least 0.85",
+        _MOCAP + " of people who walk: at least 0.85",
         below=True,
     ),
     Check(
@@ -139,7 +139,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         18.0,
         "nobody walks so: " + _FIT,
-        _MOCAP + ", who walks: below 15, but for basketball (19 and 32)",
+        _MOCAP + " of people who walk: below 15, but for basketball (19 and 32)",
     ),
     Check(
         "turn_of_walker",
@@ -147,7 +147,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees/s within 0.2 s",
         500.0,
         _IDENTITY,
-        _MOCAP + ", who walks: at most 170; dancing on the way 500",
+        _MOCAP + " of people who walk: at most 170; dancing on the way 500",
     ),
     Check(
         "turn",
@@ -163,7 +163,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s within 0.2 s",
         1.8,
         _IDENTITY,
-        _MOCAP + ", who walks: at most 1.4",
+        _MOCAP + " of people who walk: at most 1.4",
     ),
     Check(
         "velocity_jump",

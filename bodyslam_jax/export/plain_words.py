@@ -6,15 +6,15 @@ from typing import Any
 _PERSON = {
     "standing_foot_speed": "The feet of {who} slide over the ground while they stand.",
     "gliding": "{Who} glides: the foot that should stand moves along.",
-    "step_short_of_reach": "{Who} steps, but hardly gets on.",
-    "step_beyond_reach": "{Who} gets on further with each step than legs can reach.",
+    "step_short_of_reach": "{Who} steps, but hardly advances.",
+    "step_beyond_reach": "{Who} advances further with each step than legs can reach.",
     "step_beyond_reach_of_runner": (
-        "{Who} gets on further with each step than a runner does."
+        "{Who} advances further with each step than a runner does."
     ),
     "quick_steps": "{Who} takes steps as quickly as only children do.",
     "turned_from_body": "{Who} is tilted against the bodies that were given.",
     "feet_off_ground": "{Who} floats above the ground, or sinks into it.",
-    "ground_slope": "{Who} rises or sinks along the way, as on a steep slope.",
+    "ground_slope": "{Who} rises or sinks along the path, as on a steep slope.",
     "knee": "{Who} walks with knees bent as nobody's are.",
     "straighter_knee": "{Who} walks without ever stretching a knee.",
     "hip_over_ankle": "{Who} walks as if crouching.",

@@ -12,6 +12,9 @@ from bodyslam_jax.initialisation.carried_people import (
 from bodyslam_jax.initialisation.contact_factors import (
     contact_factor as contact_factor,
 )
+from bodyslam_jax.initialisation.contact_factors import (
+    without_contacts as without_contacts,
+)
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,
 )

@@ -40,6 +40,16 @@ def contact_factor(
     return graph.FootContact(body, shape, scale, sigma.astype(shape.dtype), loss=loss)
 
 
+def without_contacts(
+    state: graph.State, fps: float, body: BodyModel, weights: GraphWeights
+) -> graph.FootContact:
+    """The same factor without weight: no point stands."""
+    people, frames = state.poses.shape[:2]
+    probability = jnp.zeros((people, frames, 4), state.poses.dtype)
+    nobody = np.zeros((people, frames), bool)
+    return contact_factor(probability, state, nobody, fps, body, weights)
+
+
 def _before(x):
     """The values of the previous frame, zero in the first."""
     xp = jnp if isinstance(x, jax.Array) else np

@@ -1,12 +1,14 @@
-"""Standing feet are held, after the joint estimate: only roots and poses change.
+"""Feet that stand are held still after the joint estimate: only roots and poses change.
 
 Which points of the feet stand is read from the postures of the joint estimate
 (`motion.contact_network`). Then people's roots and poses are estimated once more with
 the same factors, the one of standing points (`graph.FootContact`), and a larger weight
-of their height over the map's plane. Cameras, map,
-scale and shapes are constants: thousands of landmarks and the size of the person
-determine them, and steps would stretch them by the errors of postures. The problem has
-no landmarks, so that videos of about the same length share its program.
+of their height over the map's plane. Cameras, map, scale and shapes are constants:
+thousands of landmarks and the size of the person determine them, and steps would
+stretch them by the errors of postures.
+
+The factor of standing points is in the joint problem from the beginning, without
+weight, so that both solves are one compiled program.
 """
 
 import dataclasses
@@ -58,36 +60,37 @@ def hold_standing_feet(
     Nothing changes without people, without `weights.contact_sigma`, or with a body
     model that the contact network was not trained on.
     """
-    roots, weights = prepared.roots, config.weights
+    roots = prepared.roots
     present = roots.present & cameras.registered
-    if not weights.contact_sigma or not present.any():
-        return Standing(best)
-    predictor = contact_predictor(sequence, roots, body)
-    if predictor.model[0].body != body.kind:
+    predictor = contact_predictor(sequence, roots, body, config)
+    if predictor is None or not present.any():
         return Standing(best)
     probability = predict(predictor, best)
     present[list(prepared.passengers)] = False
     contact = initialisation.contact_factor(
-        probability, best, present, sequence.fps, body, weights
+        probability, best, present, sequence.fps, body, config.weights
     )
-    start = eqx.tree_at(lambda s: s.landmarks, best, best.landmarks[:0])
-    free = graph.set_constant(initialisation.free_people(start), "shapes")
-    factors = [f for f in prepared.problem.factors if _of_motion(f)]
-    on_ground = lambda f: isinstance(f, graph.GroundContact)
-    factors = [
-        stand_on_plane(f, best, np.asarray(probability), sequence.fps)
-        if on_ground(f)
-        else f
-        for f in factors
-    ]
-    problem = graph.make_problem(
-        [*factors, contact], start, motion=prepared.problem.motion, free=free
+    alone = graph.disable(prepared.problem, graph.Reprojection, graph.LandmarkPrior)
+    chance = np.asarray(probability)
+
+    def weighed(factor: graph.Factor) -> graph.Factor:
+        if isinstance(factor, graph.FootContact):
+            return contact
+        if isinstance(factor, graph.GroundContact):
+            return stand_on_plane(factor, best, chance, sequence.fps)
+        return factor
+
+    held = ("scale", "cameras", "landmarks", "intrinsics", "shapes")
+    problem = dataclasses.replace(
+        alone,
+        factors=tuple(weighed(factor) for factor in alone.factors),
+        free=graph.set_constant(alone.free, *held),
     )
-    solution, stage = solve_stage(problem, start, config, "standing feet")
+    solution, stage = solve_stage(problem, best, config, "standing feet")
     found = solution.state
     moved = dataclasses.replace(best, roots=found.roots, poses=found.poses)
     valid = bool(jnp.isfinite(found.roots).all() & jnp.isfinite(found.poses).all())
-    return Standing(moved if valid else best, np.asarray(probability), (stage,))
+    return Standing(moved if valid else best, chance, (stage,))
 
 
 def stand_on_plane(
@@ -121,10 +124,3 @@ def stand_on_plane(
         contact,
         (plane, jnp.asarray(sigma, contact.sigma.dtype)),
     )
-
-
-def _of_motion(factor: graph.Factor) -> bool:
-    """Whether a factor depends on people's roots or poses."""
-    if not isinstance(factor, graph.FrameFactor):
-        return False
-    return any(name in ("root", "pose") for name, _ in factor.keys)

@@ -13,7 +13,11 @@ from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PATH_SIGMA, Config, Measured
 from bodyslam_jax.people import PersonState
-from bodyslam_jax.pipeline.motion_prediction import motion_predictor, predict
+from bodyslam_jax.pipeline.motion_prediction import (
+    contact_predictor,
+    motion_predictor,
+    predict,
+)
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
 
@@ -64,10 +68,13 @@ def prepare(
     config: Config,
     *,
     body_only_solve: bool = True,
+    feet: bool = True,
 ) -> Prepared:
     """The body-only solve, the first scale in closed form, then the whole graph.
 
     Without `body_only_solve` nothing is solved: people start as their bodies are given.
+    With `feet` the problem has room for standing feet (`contact_stage.py`), which so
+    far have no weight.
 
     Body poses are fitted to keypoints before the motion model reads them: a regressor's
     errors in orientation bias the displacements that are predicted from it.
@@ -96,6 +103,10 @@ def prepare(
             sequence, cameras, crowd, state, prediction, body, config
         )
         factors += people_factors
+        if feet and contact_predictor(sequence, roots, body, config) is not None:
+            factors.append(
+                initialisation.without_contacts(state, sequence.fps, body, weights)
+            )
         present = roots.present & cameras.registered
         motion_factors = functools.partial(
             _motion_factors,
@@ -151,6 +162,7 @@ def solve_body_only(
         graph.RelativeOrientation,
         graph.RootSmoothness,
         graph.GroundContact,
+        graph.FootContact,
     )
     rest = ("scale", "cameras", "landmarks", "intrinsics")
     alone = dataclasses.replace(alone, free=graph.set_constant(alone.free, *rest))

@@ -25,10 +25,15 @@ def motion_predictor(
 
 
 def contact_predictor(
-    sequence: Sequence, roots: PersonState, body: BodyModel
-) -> graph.MotionPredictor:
-    """The contact network, resampled to the times of the sequence's frames."""
+    sequence: Sequence, roots: PersonState, body: BodyModel, config: Config
+) -> graph.MotionPredictor | None:
+    """The contact network, resampled to the times of the sequence's frames; `None`
+    without `weights.contact_sigma`, or if it was not trained on this kind of body."""
+    if not config.weights.contact_sigma:
+        return None
     model = motion.load_contact_model()
+    if model.body != body.kind:
+        return None
     clock = motion.make_clock(sequence.timestamps, model.fps)
     present = jnp.asarray(roots.present)
     return graph.MotionPredictor(motion.contact_between, (model, clock), body, present)

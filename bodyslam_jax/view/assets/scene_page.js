@@ -4,7 +4,7 @@
 
 const LAYERS = {
   people: "People", names: "Names", camera: "Camera", images: "Its images",
-  paths: "Ways on the ground", map: "Map", ground: "Grid", contacts: "Standing feet",
+  paths: "Paths on the ground", map: "Map", ground: "Grid", contacts: "Standing feet",
   uncertainty: "Uncertainty",
 };
 const OFF_AT_FIRST = ["uncertainty"];
