@@ -73,10 +73,9 @@ def hold_standing_feet(
     start = eqx.tree_at(lambda s: s.landmarks, best, best.landmarks[:0])
     free = graph.set_constant(initialisation.free_people(start), "shapes")
     factors = [f for f in prepared.problem.factors if _of_motion(f)]
-    on_ground = lambda f: isinstance(f, graph.GroundContact)
     factors = [
         stand_on_plane(f, best, np.asarray(probability), sequence.fps)
-        if on_ground(f)
+        if isinstance(f, graph.GroundContact)
         else f
         for f in factors
     ]
