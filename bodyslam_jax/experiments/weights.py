@@ -123,7 +123,7 @@ def reweighted(
 
 def _scaled(factor: graph.Factor, field: str, by: Array) -> graph.Factor:
     if field == "loss":
-        return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)  # pyright: ignore
+        return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)
     old = getattr(factor, field)
     if field == "whitening":
         new = old / by
