@@ -57,6 +57,7 @@ def run_many(
     """
     jobs = plan(inputs, config, Path(out), part)
     if isinstance(engine, str):
+        # `Distribution` refuses other names.
         engine = Distribution(engine=engine)  # pyright: ignore[reportArgumentType]
     if isinstance(engine, Distribution):
         engine = make_engine(engine, Path(out).resolve(), config.device != "cpu")

@@ -137,8 +137,9 @@ def share() -> None:
     """
     import jax
 
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if not folder or jax.config.jax_compilation_cache_max_size != -1:  # pyright: ignore
+    options: Any = jax.config  # whose class declares no options
+    limit = options.jax_compilation_cache_max_size
+    if not options.jax_compilation_cache_dir or limit != -1:
         return
     try:
         from jax._src import compilation_cache as inner

@@ -5,7 +5,7 @@ import dataclasses
 import io
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 Row = dict[str, Any]
 
@@ -94,9 +94,7 @@ def _medians(columns: Sequence[Column], rows: Sequence[Row]) -> list[str]:
     found = []
     for column in columns:
         values: list[float] = sorted(
-            v
-            for row in rows
-            if _is_number(v := row.get(column.key))  # pyright: ignore
+            v for row in rows if _is_number(v := row.get(column.key))
         )
         if column.digits is None or not values:
             found.append("")
@@ -107,7 +105,7 @@ def _medians(columns: Sequence[Column], rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 

@@ -5,6 +5,7 @@ import importlib.metadata
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 from bodyslam_jax.batch.program_cache import user_folder
 from bodyslam_jax.cli import interrupts
@@ -54,7 +55,8 @@ def compiles_first() -> bool:
     """Whether the cache of compiled programs is empty."""
     import jax
 
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    options: Any = jax.config  # whose class declares no options
+    folder = options.jax_compilation_cache_dir
     return bool(folder) and not (Path(folder).is_dir() and any(Path(folder).iterdir()))
 
 

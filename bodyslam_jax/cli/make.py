@@ -7,7 +7,7 @@ import os
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -153,5 +153,6 @@ def _make_each_core_a_device() -> None:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     with contextlib.suppress(RuntimeError):
-        if jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
+        options: Any = jax.config  # whose class declares no options
+        if options.jax_num_cpu_devices < 1:
             jax.config.update("jax_num_cpu_devices", cores)

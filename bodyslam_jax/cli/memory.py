@@ -26,8 +26,8 @@ def return_memory() -> None:
     library = ctypes.CDLL(None)
     library.mallopt(_MMAP_THRESHOLD, _LARGE)
 
-    def trim(event: str, seconds: float, **_: object) -> None:
-        if event == _COMPILED and seconds > _LEAST:
+    def trim(event: str, duration_secs: float, **_: object) -> None:
+        if event == _COMPILED and duration_secs > _LEAST:
             library.malloc_trim(0)
 
     jax.monitoring.register_event_duration_secs_listener(trim)

@@ -117,5 +117,6 @@ def prepared(
         jax_setup.prepare("cpu" if elsewhere else device)
         return command(*args, **kwargs)
 
-    run.__signature__ = signature  # pyright: ignore
+    # `inspect` reads it; typeshed does not declare it.
+    run.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
     return run

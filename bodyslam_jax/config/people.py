@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from bodyslam_jax.config.check import NOT_NEGATIVE, check
+from bodyslam_jax.config.check import NOT_NEGATIVE, Range, check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PeopleFit:
     `bodies.npz` whose `shapes_regressed` is false)."""
 
     def __post_init__(self):
-        free = dict.fromkeys(
+        free: dict[str, Range] = dict.fromkeys(
             ("max_gap", "lift_scale", "lift_correlation"), NOT_NEGATIVE
         )
         check(self, free, infinite=("limit_sigma", "lift_scale"))

@@ -33,7 +33,7 @@ def implausible(
         scale_sigma: m per unit of the map.
         ground_factor: factor, 1 or more, between the size of the map and that of the
             people on its ground.
-        statures: of each person, m.
+        statures: of each person, m; `None` if unknown.
     """
     fps, found = sequence.fps, []
     walking = False
@@ -42,7 +42,9 @@ def implausible(
         of_person = figures.person_figures(result.joints[h], present, fps)
         walking |= "trunk_lean" in of_person
         if present.any():
-            of_person["stature"] = of_person["short_stature"] = statures[h]
+            stature = statures[h]
+            if stature is not None:
+                of_person["stature"] = of_person["short_stature"] = stature
             of_person["keypoint_misfit"] = misfits[h]
             of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
         found += judge(PERSON_CHECKS, of_person, h)

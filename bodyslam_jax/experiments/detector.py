@@ -9,7 +9,7 @@ from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
 from bodyslam_jax.simulation import SimulatedSequence
 from bodyslam_jax.simulation.point_tracks import is_behind
-from bodyslam_jax.types import Sequence
+from bodyslam_jax.types import Keypoints, Sequence
 
 _TALLEST = 60.0
 """Height in the image, px, above which a person counts as detectable."""
@@ -34,7 +34,7 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
     wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
     if found.keypoints is None or not wanted.any():
         return {"found": 0.0, "keypoints": {}}
-    uv, valid, number = _nearest(found, exact)
+    uv, valid, number = _nearest(found.keypoints, exact)
     stature = np.ptp(simulated.person.skin[:, 1])
     error = (uv - exact) / simulated.intrinsics[:2] * depth[:, :, None] / stature
     return {
@@ -82,13 +82,13 @@ def _leader(name: str) -> int:
 
 
 def _nearest(
-    found: Sequence, exact: Float[np.ndarray, "t 25 2"]
+    found: Keypoints, exact: Float[np.ndarray, "t 25 2"]
 ) -> tuple[
     Float[np.ndarray, "t 25 2"], Bool[np.ndarray, "t 25"], Bool[np.ndarray, " t"]
 ]:
     """The detection in each frame that is of the person, if any: within a quarter of
     the height in the median."""
-    uv, valid = found.keypoints.uv, found.keypoints.confidence > 0
+    uv, valid = found.uv, found.confidence > 0
     away = np.linalg.norm(uv - exact, axis=-1)
     few = valid.sum(axis=-1) < 5
     middle = np.ma.median(np.ma.masked_array(away, ~valid), axis=-1).filled(np.inf)

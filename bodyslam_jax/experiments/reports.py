@@ -110,9 +110,10 @@ def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     beside = []
     for row in rows:
         published = paper.STRUCTURE.get(row["sequence"].split("-")[0])
-        values = None if published is None else [1e-3 * v for v in published]
-        theirs.append(values and dict(zip(names, values, strict=True)))
-        found = theirs[-1] or {}
+        found: Row = {}
+        if published is not None:
+            found = {k: 1e-3 * v for k, v in zip(names, published, strict=True)}
+        theirs.append(found or None)
         beside.append({**row, **{f"paper:{name}": v for name, v in found.items()}})
     ours_and_theirs = lambda title, name: (
         Column(f"{title}, mm", name, MM),

@@ -37,8 +37,9 @@ def simulations(
     )
     return [
         Simulation(
-            sequence=sequence,  # pyright: ignore
-            family=family,  # pyright: ignore
+            # `Simulation` refuses other names.
+            sequence=sequence,  # pyright: ignore[reportArgumentType]
+            family=family,  # pyright: ignore[reportArgumentType]
             length=experiment.frames,
             seed=chance(f"{sequence}-{family}"),
             motion=experiment.motion,

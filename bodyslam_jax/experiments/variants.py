@@ -89,7 +89,9 @@ def beside(
     def variant(problem: graph.Problem, state: graph.State) -> Start:
         body, present = _person(problem)
         more = make(body, state, np.asarray(present))
-        factors = problem.factors if more is None else [*problem.factors, more]
+        factors = list(problem.factors)
+        if more is not None:
+            factors.append(more)
         return rebuild(problem, state, factors), state
 
     return variant

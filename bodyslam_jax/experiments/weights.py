@@ -123,7 +123,7 @@ def reweighted(
 
 def _scaled(factor: graph.Factor, field: str, by: Array) -> graph.Factor:
     if field == "loss":
-        return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)  # pyright: ignore
+        return eqx.tree_at(lambda f: f.loss.scale, factor, factor.loss.scale * by)
     old = getattr(factor, field)
     if field == "whitening":
         new = old / by
@@ -210,7 +210,8 @@ def learn_weights(
         # optax takes powers of Python's numbers.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(slope, memory)
-        value = jnp.clip(optax.apply_updates(value, change), -2.0, 2.0)
+        moved = jnp.asarray(optax.apply_updates(value, change))
+        value = jnp.clip(moved, -2.0, 2.0)
         standing = (value, memory, states)
         if progress is not None:
             leaves = tuple(np.asarray(x) for x in jax.tree.leaves(standing))

@@ -152,7 +152,9 @@ class _Finder:
         number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
         unknown = np.zeros((25, 3))
         alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
-        rows = [alone(*other) for other in self.others]
+        rows: list[tuple[int, int, np.ndarray, np.ndarray]] = [
+            alone(*other) for other in self.others
+        ]
         for tracklet in self.tracker.tracklets:
             who = number.get(tracklet.number, -1)
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):

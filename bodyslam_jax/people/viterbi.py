@@ -96,7 +96,7 @@ def _cheapest(
         return np.array([np.argmin(costs[0])])
     gap = np.maximum(np.diff(time), 1e-3)
     # A state is a pair of fits [previous, current]: their difference is a velocity.
-    jump = lambda k: _jump(joints, orientation, gap[k - 1], k, scales)
+    jump = lambda k: _jump(joints, orientation, float(gap[k - 1]), k, scales)
     total = costs[0][:, None] + costs[1] + jump(1)
     came_from = np.zeros((frames, starts, starts), int)
     for k in range(2, frames):

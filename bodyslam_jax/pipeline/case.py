@@ -99,7 +99,12 @@ def simulate_case(
     **Raises:** as `simulation.simulate` and `pipeline.run`.
     """
     if not isinstance(sequence, Simulation):
-        sequence = Simulation(sequence=sequence, length=frames, **settings)  # pyright: ignore
+        sequence = Simulation(
+            # `Simulation` refuses other names.
+            sequence=sequence,  # pyright: ignore[reportArgumentType]
+            length=frames,
+            **settings,
+        )
     elif frames is not None or settings:
         sequence = dataclasses.replace(
             sequence, length=frames or sequence.length, **settings

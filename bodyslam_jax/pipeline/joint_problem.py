@@ -138,7 +138,7 @@ def prepare(
         )
     problem = make(factors, state)
     if config.motion_coupling == "frozen":
-        if anybody and weights.posture_predicted:
+        if prediction is not None and weights.posture_predicted:
             problem = problem.with_prediction({"body_pose": prediction.body_pose})
         problem = dataclasses.replace(problem, motion=None)
     warnings = initialisation.lines_of_carried(passengers)

@@ -55,7 +55,7 @@ def estimate(
         standing.state,
         prepared,
         uncertainty,
-        solution.status,
+        str(solution.status),
         (*prepared.stages, stage, *standing.stages),
         standing.probability,
     )
@@ -110,7 +110,7 @@ def estimate_uncertainty(
     unobserved = solver.observability(prepared.problem, best, marginals)
     variance, shapes = marginals.scale, marginals.shapes
     fitted = people.without_bodies(sequence)
-    anywhere = prepared.roots.present.any(axis=1)
+    anywhere = np.any(prepared.roots.present, axis=1)
     if len(anywhere) and (fitted & anywhere).any():
         sigma = np.where(fitted, config.weights.shape_sigma, 1.0)
         variance, shapes = inflate_fitted_shapes(

@@ -86,9 +86,9 @@ def _compile_clock() -> list[float]:
     list of one number that JAX's events add to."""
     clock = [0.0]
 
-    def add(event: str, seconds: float, **_: object) -> None:
+    def add(event: str, duration_secs: float, **_: object) -> None:
         if event in _COMPILING:
-            clock[0] += seconds
+            clock[0] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(add)
     return clock

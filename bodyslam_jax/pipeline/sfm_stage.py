@@ -100,6 +100,7 @@ def _with_focal(
     """Cameras with the focal length estimated, if the camera's path determines it."""
     guess = sequence.intrinsics
     sigma = clipped_sigma(error / ERROR_PER_SIGMA)
+    adjusted = cameras
     for _ in range(3):
         adjusted = adjust(cameras, sigma, config, guess)
         if adjusted.focal_sigma > config.structure.focal_accuracy * adjusted.focal:

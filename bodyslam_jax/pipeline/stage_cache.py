@@ -205,9 +205,8 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
     if "fields" in header:
         fields = header["fields"]
         # A default of a new field need not be what was computed, so it does not count.
-        if not dataclasses.is_dataclass(kind) or fields.keys() != {
-            field.name for field in dataclasses.fields(kind)
-        }:
+        is_class = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        if not is_class or fields.keys() != {f.name for f in dataclasses.fields(kind)}:
             raise ValueError(f"fields {', '.join(fields)} of another version")
         kinds = typing.get_type_hints(kind)
         return kind(

@@ -87,7 +87,7 @@ def adjust(
     damping, cost = _DAMPING, _cost(scene, views, loss)
     for _ in range(iterations):
         system = _linearise(scene, views, camera_of, point_of, loss, len(cameras))
-        improved = False
+        better = None
         for _ in range(4):
             step = _solve(system, damping, len(points))
             if step is None:
@@ -96,13 +96,14 @@ def adjust(
             trial = _moved(scene, cameras, points, *step)
             new = _cost(trial, views, loss)
             if new < cost:
-                improved = True
+                better = trial, new
                 break
             if new < (1 + tolerance) * cost:
                 break  # as good as it gets, up to rounding
             damping *= 100
-        if not improved:
+        if better is None:
             break
+        trial, new = better
         scene.R_CW, scene.centre, scene.points = trial.R_CW, trial.centre, trial.points
         damping = max(damping / 10, _LEAST)
         done = cost - new < tolerance * cost

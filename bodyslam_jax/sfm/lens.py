@@ -197,12 +197,12 @@ class _Fit:
                     trial = x.moved(*step)
                     new = self.cost(trial, sigma)
                     if new < cost:
-                        better = trial
+                        better = trial, new
                         break
                 damping *= 10
             if better is None:
                 break
-            x, damping = better, max(damping / 10, 1e-9)
+            (x, new), damping = better, max(damping / 10, 1e-9)
             if cost - new < 2e-5 * cost:
                 break
         error = float(np.median(self._errors(x)))

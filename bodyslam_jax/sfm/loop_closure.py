@@ -157,8 +157,8 @@ class Revisits:
         for _, i, j in sorted(best):
             if i in taken or j in taken:
                 continue
-            frames = [self.views.frame[self.views_of(k)] for k in (i, j)]
-            if not np.isin(*frames).any():
+            of_i, of_j = (self.views.frame[self.views_of(k)] for k in (i, j))
+            if not np.isin(of_i, of_j).any():
                 taken |= {i, j}
                 chosen.append((i, j))
         return chosen

@@ -33,13 +33,12 @@ def fit_rotation(
     Args:
         scale: angle from which a pair is doubted, rad (Cauchy).
     """
-    weight = np.ones(len(ray_a))
-    R = np.eye(3)
+    R, away = np.eye(3), np.zeros(len(ray_a))
     for _ in range(10):
+        weight = 1 / (1 + (away / scale) ** 2)
         U, _, Vt = np.linalg.svd((ray_b * weight[:, None]).T @ ray_a)
         R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
         away = np.linalg.norm(ray_b - ray_a @ R.T, axis=-1)
-        weight = 1 / (1 + (away / scale) ** 2)
     return R, away
 
 

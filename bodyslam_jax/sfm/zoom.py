@@ -53,7 +53,7 @@ def turning_zoom(
     at = np.unique(np.r_[np.arange(0, num_frames, _LINK), num_frames - 1])
     log_scale = np.zeros(len(at))
     for i, (a, b) in enumerate(zip(at[:-1], at[1:], strict=True)):
-        found = pair(int(a), int(b), log_scale[i])
+        found = pair(int(a), int(b), float(log_scale[i]))
         log_scale[i + 1] = log_scale[i] + (found[0] if found else 0.0)
     if np.ptp(log_scale) < LEAST_ZOOM:
         return None
@@ -62,7 +62,7 @@ def turning_zoom(
     i, j = np.nonzero(np.triu(change >= LEAST_ZOOM))
     judged = []
     for k in np.argsort(-change[i, j], kind="stable"):
-        found = pair(int(at[i[k]]), int(at[j[k]]), log_scale[i[k]])
+        found = pair(int(at[i[k]]), int(at[j[k]]), float(log_scale[i[k]]))
         if found is not None:
             judged.append(found[1:])
         if len(judged) == _PAIRS:
@@ -81,7 +81,7 @@ def _turn_and_scale(
     """Logarithm of the scale, median error with it and with a rotation alone."""
     away = []
     for free in (False, True):
-        turn, log_s = np.eye(3), 0.0
+        turn, log_s, r = np.eye(3), 0.0, xy_a - xy_b
         for _ in range(10):
             p = unit_rays(xy_a) @ turn.T
             q = p[:, :2] / p[:, 2:]

@@ -13,6 +13,12 @@ PARTS = ("skin", "shirt", "trousers", "shoes", "sole", "hair", "eye", "iris", "l
 """What a vertex can be; trousers are a skirt as well."""
 SKIN, SHIRT, TROUSERS, SHOES, SOLE, HAIR, EYE, IRIS, LIPS = range(len(PARTS))
 
+_Hair = Literal["short", "cap", "long", "tail"]
+_Pattern = Literal["plain", "stripes", "checks", "print"]
+_HAIR: tuple[_Hair, ...] = ("short", "short", "cap", "long", "tail")
+_PATTERNS: tuple[_Pattern, ...] = ("plain", "plain", "stripes", "checks", "print")
+"""Those drawn at random; the first is drawn twice as often."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Outfit:
@@ -28,10 +34,10 @@ class Outfit:
     """Whether the skirt is of the shirt's cloth."""
     looseness: float = 1.0
     """How far clothes stand off: 1 is about 15 mm at the trunk."""
-    hair: Literal["short", "cap", "long", "tail"] = "short"
+    hair: _Hair = "short"
     beard: bool = False
     boots: bool = False
-    pattern: Literal["plain", "stripes", "checks", "print"] = "plain"
+    pattern: _Pattern = "plain"
     """Of the shirt."""
 
 
@@ -45,8 +51,8 @@ def draw_outfit(rng: np.random.Generator) -> Outfit:
         skirt=float(skirt),
         is_dress=kind == "dress",
         looseness=float(rng.uniform(0.5, 1.6)),
-        hair=str(rng.choice(["short", "short", "cap", "long", "tail"])),  # pyright: ignore
+        hair=_HAIR[rng.integers(len(_HAIR))],
         beard=bool(rng.random() < 0.2 and not skirt),
         boots=bool(rng.random() < 0.2),
-        pattern=str(rng.choice(["plain", "plain", "stripes", "checks", "print"])),  # pyright: ignore
+        pattern=_PATTERNS[rng.integers(len(_PATTERNS))],
     )

@@ -7,7 +7,7 @@ All textures lie, at every resolution, in one image, so that one look-up draws a
 The bodies' small triangles are drawn with a z-buffer.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -127,7 +127,7 @@ class Renderer:
         turn = (np.trace(cameras[0, :3, :3].T @ cameras[1, :3, :3]) - 1) / 2
         moved = [np.arccos(np.clip(turn, -1, 1)) * self.intrinsics[0]]
         for moving in people:
-            sample = tuple(term[::97] for term in moving)
+            sample = _each(moving, lambda term: term[::97])
             uv = [
                 self._project(cameras[i : i + 1], ends[i : i + 1], sample)
                 for i in range(2)
@@ -267,7 +267,7 @@ class Renderer:
     def _shadow(self, image, floor, T, when, moving: Moving) -> None:
         """Darkens the floor where the lamp's light does not reach."""
         flat = np.eye(3) - np.outer([0, 1, 0], self.light / self.light[1])
-        uv = self._project(T, when, tuple(term[::7] @ flat for term in moving))
+        uv = self._project(T, when, _each(moving, lambda term: term[::7] @ flat))
         if uv[:, 2].min() < 0.2:
             return
         # A shadow is made of discs that overlap: about 7 cm on the floor
@@ -306,6 +306,12 @@ class Renderer:
         image.reshape(-1, 3)[hits.pixel] = light * figure.albedo(hits, size)
         inverse_depth.reshape(-1)[hits.pixel] = hits.inverse
         who.reshape(-1)[hits.pixel] = h + 1
+
+
+def _each(moving: Moving, change: Callable[[np.ndarray], np.ndarray]) -> Moving:
+    """A linear `change` of the vertices, and of their differences."""
+    position, first, second = moving
+    return change(position), change(first), change(second)
 
 
 def _soften(image: Float[np.ndarray, "r c 3"], mask: Bool[np.ndarray, "r c"]) -> None:

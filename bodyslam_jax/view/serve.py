@@ -5,6 +5,7 @@ import re
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -41,9 +42,9 @@ def address_of(server: ThreadingHTTPServer) -> str:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
-    def __init__(self, page: bytes, folder: Path, *args: object):
+    def __init__(self, page: bytes, folder: Path, *args: Any):
         self.page, self.folder = page, folder
-        super().__init__(*args)  # type: ignore[arg-type]
+        super().__init__(*args)
 
     def do_GET(self) -> None:
         name = self.path.partition("?")[0].lstrip("/")

@@ -61,14 +61,14 @@ class ImageMap:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """One hypothesis; `kind` determines which of the fields it has."""
+    """One hypothesis; fields that do not belong to its `kind` change nothing."""
 
     kind: str
     """`agree`, `sides`, `keypoints` (`image`), `axes` (`R`), `focal`, `unit`
     (`factor`), `crop` (`image`) or `copy` (`image`: resized and moved)"""
     forecast: Forecast
-    image: ImageMap | None = None
-    R: Float[np.ndarray, "3 3"] | None = None
+    image: ImageMap = ImageMap(np.eye(2), np.zeros(2))
+    R: Float[np.ndarray, "3 3"] = dataclasses.field(default_factory=lambda: np.eye(3))
     """Rotates given bodies into the camera frame."""
     factor: float = 1.0
     """Factor of resizing; the bodies' focal length over the camera's; units per m."""
@@ -148,7 +148,7 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
             value = by * factor
             forecast = scaled([1, 1, value])
             name = "" if by == 1 else "of people nearby"
-            yield Explanation("focal", forecast, None, None, value, name, reason)
+            yield Explanation("focal", forecast, factor=value, name=name, reason=reason)
     # Bodies that are `factor` times too far look as small: mm, cm, dm, feet.
     for factor, reason in _likely(ratios, (10.0, 100.0, 1000.0, 1 / 0.3048), _SIZE):
         yield Explanation(

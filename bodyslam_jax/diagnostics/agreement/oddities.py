@@ -17,7 +17,7 @@ from bodyslam_jax.diagnostics.agreement.image_points import (
     project,
 )
 from bodyslam_jax.diagnostics.agreement.undo import with_keypoints_mapped_back
-from bodyslam_jax.types import Sequence
+from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
 _FEWEST = 10
 """Least number of frames for a statement about most of them."""
@@ -50,9 +50,9 @@ def warn_of_oddities(
     sequence = _upright(sequence, people, warn)
     if sequence.keypoints is None:
         _check_bodies_alone(people, projected, warn)
-    else:
-        _warn_of_renumbering(sequence, warn)
-        _warn_of_a_corner(sequence, warn)
+    elif sequence.bodies is None:
+        _warn_of_renumbering(sequence.keypoints, warn)
+        _warn_of_a_corner(sequence.keypoints, people.camera, warn)
     return sequence
 
 
@@ -127,7 +127,7 @@ def _upright(sequence: Sequence, people: People, warn) -> Sequence:
         )
         return sequence
     clockwise = worst == "right"
-    if kind == "keypoints" and _exceeds(sequence, width, height):
+    if kind == "keypoints" and _exceeds(sequence.keypoints, width, height):
         w, h = width - 1.0, height - 1.0
         image = (
             ImageMap(np.array([[0.0, -1.0], [1.0, 0.0]]), np.array([h, 0.0]))
@@ -135,7 +135,7 @@ def _upright(sequence: Sequence, people: People, warn) -> Sequence:
             else ImageMap(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([0.0, w]))
         )
         back = with_keypoints_mapped_back(sequence, image)
-        if not _exceeds(back, width, height):
+        if not _exceeds(back.keypoints, width, height):
             warn(
                 f"keypoints are of an image of {height}x{width} px turned by 90 "
                 "degrees "
@@ -152,8 +152,9 @@ def _upright(sequence: Sequence, people: People, warn) -> Sequence:
     return sequence
 
 
-def _exceeds(sequence: Sequence, width: int, height: int) -> bool:
-    keypoints = sequence.keypoints
+def _exceeds(keypoints: Keypoints | None, width: int, height: int) -> bool:
+    if keypoints is None:
+        return False
     uv = keypoints.uv[keypoints.confidence > 0.3]
     if not len(uv):
         return False
@@ -190,11 +191,9 @@ def _check_bodies_alone(people: People, projected, warn) -> None:
         )
 
 
-def _warn_of_renumbering(sequence: Sequence, warn) -> None:
+def _warn_of_renumbering(keypoints: Keypoints, warn) -> None:
     """Warns of keypoints that end where every n-th frame, renumbered, would."""
-    if sequence.bodies is not None:
-        return
-    detected = np.any(sequence.keypoints.confidence > 0, axis=(0, 2))
+    detected = np.any(keypoints.confidence > 0, axis=(0, 2))
     t, count = len(detected), int(np.flatnonzero(detected)[-1]) + 1
     for n in (2, 3, 4, 5, 6, 10):
         if count == -(-t // n) and count >= _FEWEST and detected[:count].mean() > _MOST:
@@ -205,15 +204,14 @@ def _warn_of_renumbering(sequence: Sequence, warn) -> None:
             )
 
 
-def _warn_of_a_corner(sequence: Sequence, warn) -> None:
+def _warn_of_a_corner(keypoints: Keypoints, camera: Intrinsics, warn) -> None:
     """Warns of keypoints in the upper left quarter only, as of a copy of half the size:
     people on the ground before a level camera are not all there."""
-    keypoints = sequence.keypoints
-    size = np.array([sequence.intrinsics.width, sequence.intrinsics.height])
+    size = np.array([camera.width, camera.height])
     uv = keypoints.uv[keypoints.confidence > 0]
     high = np.quantile(uv, 0.99, axis=0) if len(uv) else size
     frames = int((keypoints.confidence > 0).any((0, 2)).sum())
-    if sequence.bodies is None and frames >= _FEWEST and (high < 0.5 * size).all():
+    if frames >= _FEWEST and (high < 0.5 * size).all():
         warn(
             f"keypoints reach ({high[0]:.0f}, {high[1]:.0f}) px only, of {size[0]}x"
             f"{size[1]}: all in the upper left quarter; if people are elsewhere in the "

@@ -24,7 +24,7 @@ def settle_times(
 
     **Raises:** `ValueError` if it is ambiguous which of the two was renumbered.
     """
-    with_keypoints, with_bodies = (rows.any(0) for rows in have_any(sequence))
+    with_keypoints, with_bodies = (np.any(x, axis=0) for x in have_any(sequence))
     figures = (
         f"distance {found.disagreement:.2f} of a person's size then, "
         f"{given.disagreement:.2f} as they are (median)"

@@ -17,9 +17,11 @@ from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
 def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
-    """The sequence with its keypoints mapped by the inverse of `image`, to pixels of
-    the video."""
+    """The sequence with its keypoints, if any, mapped by the inverse of `image`, to
+    pixels of the video."""
     keypoints = sequence.keypoints
+    if keypoints is None:
+        return sequence
     uv, confidence = image.inverse(keypoints.uv), keypoints.confidence
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
     if image.swap:
@@ -34,9 +36,11 @@ def with_bodies_moved(
     place: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 3"]],
     R: Float[np.ndarray, "3 3"] | None = None,
 ) -> Sequence:
-    """The sequence with pelvis positions (m, camera frame) mapped by `place`, and each
-    body rotated about its pelvis by `R`, if given."""
+    """The sequence with the pelvis positions (m, camera frame) of its bodies, if any,
+    mapped by `place`, and each body rotated about its pelvis by `R`, if given."""
     bodies = sequence.bodies
+    if bodies is None:
+        return sequence
     at = bodies.present
     J_0 = np.asarray(body.joint_template[0], float)
     J_0 = J_0 + bodies.shapes[at] @ np.asarray(body.joint_shape_dirs[0], float).T

@@ -7,6 +7,7 @@ numbers a point: x, y, z and a residual, which is -1 where the point is missing.
 import math
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,10 +95,10 @@ def _entry(name: str, group: int, data: bytes) -> bytes:
     return head + struct.pack("<h", len(rest) + 2) + rest
 
 
-def _value(kind: int, value: object) -> bytes:
-    """Type, dimensions and numbers of a parameter."""
+def _value(kind: int, value: Any) -> bytes:
+    """Type, dimensions and values of a parameter: a text, texts or numbers."""
     if kind == _CHAR:
-        words = [value] if isinstance(value, str) else list(value)  # pyright: ignore
+        words = [value] if isinstance(value, str) else list(value)
         width = max(map(len, words))
         shape = [width] if isinstance(value, str) else [width, len(words)]
         data = "".join(word.ljust(width) for word in words).encode()

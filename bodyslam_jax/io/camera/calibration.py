@@ -182,7 +182,8 @@ def rays(
         return np.zeros((0, 2))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-7)
     uv = np.asarray(uv, float)[:, None]
-    return cv2.undistortPointsIter(uv, K, distortion, None, None, stop)[:, 0]
+    rotation, projection = np.eye(3), np.eye(3)  # none: rays, not pixels
+    return cv2.undistortPointsIter(uv, K, distortion, rotation, projection, stop)[:, 0]
 
 
 def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

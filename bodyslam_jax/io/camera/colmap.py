@@ -166,7 +166,11 @@ def _load(path: Path) -> dict[str, Any]:
 def _nerfstudio_camera(path: Path, data: dict[str, Any]) -> FoundCamera:
     frames = data.get("frames")
     first = frames[0] if isinstance(frames, list) and frames else {}
-    value = lambda name: data.get(name, first.get(name))
+
+    def value(name: str) -> Any:
+        """Of all frames, else of the first; `None` if neither has it."""
+        return data.get(name, first.get(name))
+
     needed = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     missing = [name for name in needed if value(name) is None]
     if missing:

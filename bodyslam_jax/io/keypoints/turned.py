@@ -31,7 +31,7 @@ def turned_back(
     width, height = size
     uv = points[..., :2]
     inside = lambda limit: ((uv[sure] >= 0) & (uv[sure] <= limit)).all(axis=-1)
-    beyond = (uv[sure] > np.array([width, height])).any(axis=-1)
+    beyond = np.any(uv[sure] > np.array([width, height]), axis=-1)
     if not len(beyond) or beyond.mean() < _BEYOND:
         return None
     trunk = (uv[:, _MID_HIP] - uv[:, _NECK])[sure[:, _NECK] & sure[:, _MID_HIP]]

@@ -38,9 +38,16 @@ def compare(
 
     One row per model, drift and motion class; constant velocity once; the mean
     displacement of `training` clips, if given. `write_table` writes them.
+
+    **Raises:** `ValueError` without models or drifts.
     """
+    if not len(models) or not len(drifts):
+        raise ValueError(
+            f"compare: {len(models)} models and {len(drifts)} drifts, expected one of "
+            "each or more."
+        )
     skip = max(model.past for model in models.values()) + 1
-    rows = []
+    rows, steady = [], {}
     for name, model in models.items():
         for drift_deg in drifts:
             found = evaluate_model(
@@ -51,12 +58,13 @@ def compare(
                 for kind, measures in found.items()
                 if kind != "constant velocity"
             ]
+            steady = found["constant velocity"]
     rows.append(
         {
             "model": "constant velocity (given the last displacement)",
             "drift": 0.0,
             "class": "all",
-            **found["constant velocity"],
+            **steady,
         }
     )
     if training:
@@ -139,16 +147,16 @@ def draw_rollout(
     from matplotlib.figure import Figure  # takes half a second to import
 
     figure = Figure((9, 4), layout="constrained")
-    views = zip(figure.subplots(2, 1, sharex=True), (up, side), strict=True)
-    for axis, vertical in views:
+    axes = figure.subplots(2, 1, sharex=True)
+    for axis, vertical in zip(axes, (up, side), strict=True):
         for k in range(0, len(joints), every):
             color = "0.6" if k == 0 else f"C{k // every % 10}"
             for joint in range(1, 24):
                 ends = joints[k, [joint, PARENTS[joint]]]
                 axis.plot(ends @ heading, ends @ vertical, color=color, lw=1)
         axis.set_aspect("equal")
-    axis.set(xlabel="m ahead", ylabel="m to the left")
-    figure.axes[0].set(ylabel="m up", title=f"every {every / FPS:.2g} s")
+    axes[1].set(xlabel="m ahead", ylabel="m to the left")
+    axes[0].set(ylabel="m up", title=f"every {every / FPS:.2g} s")
     figure.savefig(path, dpi=120)
 
 
