@@ -1,44 +1,42 @@
 """Correction of left-right exchanges in detected keypoints.
 
 Detectors process single images, and may exchange the left and right limbs for some
-frames, mostly of people seen from behind. A hidden Markov model with two states
-(correct and exchanged) for the arms, and one for the legs: between two frames the
-vector from each right joint to the left one changes little, or changes sign if the
-labels were exchanged in between. Changes are whitened by the usual changes around them.
+frames: of people seen from behind, and where legs cross in a view from the side. The
+vector from each left joint to the right one moves at nearly constant velocity, so that
+it passes through zero where legs cross; with exchanged labels it changes sign, or turns
+back at a crossing. A Kalman filter of constant velocity follows these vectors, arms and
+legs apart, under several hypotheses of which frames are exchanged; of those that agree
+in the last frames the most likely one is kept (a Viterbi algorithm over the last
+`_REMEMBERED` labels).
 """
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.ndimage import median_filter
+from jaxtyping import Bool, Float, Int
 
-from bodyslam_jax.people.viterbi import cheapest_states
 from bodyslam_jax.types import Keypoints
 
 ARMS = ((2, 5), (3, 6), (4, 7))
 """Shoulders, elbows, wrists of BODY_25: right and left."""
 LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
 """Hips, knees, ankles, big toes, small toes, heels."""
-_CHANGE = 4.0
+_CHANGE = 1.0
 """-log odds of a change of state at a frame."""
-_EXCHANGED = 3.0
-"""-log odds of exchanged labels, per correlation time of the errors."""
-_LASTING = 1 / 3
-"""s: correlation time of the errors."""
+_EXCHANGED = 0.3
+"""-log odds of exchanged labels, per frame at 30 fps; less at higher rates, as errors
+are correlated from frame to frame."""
 _INDEPENDENT = 0.5
 """Weight of each joint's evidence, as the joints of a limb are correlated."""
-_SCALE = 5.0
-"""Scale of the robust loss on changes, in their standard deviations."""
-_WINDOW = 7
-"""Frames within which the usual change is measured."""
-_MEDIAN_OF_TWO = 1.177
-"""Median length of a vector with two normal components of deviation 1."""
-_FLOOR = 0.01
-"""Least standard deviation of a change, of the person's size; combined with 1 px, the
-noise assumed of any detector in images of any size."""
-_LONGEST = 5
-"""Longest gap, frames, over which labels are compared."""
+_NOISE = 0.04
+"""Standard deviation of a vector's components, of the person's size in the image;
+combined with 1 px, the noise assumed of any detector in images of any size."""
+_ACCELERATION = 6.0
+"""Spectral density of the vectors' acceleration, its root, sizes/s^1.5."""
+_GATE = 6.0
+"""Innovations of more standard deviations cost no more than this, and are not used."""
+_REMEMBERED = 5
+"""Number of last frames whose labels tell hypotheses apart."""
 
 
 def correct_left_right(
@@ -67,24 +65,63 @@ def _exchanged(
 ) -> Bool[np.ndarray, " t"]:
     """Frames in which the labels of these pairs of one person are exchanged."""
     size = _size(uv, detected)
-    changes = np.full(max(len(uv) - 1, 0), _CHANGE)
-    for i, j in pairs:
-        where = np.flatnonzero(detected[:, i] & detected[:, j])
-        gap = np.diff(where)
-        if len(where) < 3:
-            continue
-        across = uv[where, i] - uv[where, j]
-        on = np.linalg.norm(across[1:] - across[:-1], axis=-1)
-        off = np.linalg.norm(across[1:] + across[:-1], axis=-1)
-        smaller = np.minimum(on, off) / gap
-        usual = median_filter(smaller, min(_WINDOW, len(gap)), mode="nearest")
-        floor = np.hypot(_FLOOR * size, 1.0)
-        sigma = np.hypot(usual * gap / _MEDIAN_OF_TWO, floor)
-        evidence = 0.5 * (_robust(off / sigma) - _robust(on / sigma))
-        near = gap <= _LONGEST
-        changes[where[1:][near] - 1] += _INDEPENDENT * evidence[near]
-    cost = _EXCHANGED * min(1.0, 1 / (fps * _LASTING))
-    return cheapest_states(np.full(len(uv), cost), changes)
+    first, second = np.array(pairs).T
+    seen = detected[:, first] & detected[:, second]
+    if size == 0 or not seen.any():
+        return np.zeros(len(uv), bool)
+    across = np.where(seen[..., None], uv[:, first] - uv[:, second], 0.0) / size
+    dt = 1 / fps
+    move = np.array([[1.0, dt], [0.0, 1.0]])
+    spread = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * _ACCELERATION**2
+    noise = _NOISE**2 + size**-2.0
+    sign, prior = np.array([1.0, -1.0]), np.array([0.0, _EXCHANGED * min(1.0, 30 * dt)])
+
+    # Axes: hypotheses, pairs, (place, velocity), image coordinates.
+    mean = np.zeros((1, len(pairs), 2, 2))
+    covariance = np.tile(np.diag([1.0, 10.0]), (1, len(pairs), 1, 1))
+    cost, labels, steps = np.zeros(1), np.zeros(1, int), []
+    for k in range(len(uv)):
+        mean = move @ mean
+        covariance = move @ covariance @ move.T + spread
+        variance = covariance[..., 0, 0] + noise
+        # Each hypothesis goes on with both labels, which are the last axis but three.
+        innovation = sign[:, None, None] * across[k] - mean[:, None, :, 0]
+        away = (innovation**2).sum(-1) / variance[:, None]
+        near = seen[k] & (away < _GATE**2)
+        paid = (seen[k] * np.minimum(away, _GATE**2)).sum(-1) * _INDEPENDENT / 2
+        changed = (labels[:, None] & 1) != np.arange(2)
+        total = cost[:, None] + paid + prior + _CHANGE * (changed & (k > 0))
+        gain = (covariance[..., 0] / variance[..., None])[:, None] * near[..., None]
+        means = mean[:, None] + gain[..., None] * innovation[..., None, :]
+        covariances = (
+            covariance[:, None]
+            - gain[..., None] * covariance[:, None, :, 0][..., None, :]
+        )
+        longer = (labels[:, None] << 1 | np.arange(2)) % 2**_REMEMBERED
+        kept = _cheapest_of_each(longer.ravel(), total.ravel())
+        flat = lambda x: x.reshape(-1, *x.shape[2:])[kept]
+        mean, covariance, cost, labels = map(flat, (means, covariances, total, longer))
+        steps.append((kept // 2, labels & 1))
+    return _traced_back(steps, int(cost.argmin()))
+
+
+def _cheapest_of_each(
+    group: Int[np.ndarray, " n"], cost: Float[np.ndarray, " n"]
+) -> Int[np.ndarray, " g"]:
+    """The index of the cheapest member of each group."""
+    order = np.lexsort((cost, group))
+    return order[np.unique(group[order], return_index=True)[1]]
+
+
+def _traced_back(
+    steps: list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, " _"]]], last: int
+) -> Bool[np.ndarray, " t"]:
+    """The labels that led to a hypothesis; `steps` are parents and labels."""
+    found = np.zeros(len(steps), bool)
+    for k in range(len(steps) - 1, -1, -1):
+        parents, labels = steps[k]
+        found[k], last = labels[last], int(parents[last])
+    return found
 
 
 def _size(uv: Float[np.ndarray, "t 25 2"], detected: Bool[np.ndarray, "t 25"]) -> float:
@@ -95,9 +132,3 @@ def _size(uv: Float[np.ndarray, "t 25 2"], detected: Bool[np.ndarray, "t 25"]) -
     some = detected.sum(axis=1) > 1
     extent = np.linalg.norm((high - low)[some], axis=-1)
     return float(np.median(extent)) if some.any() else 0.0
-
-
-def _robust(whitened: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Geman and McClure's ρ."""
-    squared = whitened**2
-    return squared / (1 + squared / _SCALE**2)
