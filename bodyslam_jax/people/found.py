@@ -19,6 +19,12 @@ _SCORES = (0.08, 0.15, 0.22, 0.30, 0.40, 0.50)
 _CONFIDENCES = (0.0, 0.1, 0.2, 0.5, 0.8, 1.0)
 _FEET = ((21, 19, 11, 15), (24, 22, 14, 16))
 """BODY_25's heel, big toe and ankle, COCO's ankle, of both sides."""
+_WRISTS = [9, 10]
+"""Of COCO."""
+_HIDDEN = 3
+"""Power of a wrist's confidence: behind the trunk it is guessed, often where the other
+wrist is. On ten rendered sequences its error was 2.5 times that of a sure one at a
+confidence of 0.8, 7 times at 0.5; other joints' go with its inverse."""
 
 _LANDMARK = np.array(
     [0, -1, 12, 14, 16, 11, 13, 15, -1, 24, 26, 28, 23, 25, 27] + [-1] * 10
@@ -81,8 +87,9 @@ def as_body25(
     points: Float[np.ndarray, "17 3"], feet: Float[np.ndarray, "4 3"] | None
 ) -> Float[np.ndarray, "25 3"]:
     """BODY_25 from MoveNet's keypoints, and what `find_feet` found."""
-    sure = np.column_stack([points[:, :2], confidence(points[:, 2])])
-    found = to_body25(sure)
+    sure = confidence(points[:, 2])
+    sure[_WRISTS] **= _HIDDEN
+    found = to_body25(np.column_stack([points[:, :2], sure]))
     if feet is not None:
         for side, (heel, toe, _, _) in enumerate(_FEET):
             found[heel], found[toe] = feet[2 * side], feet[2 * side + 1]
