@@ -168,7 +168,7 @@ def main():
     )
     parser.add_argument(
         "--tracks",
-        choices=["short", "long", "again", "far"],
+        choices=["short", "long", "again", "far", "corridor"],
         default="short",
         help="some last long, or go on on the way back, or a few all the time "
         "(landmarks, joint, breakdown, peers)",

@@ -17,6 +17,16 @@ TRACK = 16.0
 """Mean length of a track, frames."""
 AGAIN = 0.3
 """Share of the points that are seen on the way back too."""
+CORRIDOR = np.array([1.6, 1.4, 25.0])
+"""Half of a corridor's width and height, and how far along it points are seen, m."""
+MEDIAN, SPREAD, LONGEST = 15.0, 0.7, 60
+"""Tracks in the corridor: median length, frames; standard deviation of its logarithm;
+longest."""
+SEEN = 150
+"""Points in each frame in the corridor."""
+DRIFT = 0.012
+"""Standard deviation of the change of the start's logarithm of scale, from frame to
+frame of the corridor."""
 FAR = 40
 """Points so far away that the camera has them before it all the way."""
 
@@ -68,11 +78,18 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
     """Points seen in a run of frames each; about 10 new ones a frame. Of `long` tracks
     each is as likely to be lost in the next frame as any other, and some last long;
     some points of `again` are seen a second time, on the way back; the last few of
-    `far` are distant, and found in one frame of three all the time."""
+    `far` are distant, and found in one frame of three all the time. Those of `corridor`
+    are on its walls, floor and ceiling, their lengths log-normal."""
+    if tracks == "corridor":
+        # Of long tracks the first and last points are out of the image.
+        per_frame = 1.15 * SEEN / (MEDIAN * np.exp(SPREAD**2 / 2))
     count = int(per_frame * frames)
     start = rng.integers(-int(TRACK) // 2, frames - 2, count)
     if tracks == "long":
         length = 3 + rng.geometric(1 / (TRACK - 3), count)
+    elif tracks == "corridor":
+        length = rng.lognormal(np.log(MEDIAN), SPREAD, count)
+        length = np.clip(length, 3, LONGEST).astype(int)
     else:
         length = np.clip(rng.gamma(4.0, TRACK / 4, count), 4, 3 * TRACK).astype(int)
     stop = np.minimum(start + length, frames)
@@ -86,6 +103,12 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
         [(u - INTRINSICS[2:]) / INTRINSICS[:2], np.ones((len(u), 1))], 1
     )
     camera = cameras[middle]
+    if tracks == "corridor":
+        away = np.einsum("mij,mj->mi", camera[:, :3, :3], ray)
+        to_wall = (CORRIDOR - np.abs(camera[:, :3, 3] * [1, 1, 0]) * scale) / np.abs(
+            away
+        )
+        depth = to_wall.min(axis=1) / scale
     points = camera[:, :3, 3] + np.einsum(
         "mij,mj->mi", camera[:, :3, :3], ray * depth[:, None]
     )
@@ -139,6 +162,8 @@ def make(
     )
     pixel = np.array(project(truth.intrinsics, array(p_C)), float)
     seen = p_C[:, 2] > 0.3
+    if tracks == "corridor":
+        seen &= np.all((pixel > 0) & (pixel < 2 * INTRINSICS[2:]), axis=1)
     missing = rng.random((people, frames, 25)) < 0.1
     # The scene is the same for every draw, so that one compilation serves all.
     rng = np.random.default_rng((seed, draw))
@@ -158,7 +183,28 @@ def make(
     if people:
         factors += person(truth, missing, rng, array, loss, noise)
     problem = g.make_problem(factors, truth)
-    return problem, truth, start_of(problem, truth, rng, array)
+    start = start_of(problem, truth, rng, array)
+    if tracks == "corridor":
+        start = with_scale_drift(start, frame, landmark, rng)
+    return problem, truth, start
+
+
+def with_scale_drift(state, frame, landmark, rng):
+    """The state as odometry leaves it: the scale of the path wanders, and landmarks
+    have that of the middle of their tracks."""
+    centres, points = np.asarray(state.cameras[:, :3, 3]), np.asarray(state.landmarks)
+    scale = np.exp(np.cumsum(DRIFT * rng.standard_normal(len(centres))))
+    steps = np.diff(centres, axis=0, prepend=centres[:1])
+    drifted = centres[0] + np.cumsum(scale[:, None] * steps, axis=0)
+    number = np.maximum(np.bincount(landmark, minlength=len(points)), 1)
+    middle = np.bincount(landmark, frame, minlength=len(points)) / number
+    k = np.round(middle).astype(int)
+    moved = drifted[k] + scale[k, None] * (points - centres[k])
+    return eqx.tree_at(
+        lambda s: (s.cameras, s.landmarks),
+        state,
+        (state.cameras.at[:, :3, 3].set(drifted), jnp.asarray(moved, points.dtype)),
+    )
 
 
 def person(truth, missing, rng, array, loss, noise):
