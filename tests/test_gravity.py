@@ -120,6 +120,18 @@ def test_trunks_count_more_across_the_view_than_along_it():
     assert abs(tilts[0][2]) > abs(tilts[1][0])
 
 
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_many_people_who_lean_alike_do_not_outvote_the_floor(count):
+    """Seen by one detector from one side, trunks err alike: a crowd is no better a
+    spirit level than one of them."""
+    feet = np.concatenate(
+        [walker(way(bend=0.2) + [0.8 * h - 3.0, 0.5 * h]) for h in range(count)]
+    )
+    found = find_upright(*cues(feet, [9, 0, 0]))
+    assert off(found.up) < 3.0
+    assert found.sigma < np.radians(4.0)
+
+
 def test_people_of_wrong_size_do_not_tilt_the_floor():
     """A man who is made 5 % too small floats; he is further away as well."""
     near, far = walker(way(bend=2.0)), walker(way(bend=2.0) + [0.0, 3.0])
