@@ -23,12 +23,12 @@ LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
 """Hips, knees, ankles, big toes, small toes, heels."""
 _CHANGE = 1.0
 """-log odds of a change of state at a frame."""
-_EXCHANGED = 0.3
+_EXCHANGED = 0.45
 """-log odds of exchanged labels, per frame at 30 fps; less at higher rates, as errors
 are correlated from frame to frame."""
 _INDEPENDENT = 0.5
 """Weight of each joint's evidence, as the joints of a limb are correlated."""
-_NOISE = 0.04
+_NOISE = 0.05
 """Standard deviation of a vector's components, of the person's size in the image;
 combined with 1 px, the noise assumed of any detector in images of any size."""
 _ACCELERATION = 6.0
@@ -65,7 +65,8 @@ def _exchanged(
 ) -> Bool[np.ndarray, " t"]:
     """Frames in which the labels of these pairs of one person are exchanged."""
     size = _size(uv, detected)
-    first, second = np.array(pairs).T
+    # Hips and shoulders are little apart in a view from the side, and err by as much.
+    first, second = np.array(pairs[1:]).T
     seen = detected[:, first] & detected[:, second]
     if size == 0 or not seen.any():
         return np.zeros(len(uv), bool)
@@ -77,8 +78,8 @@ def _exchanged(
     sign, prior = np.array([1.0, -1.0]), np.array([0.0, _EXCHANGED * min(1.0, 30 * dt)])
 
     # Axes: hypotheses, pairs, (place, velocity), image coordinates.
-    mean = np.zeros((1, len(pairs), 2, 2))
-    covariance = np.tile(np.diag([1.0, 10.0]), (1, len(pairs), 1, 1))
+    mean = np.zeros((1, len(first), 2, 2))
+    covariance = np.tile(np.diag([1.0, 10.0]), (1, len(first), 1, 1))
     cost, labels, steps = np.zeros(1), np.zeros(1, int), []
     for k in range(len(uv)):
         mean = move @ mean
