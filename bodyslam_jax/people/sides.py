@@ -33,7 +33,9 @@ _NOISE = 0.05
 combined with 1 px, the noise assumed of any detector in images of any size."""
 _ACCELERATION = 6.0
 """Spectral density of the vectors' acceleration, its root, sizes/s^1.5."""
-_GATE = 6.0
+_FORGOTTEN = 0.5
+"""Time constant with which velocities decay, s: so they stay bounded across gaps."""
+_GATE = 5.0
 """Innovations of more standard deviations cost no more than this, and are not used."""
 _REMEMBERED = 5
 """Number of last frames whose labels tell hypotheses apart."""
@@ -72,14 +74,15 @@ def _exchanged(
         return np.zeros(len(uv), bool)
     across = np.where(seen[..., None], uv[:, first] - uv[:, second], 0.0) / size
     dt = 1 / fps
-    move = np.array([[1.0, dt], [0.0, 1.0]])
+    move = np.array([[1.0, dt], [0.0, np.exp(-dt / _FORGOTTEN)]])
     spread = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * _ACCELERATION**2
     noise = _NOISE**2 + size**-2.0
     sign, prior = np.array([1.0, -1.0]), np.array([0.0, _EXCHANGED * min(1.0, 30 * dt)])
 
     # Axes: hypotheses, pairs, (place, velocity), image coordinates.
     mean = np.zeros((1, len(first), 2, 2))
-    covariance = np.tile(np.diag([1.0, 10.0]), (1, len(first), 1, 1))
+    usual = _ACCELERATION**2 * _FORGOTTEN / 2
+    covariance = np.tile(np.diag([1.0, usual]), (1, len(first), 1, 1))
     cost, labels, steps = np.zeros(1), np.zeros(1, int), []
     for k in range(len(uv)):
         mean = move @ mean
