@@ -70,7 +70,7 @@ def run(
 def demo(
     *,
     out: Path = Path("bodyslam_demo"),
-    from_pixels: bool = False,
+    from_pixels: bool = True,
     preset: Preset = "default",
     settings: Path | None = None,
     open: bool = False,
@@ -80,8 +80,8 @@ def demo(
 
     Args:
         out: Run folder to write.
-        from_pixels: Detect the walker in the images by the networks that ship, in place
-            of simulated keypoints and bodies.
+        from_pixels: Find the walker in the images by the networks that ship; otherwise
+            simulated keypoints and bodies are given, as of a regressor.
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.

@@ -19,15 +19,15 @@ def demo(
     out: Path,
     config: Config = Config(),
     *,
-    from_pixels: bool = False,
+    from_pixels: bool = True,
 ) -> Result:
     """Renders a walker filmed by a moving camera and runs the pipeline on the images.
 
     The scene is written to `out/scene`, a sequence folder with its ground truth.
 
     Args:
-        from_pixels: whether people are found in the images, in place of simulated
-            keypoints and bodies.
+        from_pixels: whether people are found in the images, by the networks that
+            ship, or else simulated keypoints and bodies are given.
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
