@@ -89,6 +89,7 @@ def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     assert "in metres: C-ATE, SE(3) 4.9" in second and "H-ATE" in second
 
 
+@pytest.mark.slow
 def test_a_run_without_people_has_no_metres_to_be_judged():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
     nobody = dataclasses.replace(result, present=np.zeros_like(result.present))

@@ -229,6 +229,7 @@ def test_default_body_is_a_symmetric_adult(default):
     assert points["left_eye"][0] > 0.02 > -0.02 > points["right_eye"][0]
 
 
+@pytest.mark.slow
 def test_picture(default, tmp_path):
     path = tmp_path / "body.png"
     body.save_picture(default, path)

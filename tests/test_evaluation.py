@@ -567,6 +567,7 @@ def test_what_is_compared_is_said():
     assert any("in 2 frames only, which alignment brings together" in x for x in said)
 
 
+@pytest.mark.slow
 def test_poses_beyond_a_cut_are_not_compared():
     truth = _truth()
     T_WC = truth.T_WC.copy()

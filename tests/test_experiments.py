@@ -113,6 +113,7 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     np.testing.assert_allclose(state.shapes[0], regressed.mean(axis=0))
 
 
+@pytest.mark.slow
 def test_shaking_keeps_what_holds_the_map(scene):
     problem, _, start = scene
     shaken = shake(start, problem.free, jax.random.key(0), shift=0.1, turn=0.01)

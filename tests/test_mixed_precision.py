@@ -72,6 +72,7 @@ def test_slopes_and_costs_are_those_of_double_precision():
         np.testing.assert_allclose(some, exact, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_products_are_of_all_bits_where_a_gpu_would_leave_some_out():
     problem, _, start = make()
     program = str(jax.make_jaxpr(lambda s: mixed(problem, s).cost)(start))

@@ -266,6 +266,7 @@ def test_the_output_path_is_checked_before_training(
     assert sorted(tmp_path.iterdir()) == [file, folder]
 
 
+@pytest.mark.slow
 def test_training_learns(trained):
     _, history = trained
     assert history[-1, 0] < history[0, 0]

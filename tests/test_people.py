@@ -394,6 +394,7 @@ def test_people_without_bodies_are_fitted_to_their_keypoints(
     assert people.without_bodies(alone).tolist() == [True, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("regressed", "said", "gain"),
     [

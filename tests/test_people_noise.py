@@ -135,6 +135,7 @@ def test_a_burst_of_jitter_turns_nobody_round(truth, body):
     assert np.all(error < own[: len(error)] + 45)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [

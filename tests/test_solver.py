@@ -377,6 +377,7 @@ def test_the_world_and_unit_of_the_map_do_not_matter():
     assert jnp.isclose(first.cost, second.cost, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_starts_are_mapped_over_in_one_go():
     problem, truth, start = make()
     rng = np.random.default_rng(1)

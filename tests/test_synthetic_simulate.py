@@ -165,6 +165,7 @@ def procrustes(x, y):
     return np.linalg.norm(scale * x @ (U @ S @ V).T - y, axis=1).mean()
 
 
+@pytest.mark.slow
 def test_regressed_bodies_have_shrunken_shapes_and_wrong_depths():
     ratio, spread, shrink = [], [], []
     for seed in range(8):

@@ -46,6 +46,7 @@ PLACES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", PLACES)
 def test_lost_landmarks_are_found_exactly_and_others_stay(where):
     problem, truth = make()
