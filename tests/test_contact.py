@@ -1,8 +1,10 @@
 """Which of heels and toes stand: labels, network, the factor that holds them."""
 
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -19,7 +21,7 @@ from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.contact_network import windows_within
-from bodyslam_jax.pipeline import joint_problem
+from bodyslam_jax.pipeline import contact_stage, joint_problem
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet, stand_on_plane
 from bodyslam_jax.simulation import sequences
 
@@ -239,3 +241,28 @@ def test_standing_feet_stop_sliding_and_nothing_else_changes():
     moved = found.state.roots[..., :3, 3] - start.roots[..., :3, 3]
     assert float(jnp.abs(moved).max()) < 0.15
     assert found.probability.shape == (1, 60, 4)
+
+
+def test_the_joint_problem_and_that_of_standing_feet_are_one_program(monkeypatch):
+    """Their trees and shapes are equal, so that the second solve compiles nothing."""
+    case = simulate_case("E2", frames=20, family="follow")
+    arguments = case.sequence, case.cameras, case.bodies, case.body, case.config
+    solved = []
+
+    def record(problem, state, config, name):
+        solved.append(problem)
+        return SimpleNamespace(state=state), {}
+
+    monkeypatch.setattr(contact_stage, "solve_stage", record)
+    prepared = joint_problem.prepare(*arguments, body_only_solve=False)
+    rest = case.sequence, case.cameras, case.body, case.config
+    hold_standing_feet(prepared, prepared.state, *rest)
+    (problem,) = solved
+    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x
+    ours, joint = (jax.tree.map(shape, p) for p in (problem, prepared.problem))
+    assert eqx.tree_equal(ours, joint)
+    (contact,) = [f for f in problem.factors if isinstance(f, g.FootContact)]
+    assert np.isfinite(contact.sigma).any()
+    bare = joint_problem.prepare(*arguments, body_only_solve=False, feet=False)
+    with pytest.raises(ValueError, match="no FootContact"):
+        hold_standing_feet(bare, bare.state, *rest)

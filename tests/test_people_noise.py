@@ -291,3 +291,39 @@ def test_who_is_named_left_for_right_is_the_same_person(truth):
     )
     assert found.keypoints.uv.shape[0] == 1
     assert (found.keypoints.confidence[0] > 0).any(axis=1).all()
+
+
+def test_legs_exchanged_from_one_crossing_to_the_next_are_found():
+    """Of a walker seen from the side: where legs cross, the vector from left to right
+    is near zero, so that exchanged labels show in its velocity only."""
+    legs = ((10, 13), (11, 14), (22, 19), (24, 21))  # knees, ankles, toes, heels
+    frame = np.arange(60)
+    swing = 60.0 * np.sin(2 * np.pi * frame / 30)
+    rng = np.random.default_rng(0)
+    uv = np.tile([300.0, 200.0], (1, 60, 25, 1))
+    for depth, (right, left) in enumerate(legs, start=1):
+        uv[0, :, right] += np.column_stack(
+            [swing * depth / 2, 60.0 * depth + 0 * swing]
+        )
+        uv[0, :, left] += np.column_stack(
+            [-swing * depth / 2, 60.0 * depth + 0 * swing]
+        )
+    uv[0, :, 0, 1] -= 120.0
+    uv += 1.5 * rng.standard_normal(uv.shape)
+    confidence = np.zeros((1, 60, 25))
+    confidence[0][:, [0, *np.ravel(legs)]] = 1.0
+    seen = Keypoints(uv, confidence)
+    between = (frame >= 15) & (frame < 30)
+    _, none = people.correct_left_right(seen, 30.0)
+    assert not none.any()
+    wrong = uv.copy()
+    for right, left in legs:
+        wrong[:, between, right] = uv[:, between, left]
+        wrong[:, between, left] = uv[:, between, right]
+    found, renamed = people.correct_left_right(Keypoints(wrong, confidence), 30.0)
+    # In the frames of a crossing either label explains the same pixels.
+    crossing = np.abs(swing) < 15.0
+    assert (renamed[0, :, 1] == between)[~crossing].all()
+    assert not renamed[0, :, 0].any()
+    apart = np.abs(found.uv - uv)[0][~crossing][:, np.ravel(legs)]
+    assert apart.max() == 0.0

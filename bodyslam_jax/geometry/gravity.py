@@ -34,8 +34,9 @@ _TRUNK_ALONG = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
 """The same along the view, without and with bodies fitted to keypoints: ten simulated
 sequences gave 1.5 and 3.4 degrees root mean square; of real clips one gave 11."""
 _TRUNK_COMMON = 0.65
-"""Share of these deviations that is the same for all people of a video, who are seen
-from one side by one detector: more people do not reduce it."""
+"""Share of these standard deviations that is common to all people of a video, whom one
+detector sees from one side: averaging over people does not reduce it. Assumed; the
+sequences with a known up have one or two people."""
 _WORSE_TRUNKS = {False: 0.05, True: 0.15}
 _HOW_MUCH_WORSE = 2.5
 """Probability that a person's trunk is a worse measurement, without and with bodies

@@ -43,7 +43,7 @@ def contact_factor(
 def without_contacts(
     state: graph.State, fps: float, body: BodyModel, weights: GraphWeights
 ) -> graph.FootContact:
-    """The same factor without weight: no point stands."""
+    """`contact_factor` for probabilities of zero, so that its cost is zero."""
     people, frames = state.poses.shape[:2]
     probability = jnp.zeros((people, frames, 4), state.poses.dtype)
     nobody = np.zeros((people, frames), bool)

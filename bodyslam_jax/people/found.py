@@ -21,10 +21,11 @@ _FEET = ((21, 19, 11, 15), (24, 22, 14, 16))
 """BODY_25's heel, big toe and ankle, COCO's ankle, of both sides."""
 _WRISTS = [9, 10]
 """Of COCO."""
-_HIDDEN = 3
-"""Power of a wrist's confidence: behind the trunk it is guessed, often where the other
-wrist is. On ten rendered sequences its error was 2.5 times that of a sure one at a
-confidence of 0.8, 7 times at 0.5; other joints' go with its inverse."""
+_WRIST_POWER = 3
+"""Exponent of a wrist's confidence. The network guesses a wrist behind the trunk, often
+at the place of the other wrist: on ten rendered sequences the error was 2.5 times that
+of a certain wrist at a confidence of 0.8, and 7 times at 0.5. Errors of other joints
+are about inverse to their confidence."""
 
 _LANDMARK = np.array(
     [0, -1, 12, 14, 16, 11, 13, 15, -1, 24, 26, 28, 23, 25, 27] + [-1] * 10
@@ -88,7 +89,7 @@ def as_body25(
 ) -> Float[np.ndarray, "25 3"]:
     """BODY_25 from MoveNet's keypoints, and what `find_feet` found."""
     sure = confidence(points[:, 2])
-    sure[_WRISTS] **= _HIDDEN
+    sure[_WRISTS] **= _WRIST_POWER
     found = to_body25(np.column_stack([points[:, :2], sure]))
     if feet is not None:
         for side, (heel, toe, _, _) in enumerate(_FEET):

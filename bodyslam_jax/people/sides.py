@@ -32,13 +32,15 @@ _NOISE = 0.05
 """Standard deviation of a vector's components, of the person's size in the image;
 combined with 1 px, the noise assumed of any detector in images of any size."""
 _ACCELERATION = 6.0
-"""Spectral density of the vectors' acceleration, its root, sizes/s^1.5."""
+"""Square root of the spectral density of the vectors' acceleration, sizes/s^1.5."""
 _FORGOTTEN = 0.5
 """Time constant with which velocities decay, s: so they stay bounded across gaps."""
 _GATE = 5.0
-"""Innovations of more standard deviations cost no more than this, and are not used."""
+"""Standard deviations beyond which an innovation is an outlier: it costs as much as one
+at this bound, and the filter is not updated with it."""
 _REMEMBERED = 5
-"""Number of last frames whose labels tell hypotheses apart."""
+"""Hypotheses with the same labels in this number of last frames are merged: the most
+likely one is kept."""
 
 
 def correct_left_right(
@@ -65,9 +67,14 @@ def _exchanged(
     pairs: tuple[tuple[int, int], ...],
     fps: float,
 ) -> Bool[np.ndarray, " t"]:
-    """Frames in which the labels of these pairs of one person are exchanged."""
+    """Frames in which the labels of these pairs of one person are exchanged.
+
+    The state of a pair is its vector and the vector's velocity, in units of the
+    person's size; exchanged labels measure the vector with the opposite sign.
+    """
     size = _size(uv, detected)
-    # Hips and shoulders are little apart in a view from the side, and err by as much.
+    # Hips and shoulders are close together in a view from the side: their vectors are
+    # no longer than the error of a keypoint.
     first, second = np.array(pairs[1:]).T
     seen = detected[:, first] & detected[:, second]
     if size == 0 or not seen.any():
@@ -88,7 +95,8 @@ def _exchanged(
         mean = move @ mean
         covariance = move @ covariance @ move.T + spread
         variance = covariance[..., 0, 0] + noise
-        # Each hypothesis goes on with both labels, which are the last axis but three.
+        # Each hypothesis is continued with both labels: axes are hypotheses, labels,
+        # pairs, image coordinates.
         innovation = sign[:, None, None] * across[k] - mean[:, None, :, 0]
         away = (innovation**2).sum(-1) / variance[:, None]
         near = seen[k] & (away < _GATE**2)

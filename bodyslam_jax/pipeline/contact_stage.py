@@ -59,12 +59,19 @@ def hold_standing_feet(
 
     Nothing changes without people, without `weights.contact_sigma`, or with a body
     model that the contact network was not trained on.
+
+    **Raises:** `ValueError` if `prepared` was made with `feet=False`.
     """
     roots = prepared.roots
     present = roots.present & cameras.registered
     predictor = contact_predictor(sequence, roots, body, config)
     if predictor is None or not present.any():
         return Standing(best)
+    if not any(isinstance(f, graph.FootContact) for f in prepared.problem.factors):
+        raise ValueError(
+            "prepared.problem.factors: no FootContact; expected a problem of "
+            "`prepare(..., feet=True)`."
+        )
     probability = predict(predictor, best)
     present[list(prepared.passengers)] = False
     contact = initialisation.contact_factor(

@@ -73,8 +73,8 @@ def prepare(
     """The body-only solve, the first scale in closed form, then the whole graph.
 
     Without `body_only_solve` nothing is solved: people start as their bodies are given.
-    With `feet` the problem has room for standing feet (`contact_stage.py`), which so
-    far have no weight.
+    With `feet` the problem has the factor of standing feet, without weight, which
+    `contact_stage.hold_standing_feet` replaces.
 
     Body poses are fitted to keypoints before the motion model reads them: a regressor's
     errors in orientation bias the displacements that are predicted from it.
