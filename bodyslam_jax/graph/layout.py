@@ -98,9 +98,15 @@ def make_layout(
     landmark: Int[np.ndarray, " m"],
     num_people: int = 0,
     limbs: Limbs = (JOINTS,),
+    *,
+    common_sizes: bool = True,
 ) -> Layout:
-    """Groups `m` observations of landmarks. Indices are not checked."""
-    for size in sizes.SIZES:
+    """Groups `m` observations of landmarks. Indices are not checked.
+
+    Without `common_sizes`, or if there is none that holds the problem, its tables are
+    as large as it needs.
+    """
+    for size in sizes.SIZES if common_sizes else ():
         found = _in_size(size, num_frames, num_landmarks, frame, landmark, limbs)
         if found is not None:
             return found
@@ -169,8 +175,8 @@ def _of_own_size(
     num_people: int,
     limbs: Limbs,
 ) -> Layout:
-    """The layout of a problem that fits in no common size: many frames or landmarks,
-    or long tracks. Its sizes are rounded up."""
+    """The layout of a problem whose sizes are its own, rounded up. So are those of
+    many frames or landmarks, or of long tracks, which fit in no common size."""
     count = -(-num_frames // CHUNK)
     num_chunks = round_up(count, parts=8)
     room = round_up(num_landmarks + 1), round_up(len(frame) + 1)

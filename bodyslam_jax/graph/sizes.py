@@ -3,6 +3,10 @@
 A problem is padded to the first size that holds it, so that videos of any length, and
 with any tracks, share a few programs. All sizes of one problem follow from its number
 of chunks: frames, landmarks, observations, and the tables of landmarks.
+
+Empty rows of tables cost time. With people that is a tenth of an iteration, and with
+few landmarks it is little. Without people, and with many landmarks, it would be half of
+an iteration: such a problem has sizes of its own by default (`is_dense`).
 """
 
 from typing import NamedTuple
@@ -35,6 +39,15 @@ LONGEST = 20
 _MOST = 40
 """Chunks up to which there is a size for longer tracks: their covariances take memory
 in proportion to the number of chunks and the square of the bandwidth."""
+_LONG, _DENSE = 200, 6.4
+"""Number of frames, and landmarks for each, from which on a problem without people
+saves more in three solves with sizes of its own than their compilation takes."""
+
+
+def is_dense(num_frames: int, num_landmarks: int, num_people: int) -> bool:
+    """Whether a problem is faster, by its compilation too, in sizes of its own."""
+    many = num_landmarks > _DENSE * num_frames
+    return num_people == 0 and num_frames >= _LONG and many
 
 
 def _size(chunks: int, narrow: int, wide: int) -> Size:

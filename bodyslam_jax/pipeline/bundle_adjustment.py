@@ -107,7 +107,7 @@ def _problem(
     guess: Intrinsics | None,
 ) -> graph.Problem:
     if guess is None:
-        return graph.make_problem(factors, state)
+        return graph.make_problem(factors, state, common_sizes=True)
     params = np.asarray(guess.params, float)
     focal = params[0]
     # Errors of a track are temporally correlated, so that `focal_runs` observations
@@ -125,4 +125,4 @@ def _problem(
             jnp.asarray([_ASPECT_SIGMA * focal]), ratio=float(focal / params[1])
         ),
     ]
-    return graph.make_problem(factors, state, free_intrinsics=True)
+    return graph.make_problem(factors, state, free_intrinsics=True, common_sizes=True)

@@ -326,7 +326,9 @@ def _make_problem(
 ) -> graph.Problem:
     """The problem, with cameras beyond a cut of the video held constant: no factor
     determines them."""
-    problem = graph.make_problem(factors, state, motion=predictor, free=free)
+    problem = graph.make_problem(
+        factors, state, motion=predictor, free=free, common_sizes=True
+    )
     within = cameras.within
     if within.all() or cameras.kind != "moving":
         return problem
