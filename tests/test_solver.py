@@ -442,7 +442,9 @@ def test_gradients_of_solutions_are_mapped_over():
     assert np.allclose(jax.grad(place)(shifts[1], idle), found[1], rtol=1e-9)
 
 
-def test_triangular_matrices_of_any_width_are_inverted():
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_triangular_matrices_of_any_width_are_inverted(backend, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     rng = np.random.default_rng(0)
     for n in (1, 24, 25, 69):
         lower = np.tril(rng.standard_normal((2, n, n))) + 4 * np.sqrt(n) * np.eye(n)

@@ -52,7 +52,10 @@ def in_full_precision(function: F) -> F:
 
 @functools.cache
 def quick_options() -> Mapping[str, bool] | None:
-    """Options that shorten compilation; `None` where this version of XLA knows none."""
+    """Options that shorten compilation for a CPU; `None` on other devices, and where
+    this version of XLA does not know them."""
+    if jax.default_backend() != "cpu":
+        return None
     try:
         jax.jit(jnp.negative, compiler_options=dict(_OPTIONS)).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:

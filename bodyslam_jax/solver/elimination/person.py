@@ -82,7 +82,10 @@ def eliminate_people(
 
 def group_size(count: int) -> int:
     """How many chunks are eliminated together: enough that small steps do not wait for
-    each other, few enough that what they work on stays in the processor's cache."""
+    each other, few enough that what they work on stays in the processor's cache. On
+    a GPU all of them."""
+    if jax.default_backend() != "cpu":
+        return count
     return max(size for size in range(1, GROUP + 1) if count % size == 0)
 
 
