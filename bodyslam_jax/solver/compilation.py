@@ -52,12 +52,16 @@ def in_full_precision(function: F) -> F:
 
 @functools.cache
 def quick_options() -> Mapping[str, bool] | None:
-    """Options that shorten compilation for a CPU; `None` on other devices, and where
-    this version of XLA does not know them."""
+    """Options that shorten compilation for a CPU, those that this version of XLA knows;
+    `None` if it knows none, and on other devices."""
     if jax.default_backend() != "cpu":
         return None
+    return {name: x for name, x in _OPTIONS.items() if _is_known(name, x)} or None
+
+
+def _is_known(name: str, value: bool) -> bool:
     try:
-        jax.jit(jnp.negative, compiler_options=dict(_OPTIONS)).lower(0.0).compile()
+        jax.jit(jnp.negative, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
-        return None
-    return _OPTIONS
+        return False
+    return True
