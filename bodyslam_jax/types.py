@@ -341,6 +341,9 @@ class Result:
     """Frames in which the person is known; elsewhere the arrays hold finite fill."""
     summary: dict = dataclasses.field(default_factory=dict)
     """Content of `summary.json`."""
+    joint_sigma: Float[np.ndarray, "h t 24"] | None = None
+    """Expected error (RMS distance) of each joint within the body, m, larger for limbs
+    that were hidden; 0 where the person is absent. `None` for a truth."""
 
     @property
     def fps(self) -> float:

@@ -117,7 +117,7 @@ def _figures(name: str, summary: dict[str, Any]) -> Row:
         row["scale_error"] = scale["sigma"] / scale["value"]
     people = summary.get("people") or []
     row["people"] = len(people)
-    if people:
+    if people and people[0].get("status") != "not_measurable":
         row |= {
             "stature": people[0].get("stature_m"),
             "stature_sigma": people[0].get("stature_sigma_m"),

@@ -1,6 +1,9 @@
 """Whether a result can be true: its figures, judged by the table of thresholds."""
 
+import dataclasses
+
 import numpy as np
+from jaxtyping import Bool
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import figures
@@ -15,6 +18,16 @@ _LEAST_CONFIDENCE = 0.3
 """Of keypoints that are compared with the body."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Doubts:
+    """Reasons to doubt a result."""
+
+    of_person: tuple[tuple[Reason, ...], ...]
+    """Those about each person."""
+    of_whole: tuple[Reason, ...]
+    """Those about the camera, the ground and the scale."""
+
+
 def implausible(
     sequence: Sequence,
     body: BodyModel,
@@ -26,7 +39,9 @@ def implausible(
     scale_sigma: float,
     ground_factor: float,
     statures: list[float | None],
-) -> list[Reason]:
+    of_measurement: list[dict[str, float]],
+    measurable: Bool[np.ndarray, " h"],
+) -> Doubts:
     """Reasons where people, camera or ground are beyond what there is.
 
     Args:
@@ -34,23 +49,25 @@ def implausible(
         ground_factor: factor, 1 or more, between the size of the map and that of the
             people on its ground.
         statures: of each person, m; `None` if unknown.
+        of_measurement: figures of `measurability.measurement_figures` of each person.
+        measurable: people who are judged, and who count as people in the world.
     """
-    fps, found = sequence.fps, []
+    fps, of_people = sequence.fps, []
     walking = False
     misfits = _misfits(sequence, body, joint)
-    for h, present in enumerate(result.present):
-        of_person = figures.person_figures(result.joints[h], present, fps)
+    present = result.present & measurable[:, None]
+    for h, there in enumerate(present):
+        of_person = figures.person_figures(result.joints[h], there, fps)
         walking |= "trunk_lean" in of_person
-        if present.any():
+        if there.any():
             stature = statures[h]
             if stature is not None:
                 of_person["stature"] = of_person["short_stature"] = stature
             of_person["keypoint_misfit"] = misfits[h]
             of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
-        found += judge(PERSON_CHECKS, of_person, h)
-    of_world = {
-        "floors_apart": figures.floors_apart(result.joints, result.present, fps)
-    }
+            of_person |= of_measurement[h]
+        of_people.append(tuple(judge(PERSON_CHECKS, of_person, h)))
+    of_world = {"floors_apart": figures.floors_apart(result.joints, present, fps)}
     if walking:
         of_world["up_against_trunks"] = np.degrees(up.trunks)
         of_world["slope_of_ground"] = np.degrees(up.ground)
@@ -61,7 +78,7 @@ def implausible(
         of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
         of_world["ground_under_feet"] = ground_factor
-    return found + judge(WORLD_CHECKS, of_world)
+    return Doubts(tuple(of_people), tuple(judge(WORLD_CHECKS, of_world)))
 
 
 def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> float:

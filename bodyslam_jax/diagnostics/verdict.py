@@ -3,12 +3,22 @@
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics import measurability
 from bodyslam_jax.diagnostics.checks import Reason, Status, status_of
 from bodyslam_jax.diagnostics.completeness import incomplete, scale_undetermined
 from bodyslam_jax.diagnostics.gait import Gait, gait
 from bodyslam_jax.diagnostics.ground_scale import ground_scale
+from bodyslam_jax.diagnostics.measured import measured
+from bodyslam_jax.diagnostics.person_verdict import (
+    PersonVerdict,
+    assess_person,
+    reasons_of_people,
+    warnings_of_people,
+    with_doubts,
+)
 from bodyslam_jax.diagnostics.plausibility import implausible
 from bodyslam_jax.diagnostics.reprojection import per_frame
 from bodyslam_jax.diagnostics.scale_uncertainty import (
@@ -18,8 +28,6 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
 from bodyslam_jax.diagnostics.statistics import (
     PathStatistics,
     camera_statistics,
-    person_statistics,
-    stature_and_sigma,
 )
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
@@ -27,21 +35,6 @@ from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 _GROUND_WARNING = 1.15
 """Factor between the size of the map and that of the people on its ground from which
 there is a warning."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PersonVerdict:
-    """One person's figures."""
-
-    frames: int
-    """Frames in which the person is present."""
-    path: PathStatistics
-    steps_per_s: float | None
-    """`None` where no regular steps are found."""
-    stature: float | None
-    """m; `None` for a person who is in no frame."""
-    stature_sigma: float | None
-    """Standard deviation, m; NaN if uncertainty was not computed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +55,8 @@ class Verdict:
     people: tuple[PersonVerdict, ...]
     per_frame: dict[str, list[float | None]]
     """As of `reprojection.per_frame`."""
+    joint_sigma: Float[np.ndarray, "h t 24"]
+    """As of `measured.Measured`."""
 
 
 def assess(
@@ -81,14 +76,16 @@ def assess(
     ground_factor = ground_scale(result) if cameras.kind == "moving" else None
     scale_sigma = reported_sigma(result.scale, joint.scale_sigma, joint.start)
     gaits = [gait(result, h) for h in range(len(result.poses))]
-    people = tuple(
-        _person(result, body, joint, h, steps) for h, steps in enumerate(gaits)
-    )
-    reasons = incomplete(result, cameras)
-    reasons += scale_undetermined(result, cameras, joint.start)
-    if not any(reason.fatal for reason in reasons):
+    found = measured(sequence, joint, sequence.fps)
+    people = [
+        assess_person(sequence, result, body, joint, h, steps, found)
+        for h, steps in enumerate(gaits)
+    ]
+    whole = incomplete(result, cameras)
+    whole += scale_undetermined(result, cameras, joint.start)
+    if not any(reason.fatal for reason in whole):
         factor = ground_factor or 1.0
-        reasons += implausible(
+        doubts = implausible(
             sequence,
             body,
             cameras,
@@ -98,40 +95,26 @@ def assess(
             scale_sigma=scale_sigma,
             ground_factor=max(factor, 1 / factor),
             statures=[person.stature for person in people],
+            of_measurement=measurability.measurement_figures(sequence, found, result),
+            measurable=np.array([p.status == "ok" for p in people], bool),
         )
+        people = with_doubts(people, doubts)
+        whole += doubts.of_whole
     warnings = _warnings(sequence, cameras, joint, ground_factor)
+    warnings += warnings_of_people(people)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
+    reasons = (*reasons_of_people(people), *whole)
     return Verdict(
-        status=status_of(reasons),
-        reasons=tuple(reasons),
+        status=status_of(list(reasons)),
+        reasons=reasons,
         warnings=tuple(warnings),
         scale_sigma=scale_sigma,
         ground_factor=ground_factor,
         camera=camera_statistics(result, cameras.within),
-        people=people,
+        people=tuple(people),
         per_frame=per_frame(sequence, body, cameras, joint),
-    )
-
-
-def _person(
-    result: Result,
-    body: BodyModel,
-    joint: JointEstimate,
-    person: int,
-    steps: Gait | None,
-) -> PersonVerdict:
-    stature, sigma = None, None
-    if result.present[person].any():
-        stature, sigma = stature_and_sigma(
-            body, result.betas[person], joint.shape_covariance[person]
-        )
-    return PersonVerdict(
-        frames=int(result.present[person].sum()),
-        path=person_statistics(result, person),
-        steps_per_s=None if steps is None else steps.frequency,
-        stature=stature,
-        stature_sigma=sigma,
+        joint_sigma=found.joint_sigma,
     )
 
 

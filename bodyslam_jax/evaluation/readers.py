@@ -59,6 +59,9 @@ def read_result(path: Path) -> Result:
     fields: dict[str, Any] = {name: _float(arrays[name]) for name in _RUN_FIELDS}
     fields["scale"] = float(arrays["scale"])
     fields["present"] = arrays["present"].astype(bool)
+    sigma = arrays.get("joint_sigma")
+    if sigma is not None and sigma.shape == fields["joints"].shape[:3]:
+        fields["joint_sigma"] = _float(sigma)
     return Result(**fields, summary=summary)
 
 

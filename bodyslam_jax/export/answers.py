@@ -28,10 +28,12 @@ def answers(
     rows = lambda text: [(f"person-{h % 4}", name(h), text(h)) for h in shown]
     kind = _STILL.get(str(summary.get("camera_motion")))
     if shown:
-        far = rows(lambda h: f"{people[h].distance:.1f} m")
-        fast = rows(lambda h: f"{people[h].mean_speed:.1f} m/s")
-        walk = [f"{name(h)}: {3.6 * people[h].mean_speed:.1f} km/h" for h in shown[:1]]
-        tall = rows(lambda h: _stature(result, summary, body, h))
+        known = [h for h in shown if person_status(summary, h) != "not_measurable"]
+        if_known = lambda h, text: text if h in known else "not measurable"
+        far = rows(lambda h: if_known(h, f"{people[h].distance:.1f} m"))
+        fast = rows(lambda h: if_known(h, f"{people[h].mean_speed:.1f} m/s"))
+        walk = [f"{name(h)}: {3.6 * people[h].mean_speed:.1f} km/h" for h in known[:1]]
+        tall = rows(lambda h: if_known(h, _stature(result, summary, body, h)))
         moved = kind or f"{camera.distance:.1f} m"
         pace = "–" if kind else f"{camera.mean_speed:.1f} m/s"
     else:
@@ -62,6 +64,13 @@ def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
     """Standard deviation of a person's stature, m, as reported."""
     reported = (summary.get("people") or [])[h : h + 1]
     return reported[0].get("stature_sigma_m") if reported else None
+
+
+def person_status(summary: Mapping[str, Any], h: int) -> str | None:
+    """`ok`, `doubtful`, `not_measurable` or `absent`, as reported; `None` if it was
+    not."""
+    reported = (summary.get("people") or [])[h : h + 1]
+    return reported[0].get("status") if reported else None
 
 
 def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import statistics
-from bodyslam_jax.export.answers import stature_sigma
+from bodyslam_jax.export.answers import person_status, stature_sigma
 from bodyslam_jax.export.tables import table
 from bodyslam_jax.types import Result
 
@@ -28,6 +28,7 @@ def people_table(
         plus_minus = "" if sigma is None else f" ± {100 * sigma:.1f}"
         columns.append(
             {
+                "can be trusted": person_status(summary, h),
                 "visible, s": f"{way.seconds:.1f}",
                 "distance from the camera, m": f"{near:.1f} to {far:.1f}",
                 "way, m": f"{way.distance:.2f}",
@@ -35,6 +36,8 @@ def people_table(
                 "stature, cm": f"{100 * statistics.stature(body, result.betas[h]):.1f}"
                 + plus_minus,
                 "lower foot, cm/s": f"{100 * statistics.foot_skating(result, h):.0f}",
+                "not measured, % of frames": _not_measured(summary, h),
+                "leg in the image, px": _leg(summary, h),
             }
         )
     if not columns:
@@ -43,9 +46,26 @@ def people_table(
     note = (
         "<p>Ways are over the ground, smoothed over half a second. The stature is "
         "barefoot, from the estimated shape. The lower foot (its joint, median) of a "
-        "real walk moves at about 10 cm/s.</p>"
+        "real walk moves at about 10 cm/s. What was not measured was hidden, out of "
+        "the image or uncertain to the detector: the posture is inferred there.</p>"
     )
     return table(["people", *(f"person {h}" for h in shown)], rows) + note
+
+
+def _not_measured(summary: Mapping[str, Any], h: int) -> str | None:
+    """Limbs with the share of frames in which they were not measured."""
+    shares = _reported(summary, h).get("not_measured") or {}
+    return ", ".join(f"{limb} {100 * x:.0f}" for limb, x in shares.items()) or None
+
+
+def _leg(summary: Mapping[str, Any], h: int) -> str | None:
+    leg = _reported(summary, h).get("leg_px")
+    return None if leg is None else f"{leg:.0f}"
+
+
+def _reported(summary: Mapping[str, Any], h: int) -> Mapping[str, Any]:
+    people = summary.get("people") or []
+    return people[h] if h < len(people) else {}
 
 
 def lengths(result: Result, scale: Mapping[str, Any]) -> str:

@@ -148,8 +148,11 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
     arrays = {
         field.name: np.asarray(getattr(result, field.name))
         for field in dataclasses.fields(result)
-        if field.name != "summary"
+        if field.name != "summary" and getattr(result, field.name) is not None
     }
+    statuses = [p.get("status") for p in result.summary.get("people") or []]
+    if statuses and None not in statuses:
+        arrays["person_status"] = np.array(statuses, dtype="U14")
     atomic.write_npz(folder / "result.npz", arrays)
     located = result.located
     write_tum(folder / "camera.tum", result.timestamps[located], result.T_WC[located])

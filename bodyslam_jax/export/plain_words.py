@@ -28,6 +28,20 @@ _PERSON = {
     "stature": "{Who} is too tall for a person.",
     "short_stature": "{Who} is too short for an adult.",
     "keypoint_misfit": "The body of {who} is away from the person in the images.",
+    "legs_inferred": (
+        "The legs of {who} are hidden or out of the image for a while; what is shown "
+        "there is a guess."
+    ),
+    "seen_in_pieces": "{Who} is seen in short pieces only, which do not fit together.",
+    "appears_within": (
+        "{Who} appears in front of or behind somebody else: the two may be exchanged, "
+        "or be one."
+    ),
+    "speed_across_gap": (
+        "{Who} is gone for a moment and back too far away to be the same person."
+    ),
+    "leg_in_image": "{Who} is too small in the video to be measured.",
+    "speed_error": "{Who} is too far away, for too short a time, to be measured.",
 }
 _WHOLE = {
     "floors_apart": "People stand at different heights, as if on different floors.",

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.config import Config
-from bodyslam_jax.diagnostics.verdict import PersonVerdict, Verdict
+from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
+from bodyslam_jax.diagnostics.verdict import Verdict
 from bodyslam_jax.types import JointEstimate, Result, ScaleStart, Sequence, SfmResult
 
 
@@ -112,18 +113,29 @@ def _headline(
     for h, person in enumerate(verdict.people):
         if person.stature is None or person.stature_sigma is None:
             continue
-        sigma = person.stature_sigma
-        plus_minus = "" if np.isnan(sigma) else f" ± {100 * sigma:.0f}"
-        lines.append(
-            f"person {h}: {person.path.distance:.2f} m at {person.path.mean_speed:.2f} "
-            f"m/s, {100 * person.stature:.0f}{plus_minus} cm tall"
-        )
+        lines.append(f"person {h}: {_in_a_line(person)}")
     if lens["guessed"]:
         text = f"focal length: guess {lens['guess_px']:.0f} px"
         if (sigma := lens["focal_sigma_px"]) is not None:
             text += f", from the camera's path {lens['focal_px']:.0f} ± {sigma:.0f} px"
         lines.append(text)
     return lines
+
+
+def _in_a_line(person: PersonVerdict) -> str:
+    """Way, speed and stature, and whether they can be trusted."""
+    if person.status == "not_measurable":
+        return (
+            f"too small or too far away to be measured ({person.frames} frames, legs "
+            f"of {person.leg_px:.0f} px)"
+        )
+    sigma = person.stature_sigma
+    plus_minus = "" if sigma is None or np.isnan(sigma) else f" ± {100 * sigma:.0f}"
+    tall = f"{100 * (person.stature or 0.0):.0f}{plus_minus}"
+    return (
+        f"{person.path.distance:.2f} m at {person.path.mean_speed:.2f} m/s, "
+        f"{tall} cm tall ({person.status})"
+    )
 
 
 def _length_error(relative: float, cameras: SfmResult) -> str:
@@ -136,13 +148,20 @@ def _length_error(relative: float, cameras: SfmResult) -> str:
 
 
 def _person(person: PersonVerdict) -> dict[str, Any]:
+    known = lambda x: None if np.isnan(x) else float(x)
     return {
+        "status": person.status,
+        "reasons": [reason.message for reason in person.reasons],
         "frames": person.frames,
         "path_m": person.path.distance,
         "speed_m_s": person.path.mean_speed,
         "steps_per_s": person.steps_per_s,
         "stature_m": person.stature,
         "stature_sigma_m": person.stature_sigma,
+        "speed_noise_m_s": known(person.speed_noise),
+        "leg_px": known(person.leg_px),
+        "not_measured": person.not_measured,
+        "inferred_frames": [list(stretch) for stretch in person.inferred_frames],
     }
 
 

@@ -10,7 +10,7 @@ from bodyslam_jax.types import Intrinsics, Keypoints
 
 _BOX_DIAGONAL = 1.75
 """m: what the keypoints of a standing adult span, nose to toe and arms."""
-_DETECTOR_FLOOR = 1.0
+DETECTOR_FLOOR = 1.0
 """px: least standard deviation of any detector, in images of any size."""
 
 
@@ -67,7 +67,7 @@ def pixels_per_metre(
     largest = maximum_filter1d(diagonal, 2 * round(fps / 2) + 1)
     valid = diagonal[diagonal > 0]
     # All keypoints in one pixel: not a person, but no reason to fail.
-    overall = np.median(valid) if len(valid) else _DETECTOR_FLOOR
+    overall = np.median(valid) if len(valid) else DETECTOR_FLOOR
     return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
 
 
@@ -75,4 +75,4 @@ def in_pixels(
     sigma: Float[np.ndarray, "t 25"], scale: Float[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t 25"]:
     """The same in pixels, where a metre is `scale` of them."""
-    return np.hypot(sigma * scale[:, None], _DETECTOR_FLOOR)
+    return np.hypot(sigma * scale[:, None], DETECTOR_FLOOR)

@@ -126,7 +126,7 @@ def assemble(
     result, up = to_metric(sequence, config, body, cameras, joint)
     verdict = diagnostics.assess(sequence, body, cameras, joint, result, up)
     summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
-    return dataclasses.replace(result, summary=summary)
+    return dataclasses.replace(result, summary=summary, joint_sigma=verdict.joint_sigma)
 
 
 def _check_length(sequence: Sequence) -> None:

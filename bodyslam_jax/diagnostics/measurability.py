@@ -1,0 +1,160 @@
+"""Figures of whether a person can be measured, and how much of them was.
+
+People who are small in the image, or far and seen briefly, have no speed and no path in
+metres; of people whose legs are hidden the posture is inferred.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.body.skeleton import PELVIS
+from bodyslam_jax.diagnostics.measured import LIMBS, Measured, pixels_per_metre
+from bodyslam_jax.diagnostics.statistics import runs
+from bodyslam_jax.people.costs import KEYPOINT_SIGMA
+from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, DETECTOR_FLOOR
+from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence
+
+_MOSTLY = 0.55
+"""Share of knees and ankles that must be measured in a stretch of frames: with fewer,
+postures err by twice as much as those of people in full view."""
+_PLAN = [0, 2]
+_FEWEST = 3
+"""Keypoints by whose spread in the image a depth is measured."""
+_PIECE = 1.0
+"""s: in a shorter stretch most frames have no prediction by the motion model, which
+reads the half second before."""
+_WALKING = 1.25
+"""m/s: a walker's speed."""
+
+
+def inferred_legs(
+    found: Measured, person: int, present: Bool[np.ndarray, " t"]
+) -> Bool[np.ndarray, " t"]:
+    """Frames of the stretches in which a person's legs were mostly inferred.
+
+    A stretch is a run of consecutive frames in which the person is present.
+    """
+    legs = found.keypoint[person][:, LIMBS["legs"]] | found.body[person][:, None]
+    inferred = np.zeros(len(present), bool)
+    for run in runs(present):
+        inferred[run] = legs[run].mean() < _MOSTLY
+    return inferred
+
+
+def measurement_figures(
+    sequence: Sequence, found: Measured, result: Result
+) -> list[dict[str, float]]:
+    """For each person the figures that `PERSON_CHECKS` judge beside those of motion:
+    frames with inferred legs and in short pieces, speed across gaps, appearance within
+    others."""
+    within = _appears_within(sequence.keypoints, result.present)
+    out = []
+    for h, present in enumerate(result.present):
+        figures = {
+            "speed_across_gap": _speed_across_gaps(
+                result.joints[h, :, PELVIS], present, result.timestamps
+            ),
+            "appears_within": within[h],
+            "seen_in_pieces": _in_pieces(present, sequence.fps),
+        }
+        if sequence.keypoints is not None and present.any():
+            inferred = inferred_legs(found, h, present)
+            figures["legs_inferred"] = 100 * float(inferred[present].mean())
+        out.append(figures)
+    return out
+
+
+def leg_in_image(joint: JointEstimate, result: Result, person: int) -> float:
+    """Length of a stretched leg at the person's depth, px (median over frames)."""
+    present = result.present[person]
+    if not present.any():
+        return np.nan
+    hip, knee, ankle = result.joints[person, present][:, [1, 4, 7]].swapaxes(0, 1)
+    leg = np.linalg.norm(hip - knee, axis=1) + np.linalg.norm(knee - ankle, axis=1)
+    return float(np.median(leg * pixels_per_metre(joint, person)[present]))
+
+
+def speed_noise(
+    sequence: Sequence, found: Measured, joint: JointEstimate, person: int
+) -> float:
+    """Standard deviation of a person's mean speed along the view by noise, m/s.
+
+    It is that of the slope of a line through the depths of the person's longest
+    stretch. A depth is measured by the spread of keypoints in the image, with the usual
+    error of detectors, at least a pixel, which stays the same for 0.15 s. NaN without
+    keypoints.
+    """
+    if sequence.keypoints is None or not joint.present[person].any():
+        return np.nan
+    stretch = max(runs(joint.present[person]), key=lambda run: run.stop - run.start)
+    here = found.keypoint[person, stretch]
+    enough = here.sum(axis=1) >= _FEWEST
+    if not enough.any():
+        return np.inf
+    pixels = pixels_per_metre(joint, person)[stretch][enough]
+    sigma = np.hypot(KEYPOINT_SIGMA * pixels[:, None], DETECTOR_FLOOR)
+    weight = np.where(here[enough], sigma**-2, 0.0)
+    uv = sequence.keypoints.uv[person, stretch][enough]
+    centre = (weight[..., None] * uv).sum(1) / weight.sum(1)[:, None]
+    apart = ((uv - centre[:, None]) ** 2).sum(-1)
+    relative = np.maximum((weight * apart).sum(1), 1e-12) ** -0.5
+    depth = joint.roots[person, stretch, 2, 3][enough]
+    seconds = len(here) / sequence.fps
+    independent = max(seconds / CORRELATION_TIME, 1.0)
+    error = float(np.median(depth * relative))
+    return error * float(np.sqrt(12 / independent)) / seconds
+
+
+def relative_speed_error(sigma: float, speed: float) -> float:
+    """The standard deviation of a speed, % of the speed, at least a walker's."""
+    return 100 * sigma / max(speed, _WALKING)
+
+
+def _speed_across_gaps(
+    pelvis: Float[np.ndarray, "t 3"],
+    present: Bool[np.ndarray, " t"],
+    times: Float[np.ndarray, " t"],
+) -> float:
+    """Greatest speed over the ground from the end of a stretch to the start of the
+    next, m/s; NaN where there is one stretch only."""
+    stretches = runs(present)
+    speeds = [
+        np.linalg.norm((pelvis[b.start] - pelvis[a.stop - 1])[_PLAN])
+        / (times[b.start] - times[a.stop - 1])
+        for a, b in zip(stretches[:-1], stretches[1:], strict=True)
+    ]
+    return float(max(speeds)) if speeds else np.nan
+
+
+def _in_pieces(present: Bool[np.ndarray, " t"], fps: float) -> float:
+    """Share of the frames in stretches of less than a second, %; 0 for somebody who is
+    seen once."""
+    lengths = np.array([run.stop - run.start for run in runs(present)])
+    if len(lengths) < 2:
+        return 0.0
+    return 100 * float(lengths[lengths < _PIECE * fps].sum() / lengths.sum())
+
+
+def _appears_within(
+    keypoints: Keypoints | None, present: Bool[np.ndarray, "h t"]
+) -> list[float]:
+    """Share of each person's region of the image that another person covers who was
+    there before, in the frame in which the person first appears, %; NaN if that is the
+    first frame."""
+    if keypoints is None:
+        return [np.nan] * len(present)
+    detected = (keypoints.confidence > 0)[..., None]
+    low = np.where(detected, keypoints.uv, np.inf).min(axis=2)
+    high = np.where(detected, keypoints.uv, -np.inf).max(axis=2)
+    found = []
+    for h, there in enumerate(present):
+        k = int(there.argmax())
+        others = present[:, k] & present[:, :k].any(axis=1) & detected[:, k].any((1, 2))
+        if not there.any() or k == 0 or not others.any() or not detected[h, k].any():
+            found.append(np.nan)
+            continue
+        common = np.minimum(high[h, k], high[others, k])
+        common = np.maximum(common - np.maximum(low[h, k], low[others, k]), 0)
+        area = max(float(np.prod(high[h, k] - low[h, k])), 1.0)
+        found.append(100 * float(common.prod(axis=1).max()) / area)
+    return found

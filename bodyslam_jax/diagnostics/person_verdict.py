@@ -1,0 +1,133 @@
+"""One person's part of the verdict: figures, status and reasons."""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.diagnostics import measurability
+from bodyslam_jax.diagnostics.checks import Reason, judge
+from bodyslam_jax.diagnostics.gait import Gait
+from bodyslam_jax.diagnostics.measured import Measured
+from bodyslam_jax.diagnostics.plausibility import Doubts
+from bodyslam_jax.diagnostics.statistics import (
+    PathStatistics,
+    person_statistics,
+    runs,
+    stature_and_sigma,
+)
+from bodyslam_jax.diagnostics.thresholds import MEASURABLE_CHECKS
+from bodyslam_jax.types import JointEstimate, Result, Sequence
+
+PersonStatus = Literal["ok", "doubtful", "not_measurable", "absent"]
+"""Of one person. Who is `not_measurable` is too small or too far away for a speed, a
+path or a size in metres; `absent` is who is in no frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonVerdict:
+    """One person's figures."""
+
+    frames: int
+    """Frames in which the person is present."""
+    path: PathStatistics
+    steps_per_s: float | None
+    """`None` where no regular steps are found."""
+    stature: float | None
+    """m; `None` for a person who is in no frame."""
+    stature_sigma: float | None
+    """Standard deviation, m; NaN if uncertainty was not computed."""
+    status: PersonStatus
+    reasons: tuple[Reason, ...]
+    """Why it is not `ok`."""
+    not_measured: dict[str, float]
+    """Share of the frames in which arms, legs, feet were not measured."""
+    inferred_frames: tuple[tuple[int, int], ...]
+    """First and last frames of the stretches whose legs were mostly inferred."""
+    leg_px: float
+    """Length of a leg in the image, px."""
+    speed_noise: float
+    """Standard deviation of the mean speed along the view by noise of the keypoints
+    alone, m/s; NaN if unknown."""
+
+
+def assess_person(
+    sequence: Sequence,
+    result: Result,
+    body: BodyModel,
+    joint: JointEstimate,
+    person: int,
+    steps: Gait | None,
+    found: Measured,
+) -> PersonVerdict:
+    """A person's figures, and whether they can be measured at all."""
+    stature, sigma = None, None
+    present = result.present[person]
+    path = person_statistics(result, person)
+    reasons: list[Reason] = []
+    leg_px, speed_noise = np.nan, np.nan
+    if present.any():
+        stature, sigma = stature_and_sigma(
+            body, result.betas[person], joint.shape_covariance[person]
+        )
+        leg_px = measurability.leg_in_image(joint, result, person)
+        speed_noise = measurability.speed_noise(sequence, found, joint, person)
+        if not found.body[person].any():
+            error = measurability.relative_speed_error(speed_noise, path.mean_speed)
+            figures = {"leg_in_image": leg_px, "speed_error": error}
+            reasons = judge(MEASURABLE_CHECKS, figures, person)
+    inferred = runs(measurability.inferred_legs(found, person, present))
+    known = "ok" if present.any() else "absent"
+    return PersonVerdict(
+        frames=int(present.sum()),
+        path=path,
+        steps_per_s=None if steps is None else steps.frequency,
+        stature=stature,
+        stature_sigma=sigma,
+        status="not_measurable" if reasons else known,
+        reasons=tuple(reasons),
+        not_measured=found.shares(person, present),
+        inferred_frames=tuple((int(run.start), int(run.stop - 1)) for run in inferred),
+        leg_px=leg_px,
+        speed_noise=speed_noise,
+    )
+
+
+def with_doubts(people: list[PersonVerdict], doubts: Doubts) -> list[PersonVerdict]:
+    """The people, those with reasons to doubt them `doubtful`."""
+    return [
+        dataclasses.replace(person, status="doubtful", reasons=reasons)
+        if reasons
+        else person
+        for person, reasons in zip(people, doubts.of_person, strict=True)
+    ]
+
+
+def reasons_of_people(people: list[PersonVerdict]) -> list[Reason]:
+    """Reasons to doubt the whole result: those about people who can be measured, or,
+    where nobody can, why not."""
+    somebody = any(person.status in ("ok", "doubtful") for person in people)
+    return [
+        reason
+        for person in people
+        if person.status == "doubtful" or not somebody
+        for reason in person.reasons
+    ]
+
+
+def warnings_of_people(people: list[PersonVerdict]) -> list[str]:
+    """A line for each person who cannot be measured, and for frames that were inferred
+    without making the person doubtful."""
+    lines = []
+    for h, person in enumerate(people):
+        if person.status == "not_measurable":
+            why = " ".join(reason.message for reason in person.reasons)
+            lines.append(f"{why} No length, speed or place of this person is measured.")
+        elif person.inferred_frames and person.status == "ok":
+            frames = ", ".join(f"{a} to {b}" for a, b in person.inferred_frames)
+            lines.append(
+                f"person {h}, frames {frames}: most of the legs are hidden or out of "
+                "the image; the posture is inferred there, not measured."
+            )
+    return lines
