@@ -81,6 +81,7 @@ def assess(
         assess_person(sequence, result, body, joint, h, steps, found)
         for h, steps in enumerate(gaits)
     ]
+    of_world: tuple[Reason, ...] = ()
     whole = incomplete(result, cameras)
     whole += scale_undetermined(result, cameras, joint.start)
     if not any(reason.fatal for reason in whole):
@@ -99,12 +100,12 @@ def assess(
             measurable=np.array([p.status == "ok" for p in people], bool),
         )
         people = with_doubts(people, doubts)
-        whole += doubts.of_whole
+        of_world = doubts.of_whole
     warnings = _warnings(sequence, cameras, joint, ground_factor)
     warnings += warnings_of_people(people)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
-    reasons = (*reasons_of_people(people), *whole)
+    reasons = (*whole, *reasons_of_people(people), *of_world)
     return Verdict(
         status=status_of(list(reasons)),
         reasons=reasons,
