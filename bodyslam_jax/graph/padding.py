@@ -32,15 +32,16 @@ _RTOL = {"float64": 1e-8, "float32": 1e-3}
 class Masked(FrameFactor):
     """A factor that is active only in some frames: the residual of the others is 0.
 
-    Inactive frames are evaluated with the measurements and variables of the last active
-    frame. So the factor is never evaluated where it may not be defined, such as at two
-    equal poses, and derivatives are finite wherever those of the factor are.
+    Inactive frames are evaluated with the measurements and variables of the first or
+    last active frame. So the factor is never evaluated where it may not be defined,
+    such as at two equal poses, and derivatives are finite wherever those of the factor
+    are.
     """
 
     factor: FrameFactor
     present: Bool[Array, "*h t"]
-    """The active frames, of each person if the factor is of people; all inactive frames
-    come after them."""
+    """The active frames, of each person if the factor is of people: one run of them,
+    before and after which all are inactive."""
     padding = {"present": False}
 
     @property
@@ -69,8 +70,9 @@ class Masked(FrameFactor):
 
     def frame_of_row(self, num_frames):
         active = self.present.reshape(-1, num_frames).any(axis=0)
-        last = jnp.maximum(active.sum(dtype=int) - 1, 0)
-        return jnp.minimum(jnp.arange(num_frames), last)
+        first = jnp.argmax(active)
+        last = jnp.maximum(first + active.sum(dtype=int) - 1, 0)
+        return jnp.clip(jnp.arange(num_frames), first, last)
 
     def data(self):
         row = self.frame_of_row(self.present.shape[-1])

@@ -55,7 +55,7 @@ def _program(alone: bool) -> Callable[..., Problem]:
 def _cotangent_of_problem(problem, state, cotangent):
     problem = _without_single_views(problem)
     zero = state.zero_step()
-    diagonal = _diagonal(problem, state)
+    diagonal = diagonal_of(problem, state)
     mask = jax.tree.map(
         lambda m, d: jnp.where(d > 0, m, 0.0), mask_of(problem), diagonal
     )
@@ -82,7 +82,7 @@ def _cotangent_of_problem(problem, state, cotangent):
         return jax.grad(cost)(zero)
 
     _, transpose = jax.vjp(gradient, zero, arrays)
-    precondition = _preconditioner(problem, state)
+    precondition = normal_solver(problem, state)
     flat, unravel = ravel_pytree(right)
     scale, _ = ravel_pytree(unit)
 
@@ -123,8 +123,8 @@ def _without_single_views(problem: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
 
 
-def _diagonal(problem: Problem, state: State) -> Step:
-    """Of `J^T J`: 0 for coordinates that no measurement sees."""
+def diagonal_of(problem: Problem, state: State) -> Step:
+    """The diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
     diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
@@ -146,8 +146,8 @@ def _diagonal(problem: Problem, state: State) -> Step:
     )
 
 
-def _preconditioner(problem: Problem, state: State):
-    """`v -> (J^T J)^-1 v`, by the solver's own elimination."""
+def normal_solver(problem: Problem, state: State) -> Callable[[Step], Step]:
+    """`v -> (J^T J)^-1 v`, hardly damped, by the solver's own elimination."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
