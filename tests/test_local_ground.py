@@ -111,7 +111,7 @@ UNIT = 5.0
 """m per unit of the map."""
 
 
-def standing(height, lift=0.0, frames=120):
+def standing(height, lift: float | np.ndarray = 0.0, frames=120):
     """A person at rest who is moved over a floor, filmed from eye level; map in units.
 
     `lift` raises the person over the floor, m, for each frame.
@@ -163,12 +163,13 @@ def _lowest(person, body):
     return float(residual[0, 0, 0])
 
 
-def ground_of(height, lift=0.0):
+def ground_of(height, lift: float | np.ndarray = 0.0):
     state, person, body = standing(height, lift)
     registered = np.ones(person.present.shape[1], bool)
     found = initialisation.ground_contact(
         state, person, registered, None, body, GraphWeights(), FPS
     )
+    assert found is not None
     return found, state
 
 
