@@ -12,6 +12,9 @@ from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
 from bodyslam_jax.people import PersonState
+from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
+from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.types import ScaleStart
 
 UP = np.array([0.0, 1.0, 0.0])
 FPS = 30.0
@@ -218,3 +221,30 @@ def test_soles_are_where_the_person_stands():
     np.testing.assert_allclose(below[:, [0, 2]], place, atol=0.2)
     # A soft minimum of four points is a little below the lowest.
     np.testing.assert_allclose(below[:, 1], stairs(*place.T), atol=0.03)
+
+
+def test_uneven_ground_is_estimated_again_where_people_are_found():
+    contact, state = ground_of(stairs)
+    _, person, body = standing(stairs)
+    prepared = Prepared(
+        graph.make_problem([contact], state), state, ScaleStart(), person, True, ()
+    )
+    assert is_uneven(prepared.problem)
+    registered = np.ones(person.present.shape[1], bool)
+    anew = lambda state, prepared: with_ground_of(
+        state, prepared, registered, None, body, GraphWeights(), FPS
+    )
+    offset = lambda prepared: np.asarray(prepared.problem.factors[0].offset)[0]
+    np.testing.assert_array_equal(offset(anew(state, prepared)), offset(prepared))
+    # A person who turns out to be nearer to the camera stands elsewhere.
+    nearer = dataclasses.replace(
+        state, roots=state.roots.at[..., :3, 3].add(jnp.array([0.0, 0.3, 0.0]))
+    )
+    assert (offset(anew(nearer, prepared)) != offset(prepared)).any()
+    flat, level_state = ground_of(level)
+    plane = dataclasses.replace(
+        prepared, problem=graph.make_problem([flat], level_state)
+    )
+    assert not is_uneven(plane.problem)
+    bare = dataclasses.replace(level_state, landmarks=level_state.landmarks[:0])
+    assert anew(bare, plane) is plane
