@@ -220,7 +220,8 @@ def extra_factors(rng, state, seen=None):
         g.UprightPrior(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
             body=body,
-            plane=jnp.array([0.1, -0.99, 0.1, 1.2]),
+            normal=jnp.array([0.1, -0.99, 0.1]),
+            offset=1.2 + 0.1 * normal(h, t),
             sigma=late(h, t, skip=1),
         ),
     ]

@@ -187,9 +187,10 @@ def test_stances_are_where_the_network_finds_toes_standing():
 @pytest.mark.slow
 def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
     state = scenes.truth(rng, frames=20, people=1, landmarks=4)
-    plane = jnp.array([0.0, -1.0, 0.0, 2.0])
+    up = jnp.array([0.0, -1.0, 0.0])
     sigma = jnp.full((1, 20), 0.3).at[0, 0].set(jnp.inf)
-    contact = g.GroundContact(scenes.body_model(), plane, sigma)
+    offset = jnp.full((1, 20), 2.0)
+    contact = g.GroundContact(scenes.body_model(), up, offset, sigma)
     stands = np.ones((1, 20, 4))
     stands[0, 5] = 0.0
     height = lambda factor, state: np.asarray(
@@ -202,8 +203,9 @@ def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
     # Feet of half of the frames are a step higher: the plane has less weight.
     C_CW = jnp.swapaxes(state.cameras[:, :3, :3], 1, 2)
     raised = 0.4 * (np.arange(20) % 2)
-    up = jnp.asarray(raised)[:, None] * (C_CW @ plane[:3])
-    stairs = eqx.tree_at(lambda s: s.roots, state, state.roots.at[0, :, :3, 3].add(up))
+    lift = jnp.asarray(raised)[:, None] * (C_CW @ up)
+    lifted = state.roots.at[0, :, :3, 3].add(lift)
+    stairs = eqx.tree_at(lambda s: s.roots, state, lifted)
     rough = stand_on_plane(contact, stairs, stands, 30.0)
     weight = lambda f: float((np.asarray(f.sigma) ** -2.0).sum())
     assert weight(rough) < 0.2 * weight(found)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from bodyslam_jax.geometry.gravity import (
     feet_plane,
     find_upright,
+    map_plane,
 )
 from bodyslam_jax.geometry.stances import find_stances, standing_feet
 
@@ -110,6 +111,27 @@ def test_on_a_hill_up_stays_where_trunks_point():
     # Bodies that were fitted to keypoints may be what is wrong: less is sure.
     loose = find_upright(*cues(feet, (0.0, 0, 0), fitted=True))
     assert loose.sigma > np.radians(2.5)
+
+
+def test_a_floor_of_steps_says_less_of_gravity_than_a_level_one():
+    """Stances on stairs are off a plane one like the next, so that many are no better
+    than a few; and a plane of the map that they are not on may lie across steps."""
+    steps = lambda x, z: 0.17 * np.clip(np.floor(z - 7.0) + 1, 0, 4)
+    stances = lambda floor: find_stances(
+        walker(way(bend=0.5), floor=floor), np.ones((1, 240), bool), FPS
+    )
+    rough, flat = stances(steps), stances(lambda x, z: 0.0 * x)
+    sigma = lambda plane: np.sqrt(np.trace(plane.covariance))
+    assert sigma(feet_plane(rough, 0.08)) > 2.0 * sigma(feet_plane(flat, 0.08))
+    rng = np.random.default_rng(1)
+    floor = np.column_stack(
+        [rng.uniform(-3, 3, 900), rng.normal(0, 0.01, 900), rng.uniform(2, 12, 900)]
+    )
+    eyes = np.tile([0.0, 1.5, 0.0], (20, 1))
+    slanted = floor + [0, -0.4, 0] + np.outer(floor[:, 2], [0, np.tan(0.1), 0])
+    level = map_plane(floor, eyes, flat)
+    assert np.degrees(sigma(level)) < 0.6
+    assert sigma(map_plane(slanted, eyes, flat)) > 2.0 * sigma(level)
 
 
 def test_trunks_count_more_across_the_view_than_along_it():

@@ -94,9 +94,10 @@ def test_a_table_is_not_the_ground():
 
 def contact(state: graph.State, units: float = 1.0) -> graph.GroundContact:
     """A floor under the people of `scenes`, whose world has y down."""
-    plane = jnp.array([0.0, -1.0, 0.0, 1.3 / float(state.scale) / units])
-    sigma = jnp.full(state.roots.shape[:2], 0.05)
-    return graph.GroundContact(scenes.body_model(), plane, sigma)
+    everywhere = state.roots.shape[:2]
+    up, sigma = jnp.array([0.0, -1.0, 0.0]), jnp.full(everywhere, 0.05)
+    offset = jnp.full(everywhere, 1.3 / float(state.scale) / units)
+    return graph.GroundContact(scenes.body_model(), up, offset, sigma)
 
 
 @pytest.mark.slow
@@ -115,7 +116,7 @@ def test_the_unit_of_the_map_does_not_matter_to_contact():
     cameras = state.cameras.at[:, :3, 3].divide(factor)
     other = dataclasses.replace(state, cameras=cameras, scale=state.scale * factor)
     there, here = contact(state, factor), contact(state)
-    there = dataclasses.replace(there, plane=here.plane.at[3].divide(factor))
+    there = dataclasses.replace(there, offset=here.offset / factor)
     np.testing.assert_allclose(
         there.scales(other), factor * here.scales(state), rtol=1e-12
     )

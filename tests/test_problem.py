@@ -64,7 +64,7 @@ def fitting() -> tuple[g.State, dict[str, g.Factor]]:
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
         g.RootPositionPrior(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
         g.UprightPrior(jnp.array([0.0, -1, 0]), ones(1, T)),
-        g.GroundContact(body, jnp.array([0.0, -1, 0, 1.5]), ones(1, T)),
+        g.GroundContact(body, jnp.array([0.0, -1, 0]), 1.5 * ones(1, T), ones(1, T)),
     ]
     return state, {type(factor).__name__: factor for factor in factors}
 
@@ -161,7 +161,7 @@ def test_an_invalid_state_is_refused(where, value, message):
         ),
         ("UprightPrior", "up", ones(4), "(4,), expected (3,)"),
         ("UprightPrior", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
-        ("GroundContact", "plane", lambda x: x / 1.5, "length 0.6667, expected 1"),
+        ("GroundContact", "normal", lambda x: x / 1.5, "length 0.6667, expected 1"),
     ],
 )
 def test_measurements_that_do_not_fit_are_refused(name, where, value, message):

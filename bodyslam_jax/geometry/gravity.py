@@ -21,7 +21,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.config import GRAVITY_SIGMA
 from bodyslam_jax.geometry.ground_plane import find_ground
@@ -48,8 +48,13 @@ level, and the standard deviation of its slope in that case."""
 _FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
 """Standard deviations of the systematic errors of slope, of the plane through feet and
 of the map's plane: more feet or points do not reduce them."""
+_AUTOCORRELATION = 0.9
+"""Greatest autocorrelation of the residuals of stances: few stances determine no
+larger one."""
 _HEIGHT_SIGMA = 0.02
 """Least standard deviation of the height of a foot that stands, m."""
+_HEIGHT_SCATTER = 0.04
+"""Scatter of stances about the map's plane that errors of estimates explain, m."""
 _SIZE = 0.05
 """Relative standard deviation of a person's size. A person who is estimated too large
 has all stances too low or too high by that share of the camera's height above them."""
@@ -192,7 +197,9 @@ def feet_plane(
     `None` with fewer than three stances. One height offset per person, with the prior
     standard deviation `person_sigma` (m), is estimated with the plane: a wrong size of
     a person shifts all of that person's feet alike. Iteratively reweighted with a
-    Cauchy loss, whose scale is estimated from the median absolute residual.
+    Cauchy loss, whose scale is estimated from the median absolute residual. Residuals
+    of stances that follow one another are alike where the ground is not a plane, as on
+    stairs: the covariance grows with their autocorrelation.
     """
     people = np.concatenate(
         [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
@@ -221,8 +228,24 @@ def feet_plane(
         sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
         cauchy = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
         information, solution = fit(cauchy / sigma**2)
-    covariance = np.linalg.inv(information)[:2, :2] + _FEET_SYSTEMATIC**2 * np.eye(2)
-    return Plane(solution[:2], covariance)
+    covariance = np.linalg.inv(information)[:2, :2]
+    covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
+    return Plane(solution[:2], covariance + _FEET_SYSTEMATIC**2 * np.eye(2))
+
+
+def _variance_factor(
+    residual: Float[np.ndarray, " n"], people: Int[np.ndarray, " n"]
+) -> float:
+    """Factor by which an autoregressive error of first order enlarges the variance of
+    a mean; 1 without positive autocorrelation."""
+    spread = 1.4826 * np.median(np.abs(residual))
+    r = np.clip(residual, -3 * spread, 3 * spread)
+    same = people[1:] == people[:-1]
+    if same.sum() < 4 or not spread:
+        return 1.0
+    rho = np.sum(r[1:] * r[:-1] * same) / np.sum((r[1:] ** 2 + r[:-1] ** 2) / 2 * same)
+    rho = np.clip(rho, 0.0, _AUTOCORRELATION)
+    return float((1 + rho) / (1 - rho))
 
 
 def map_plane(
@@ -232,7 +255,8 @@ def map_plane(
 ) -> Plane | None:
     """The ground plane of the map's landmarks (m).
 
-    `None` if there is none, or if people do not stand on it.
+    `None` if there is none, or if people do not stand on it. Where few stances are at
+    one height over it, it may lie across steps: its covariance grows by their scatter.
     """
     up = np.array([0.0, 1.0, 0.0])
     plane = find_ground(landmarks, eyes, up) if len(landmarks) else None
@@ -241,10 +265,12 @@ def map_plane(
     normal, offset = plane[:3], plane[3]
     height = float(np.median(eyes @ normal + offset))
     every = np.concatenate([np.zeros((0, 3)), *stances])
+    excess = 0.0
     if len(every):
-        away = np.median(every @ normal + offset)
-        if height <= 0 or abs(away) > _OFF_THE_PLANE * height:
+        away = every @ normal + offset
+        if height <= 0 or abs(np.median(away)) > _OFF_THE_PLANE * height:
             return None
+        excess = max(_scatter_of_level(away) ** 2 - _HEIGHT_SCATTER**2, 0.0)
     away = landmarks @ normal + offset
     near = np.abs(away) < 0.05 * height
     flat = landmarks[near][:, [0, 2]]
@@ -252,10 +278,22 @@ def map_plane(
     # Errors of neighbouring points are correlated: ten count as one.
     information = flat.T @ flat / 10 / max(float(np.var(away[near])), 1e-12)
     covariance = np.linalg.inv(information + np.eye(2))
+    if excess:
+        covariance += excess * np.linalg.inv(flat.T @ flat / len(flat) + np.eye(2))
     return Plane(
         -normal[[0, 2]] / normal[1],
         covariance + _MAP_SYSTEMATIC**2 * np.eye(2),
     )
+
+
+def _scatter_of_level(heights: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of the heights at the most frequent level, by the shortest
+    interval with 40 % of them: half of its length is 0.524 σ of a normal distribution.
+    """
+    ordered = np.sort(heights)
+    count = max(1, round(0.4 * len(ordered)))
+    length = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
+    return float(length.min()) / 2 / 0.524
 
 
 def _fused(planes: list[Plane]) -> Plane | None:

@@ -106,7 +106,7 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
         measured = _measured(factor.sigma[:, :3])
         _check_rotations(factor.cameras, f"{name}.cameras", measured)
     if isinstance(factor, GroundContact):
-        _check_unit(factor.plane[:3], f"{name}.plane")
+        _check_unit(factor.normal, f"{name}.normal")
     if isinstance(factor, UprightPrior):
         _check_unit(factor.up, f"{name}.up")
     if isinstance(factor, RootPositionPrior) and not is_traced(factor.position):

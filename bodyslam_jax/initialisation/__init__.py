@@ -15,6 +15,8 @@ from bodyslam_jax.initialisation.contact_factors import (
 from bodyslam_jax.initialisation.contact_factors import (
     without_contacts as without_contacts,
 )
+from bodyslam_jax.initialisation.ground import ground_contact as ground_contact
+from bodyslam_jax.initialisation.ground import with_wander as with_wander
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,
 )
@@ -32,6 +34,5 @@ from bodyslam_jax.initialisation.people_factors import stature_factor as stature
 from bodyslam_jax.initialisation.placement import first_state as first_state
 from bodyslam_jax.initialisation.placement import free_people as free_people
 from bodyslam_jax.initialisation.placement import no_people as no_people
-from bodyslam_jax.initialisation.scale import ground_contact as ground_contact
 from bodyslam_jax.initialisation.scale import scale_start as scale_start
 from bodyslam_jax.initialisation.upright import upright_factor as upright_factor

@@ -2,29 +2,15 @@
 
 import dataclasses
 from collections.abc import Collection
-from typing import cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, motion
-from bodyslam_jax.body import BodyModel
-from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
-from bodyslam_jax.config import PATH_SIGMA, GraphWeights
-from bodyslam_jax.geometry.ground_plane import find_ground
-from bodyslam_jax.geometry.lengths import padded_length
-from bodyslam_jax.initialisation.upright import mean_up
-from bodyslam_jax.people import PersonState
-from bodyslam_jax.types import Keypoints, ScaleStart
-
-_MIN_CONFIDENCE = 0.2
-"""From which a keypoint of the feet counts as visible."""
-_MAX_SPREAD = 0.3
-"""Interquartile range of the scales of single frames, as a share of their median. It is
-larger on stairs, or where people do not stand on the plane."""
+from bodyslam_jax.config import PATH_SIGMA
+from bodyslam_jax.initialisation.ground import heights_of_camera, scales
+from bodyslam_jax.types import ScaleStart
 
 
 def scale_start(
@@ -52,60 +38,11 @@ def scale_start(
     if contact is None:
         return start
     used = np.isfinite(np.asarray(contact.sigma))
-    ground = float(np.median(_scales(contact, state)[used]))
+    ground = float(np.median(scales(contact, state)[used]))
     # Error of the ground in m, over the camera's height above it in units.
     metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
-    units = state.cameras[:, :3, 3] @ contact.plane[:3] + contact.plane[3]
-    error = metres / float(np.median(np.asarray(units)))
+    error = metres / float(np.median(heights_of_camera(contact, state)[used]))
     return dataclasses.replace(start, ground=ground, ground_error=error)
-
-
-def ground_contact(
-    state: graph.State,
-    roots: PersonState,
-    registered: Bool[np.ndarray, " t"],
-    keypoints: Keypoints | None,
-    body: BodyModel,
-    weights: GraphWeights,
-) -> graph.GroundContact | None:
-    """The factor of people who stand on the ground plane of the map, in frames with
-    visible feet; `None` without a plane, or if scales disagree from frame to frame.
-
-    Up is the mean direction of people's trunks.
-    """
-    visible = roots.present & registered
-    if keypoints is not None:
-        feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
-        visible &= (feet > _MIN_CONFIDENCE).any(axis=-1)
-    if weights.ground_sigma is None or visible.sum() < 2:
-        return None
-    plane = find_ground(
-        np.asarray(state.landmarks),
-        np.asarray(state.cameras[:, :3, 3]),
-        mean_up(state, visible),
-    )
-    if plane is None:
-        return None
-    sigma = np.where(visible, weights.ground_sigma * np.sqrt(visible.sum()), np.inf)
-    contact = graph.GroundContact(body, jnp.asarray(plane), jnp.asarray(sigma))
-    every = _scales(contact, state)[visible]
-    low, middle, high = np.quantile(every, [0.25, 0.5, 0.75])
-    return contact if low > 0 and high - low < _MAX_SPREAD * middle else None
-
-
-def _scales(
-    contact: graph.GroundContact, state: graph.State
-) -> Float[np.ndarray, "h t"]:
-    """The scales that would put people's feet on the ground."""
-    frames = len(state.cameras)
-    more = padded_length(frames) - frames
-    none = jnp.zeros((0, 3), state.landmarks.dtype)
-    longer = graph.extend_state(eqx.tree_at(lambda s: s.landmarks, state, none), more)
-    contact = cast(graph.GroundContact, graph.pad_factor(contact, state, more))
-    return np.asarray(_scales_of_ground(contact, longer))[:, :frames]
-
-
-_scales_of_ground = eqx.filter_jit(lambda contact, state: contact.scales(state))
 
 
 def _motion_scale(

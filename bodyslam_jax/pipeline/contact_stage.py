@@ -3,9 +3,9 @@
 Which points of the feet stand is read from the postures of the joint estimate
 (`motion.contact_network`). Then people's roots and poses are estimated once more with
 the same factors, the one of standing points (`graph.FootContact`), and a larger weight
-of their height over the map's plane. Cameras, map, scale and shapes are constants:
-thousands of landmarks and the size of the person determine them, and steps would
-stretch them by the errors of postures.
+of their height over the ground of the map. Cameras, map, scale and shapes are
+constants: thousands of landmarks and the size of the person determine them, and steps
+would stretch them by the errors of postures.
 
 The factor of standing points is in the joint problem from the beginning, without
 weight, so that both solves are one compiled program.
@@ -21,19 +21,20 @@ from jaxtyping import Float
 from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
+from bodyslam_jax.geometry.local_ground import wander
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.motion_prediction import contact_predictor, predict
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Sequence, SfmResult
 
 _HEIGHT_SIGMA = 0.08
-"""Standard deviation of the height of the lower foot over the plane, m in a frame of
+"""Standard deviation of the height of the lower foot over the ground, m in a frame of
 1/30 s: 2 cm in a stance, in which its error lasts."""
 _SCATTER = 0.04
-"""Scatter of these heights from which the plane counts less, m: more than estimates
+"""Scatter of these heights from which the ground counts less, m: more than estimates
 have on level ground."""
 _FEWEST_FRAMES = 10
-"""With standing feet, for a plane to be shifted to their height."""
+"""With standing feet, for the ground to be shifted to their height."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,12 +107,13 @@ def stand_on_plane(
     probability: Float[np.ndarray, "h t 4"],
     fps: float,
 ) -> graph.GroundContact:
-    """The factor of the map's ground plane, with the weight of heights over it.
+    """The factor of the ground, with the weight of heights over it.
 
     At constant scale it says how far away people are, so that short steps of estimated
-    postures cannot bring them nearer. The plane is shifted to the median height of
-    standing feet, and believed only as far as it explains them: σ grows with their
-    scatter, and frames far from it, on a step or a kerb, have no weight.
+    postures cannot bring them nearer. The ground is shifted to the median height of
+    standing feet, and believed only as far as it explains them: where they rise and
+    sink over seconds (`wander`) it follows them, and its σ grows with what is left of
+    their scatter; frames far from it, on a step or a kerb, have no weight.
     """
     bare = eqx.tree_at(lambda f: f.sigma, contact, jnp.ones_like(contact.sigma))
     height = np.asarray(graph.residual_of(bare, state))[..., 0]
@@ -119,15 +121,18 @@ def stand_on_plane(
     used = np.isfinite(np.asarray(contact.sigma)) & (stands > 0.5)
     if used.sum() < _FEWEST_FRAMES:
         return contact
-    offset = float(np.median(height[used]))
+    offset = float(np.median(height[used])) + wander(height, used, fps)[0]
     away = np.abs(height - offset)
     spread = max(1.4826 * float(np.median(away[used])) / _SCATTER, 1.0)
     near = used & (away < 3 * spread * _SCATTER)
     sigma = _HEIGHT_SIGMA * spread * np.sqrt(fps / 30.0)
     sigma = np.where(near, sigma / np.sqrt(np.maximum(stands, 0.5)), np.inf)
-    plane = contact.plane.at[3].add(-offset / state.scale)
+    shifted = np.asarray(contact.offset) - offset / float(state.scale)
     return eqx.tree_at(
-        lambda f: (f.plane, f.sigma),
+        lambda f: (f.offset, f.sigma),
         contact,
-        (plane, jnp.asarray(sigma, contact.sigma.dtype)),
+        (
+            jnp.asarray(shifted, contact.offset.dtype),
+            jnp.asarray(sigma, contact.sigma.dtype),
+        ),
     )

@@ -121,6 +121,10 @@ def prepare(
             state, stage = solve_body_only(problem, state, config)
             stages = (stage,)
             prediction = predict(predictor, state)
+        if contact is not None:
+            rough = initialisation.with_wander(contact, state, sequence.fps)
+            factors = [rough if factor is contact else factor for factor in factors]
+            contact = rough
         start, passengers = _start_of_scale(
             sequence, cameras, crowd, state, prediction, contact, present, config
         )
@@ -230,7 +234,13 @@ def _people_factors(
     contact = None
     if cameras.kind == "moving":
         contact = initialisation.ground_contact(
-            state, roots, cameras.registered, sequence.keypoints, body, weights
+            state,
+            roots,
+            cameras.registered,
+            sequence.keypoints,
+            body,
+            weights,
+            sequence.fps,
         )
     present = roots.present & cameras.registered
     upright = initialisation.upright_factor(state, present, sequence.fps, weights)

@@ -1,6 +1,7 @@
 """The joint estimate: cameras, people, map and scale in one problem (section 3.6).
 
-Then standing feet are held (`contact_stage.py`).
+Where people stand on uneven ground it is solved once more (`ground_stage.py`). Then
+standing feet are held (`contact_stage.py`).
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
     inflate_fitted_shapes,
 )
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
+from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
@@ -48,6 +50,21 @@ def estimate(
         return empty_estimate(cameras)
     prepared = prepare(sequence, cameras, bodies, body, config)
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
+    stages = (*prepared.stages, stage)
+    if is_uneven(prepared.problem):
+        prepared = with_ground_of(
+            solution.state,
+            prepared,
+            cameras.registered,
+            sequence.keypoints,
+            body,
+            config.weights,
+            sequence.fps,
+        )
+        solution, stage = solve_stage(
+            prepared.problem, solution.state, config, "uneven ground"
+        )
+        stages += (stage,)
     best = solution.state
     uncertainty = estimate_uncertainty(sequence, cameras, prepared, best, body, config)
     standing = hold_standing_feet(prepared, best, sequence, cameras, body, config)
@@ -56,7 +73,7 @@ def estimate(
         prepared,
         uncertainty,
         str(solution.status),
-        (*prepared.stages, stage, *standing.stages),
+        (*stages, *standing.stages),
         standing.probability,
     )
 
