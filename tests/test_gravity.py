@@ -161,6 +161,7 @@ def test_people_of_wrong_size_do_not_tilt_the_floor():
         np.concatenate([near, far + [0, 0.1, 0]]), np.ones((2, 240), bool), FPS
     )
     plane = feet_plane(stances, 0.08)
+    assert plane is not None
     assert np.degrees(np.linalg.norm(plane.gradient)) < 0.7
     assert feet_plane([stances[0][:2]], 0.08) is None
 
