@@ -58,7 +58,6 @@ from bodyslam_jax.graph.losses import Squared as Squared
 from bodyslam_jax.graph.losses import robustify as robustify
 from bodyslam_jax.graph.losses import squared_norm as squared_norm
 from bodyslam_jax.graph.ordering import CHUNK as CHUNK
-from bodyslam_jax.graph.padding import Masked as Masked
 from bodyslam_jax.graph.padding import extend as extend
 from bodyslam_jax.graph.padding import extend_state as extend_state
 from bodyslam_jax.graph.padding import pad_factor as pad_factor

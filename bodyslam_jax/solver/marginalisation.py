@@ -35,12 +35,12 @@ from bodyslam_jax.graph import (
     Factor,
     FrameFactor,
     LandmarkPrior,
-    Masked,
     Problem,
     Reprojection,
     State,
     Step,
 )
+from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.solver.blocks import mask_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.implicit import diagonal_of, normal_solver
