@@ -154,6 +154,24 @@ def test_many_people_who_lean_alike_do_not_outvote_the_floor(count):
     assert found.sigma < np.radians(4.0)
 
 
+@pytest.mark.parametrize("floor", [True, False])
+def test_people_who_sit_do_not_tilt_those_who_stand(floor):
+    """Two of seven have trunks at 45 and 30 degrees, one way; with a floor, all of
+    them walk on it."""
+    feet = np.concatenate(
+        [walker(way(bend=0.2) + [0.8 * h - 3.0, 0.5 * h]) for h in range(7)]
+    )
+    trunks, *rest = cues(feet, [0, 0, 2])
+    trunks = trunks.copy()
+    for h, lean in ((5, 45.0), (6, 30.0)):
+        trunks[h] = Rotation.from_rotvec(np.radians([0, 0, -lean])).apply([0, 1.0, 0])
+    if not floor:
+        rest[0] = np.cumsum(np.full_like(rest[0], 0.05), axis=1)
+    found = find_upright(trunks, *rest)
+    assert off(found.up) < 3.0
+    assert found.trunks < np.radians(3.0)
+
+
 def test_people_of_wrong_size_do_not_tilt_the_floor():
     """A man who is made 5 % too small floats; he is further away as well."""
     near, far = walker(way(bend=2.0)), walker(way(bend=2.0) + [0.0, 3.0])

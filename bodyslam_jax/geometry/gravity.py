@@ -37,6 +37,9 @@ _TRUNK_COMMON = 0.65
 """Share of these standard deviations that is common to all people of a video, whom one
 detector sees from one side: averaging over people does not reduce it. Assumed; the
 sequences with a known up have one or two people."""
+_CAUCHY = 2.4
+"""Scale of the Cauchy loss in standard deviations: 95 % as efficient as least squares
+where errors are normal."""
 _WORSE_TRUNKS = {False: 0.05, True: 0.15}
 _HOW_MUCH_WORSE = 2.5
 """Probability that a person's trunk is a worse measurement, without and with bodies
@@ -146,7 +149,7 @@ def _with_measured(trunk_tilt, up):
 def _trunks(trunks, present, eyes, feet, fps, fitted):
     """Mean direction of people's trunks as a tilt (x, z over y), and its covariance,
     rad²; `None` without upright people."""
-    information, total = np.zeros((2, 2)), np.zeros(2)
+    means, weights = [], []
     views, anybody_fitted = [], False
     own_share = 1 - _TRUNK_COMMON**2
     for h in np.flatnonzero(present.any(axis=1)):
@@ -171,15 +174,37 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         weight = weight + across / (own_share * _TRUNK_ACROSS**2 + noise)
         views.append(along)
         anybody_fitted |= bool(fitted[h])
-        information += weight
-        total += weight @ mean
-    if not information.any():
+        means.append(mean)
+        weights.append(weight)
+    if not means:
         return None
-    covariance = np.linalg.inv(information)
+    tilt, covariance = _robust_mean(np.array(means), np.array(weights))
     along = np.mean(views, axis=0)
     common = along * _TRUNK_ALONG[anybody_fitted] ** 2
     common = common + (np.eye(2) - along) * _TRUNK_ACROSS**2
-    return covariance @ total, covariance + _TRUNK_COMMON**2 * common
+    return tilt, covariance + _TRUNK_COMMON**2 * common
+
+
+def _robust_mean(
+    means: Float[np.ndarray, "h 2"], weights: Float[np.ndarray, "h 2 2"]
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "2 2"]]:
+    """The mean weighted by information, and its covariance, with a Cauchy loss.
+
+    People who sit or bend down are outliers among those who stand. Iteratively
+    reweighted from the median on. The covariance is enlarged by the squared Birge ratio
+    where those who count disagree.
+    """
+    mean, covariance = np.median(means, axis=0), np.linalg.inv(weights.sum(axis=0))
+    chi2, cauchy = np.zeros(len(means)), np.ones(len(means))
+    for _ in range(20):
+        apart = means - mean
+        chi2 = np.einsum("hi,hij,hj->h", apart, weights, apart)
+        cauchy = 1 / (1 + chi2 / _CAUCHY**2)
+        scaled = cauchy[:, None, None] * weights
+        covariance = np.linalg.inv(scaled.sum(axis=0))
+        mean = covariance @ np.einsum("hij,hj->i", scaled, means)
+    freedom = 2 * max(cauchy.sum() - 1, 0.5)
+    return mean, covariance * max(1.0, float(cauchy @ chi2) / freedom)
 
 
 def _height_of_camera(eyes, stances) -> float:
@@ -226,7 +251,7 @@ def feet_plane(
         residual = x[:, 1] - design @ solution
         spread = 1.4826 * np.median(np.abs(residual))
         sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
-        cauchy = 1 / (1 + (residual / (2.4 * sigma)) ** 2)
+        cauchy = 1 / (1 + (residual / (_CAUCHY * sigma)) ** 2)
         information, solution = fit(cauchy / sigma**2)
     covariance = np.linalg.inv(information)[:2, :2]
     covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
