@@ -114,10 +114,11 @@ UNIT = 5.0
 """m per unit of the map."""
 
 
-def standing(height, lift: float | np.ndarray = 0.0, frames=120):
+def standing(height, lift: float | np.ndarray = 0.0, frames=120, table=False):
     """A person at rest who is moved over a floor, filmed from eye level; map in units.
 
-    `lift` raises the person over the floor, m, for each frame.
+    `lift` raises the person over the floor, m, for each frame. A `table` hides the feet
+    for a while.
     """
     rng = np.random.default_rng(4)
     k = np.linspace(0, 1, frames)
@@ -142,6 +143,9 @@ def standing(height, lift: float | np.ndarray = 0.0, frames=120):
     points = floor_points(height, rng)
     trees = rng.uniform([-5, 0, 2], [5, 4, 14], (500, 3))
     T_WC[:, :3, 3] /= UNIT
+    if table:
+        top = rng.uniform([-1.5, 0.9, 3.4], [1.5, 0.9, 4.2], (800, 3))
+        points = np.concatenate([points, top])
     points = np.concatenate([points, trees[np.abs(trees[:, 0]) > 3]]) / UNIT
     state = initialisation.first_state(T_WC, points, person, scenes.INTRINSICS)
     return state, person, body
@@ -166,8 +170,8 @@ def _lowest(person, body):
     return float(residual[0, 0, 0])
 
 
-def ground_of(height, lift: float | np.ndarray = 0.0):
-    state, person, body = standing(height, lift)
+def ground_of(height, lift: float | np.ndarray = 0.0, table=False):
+    state, person, body = standing(height, lift, table=table)
     registered = np.ones(person.present.shape[1], bool)
     found = initialisation.ground_contact(
         state, person, registered, None, body, GraphWeights(), FPS
@@ -199,6 +203,12 @@ def test_scale_from_people_on_any_floor(height):
     assert planar == (height in (level, slope))
     wide = initialisation.with_wander(contact, state, FPS)
     assert start_of(wide, state).ground_error < 1.2 * start.ground_error
+
+
+def test_a_table_before_the_feet_is_not_the_ground():
+    contact, state = ground_of(level, table=True)
+    assert np.ptp(np.asarray(contact.offset)) == 0
+    assert start_of(contact, state).ground == pytest.approx(UNIT, rel=0.02)
 
 
 def test_feet_that_rise_and_sink_over_the_floor_say_less_of_scale():

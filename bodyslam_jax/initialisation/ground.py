@@ -26,6 +26,9 @@ larger where people do not stand on the ground of the map."""
 _FLAT = 0.015
 """Standard deviation of the ground under feet about the plane, as a share of the
 camera's height, up to which the plane explains it: landmarks err by half of that."""
+_BETTER = 0.7
+"""By as much as this the scales of single frames must be closer to each other with the
+ground under feet than with the plane."""
 _SMOOTH = 0.5
 """Length of the running median of heights of the ground, s; it fills gaps too."""
 _FEWEST = 15
@@ -51,8 +54,8 @@ def ground_contact(
 
     The ground is the map's plane where that explains the landmarks under people's feet.
     Where it does not, on stairs or uneven ground, or where there is no plane, it is the
-    height of these landmarks, in frames in which there are enough. Up is the mean
-    direction of people's trunks.
+    height of these landmarks, in frames in which there are enough, if people then have
+    one scale more nearly than on the plane. Up is the mean direction of their trunks.
     """
     visible = roots.present & registered
     if keypoints is not None:
@@ -130,14 +133,24 @@ def _ground(
         level[h] = running_median(own, np.isfinite(own), fps, _SMOOTH)
     known = visible & np.isfinite(level)
     enough = known.sum() >= max(_FEWEST, _LEAST_SHARE * visible.sum())
-    if plane is not None:
-        over = level[known] + d
-        if not enough or _spread(over) < _FLAT * np.median(eyes @ normal + d):
-            return contact, visible
-    elif not enough:
-        return None, visible
+    if not enough:
+        return (None if plane is None else contact), visible
     offset = jnp.asarray(np.where(known, -level, d))
-    return eqx.tree_at(lambda f: f.offset, contact, offset), known
+    local = eqx.tree_at(lambda f: f.offset, contact, offset)
+    if plane is None:
+        return local, known
+    flat = _spread(level[known] + d) < _FLAT * np.median(eyes @ normal + d)
+    # Scale is one number: landmarks of furniture in front of feet put it elsewhere.
+    apart = [_range(scales(ground, state)[known]) for ground in (contact, local)]
+    if flat or apart[1] > _BETTER * apart[0]:
+        return contact, visible
+    return local, known
+
+
+def _range(values: Float[np.ndarray, " n"]) -> float:
+    """From the 5th to the 95th percentile, as a share of the median."""
+    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+    return float((high - low) / max(abs(middle), 1e-12))
 
 
 def _spread(heights: Float[np.ndarray, " n"]) -> float:
