@@ -9,8 +9,6 @@ from bodyslam_jax.config import GraphWeights
 
 _MAX_LEAN = 0.35
 """rad: people who lean by more, in the median, have no factor."""
-_TYPICAL_LEAN = 0.15
-"""rad: of people who stand or walk, and of errors of their trunks."""
 _LOSS = 3.0
 """Cauchy scale, in standard deviations: people bend down occasionally."""
 
@@ -18,18 +16,9 @@ _LOSS = 3.0
 def mean_up(
     state: graph.State, present: Bool[np.ndarray, "h t"]
 ) -> Float[np.ndarray, "3"]:
-    """Mean direction of people's trunks in the world; a unit vector.
-
-    Robust, by iterative reweighting with a Cauchy loss: some may sit or bend down.
-    """
-    trunks = _trunks(state)[present]
-    unit = lambda v: v / max(float(np.linalg.norm(v)), 1e-9)
-    up = unit(np.median(trunks, axis=0))
-    for _ in range(10):
-        lean = np.arccos(np.clip(trunks @ up, -1.0, 1.0))
-        weight = 1 / (1 + (lean / _TYPICAL_LEAN) ** 2)
-        up = unit(weight @ trunks)
-    return up
+    """Mean direction of people's trunks in the world; a unit vector."""
+    total = _trunks(state)[present].sum(axis=0)
+    return total / max(float(np.linalg.norm(total)), 1e-9)
 
 
 def upright_factor(
