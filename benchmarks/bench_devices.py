@@ -88,7 +88,7 @@ def measure(case, steps, repeats):
     """One case in this process; a dictionary of what was found."""
     what, frames, precision = case.split("-")
     size = int(what.removeprefix("batch")) if what.startswith("batch") else 0
-    dtype = np.float32 if precision == "float32" else np.float64
+    dtype: type = np.float32 if precision == "float32" else np.float64
     jax.config.update("jax_enable_x64", dtype == np.float64)
     jax.config.update("jax_enable_compilation_cache", False)
     device = jax.devices()[0]

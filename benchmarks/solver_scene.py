@@ -134,7 +134,7 @@ def make(
     frames,
     people=1,
     seed=0,
-    dtype=np.float64,
+    dtype: type = np.float64,
     outliers=0.03,
     loss=None,
     draw=0,

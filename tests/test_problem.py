@@ -473,3 +473,13 @@ def test_a_loss_has_one_scale_or_one_for_each_keypoint():
         ValueError, match=r"scale: shape \(25,\), expected one number, "
     ):
         make(KeypointReprojection=wrong)
+
+
+def test_tracks_may_be_added_to_a_problem_that_has_none():
+    whole, _, state = problems.make()
+    sigma = jnp.ones((len(state.cameras), 6))
+    first = g.CameraPrior(cameras=state.cameras, sigma=sigma)
+    found = g.make_problem([first], state).with_factors(*whole.factors)
+    both = g.make_problem([first, *whole.factors], state)
+    assert float(found.cost(state)) == float(both.cost(state))
+    assert len(found.layout.buckets) == len(both.layout.buckets) > 0

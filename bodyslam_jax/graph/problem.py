@@ -172,7 +172,7 @@ class Problem(eqx.Module):
         everything = (*self.factors, *factors)
         layout = dataclasses.replace(self.layout, limbs=limbs_of(everything))
         if any(isinstance(f, Reprojection | LandmarkPrior) for f in factors):
-            layout = _layout_of(everything, sizes)
+            layout = _layout_of(everything, sizes, None)
             check_memory(layout, sample)
         free, variables = self.free, self.variables
         if "scale" in _variables_of(factors) - _variables_of(self.factors):
