@@ -115,6 +115,16 @@ def test_cost_is_that_of_the_best_old_variables():
     assert float(none) == 0.0
 
 
+def test_old_frames_that_nothing_ties_to_the_rest_leave_an_empty_prior():
+    _, _, state = make(frames=14)
+    known = g.CameraPrior(cameras=state.cameras, sigma=jnp.ones((14, 6)))
+    problem = g.make_problem([known], state)
+    prior, rest = marginalise(problem, state, 5)
+    assert prior.information.shape == (0, 0)
+    assert float(prior.cost(state.zero_step())) == 0.0
+    assert not np.asarray(rest.free.cameras)[:5].any()
+
+
 @pytest.mark.parametrize("frames", [0, 14])
 def test_some_frames_go_and_some_stay(frames):
     problem, _, state = make(frames=14)

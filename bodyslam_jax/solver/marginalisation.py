@@ -103,8 +103,8 @@ def marginalise(
     columns = np.full(padded_rows(len(place) + 1), _NONE)
     columns[: len(place) + 1] = *place, _GRADIENT
     rows = _program()(padded, eliminated, start, jnp.asarray(columns))
-    *information, slope = rows[: len(place) + 1, place]
-    information = jnp.asarray(information)
+    reduced = rows[: len(place) + 1, place]
+    information, slope = reduced[:-1], reduced[-1]
     left = jax.tree.map(lambda free, old: free * (1 - old), mask_of(rest), gone)
     prior = MarginalPrior(
         information=(information + information.T) / 2,
