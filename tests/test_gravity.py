@@ -10,6 +10,7 @@ from bodyslam_jax.geometry.gravity import (
     map_plane,
 )
 from bodyslam_jax.geometry.stances import find_stances, standing_feet
+from bodyslam_jax.geometry.vertical_edges import Vertical
 
 FPS = 30.0
 NOTHING = np.zeros((0, 3))
@@ -218,3 +219,35 @@ def test_a_measured_gravity_holds_on_a_hill():
     )
     np.testing.assert_allclose(alone.up[:2], np.array([0.1, 1.0]) / 1.01**0.5)
     assert alone.sigma == pytest.approx(np.radians(1.0))
+
+
+def vertical_edges(x, z, sigma=0.5):
+    """The vertical by edges, in degrees from y."""
+    tilt, covariance = np.radians([x, z]), np.radians(sigma) ** 2 * np.eye(2)
+    return Vertical(tilt, covariance, 0.01, 8.0, 20.0, np.ones(8))
+
+
+def test_walls_tell_a_hill_from_trunks_that_lean():
+    """Where the ground slopes, and where nobody walks."""
+    hill = lambda x, z: np.tan(np.radians(8.0)) * z
+    given = cues(walker(way(bend=0.3), floor=hill), (3.0, 0, 0))
+    found = find_upright(*given, edges=vertical_edges(0.0, 0.0))
+    assert off(found.up) < 0.7 < off(find_upright(*given).up)
+    assert np.degrees(found.ground) == pytest.approx(8.0, abs=1.0)
+    assert found.sigma < find_upright(*given).sigma
+    still = cues(np.zeros((1, 90, 2, 3)) + [0.0, 0.0, 4.0], (5.0, 0, 0))
+    found = find_upright(*still, edges=vertical_edges(0.0, 0.0))
+    assert off(found.up) < 0.7
+    assert np.degrees(found.edges) == pytest.approx(off(found.up), abs=0.1)
+
+
+def test_edges_that_contradict_people_and_ground_are_believed_less():
+    given = cues(walker(way()), (0.0, 0, 0), fitted=False)
+    found = find_upright(*given, edges=vertical_edges(12.0, 0.0))
+    assert off(found.up) < 3.0
+    agreeing = find_upright(*given, edges=vertical_edges(0.0, 0.0))
+    assert agreeing.sigma < found.sigma
+    nobody = np.zeros((0, 30, 2, 3))
+    alone = find_upright(*cues(nobody, (0.0, 0, 0)), edges=vertical_edges(2.0, 0.0))
+    assert off(alone.up) == pytest.approx(2.0, abs=0.1)
+    assert np.isfinite(alone.sigma)

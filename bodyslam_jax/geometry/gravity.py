@@ -1,17 +1,20 @@
-"""The direction of gravity, from trunks, standing feet and the map's ground plane.
+"""The direction of gravity, from trunks, feet, the map's ground plane and edges.
 
-Without an accelerometer three cues determine it, each with an error of its own:
+Without an accelerometer four cues determine it, each with an error of its own:
 
 - People keep their trunk upright, to some degrees. Lean across the view is observed in
   the image; lean along the view is mostly inferred and less accurate.
 - Most ground that people walk on is level, to a degree or so, and some of it slopes.
   Its plane is estimated twice: from the feet that stand on it, and from the points of
   the map that lie in one plane below the camera.
+- Walls and posts are vertical to some tenths of a degree, where there are any
+  (`geometry.vertical_edges`).
 
-The two planes are fused by their covariances; then the plane's normal and the trunks'
-mean are combined. Either can be far off, on a hill or where postures are wrong. So each
-has a mixture of a narrow and a wide error distribution, and the result is the posterior
-mean over the four combinations.
+The two planes are fused by their covariances; then the plane's normal, the trunks' mean
+and the vertical of edges are combined. Each can be far off: on a hill, where postures
+are wrong, where edges that are not vertical agree. So each has a mixture of a narrow
+and a wide error distribution, and the result is the posterior mean over all
+combinations.
 
 Small angles: a direction is its first and third coordinate over its second, in a frame
 whose y axis is nearly up.
@@ -26,6 +29,7 @@ from jaxtyping import Bool, Float, Int
 from bodyslam_jax.config import GRAVITY_SIGMA
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.geometry.stances import find_stances
+from bodyslam_jax.geometry.vertical_edges import Vertical
 
 _DEGREE = np.pi / 180
 _TRUNK_ACROSS = 2.0 * _DEGREE
@@ -44,6 +48,9 @@ _WORSE_TRUNKS = {False: 0.05, True: 0.15}
 _HOW_MUCH_WORSE = 2.5
 """Probability that a person's trunk is a worse measurement, without and with bodies
 fitted to keypoints, and the factor by which its standard deviation is then larger."""
+_WRONG_EDGES = (0.1, 5.0 * _DEGREE)
+"""Probability that edges which agree are not vertical, and the standard deviation of
+their direction in that case. Assumed: of 21 clips with such edges none was wrong."""
 _LEVEL = 0.7 * _DEGREE
 _SLOPES = (0.25, 4.0 * _DEGREE)
 """Standard deviation of the slope of level ground; probability that the ground is not
@@ -90,6 +97,8 @@ class Upright:
     """Angle between `up` and the mean direction of trunks, rad; NaN without people."""
     ground: float
     """Estimated slope of the ground, rad; NaN if no ground plane was found."""
+    edges: float = np.nan
+    """Angle between `up` and the vertical of edges, rad; NaN without such edges."""
 
 
 def find_upright(
@@ -102,6 +111,7 @@ def find_upright(
     fitted: Bool[np.ndarray, " h"],
     measured_up: Float[np.ndarray, " 3"] | None = None,
     standing: Bool[np.ndarray, "h t 2"] | None = None,
+    edges: Vertical | None = None,
 ) -> Upright:
     """Up from all available cues, in a frame whose y axis is roughly up.
 
@@ -113,6 +123,7 @@ def find_upright(
         fitted: whether a person's body was fitted to keypoints, not regressed.
         measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
         standing: toes that stand; without it, by their speed (`find_stances`).
+        edges: the vertical by edges in the images.
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps, standing)
@@ -123,7 +134,7 @@ def find_upright(
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
     if measured_up is not None:
         trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
-    tilt, slope, sigma = _combined(trunk_tilt, ground, worse)
+    tilt, slope, sigma = _combined(_tilts(trunk_tilt, worse, edges), ground)
     up = np.array([tilt[0], 1.0, tilt[1]])
     up /= np.linalg.norm(up)
     return Upright(
@@ -133,6 +144,7 @@ def find_upright(
         if trunk_tilt is None
         else float(np.linalg.norm(trunk_tilt[0] - tilt)),
         ground=float(np.arctan(np.linalg.norm(slope))),
+        edges=np.nan if edges is None else float(np.linalg.norm(edges.tilt - tilt)),
     )
 
 
@@ -340,38 +352,75 @@ def _fused(planes: list[Plane]) -> Plane | None:
     return Plane(gradient, covariance)
 
 
+def _tilts(
+    trunk_tilt: tuple[np.ndarray, np.ndarray] | None,
+    worse: float,
+    edges: Vertical | None,
+) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Up from trunks and edges: a mixture of normal distributions of its tilt, each
+    with its weight, mean and covariance; empty without either."""
+    trunks, verticals = [], []
+    if trunk_tilt is not None:
+        mean, own = trunk_tilt
+        trunks = [(1 - worse, mean, own), (worse, mean, _HOW_MUCH_WORSE**2 * own)]
+    if edges is not None:
+        wrong, sigma = _WRONG_EDGES
+        wide = edges.covariance + sigma**2 * np.eye(2)
+        verticals = [(1 - wrong, edges.tilt, edges.covariance)]
+        verticals.append((wrong, edges.tilt, wide))
+    if not trunks or not verticals:
+        return trunks or verticals
+    both = []
+    for (p, mean, own), (q, tilt, other) in itertools.product(trunks, verticals):
+        likelihood, explained = _agreement(tilt - mean, own + other)
+        covariance = own - own @ np.linalg.solve(own + other, own)
+        both.append((p * q * likelihood, mean + own @ explained, covariance))
+    return both
+
+
+def _agreement(
+    apart: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"]
+) -> tuple[float, Float[np.ndarray, " 2"]]:
+    """Likelihood of a difference, up to a constant, and its product with the inverse of
+    its covariance."""
+    explained = np.linalg.solve(covariance, apart)
+    likelihood = np.exp(-apart @ explained / 2) / np.sqrt(np.linalg.det(covariance))
+    return float(likelihood), explained
+
+
 def _combined(
-    trunk_tilt: tuple[np.ndarray, np.ndarray] | None, ground: Plane | None, worse: float
+    up_tilts: list[tuple[float, np.ndarray, np.ndarray]], ground: Plane | None
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
     """The tilt of up, the slope of the ground, and the standard deviation of the less
     sure direction of up, rad."""
     unknown = np.full(2, np.nan)
-    if trunk_tilt is None:
+    if not up_tilts:
         if ground is None:
             return np.zeros(2), unknown, np.inf
         level = ground.covariance + _LEVEL**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
-    if ground is None:
-        return trunk_tilt[0], unknown, _largest(trunk_tilt[1])
-    mean, trunk = trunk_tilt
     sloping, steep = _SLOPES
-    # Up is `mean + e`, with covariance `trunk`; the ground's gradient is `slope - up`.
-    apart = ground.gradient + mean
     density, tilts, slopes, covariances = [], [], [], []
-    for (p, factor), (q, sigma) in itertools.product(
-        [(1 - worse, 1.0), (worse, _HOW_MUCH_WORSE)],
-        [(1 - sloping, _LEVEL), (sloping, steep)],
-    ):
-        own = factor**2 * trunk
-        total = own + ground.covariance + sigma**2 * np.eye(2)
-        explained = np.linalg.solve(total, apart)
-        likelihood = np.exp(-apart @ explained / 2) / np.sqrt(np.linalg.det(total))
-        density.append(p * q * likelihood)
-        tilts.append(mean - own @ explained)
-        slopes.append(sigma**2 * explained)
-        covariances.append(own - own @ np.linalg.solve(total, own))
-    # If all likelihoods underflow the widest combination is taken.
-    weight = np.array(density) + 1e-300 * np.array([0, 0, 0, 1])
+    for p, mean, own in up_tilts:
+        if ground is None:
+            density.append(p)
+            tilts.append(mean)
+            slopes.append(unknown)
+            covariances.append(own)
+            continue
+        # Up is `mean + e`, with covariance `own`; the ground's gradient is
+        # `slope - up`.
+        apart = ground.gradient + mean
+        for q, sigma in [(1 - sloping, _LEVEL), (sloping, steep)]:
+            total = own + ground.covariance + sigma**2 * np.eye(2)
+            likelihood, explained = _agreement(apart, total)
+            density.append(p * q * likelihood)
+            tilts.append(mean - own @ explained)
+            slopes.append(sigma**2 * explained)
+            covariances.append(own - own @ np.linalg.solve(total, own))
+    # If all likelihoods underflow the widest combination, the last, is taken.
+    weight = np.array(density)
+    weight[-1] += 1e-300
     weight = weight / weight.sum()
     tilt = weight @ np.array(tilts)
     scatter = [np.outer(t - tilt, t - tilt) for t in tilts]

@@ -9,6 +9,7 @@ from bodyslam_jax import diagnostics, motion, people, sfm
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import summarise
+from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
@@ -16,6 +17,7 @@ from bodyslam_jax.pipeline.people_stage import with_warnings
 from bodyslam_jax.pipeline.progress import Counter, Stopwatch
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import to_metric
+from bodyslam_jax.pipeline.vertical_stage import find_edges
 from bodyslam_jax.types import (
     Bodies,
     JointEstimate,
@@ -58,6 +60,7 @@ def run_stages(
     sequence = diagnostics.reconcile(sequence, body)
     cameras, bodies = before_joint(sequence, body, config, cache, watch)
     key = fingerprint(sequence, config)
+    everybody = sequence
     sequence = people.select_people(sequence, config.person)
     refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     with watch("joint"):
@@ -67,7 +70,9 @@ def run_stages(
             JointEstimate,
             lambda: joint_stage.estimate(refined, cameras, bodies, body, config),
         )
-    result = assemble(sequence, config, body, cameras, joint, watch.seconds)
+    with watch("edges"):
+        edges = find_edges(everybody, cameras, joint, cache)
+    result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
     return result, cameras, refined
 
 
@@ -118,12 +123,14 @@ def assemble(
     cameras: SfmResult,
     joint: JointEstimate,
     seconds: dict[str, float],
+    edges: Edges | None = None,
 ) -> Result:
     """The joint estimate in metres, judged, with its summary.
 
-    `seconds` are the durations of the stages, for the summary.
+    `seconds` are the durations of the stages, for the summary; `edges` are straight
+    edges in the images, for gravity.
     """
-    result, up = to_metric(sequence, config, body, cameras, joint)
+    result, up = to_metric(sequence, config, body, cameras, joint, edges)
     verdict = diagnostics.assess(sequence, body, cameras, joint, result, up)
     summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
     return dataclasses.replace(result, summary=summary, joint_sigma=verdict.joint_sigma)

@@ -13,6 +13,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.gravity import Upright, find_upright
 from bodyslam_jax.geometry.lengths import lengthened, padded_length
 from bodyslam_jax.geometry.stances import find_stances
+from bodyslam_jax.geometry.vertical_edges import Edges, find_vertical
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
@@ -26,10 +27,11 @@ def to_metric(
     body: body_.BodyModel,
     cameras: SfmResult,
     joint: JointEstimate,
+    edges: Edges | None = None,
 ) -> tuple[Result, Upright]:
     """The optimum in a metric world whose y axis is up, and how up was found.
 
-    Standing feet are at y = 0.
+    Standing feet are at y = 0. `edges` are straight edges in the world of `joint`.
     """
     T_WC = joint.cameras.copy()
     T_WC[:, :3, 3] *= joint.scale
@@ -46,6 +48,7 @@ def to_metric(
         people.without_bodies(sequence),
         config.gravity,
         standing,
+        edges,
     )
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
@@ -157,6 +160,7 @@ def level(
     fitted: Bool[np.ndarray, " h"],
     gravity: tuple[float, ...] = (),
     standing: Bool[np.ndarray, "h t 2"] | None = None,
+    edges: Edges | None = None,
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
     """The rigid motion to a world whose y axis is up, and the cues it is based on.
 
@@ -181,6 +185,7 @@ def level(
         fitted,
         np.array([0.0, 1.0, 0.0]) if gravity else None,
         standing,
+        None if edges is None else find_vertical(edges.rotated(rough[:3, :3])),
     )
     return upright(rough @ T_WC, found.up) @ rough, found
 

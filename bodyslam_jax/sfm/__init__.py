@@ -10,6 +10,8 @@ from bodyslam_jax.sfm.moving_points import (
 )
 from bodyslam_jax.sfm.person_mask import SILHOUETTE_STEP as SILHOUETTE_STEP
 from bodyslam_jax.sfm.scene_tracks import track as track
+from bodyslam_jax.sfm.segments import Segments as Segments
+from bodyslam_jax.sfm.segments import find_segments as find_segments
 from bodyslam_jax.sfm.sfm import Reconstruction as Reconstruction
 from bodyslam_jax.sfm.sfm import reconstruct as reconstruct
 from bodyslam_jax.sfm.track_splitting import (

@@ -1,0 +1,204 @@
+"""The vertical from straight edges in images: walls, door frames, posts.
+
+A segment in an image and the camera's centre span a plane with unit normal n. If the
+edge is vertical, n is orthogonal to the vertical v. The residual of a segment is the
+angle in the image between it and the image of the vertical through its middle, whose
+ray is m: `r = n·v / |m × v|`.
+
+Of the segments within some degrees of a rough vertical some are images of vertical
+edges, and err by the lean of walls and posts and by the noise of the detector; the
+others have any direction. The mixture of both is fitted by expectation maximisation.
+There is a result only if it explains the segments much better than directions at
+random.
+
+A physical edge appears in many images, with the same lean in all of them. So segments
+of one image at different azimuths count as independent, and all images together count
+as much as one of them, times the number of views that do not overlap: more images of
+the same scene do not make the vertical more certain.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bodyslam_jax.geometry.camera import unproject
+
+_DEGREE = np.pi / 180
+_CONE = 15 * _DEGREE
+"""Greatest angle in the image between a segment and the rough vertical, and greatest
+angle between the result and the rough vertical."""
+_STEEPEST = 0.5
+"""Least sine of the angle between the ray of a segment and the vertical."""
+_AZIMUTH = 3 * _DEGREE
+"""Segments of one image that are closer in azimuth count as one edge."""
+_VIEW = 60 * _DEGREE
+"""Change of heading after which the camera's view is another."""
+_PIXEL = 0.25
+"""Standard deviation of an end of a segment across it, px."""
+_LEAN = (0.3 * _DEGREE, 2.0 * _DEGREE)
+"""Least and greatest standard deviation of the lean of vertical edges in a fit."""
+_TREES = 1.4 * _DEGREE
+"""Standard deviation of the lean above which edges are no walls and posts; the error of
+the fit is larger than its covariance then."""
+_SYSTEMATIC = 0.2 * _DEGREE
+"""Standard deviation of the error in the image that all edges of a clip have in common,
+by a rolling shutter or by distortion that is not modelled."""
+_LEAST_GAIN, _FEWEST = 8.0, 4.0
+"""Least gain in log-likelihood over directions at random, and least number of
+independent edges, of a result."""
+_WEAK = 20 * _DEGREE
+"""Standard deviation of the prior of the tilt, which makes the system regular."""
+_STEPS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """Straight segments of images, in a world: `s` segments of `n` images."""
+
+    frame: Int[np.ndarray, " s"]
+    """Index of the image."""
+    normal: Float[np.ndarray, "s 3"]
+    """Unit normal of the plane through the camera's centre and the segment."""
+    ray: Float[np.ndarray, "s 3"]
+    """Unit vector to the middle of the segment."""
+    length: Float[np.ndarray, " s"]
+    """px"""
+    axis: Float[np.ndarray, "n 3"]
+    """Optical axes of all images that were searched, unit vectors."""
+
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> "Edges":
+        """The same in a world with other axes: `rotation` takes directions to it."""
+        turn = lambda directions: directions @ rotation.T
+        return dataclasses.replace(
+            self, normal=turn(self.normal), ray=turn(self.ray), axis=turn(self.axis)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Vertical:
+    """The vertical from edges, in a world whose y axis is nearly up."""
+
+    tilt: Float[np.ndarray, " 2"]
+    """x and z of the vertical over its y."""
+    covariance: Float[np.ndarray, "2 2"]
+    """Of `tilt`, rad²."""
+    lean: float
+    """Standard deviation of the edges from it, beyond the detector's noise, rad."""
+    number: float
+    """Number of independent edges that agree."""
+    gain: float
+    """Gain in log-likelihood over directions at random."""
+    is_vertical: Float[np.ndarray, " s"]
+    """Probability that each segment is the image of a vertical edge."""
+
+
+def make_edges(
+    frame: Int[np.ndarray, " s"],
+    ends: Float[np.ndarray, "s 2 2"],
+    wanted: Int[np.ndarray, " n"],
+    R_WC: Float[np.ndarray, "t 3 3"],
+    intrinsics: Float[np.ndarray, " i"],
+) -> Edges:
+    """Segments with their ends in px, of images `wanted`, in the cameras' world."""
+    rays = np.asarray(unproject(np.asarray(intrinsics, float), ends))
+    rays = np.einsum("sij,skj->ski", R_WC[frame], rays)
+    unit = lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True)
+    rays = unit(rays)
+    return Edges(
+        frame,
+        unit(np.cross(rays[:, 0], rays[:, 1])),
+        unit(rays.sum(axis=1)),
+        np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1),
+        R_WC[wanted][:, :, 2],
+    )
+
+
+def find_vertical(edges: Edges) -> Vertical | None:
+    """The vertical within 15 degrees of the y axis; `None` if no edges stand out from
+    directions at random."""
+    tilt, found = np.zeros(2), None
+    for _ in range(2):  # The second time about the first result: with all its edges.
+        found = _fit(edges, tilt)
+        if found is None or np.linalg.norm(found.tilt) > np.tan(_CONE):
+            return None
+        tilt = found.tilt
+    assert found is not None
+    is_clear = found.gain > _LEAST_GAIN and found.number > _FEWEST
+    return found if is_clear and found.lean < _TREES else None
+
+
+def _fit(edges: Edges, centre: Float[np.ndarray, " 2"]) -> Vertical | None:
+    """The fit to the segments that are near a tilt; `None` with fewer than three."""
+    r, _, across = _residual(edges.normal, edges.ray, centre)
+    near = (across > _STEEPEST) & (np.abs(r) < np.sin(_CONE))
+    if near.sum() < 3:
+        return None
+    normal, ray = edges.normal[near], edges.ray[near]
+    noise = np.sqrt(2) * _PIXEL / edges.length[near]
+    weight = _weights(edges, near)
+    random = 1 / (2 * _CONE)
+    prior = np.eye(2) / _WEAK**2
+
+    def density(r: np.ndarray, lean: float) -> np.ndarray:
+        variance = lean**2 + noise**2
+        return np.exp(-(r**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
+
+    lean, share = 1.0 * _DEGREE, 0.3
+    side = np.arange(-10, 11) * _DEGREE
+    grid = centre + np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    r, slope, _ = _residual(normal, ray, centre)
+    apart = r + (grid - centre) @ slope.T
+    gain = np.log(share * density(apart, lean) / random + 1 - share) @ weight
+    tilt = grid[np.argmax(gain)]
+    for _ in range(_STEPS):
+        r, slope, _ = _residual(normal, ray, tilt)
+        inlier = share * density(r, lean)
+        is_vertical = inlier / (inlier + (1 - share) * random)
+        counts = weight * is_vertical
+        share = float(np.clip(counts.sum() / weight.sum(), 0.02, 0.98))
+        variance = lean**2 + noise**2
+        scaled = slope * (counts / variance)[:, None]
+        step = np.linalg.solve(slope.T @ scaled + prior, scaled.T @ r)
+        tilt = tilt - step
+        # What the scatter has beyond the detector's noise, by Fisher scoring.
+        r = r - slope @ step
+        fisher = counts / variance**2
+        excess = fisher @ (r**2 - noise**2) / max(float(fisher.sum()), 1e-12)
+        lean = float(np.sqrt(np.clip(excess, _LEAN[0] ** 2, _LEAN[1] ** 2)))
+    r, slope, _ = _residual(normal, ray, tilt)
+    inlier = share * density(r, lean)
+    is_vertical = np.zeros(len(near))
+    is_vertical[near] = inlier / (inlier + (1 - share) * random)
+    counts = weight * is_vertical[near]
+    by_all = counts / (lean**2 + noise**2)
+    covariance = np.linalg.inv(slope.T @ (slope * by_all[:, None]) + prior)
+    # The common error, as an angle of every edge in the image.
+    mean = slope.T @ (slope * counts[:, None]) / max(float(counts.sum()), 1e-12)
+    common = np.linalg.inv(mean / _SYSTEMATIC**2 + prior)
+    gain = float(weight @ np.log(inlier / random + 1 - share))
+    covariance = covariance + common
+    number = float(counts.sum())
+    return Vertical(tilt, covariance, lean, number, gain, is_vertical)
+
+
+def _residual(normal, ray, tilt):
+    """The residual of segments for a tilt of the vertical, its derivative by the tilt,
+    and the sine of the angle between ray and vertical."""
+    v = np.array([tilt[0], 1.0, tilt[1]])
+    across = np.maximum(np.linalg.norm(np.cross(ray, v), axis=1), 1e-9)
+    return normal @ v / across, normal[:, [0, 2]] / across[:, None], across
+
+
+def _weights(edges: Edges, near: np.ndarray) -> Float[np.ndarray, " k"]:
+    """The number of independent edges that each segment stands for."""
+    azimuth = np.arctan2(edges.ray[near, 0], edges.ray[near, 2])
+    sector = np.floor(azimuth / _AZIMUTH).astype(int)
+    place = np.stack([edges.frame[near], sector])
+    group = np.unique(place, axis=1, return_inverse=True)[1].reshape(-1)
+    length = edges.length[near]
+    share = length / np.bincount(group, length)[group]
+    heading = np.arctan2(edges.axis[:, 0], edges.axis[:, 2])
+    turned = np.angle(np.exp(1j * (heading - heading[0])))
+    views = 1 + np.ptp(turned) / _VIEW
+    return share * views / len(edges.axis)
