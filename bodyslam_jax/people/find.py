@@ -149,18 +149,23 @@ class _Finder:
             filter(self._is_estimated, everybody), key=_presence, reverse=True
         )
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
-        number = {t.number: k for k, pieces in enumerate(people) for t in pieces}
+        who = {
+            (piece.number, frame): number
+            for number, pieces in enumerate(people)
+            for piece in pieces
+            for frame in piece.frames
+        }
         unknown = np.zeros((25, 3))
         alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
         rows: list[tuple[int, int, np.ndarray, np.ndarray]] = [
             alone(*other) for other in self.others
         ]
         for tracklet in self.tracker.tracklets:
-            who = number.get(tracklet.number, -1)
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
                 key = tracklet.number, frame
                 body = as_body25(points, self.feet.get(key))
-                rows.append((frame, who, body, self.relative.get(key, unknown)))
+                relative = self.relative.get(key, unknown)
+                rows.append((frame, who.get(key, -1), body, relative))
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)

@@ -1,15 +1,17 @@
 """Tracklets -> people: re-identification after an occlusion or absence.
 
-Offline, a tracklet that ends and a later one that begins are joined if position, size
-and colours of clothes agree. Pairs of least cost are joined first.
+Offline, tracklets are cut where their colours change (`crossings`), and a piece that
+ends and a later one that begins are joined if position, size and colours of clothes
+agree. Of all ways to join them, the one of least total cost is taken.
 """
 
-import dataclasses
 from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.people.appearance import difference, mean_look
+from bodyslam_jax.people.crossings import cut, part
 from bodyslam_jax.people.tracking import GROWTH, Tracklet, displacement, height
 
 _NEAR = 1.0
@@ -30,32 +32,38 @@ _ENDS = 20
 """Frames at the end of a piece over which size is averaged."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Joint:
-    first: int
-    second: int
-    cost: float
-
-
 def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
-    """People, each as the pieces of them in order of time."""
-    joints = []
-    for i, a in enumerate(tracklets):
-        for j, b in enumerate(tracklets):
-            cost = join_cost(a, b, fps)
-            if cost < 1:
-                joints.append(_Joint(i, j, cost))
-    chains = [[i] for i in range(len(tracklets))]
-    chain_of = list(range(len(tracklets)))
-    for joint in sorted(joints, key=lambda q: (q.cost, q.first, q.second)):
-        a, b = chain_of[joint.first], chain_of[joint.second]
-        # Both ends must still be free: one piece follows one.
-        if a == b or chains[a][-1] != joint.first or chains[b][0] != joint.second:
-            continue
-        for piece in chains[b]:
-            chain_of[piece] = a
-        chains[a], chains[b] = chains[a] + chains[b], []
-    return [[tracklets[i] for i in chain] for chain in chains if chain]
+    """People, each as the pieces of them in order of time.
+
+    Pieces of one tracklet that are one person's again are that tracklet, or the part of
+    it from the first of them to the last.
+    """
+    pieces = [piece for t in tracklets for piece in cut(t, fps)]
+    if not pieces:
+        return []
+    gain = np.array([[join_cost(a, b, fps) for b in pieces] for a in pieces]) - 1
+    goes_on = {i for i, (a, b) in enumerate(pairwise(pieces)) if a.number == b.number}
+    for i in goes_on:
+        gain[i, i + 1] = _cost_to_go_on(pieces[i], pieces[i + 1]) - 1
+    rows, columns = linear_sum_assignment(np.minimum(gain, 0))
+    joined = gain[rows, columns] < 0
+    after = dict(zip(rows[joined].tolist(), columns[joined].tolist(), strict=True))
+    whole = {t.number: t for t in tracklets}
+    people = []
+    for i in sorted(set(range(len(pieces))) - set(after.values())):
+        person = [pieces[i]]
+        while i in after:
+            j = after[i]
+            if i in goes_on and j == i + 1:
+                all_of_it = whole[pieces[i].number]
+                start = all_of_it.frames.index(person[-1].frames[0])
+                stop = all_of_it.frames.index(pieces[j].frames[-1]) + 1
+                person[-1] = part(all_of_it, start, stop, fps)
+            else:
+                person.append(pieces[j])
+            i = j
+        people.append(person)
+    return people
 
 
 def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[str]:
@@ -104,6 +112,14 @@ def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
     clothes = looks / _CLOTHES_NEARBY if np.isfinite(looks) else 0.5
     worst = max(place, clothes, growth)
     return float(0.5 * place + 0.5 * clothes) if worst < 1 else np.inf
+
+
+def _cost_to_go_on(a: Tracklet, b: Tracklet) -> float:
+    """Cost of joining two successive pieces of one tracklet, whose positions and sizes
+    agree: others may explain them better, but a change of light also changes colours.
+    """
+    looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
+    return 0.5 * looks / _CLOTHES_NEARBY
 
 
 def _size(tracklet: Tracklet, *, last: bool) -> float:
