@@ -22,7 +22,7 @@ _LEAST_CHANGE = 10.0
 """Difference of colours (`appearance.difference`) below which nothing is cut."""
 _LEAST_RATIO = 2.5
 """Least change of colours in standard deviations. Exchanged people had 3.6; the
-largest of each of 24 tracklets of one person was 0.6 to 3.0."""
+largest of each of 26 tracklets of one person was 0.6 to 3.0."""
 _FLOOR = 2.0
 """Standard deviation of colours beyond that within both windows."""
 _CLEARLY = 0.5
