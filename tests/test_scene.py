@@ -214,3 +214,98 @@ def test_the_page_names_no_other_file(page_file):
     assert not re.search(r"(src|href)=[\"'](?!data:)", markup)
     assert "The MIT License" in page and "three.js authors" in page
     assert json.loads(re.search(r'class="run">(.*?)</script>', page).group(1))
+
+
+@pytest.fixture(scope="module")
+def doubted(body, result):
+    """The second person is not measurable, and the left arm was hidden for a while."""
+    people = [
+        {"status": "doubtful", "reasons": ["person 0: the feet slide."]},
+        {"status": "not_measurable", "reasons": ["person 1: too small.", "far away."]},
+    ]
+    sigma = np.where(result.present[..., None], np.full(24, 0.03), 0.0)
+    sigma[0, 4:8, 20] = 0.16
+    summary = result.summary | {"people": people}
+    return dataclasses.replace(result, summary=summary, joint_sigma=sigma)
+
+
+def test_the_status_of_people_is_shown(browser, tmp_path, doubted, body):
+    path = tmp_path / "scene.html"
+    view.write_scene(path, doubted, body)
+    with opened(browser, path, (1280, 720)) as page:
+        text = scene(page).inner_text("header")
+        assert "2 people, 1 doubtful, 1 not measurable" in text
+        assert "the feet slide." in text and "too small. (and 1 more)" in text
+        (line,) = (one for one in text.splitlines() if one.startswith("person 1:"))
+        assert line == "person 1: not measurable"
+        looks = page.evaluate(
+            "bodyslam.runs[0].people.map((p) => [p.skin.material.opacity,"
+            "p.person.inferred !== null])"
+        )
+        assert looks[0] == [1, True]
+        assert looks[1][0] < 0.5 and not looks[1][1]
+
+        def brightness(frame):
+            """Of the left forearm's vertices, and of the right one's."""
+            return page.evaluate(
+                """async (frame) => {
+                    await bodyslam.show(frame);
+                    const { skin } = bodyslam.runs[0].people[0];
+                    const { color, skinIndex, skinWeight } = skin.geometry.attributes;
+                    return [18, 19].map((joint) => {
+                        let sum = 0, count = 0;
+                        for (let v = 0; v < color.count; v++) {
+                            if (skinIndex.getX(v) !== joint) continue;
+                            if (skinWeight.getX(v) < 0.9) continue;
+                            sum += color.getX(v) + color.getY(v) + color.getZ(v);
+                            count += 1;
+                        }
+                        return sum / count;
+                    });
+                }""",
+                frame,
+            )
+
+        hidden, measured = brightness(5)
+        assert hidden > measured + 0.1
+        hidden, measured = brightness(0)
+        assert hidden == pytest.approx(measured)
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (800, 600), (390, 800)])
+def test_no_box_covers_anybody(browser, page_file, size):
+    """Heads and feet of everybody, at any time, from all fixed views."""
+    with opened(browser, page_file, size) as page:
+        scene(page)
+        for mode in ("start", "side", "above"):
+            covered = page.evaluate(
+                """async (mode) => {
+                    bodyslam.look(mode);
+                    const { camera, canvas, boxes } = bodyslam.view;
+                    const found = [];
+                    for (let k = 0; k < 12; k++) {
+                        await bodyslam.show(k);
+                        camera.updateMatrixWorld();
+                        for (const p of bodyslam.runs[0].people) {
+                            if (!p.present[k]) continue;
+                            for (const joint of [15, 10, 11]) {
+                                const q = new THREE.Vector3().setFromMatrixPosition(
+                                    p.bones[joint].matrixWorld).project(camera);
+                                const x = (q.x + 1) / 2 * canvas.clientWidth;
+                                const y = (1 - q.y) / 2 * canvas.clientHeight;
+                                for (const box of boxes) {
+                                    const b = box.getBoundingClientRect();
+                                    const inside = x > b.left && x < b.right
+                                        && y > b.top && y < b.bottom;
+                                    if (inside) found.push([k, joint, box.tagName]);
+                                }
+                                const outside = Math.max(...[q.x, q.y].map(Math.abs)) > 1;
+                                if (outside) found.push([k, joint]);
+                            }
+                        }
+                    }
+                    return found;
+                }""",
+                mode,
+            )
+            assert covered == [], mode

@@ -11,7 +11,7 @@ import pytest
 from bodyslam_jax import view
 from bodyslam_jax.body import joints, keypoints, load_body_model, write_npz
 from bodyslam_jax.types import Keypoints, Result, Tracks
-from bodyslam_jax.view import overlay, top_view, video_file
+from bodyslam_jax.view import overlay, person_style, top_view, video_file
 
 WIDTH, HEIGHT = 160, 120
 
@@ -313,3 +313,33 @@ def test_the_side_view_fits_into_pictures_of_any_size(body):
         black = [np.zeros((size[1], size[0], 3), np.uint8)] * num
         found = list(overlay.pictures(black, result, body, None, size, np.ones(2)))
         assert len(found) == num and found[0].shape == (size[1], size[0], 3)
+
+
+def test_the_status_of_people_is_drawn(body):
+    """Who is not measurable is nearly transparent, who is doubtful has dashes around
+    them, and both are named; an arm that was hidden is paler than the other."""
+    plain = _scene(body, depths=(3.0,))
+    image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+
+    def drawn(status, hidden=()):
+        summary = {"people": [{"status": status, "reasons": []}]}
+        sigma = np.full(plain.joints.shape[:3], 0.03)
+        sigma[..., list(hidden)] = 0.2
+        result = dataclasses.replace(plain, summary=summary, joint_sigma=sigma)
+        return view.draw_frame(image, result, body, 0).astype(int), result
+
+    (u, v) = _pixels(plain)[0].astype(int)
+    change = {s: np.abs(drawn(s)[0][v, u] - 90).max() for s in ("ok", "not_measurable")}
+    assert 0 < change["not_measurable"] < 0.7 * change["ok"]
+    outside = (drawn("ok")[0] == 90).all(-1) & (drawn("doubtful")[0] != 90).any(-1)
+    assert outside.sum() > 20
+    forearms = [
+        _pixels(plain)[[a, b]].mean(0).astype(int) for a, b in ((18, 20), (19, 21))
+    ]
+    shown, _ = drawn("ok", hidden=(20,))
+    hidden, measured = (shown[y, x].sum() for x, y in forearms)
+    assert hidden > measured + 30
+    _, result = drawn("doubtful")
+    styles = person_style.person_styles(result)
+    assert styles[0].name == "person 0, doubtful"
+    assert person_style.Legend(result, styles).entries == {"doubtful": styles[0].dash}

@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.diagnostics.reported_status import reported_status
 from bodyslam_jax.types import Result
 
 _MOST_ROWS = 5
@@ -28,7 +29,7 @@ def answers(
     rows = lambda text: [(f"person-{h % 4}", name(h), text(h)) for h in shown]
     kind = _STILL.get(str(summary.get("camera_motion")))
     if shown:
-        known = [h for h in shown if person_status(summary, h) != "not_measurable"]
+        known = [h for h in shown if reported_status(summary, h).measurable]
         if_known = lambda h, text: text if h in known else "not measurable"
         far = rows(lambda h: if_known(h, f"{people[h].distance:.1f} m"))
         fast = rows(lambda h: if_known(h, f"{people[h].mean_speed:.1f} m/s"))
@@ -64,13 +65,6 @@ def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
     """Standard deviation of a person's stature, m, as reported."""
     reported = (summary.get("people") or [])[h : h + 1]
     return reported[0].get("stature_sigma_m") if reported else None
-
-
-def person_status(summary: Mapping[str, Any], h: int) -> str | None:
-    """`ok`, `doubtful`, `not_measurable` or `absent`, as reported; `None` if it was
-    not."""
-    reported = (summary.get("people") or [])[h : h + 1]
-    return reported[0].get("status") if reported else None
 
 
 def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:

@@ -7,7 +7,8 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import statistics
-from bodyslam_jax.export.answers import person_status, stature_sigma
+from bodyslam_jax.diagnostics.reported_status import reported_status
+from bodyslam_jax.export.answers import stature_sigma
 from bodyslam_jax.export.tables import table
 from bodyslam_jax.types import Result
 
@@ -28,7 +29,7 @@ def people_table(
         plus_minus = "" if sigma is None else f" ± {100 * sigma:.1f}"
         columns.append(
             {
-                "can be trusted": person_status(summary, h),
+                "can be trusted": reported_status(summary, h).status or None,
                 "visible, s": f"{way.seconds:.1f}",
                 "distance from the camera, m": f"{near:.1f} to {far:.1f}",
                 "way, m": f"{way.distance:.2f}",

@@ -10,7 +10,8 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.types import Keypoints, Result, Tracks
 from bodyslam_jax.view.ground import Ground
 from bodyslam_jax.view.keypoint_marks import KeypointMarks
-from bodyslam_jax.view.people import coarse_body, draw_people, meshes
+from bodyslam_jax.view.people import Mesh, coarse_body, draw_people, meshes
+from bodyslam_jax.view.person_style import Legend, person_styles, write_names
 from bodyslam_jax.view.side_view import SideView
 from bodyslam_jax.view.style import Image, write_text
 from bodyslam_jax.view.top_view import Plan, draw_trails, trails
@@ -95,21 +96,37 @@ def pictures(
     ground, plan = Ground(result, zoom), Plan(result, size)
     side = SideView(result, plan.side)
     left = size[0] - _MARGIN - plan.side
+    styles = person_styles(result)
+    legend = Legend(result, styles)
+    named = len(styles) > 1 or any(style.words for style in styles)
     marks = None
     if keypoints is not None:
         marks = KeypointMarks(result, body, keypoints, zoom)
     posed = meshes(result, coarse, slice(0, num_frames))
     for frame, (image, people) in enumerate(zip(images, posed, strict=True)):
         picture = ground.draw(softened(image), frame)
-        picture = draw_people(picture, people, faces, zoom)
+        picture = draw_people(picture, people, faces, zoom, styles)
         draw_trails(picture, lines[frame])
+        if named:
+            heads = [(styles[mesh.person].name, _above(mesh, zoom)) for mesh in people]
+            write_names(picture, [(name, at) for name, at in heads if at is not None])
         if marks is not None:
             marks.draw(picture, frame)
         plan.draw(picture, frame, (left, _MARGIN))
         side.draw(picture, frame, (left, _MARGIN + plan.side + 4))
         text = f"frame {frame + 1}/{num_frames}  {result.timestamps[frame]:.2f} s"
         write_text(picture, text, (10, size[1] - 12))
+        legend.draw(picture, (10, size[1] - 34))
         yield picture
+
+
+def _above(mesh: Mesh, zoom: np.ndarray) -> tuple[float, float] | None:
+    """Where a person's name stands in the picture, px; `None` for somebody who reaches
+    behind the camera."""
+    if mesh.p_C[:, 2].min() < 0.1:
+        return None
+    u, v = mesh.uv[mesh.uv[:, 1].argmin()] * zoom
+    return float(u), float(v) - 8.0
 
 
 def softened(image: Image) -> Image:

@@ -1,6 +1,8 @@
 """Bodies on an image, by the painter's algorithm on a decimated mesh.
 
 Triangles are drawn farthest first; those that reach behind the camera are left out.
+Who is doubtful or not measurable is paler and has a dashed or dotted outline; limbs
+that were inferred are pale.
 """
 
 import dataclasses
@@ -10,12 +12,14 @@ import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from bodyslam_jax.body import BodyModel, vertices
+from bodyslam_jax.diagnostics.reported_status import inferred_bones
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.style import PEOPLE, Image
+from bodyslam_jax.view.person_style import PALE, PersonStyle, person_styles
+from bodyslam_jax.view.style import Image, polylines
 
 _CELL = 0.025
 """Size of the cells in which vertices are merged, m."""
@@ -37,7 +41,8 @@ def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Ima
         raise IndexError(f"frame {frame}, expected 0 to {num_frames - 1}.")
     coarse = coarse_body(body)
     people = next(meshes(result, coarse, slice(frame, frame + 1)))
-    return draw_people(image, people, np.asarray(coarse.faces), np.ones(2))
+    styles = person_styles(result)
+    return draw_people(image, people, np.asarray(coarse.faces), np.ones(2), styles)
 
 
 def middle_frame(result: Result) -> int:
@@ -92,7 +97,7 @@ def coarse_body(body: BodyModel) -> BodyModel:
     )
 
 
-class _Mesh(eqx.Module):
+class Mesh(eqx.Module):
     """One person in one frame."""
 
     person: int
@@ -100,6 +105,8 @@ class _Mesh(eqx.Module):
     """Vertices in the camera frame, m."""
     uv: np.ndarray
     """px"""
+    inferred: np.ndarray
+    """Vertices of limbs that were hidden, not measured; boolean."""
 
 
 @eqx.filter_jit
@@ -116,9 +123,15 @@ def _pose(
     return p_C, project(intrinsics, p_C)
 
 
-def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[_Mesh]]:
+def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[Mesh]]:
     """The people present in each frame, computed for some frames at a time."""
     cast = lambda x: jnp.asarray(x, body.template.dtype)
+    bone = np.take_along_axis(
+        np.asarray(body.skin_joint),
+        np.asarray(body.skin_weight).argmax(axis=1)[:, None],
+        axis=1,
+    )[:, 0]
+    inferred = inferred_bones(result)
     chosen = np.arange(len(result.timestamps))[frames]
     for start in range(0, len(chosen), _CHUNK):
         index = chosen[start : start + _CHUNK]
@@ -138,7 +151,7 @@ def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[_Mes
             drawn.append((h, np.asarray(p_C), np.asarray(uv)))
         for k, frame in enumerate(index):
             yield [
-                _Mesh(h, p_C[k], uv[k])
+                Mesh(h, p_C[k], uv[k], inferred[h, frame, bone])
                 for h, p_C, uv in drawn
                 if result.present[h, frame]
             ]
@@ -146,13 +159,18 @@ def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[_Mes
 
 def draw_people(
     image: Image,
-    people: list[_Mesh],
+    people: list[Mesh],
     faces: Int[np.ndarray, "f 3"],
     zoom: np.ndarray,
+    styles: list[PersonStyle],
 ) -> Image:
-    """Shaded bodies, those behind first, blended into the image."""
+    """Shaded bodies, those behind first, blended into the image.
+
+    Args:
+        styles: of all people of the result.
+    """
     height, width = image.shape[:2]
-    depth, corners, colors = [], [], []
+    depth, corners, colors, owners = [], [], [], []
     for mesh in people:
         # Pixel centres are whole numbers, so the image's edge is at -1/2.
         uv = (mesh.uv + 0.5) * zoom - 0.5
@@ -166,10 +184,14 @@ def draw_people(
         )
         shown = faces_camera & before & inside
         light = _lit(normal, faces, len(uv))[shown]
-        base = np.array(PEOPLE[mesh.person % len(PEOPLE)]) * 0.6 + 255 * 0.4
+        style = styles[mesh.person]
+        pale = mesh.inferred[faces[shown]].any(axis=1)
+        white = np.where(pale, PALE, style.white)[:, None]
+        base = np.array(style.color) * (1 - white) + 255 * white
         depth.append((a + b + c)[shown, 2])
         corners.append(triangle[shown])
         colors.append(light[:, None] * base)
+        owners.append(np.full(len(light), mesh.person))
     if not depth or not sum(map(len, depth)):
         return image
     order = np.argsort(-np.concatenate(depth))
@@ -180,7 +202,31 @@ def draw_people(
     drawn = image.copy()
     for triangle, shade in zip(triangles, shades, strict=True):
         cv2.fillConvexPoly(drawn, triangle, shade, cv2.LINE_8, 4)
-    return cv2.addWeighted(drawn, 0.72, image, 0.28, 0)
+    here = sorted({mesh.person for mesh in people})
+    if all(styles[h].dash is None for h in here):
+        opacity = styles[here[0]].opacity
+        return cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
+    owner = np.zeros((height, width), np.uint8)
+    number = {h: k + 1 for k, h in enumerate(here[:255])}
+    for triangle, h in zip(triangles, np.concatenate(owners)[order], strict=True):
+        cv2.fillConvexPoly(owner, triangle, number.get(int(h), 0), cv2.LINE_8, 4)
+    opacities = np.array([0.0, *(styles[h].opacity for h in number)])
+    share = opacities[owner][..., None]
+    blended = np.round(share * drawn + (1 - share) * image).astype(np.uint8)
+    for h, k in number.items():
+        _outline(blended, (owner == k).astype(np.uint8), styles[h])
+    return blended
+
+
+def _outline(image: Image, mask: UInt8[np.ndarray, "y x"], style: PersonStyle) -> None:
+    """Dashes around a person who is not `ok`."""
+    if style.dash is None:
+        return
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for contour in contours:
+        curve = 16 * contour[:, 0].astype(int)
+        polylines(image, curve, (20, 20, 20), 3, style.dash)
+        polylines(image, curve, style.color, 2, style.dash)
 
 
 _LIGHT = np.array([-0.5, -0.62, -0.6])

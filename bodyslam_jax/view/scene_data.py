@@ -10,11 +10,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import statistics
+from bodyslam_jax.diagnostics.reported_status import inferred_bones, reported_status
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.contacts import feet_on_the_ground
@@ -37,6 +38,7 @@ def scene_data(
             neither.
     """
     summary = result.summary
+    inferred = inferred_bones(result) @ (1 << np.arange(24))
     source = summary.get("input")
     source = source if isinstance(source, dict) else {}
     return {
@@ -49,7 +51,9 @@ def scene_data(
         "map": _map(result, samples),
         "images": _images(samples),
         "body": _skin(body),
-        "people": [_person(result, body, h) for h in range(len(result.poses))],
+        "people": [
+            _person(result, body, h, inferred[h]) for h in range(len(result.poses))
+        ],
     }
 
 
@@ -130,7 +134,10 @@ def _skin(body: BodyModel) -> dict[str, Any]:
     }
 
 
-def _person(result: Result, body: BodyModel, h: int) -> dict[str, Any]:
+def _person(
+    result: Result, body: BodyModel, h: int, inferred: Int[np.ndarray, " t"]
+) -> dict[str, Any]:
+    """A person; the bits of `inferred` are bones that were hidden, not measured."""
     beta = result.betas[h]
     rest = np.asarray(rest_joints(body, jnp.asarray(beta, body.dtype)), np.float64)
     template, dirs = (
@@ -139,10 +146,15 @@ def _person(result: Result, body: BodyModel, h: int) -> dict[str, Any]:
     skin = template + dirs @ beta
     way = statistics.person_statistics(result, h)
     reported = (result.summary.get("people") or [])[h : h + 1]
+    status = reported_status(result.summary, h)
     blue, green, red = PEOPLE[h % len(PEOPLE)]
     stands = feet_on_the_ground(result)[h]
     return {
         "number": h,
+        "status": status.status,
+        "words": status.words,
+        "reasons": list(status.reasons),
+        "inferred": _array(inferred, np.uint32) if inferred.any() else None,
         "color": f"#{red:02x}{green:02x}{blue:02x}",
         "present": _array(result.present[h], np.uint8),
         # Tenths of a millimetre: a body is less than 3 m from its origin.

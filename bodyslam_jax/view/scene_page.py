@@ -14,7 +14,10 @@ from bodyslam_jax.types import Result
 from bodyslam_jax.view.scene_data import scene_data
 from bodyslam_jax.view.video_samples import VideoSamples
 
-_SCRIPTS = ("three.js", "scene_run.js", "scene_view.js", "scene_page.js")
+_SCRIPTS = tuple(
+    f"{name}.js"
+    for name in ("three", "scene_pieces", "scene_run", "scene_view", "scene_page")
+)
 _RUN = '<script type="application/json" class="run">{}</script>'
 _RUNS = re.compile(_RUN.replace("{}", "(.*?)"), re.DOTALL)
 

@@ -5,7 +5,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.style import CAMERA, PEOPLE, Image, blend_inset
+from bodyslam_jax.view.person_style import person_styles
+from bodyslam_jax.view.style import CAMERA, Image, blend_inset, polylines
 
 _WIDEST = 8.0
 """m; where everybody's way is longer, the inset moves along with them."""
@@ -23,6 +24,7 @@ class SideView:
     def __init__(self, result: Result, width: int):
         """`width` of the inset, px."""
         self.result, self.width = result, width
+        self.styles = person_styles(result)
         places = [result.T_WC[result.located, :3, 3]]
         places.append(result.joints[result.present].reshape(-1, 3))
         every = np.concatenate(places)
@@ -63,8 +65,9 @@ class SideView:
         cv2.polylines(inset, [at(floor)], False, (150, 150, 150), 1, 8, 4)
         for h in there:
             limbs = [at(r.joints[h, frame, list(limb)]) for limb in _LIMBS]
-            color = PEOPLE[h % len(PEOPLE)]
-            cv2.polylines(inset, limbs, False, color, 2, cv2.LINE_AA, 4)
+            style = self.styles[h]
+            for limb in limbs:
+                polylines(inset, limb, style.faint, 2, style.dash and (4, 4))
         if r.located[frame]:
             right, down, ahead = r.T_WC[frame, :3, :3].T
             size = 14 / self.zoom

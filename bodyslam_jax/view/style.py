@@ -2,11 +2,18 @@
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 Image = UInt8[np.ndarray, "y x 3"]
-CAMERA: tuple[int, int, int] = (214, 111, 31)
-PEOPLE = ((36, 110, 232), (115, 170, 40), (200, 90, 150), (20, 160, 200))
+Color = tuple[int, int, int]
+"""BGR"""
+CAMERA: Color = (214, 111, 31)
+PEOPLE: tuple[Color, ...] = (
+    (36, 110, 232),
+    (115, 170, 40),
+    (200, 90, 150),
+    (20, 160, 200),
+)
 """BGR, as in the report."""
 
 
@@ -36,3 +43,35 @@ def blend_inset(
     inset = inset[: room.shape[0], : room.shape[1]]
     if room.size:
         room[:] = cv2.addWeighted(inset, 0.85, room.copy(), 0.15, 0)
+
+
+def polylines(
+    image: Image,
+    curve: Int[np.ndarray, "n 2"],
+    color: Color,
+    width: int,
+    dash: tuple[int, int] | None = None,
+) -> None:
+    """A curve through points in sixteenths of a pixel, in one line or in dashes.
+
+    Args:
+        dash: px that are drawn, and px left out.
+    """
+    parts = [curve] if dash is None else _dashes(curve, dash)
+    parts = [part.astype(np.int32) for part in parts]
+    cv2.polylines(image, parts, False, color, width, cv2.LINE_AA, 4)
+
+
+def _dashes(
+    curve: Int[np.ndarray, "n 2"], dash: tuple[int, int]
+) -> list[Int[np.ndarray, "_ 2"]]:
+    """The parts of a curve that are drawn, with a point each pixel."""
+    if len(curve) < 2:
+        return []
+    step = np.linalg.norm(np.diff(curve, axis=0), axis=1) / 16
+    along = np.concatenate([[0.0], np.cumsum(step)])
+    at = np.arange(0.0, along[-1], 1.0)
+    points = np.stack([np.interp(at, along, axis) for axis in curve.T], axis=-1)
+    drawn = at % sum(dash) < dash[0]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], drawn, [0]])))
+    return [np.round(points[a:b]).astype(int) for a, b in edges.reshape(-1, 2)]

@@ -5,7 +5,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.types import Result, Tracks
-from bodyslam_jax.view.style import CAMERA, PEOPLE, Image, blend_inset, write_text
+from bodyslam_jax.view.person_style import person_styles
+from bodyslam_jax.view.style import (
+    CAMERA,
+    Color,
+    Image,
+    blend_inset,
+    polylines,
+    write_text,
+)
 
 _POINT = (90, 230, 120)
 
@@ -40,6 +48,7 @@ class Plan:
     def __init__(self, result: Result, size: tuple[int, int]):
         self.side = int(0.34 * min(size))
         self.result = result
+        self.styles = person_styles(result)
         places = [result.T_WC[:, [0, 2], 3]]
         for joints, present in zip(result.joints, result.present, strict=True):
             places.append(joints[present, 0][:, [0, 2]])
@@ -70,33 +79,38 @@ class Plan:
             for a, b in ends:
                 a, b = self._to_inset(np.stack([a, b])).tolist()
                 cv2.line(inset, a, b, (62, 62, 62), 1, cv2.LINE_AA, 4)
-        for path, color in self._paths(len(self.result.timestamps)):
-            dim = tuple(int(0.45 * c + 16) for c in color)
-            cv2.polylines(inset, [self._to_inset(path)], False, dim, 1, cv2.LINE_AA, 4)
+        for path, (b, g, r), dash in self._paths(len(self.result.timestamps)):
+            dim = (int(0.45 * b + 16), int(0.45 * g + 16), int(0.45 * r + 16))
+            polylines(inset, self._to_inset(path), dim, 1, dash)
         return inset
 
-    def _paths(self, end: int) -> list[tuple[np.ndarray, tuple[int, int, int]]]:
-        paths: list[tuple[np.ndarray, tuple[int, int, int]]]
-        paths = [(self.result.T_WC[:end, [0, 2], 3], CAMERA)]
+    def _paths(
+        self, end: int
+    ) -> list[tuple[np.ndarray, Color, tuple[int, int] | None]]:
+        """Paths up to a frame, their colours and dashes."""
+        paths: list[tuple[np.ndarray, Color, tuple[int, int] | None]]
+        paths = [(self.result.T_WC[:end, [0, 2], 3], CAMERA, None)]
         for h, present in enumerate(self.result.present):
             visible = np.flatnonzero(present[:end])
             for part in np.split(visible, np.flatnonzero(np.diff(visible) > 1) + 1):
                 place = self.result.joints[h, part, 0][:, [0, 2]]
-                paths.append((place, PEOPLE[h % len(PEOPLE)]))
+                style = self.styles[h]
+                paths.append((place, style.faint, style.dash))
         return paths
 
     def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
         """Puts the inset into the image, its upper left corner at `corner`, px."""
         inset = self.background.copy()
-        for path, color in self._paths(frame + 1):
+        for path, color, dash in self._paths(frame + 1):
             if len(path):
-                line = self._to_inset(path)
-                cv2.polylines(inset, [line], False, color, 2, cv2.LINE_AA, 4)
+                polylines(inset, self._to_inset(path), color, 2, dash)
         for h, present in enumerate(self.result.present):
             if present[frame]:
                 place = self.result.joints[h, frame, :1][:, [0, 2]]
                 spot = self._to_inset(place)[0].tolist()
-                cv2.circle(inset, spot, 5 * 16, PEOPLE[h % 4], -1, cv2.LINE_AA, 4)
+                style = self.styles[h]
+                fill = -1 if style.dash is None else 2
+                cv2.circle(inset, spot, 5 * 16, style.faint, fill, cv2.LINE_AA, 4)
         T = self.result.T_WC[frame]
         reach = 0.12 * self.side / self.zoom
         right, ahead = T[[0, 2], 0], T[[0, 2], 2]

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS, vertices
+from bodyslam_jax.diagnostics.reported_status import reported_status
 from bodyslam_jax.export.formats.glb import normals
 from bodyslam_jax.export.formats.scene import COLORS, Scene
 
@@ -82,7 +83,11 @@ def _log_person(recording: Any, scene: Scene, h: int) -> None:
     rerun = _rerun()
     result = scene.result
     number = scene.people[h]
+    status = reported_status(scene.result.summary, number)
     color = COLORS[number % len(COLORS)]
+    if status.words:  # Pale, the more so the less is measured.
+        white = 0.4 if status.measurable else 0.75
+        color = tuple(round((1 - white) * c + white * 255) for c in color)
     base = f"world/person_{number}"
     kept, faces = _coarse(scene)
     bones = [(k, PARENTS[k]) for k in range(1, 24)]
@@ -94,6 +99,9 @@ def _log_person(recording: Any, scene: Scene, h: int) -> None:
     )
     recording.log(f"{base}/body", surface, static=True)
     recording.log(f"{base}/joints", marks, static=True)
+    if status.words:
+        text = rerun.TextDocument("\n".join([status.words, *status.reasons]))
+        recording.log(f"{base}/status", text, static=True)
     for k, skin in enumerate(_skins(scene, kept, h)):
         recording.set_time(_TIMELINE, duration=float(scene.seconds[k]))
         if not present[k]:

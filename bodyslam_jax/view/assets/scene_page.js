@@ -8,6 +8,7 @@ const LAYERS = {
   uncertainty: "Uncertainty",
 };
 const OFF_AT_FIRST = ["uncertainty"];
+const ROOMY = 1000; // px, from which on a window has room for open boxes
 
 function start() {
   const element = (id) => document.getElementById(id);
@@ -15,7 +16,8 @@ function start() {
   const css = getComputedStyle(document.documentElement);
   const style = { camera: css.getPropertyValue("--camera").trim() };
   const runs = data.map((run, i) => new Run(run, i, style));
-  const view = new View(element("scene"), runs);
+  const boxes = ["header", "#panel", "footer"].map((box) => document.querySelector(box));
+  const view = new View(element("scene"), runs, boxes);
   const times = runs[0].times, last = times.length - 1;
   const state = { frame: 0, playing: false, speed: 1, ready: false };
 
@@ -123,7 +125,7 @@ function start() {
       show(!run.data.hidden);
     });
   }
-  element("panel").open = window.innerWidth > 640;
+  element("panel").open = window.innerWidth >= ROOMY;
 
   const views = [["free", "free"], ["start", "whole scene"], ["side", "from the side"],
     ["above", "from above"], ["camera", "through the camera"]];
@@ -152,25 +154,54 @@ function start() {
     badge.textContent = first.status;
     element("name").append(badge);
   }
-  function fact(text, color) {
+  // A line with the mark of whom it is about, and a second one in smaller letters.
+  function fact(text, color, status = "", small = "", all = "") {
     const item = document.createElement("li");
-    if (color) item.append(dot(color));
+    if (color) {
+      const mark = dot(color);
+      mark.className = status;
+      item.append(mark);
+    }
     item.append(text);
+    if (small) {
+      const more = document.createElement("small");
+      more.textContent = small;
+      more.title = all;
+      item.append(more);
+    }
     element("facts").append(item);
   }
-  fact(`camera: ${first.camera.distance.toFixed(1)} ${unit}`, style.camera);
-  for (const { person, present } of runs[0].people) {
-    if (!present.includes(1)) continue;
+  // What was measured of a person, and why it is in doubt.
+  function personFact(person) {
     const sigma = person.stature_sigma;
     const tall = `${(100 * person.stature).toFixed(0)}`
       + (sigma ? ` ± ${(100 * sigma).toFixed(0)}` : "");
-    fact(`person ${person.number}: ${person.distance.toFixed(1)} m, `
-      + `${person.speed.toFixed(1)} m/s, ${tall} cm tall`, person.color);
+    const figures = person.status === "not_measurable" ? [] : [
+      `${person.distance.toFixed(1)} m`, `${person.speed.toFixed(1)} m/s`, `${tall} cm tall`,
+    ];
+    if (person.words) figures.push(person.words);
+    const reasons = person.reasons ?? [];
+    const more = reasons.length > 1 ? ` (and ${reasons.length - 1} more)` : "";
+    fact(`person ${person.number}: ${figures.join(", ")}`, person.color, person.status,
+      reasons.length ? reasons[0] + more : "", reasons.join("\n"));
+  }
+  fact(`camera: ${first.camera.distance.toFixed(1)} ${unit}`, style.camera);
+  const seen = runs[0].people.filter((p) => p.present.includes(1)).map((p) => p.person);
+  seen.forEach(personFact);
+  if (seen.some((person) => person.inferred)) {
+    fact("pale limbs: hidden in the video, inferred");
   }
   if (first.scale_sigma !== null && first.metric) {
     fact(`sizes are known to ${Math.max(100 * first.scale_sigma, 1).toFixed(0)} %`);
   }
-  if (!first.metric) fact("no people: sizes are in the map's own unit, not metres");
+  // In small windows the list is closed: what must be known is in its title.
+  const counts = [`${seen.length} ${seen.length === 1 ? "person" : "people"}`];
+  for (const words of new Set(seen.map((person) => person.words).filter(Boolean))) {
+    counts.push(`${seen.filter((person) => person.words === words).length} ${words}`);
+  }
+  element("found").querySelector("summary").textContent = first.metric
+    ? counts.join(", ") : "no people: sizes are in the map's own unit, not metres";
+  element("found").open = window.innerWidth >= ROOMY;
 
   // ---- begin
 

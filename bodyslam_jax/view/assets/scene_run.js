@@ -93,7 +93,7 @@ class Run {
   }
 
   // A line through points of frames that follow one another, the future fainter.
-  path(points, present, color, y = null) {
+  path(points, present, color, y = null, dash = null) {
     const steps = [], ends = [];
     for (let k = 1; k < present.length; k++) {
       if (!present[k] || !present[k - 1]) continue;
@@ -104,8 +104,8 @@ class Run {
     }
     const group = new THREE.Group();
     if (!steps.length) return group;
-    const whole = fatLines(steps, color, 1.5, 0.3);
-    const past = fatLines(steps, color, this.ghost ? 2 : 3, this.ghost ? 0.6 : 1);
+    const whole = fatLines(steps, color, 1.5, 0.3, dash);
+    const past = fatLines(steps, color, this.ghost ? 2 : 3, this.ghost ? 0.6 : 1, dash);
     group.add(whole, past);
     this.lines.push({ past, ends });
     return group;
@@ -165,9 +165,10 @@ class Run {
   // In the camera's own view its image is the background, and bodies let it through.
   seenFromInside(inside) {
     this.frustum.visible = !inside;
-    for (const { skin } of this.people) {
-      skin.material.opacity = this.ghost ? 0.45 : inside ? 0.7 : 1;
-      skin.material.transparent = this.ghost || inside;
+    for (const { skin, person } of this.people) {
+      const opacity = this.opacity(person) * (inside && !this.ghost ? 0.7 : 1);
+      skin.material.opacity = opacity;
+      skin.material.transparent = opacity < 1;
       skin.material.needsUpdate = true;
     }
     if (!this.image) return;
@@ -194,6 +195,10 @@ class Run {
 
   // ---- people
 
+  opacity(person) {
+    return this.ghost ? 0.45 : lookOf(person).opacity;
+  }
+
   addPerson(person, body) {
     const present = decode(person.present), pelvis = decode(person.pelvis);
     const bones = body.parents.map(() => new THREE.Bone());
@@ -205,16 +210,24 @@ class Run {
     });
     const inverses = bones.map((_, j) =>
       new THREE.Matrix4().makeTranslation(-rest[3 * j], -rest[3 * j + 1], -rest[3 * j + 2]));
+    const look = lookOf(person), opacity = this.opacity(person);
+    const inferred = person.inferred ? decode(person.inferred) : null;
+    const color = mix(person.color, "#ffffff", look.white);
     const skin = new THREE.SkinnedMesh(this.skin(person, body), new THREE.MeshLambertMaterial({
-      color: mix(person.color, "#ffffff", 0.35), transparent: this.ghost,
-      opacity: this.ghost ? 0.45 : 1,
+      color: inferred ? "#ffffff" : color, vertexColors: !!inferred,
+      transparent: opacity < 1, opacity,
     }));
+    if (inferred) {
+      const colors = new Float32Array(3 * body.joints.shape[0]);
+      skin.geometry.setAttribute("color", new THREE.BufferAttribute(colors, 3));
+    }
     skin.frustumCulled = false;
     skin.add(bones[0]);
     skin.bind(new THREE.Skeleton(bones, inverses), new THREE.Matrix4());
     this.layer("people").add(skin);
-    this.layer("paths").add(this.path(pelvis, present, person.color, LIFT));
-    const name = this.named(`person ${person.number}`, person.color);
+    this.layer("paths").add(this.path(pelvis, present, person.color, LIFT, look.dash));
+    const words = person.words ? `, ${person.words}` : "";
+    const name = this.named(`person ${person.number}${words}`, person.color);
     const rod = this.rod(person);
     const marks = body.feet.map(() => disc(0.11, person.color, 0.75));
     const prints = person.footprints.map(([frame, x, z]) => {
@@ -225,7 +238,7 @@ class Run {
     });
     if (person.footprints.length) this.layer("contacts").add(...marks, ...prints);
     return {
-      person, present, pelvis, bones, skin, name, rod, marks, prints,
+      person, present, pelvis, bones, skin, name, rod, marks, prints, inferred, color,
       rotations: floats(person.rotations, QUATERNION_UNIT),
       stands: decode(person.stands), feet: body.feet,
     };
@@ -254,13 +267,28 @@ class Run {
     return geometry;
   }
 
+  // The colours of a skin whose hidden limbs are pale; `bits` are these bones.
+  paint(p, bits) {
+    if (p.painted === bits) return;
+    p.painted = bits;
+    const pale = mix(p.person.color, "#ffffff", PALE);
+    const { array: joints } = this.shared.joints, { array: weights } = this.shared.weights;
+    const colors = p.skin.geometry.attributes.color, mixed = new THREE.Color();
+    for (let v = 0; v < colors.count; v++) {
+      let share = 0;
+      for (let k = 4 * v; k < 4 * v + 4; k++) if ((bits >> joints[k]) & 1) share += weights[k];
+      mixed.lerpColors(p.color, pale, share).toArray(colors.array, 3 * v);
+    }
+    colors.needsUpdate = true;
+  }
+
   // ---- uncertainty
 
   // A measuring rod as high as the person, with two standard deviations at its top.
   rod(person) {
     const rod = new THREE.Group();
     const high = person.stature, sigma = person.stature_sigma;
-    if (sigma === null || sigma === undefined) return rod;
+    if (sigma === null || sigma === undefined || person.status === "not_measurable") return rod;
     const ends = [high - 2 * sigma, high + 2 * sigma];
     const points = [0, 0, 0, 0, ends[1], 0];
     for (const y of [...ends, high]) points.push(-0.12, y, 0, 0.12, y, 0);
@@ -290,7 +318,7 @@ class Run {
             steps.push(a === 1 && y !== null ? y : x);
           }
         }
-        if (steps.length) this.layer("uncertainty").add(fatLines(steps, color, 1.5, 0.8, true));
+        if (steps.length) this.layer("uncertainty").add(fatLines(steps, color, 1.5, 0.8, [0.12, 0.08]));
       }
     }
   }
@@ -335,6 +363,7 @@ class Run {
     for (const mark of p.prints) mark.visible = mark.userData.frame <= frame;
     for (const mark of p.marks) mark.visible = false;
     if (!there) return;
+    if (p.inferred) this.paint(p, p.inferred[frame]);
     p.bones[0].position.fromArray(p.pelvis, 3 * frame);
     p.bones.forEach((bone, j) => {
       bone.quaternion.fromArray(p.rotations, 4 * (24 * frame + j)).normalize();
@@ -361,67 +390,4 @@ class Run {
     for (const p of this.people) add(p.pelvis, p.present);
     return found;
   }
-}
-
-// ---- pieces
-
-function mix(a, b, share) {
-  return new THREE.Color(a).lerp(new THREE.Color(b), share);
-}
-
-function fatLines(points, color, width, opacity, dashed = false) {
-  const geometry = new THREE.LineSegmentsGeometry();
-  geometry.setPositions(points);
-  const material = new THREE.LineMaterial({
-    color: new THREE.Color(color).getHex(), linewidth: width, transparent: opacity < 1,
-    opacity, dashed, dashSize: 0.12, gapSize: 0.08,
-  });
-  const lines = new THREE.LineSegments2(geometry, material);
-  if (dashed) lines.computeLineDistances();
-  lines.frustumCulled = false;
-  return lines;
-}
-
-function flat(geometry, color, opacity) {
-  const material = new THREE.MeshBasicMaterial({
-    color, transparent: true, opacity, side: THREE.DoubleSide, depthWrite: false,
-  });
-  const mesh = new THREE.Mesh(geometry, material);
-  mesh.rotation.x = -Math.PI / 2;
-  return mesh;
-}
-
-function disc(radius, color, opacity) {
-  return flat(new THREE.CircleGeometry(radius, 32), color, opacity);
-}
-
-function ring(radius, color) {
-  return flat(new THREE.RingGeometry(0.8 * radius, radius, 32), color, 0.8);
-}
-
-// A text that faces the viewer, of the same size on the screen at any distance.
-function label(text, color) {
-  const canvas = document.createElement("canvas");
-  const height = 64, font = "600 40px system-ui, sans-serif";
-  let pen = canvas.getContext("2d");
-  pen.font = font;
-  canvas.width = Math.ceil(pen.measureText(text).width) + 24;
-  canvas.height = height;
-  pen = canvas.getContext("2d"); // A new size clears the canvas and its font.
-  pen.font = font;
-  pen.textBaseline = "middle";
-  pen.lineWidth = 9;
-  pen.lineJoin = "round";
-  pen.strokeStyle = "rgba(255, 255, 255, .85)";
-  pen.strokeText(text, 12, height / 2);
-  pen.fillStyle = `#${mix(color, "#000000", 0.25).getHexString()}`;
-  pen.fillText(text, 12, height / 2);
-  const texture = new THREE.CanvasTexture(canvas);
-  texture.colorSpace = THREE.SRGBColorSpace;
-  const sprite = new THREE.Sprite(new THREE.SpriteMaterial({
-    map: texture, sizeAttenuation: false, depthTest: false, transparent: true,
-  }));
-  sprite.userData.aspect = canvas.width / height; // The view sets the size.
-  sprite.renderOrder = 10;
-  return sprite;
 }

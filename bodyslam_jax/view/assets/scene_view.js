@@ -4,13 +4,16 @@
 const MARGIN = 1.5; // m, of ground around everybody
 const LABEL = 24; // px, of a name's height
 const SHARE = 0.88; // of the canvas that everybody's way may fill
-const BAR = 85; // px at the canvas's lower edge that the timeline covers
+const LEAST = 0.4; // of the canvas's width or height that a free part of it has
 const REACH = 0.6; // m, from a person's pelvis to the side
 
 class View {
-  constructor(canvas, runs) {
+  // `boxes`: elements at the canvas's edges that cover a part of it.
+  constructor(canvas, runs, boxes) {
     this.canvas = canvas;
     this.runs = runs;
+    this.boxes = boxes;
+    this.part = { x: 0, y: 0 }; // of the canvas, whose middle is the middle of the view
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.scene = new THREE.Scene();
@@ -111,7 +114,8 @@ class View {
     if (!clientWidth || !clientHeight) return;
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / clientHeight;
-    this.camera.updateProjectionMatrix();
+    this.centre();
+    if (["start", "side", "above"].includes(this.mode)) this.look(this.mode);
     this.draw();
   }
 
@@ -148,25 +152,54 @@ class View {
     this.draw();
   }
 
-  // Everybody's way is in view from a direction.
+  // Parts of the canvas that no box covers: between the boxes, below all of them, and
+  // below the right one, right of the left one. In clip coordinates, -1 to 1.
+  freeParts() {
+    const width = Math.max(this.canvas.clientWidth, 1);
+    const height = Math.max(this.canvas.clientHeight, 1);
+    const [header, panel, footer] = this.boxes.map((box) => box.getBoundingClientRect());
+    const left = header.width ? header.right : 0, right = panel.width ? panel.left : width;
+    const foot = footer.height ? footer.top : height;
+    const parts = [
+      [left, right, 0, foot], [0, width, Math.max(header.bottom, panel.bottom), foot],
+      [left, width, panel.bottom, foot], [0, right, header.bottom, foot],
+    ].filter(([a, b, c, d]) => b - a > LEAST * width && d - c > LEAST * height);
+    if (!parts.length) parts.push([0, width, 0, foot]);
+    return parts.map(([a, b, c, d]) => ({
+      x: (a + b) / width - 1, y: 1 - (c + d) / height, w: (b - a) / width, h: (d - c) / height,
+    }));
+  }
+
+  // Everybody's way is in view from a direction, in the free part where it is largest.
   place(target, direction) {
     const back = direction.clone().normalize();
     const right = new THREE.Vector3(0, 1, 0).cross(back).normalize();
     const up = back.clone().cross(right);
     const half = Math.tan((this.camera.fov * Math.PI) / 360);
-    const free = Math.max(0.5, 1 - BAR / Math.max(this.canvas.clientHeight, 1));
-    let distance = 2.5;
-    const [xs, ys, zs] = this.range;
-    for (const x of xs) for (const z of zs) for (const y of [0, Math.max(ys[1], 1.9)]) {
-      const p = new THREE.Vector3(x, y, z).sub(target);
-      const aside = (Math.abs(p.dot(right)) + REACH) / this.camera.aspect;
-      const needed = Math.max(aside, (Math.abs(p.dot(up)) + 0.3) / free) / (half * SHARE);
-      distance = Math.max(distance, needed + p.dot(back));
-    }
-    // The middle of what is free lies above the middle of the canvas.
-    this.controls.target.copy(target).addScaledVector(up, -distance * half * (1 - free));
+    const [xs, ys, zs] = this.range, { aspect } = this.camera;
+    const needed = (part) => {
+      let distance = 2.5;
+      for (const x of xs) for (const z of zs) for (const y of [0, Math.max(ys[1], 1.9)]) {
+        const p = new THREE.Vector3(x, y, z).sub(target);
+        const aside = (Math.abs(p.dot(right)) + REACH) / (aspect * part.w);
+        const high = (Math.abs(p.dot(up)) + 0.3) / part.h;
+        distance = Math.max(distance, Math.max(aside, high) / (half * SHARE) + p.dot(back));
+      }
+      return distance;
+    };
+    const parts = this.freeParts().map((part) => [needed(part), part]);
+    const [distance, part] = parts.reduce((a, b) => (b[0] < a[0] ? b : a));
+    this.part = part;
+    this.centre();
+    this.controls.target.copy(target);
     this.camera.position.copy(this.controls.target).addScaledVector(back, distance);
     this.controls.update();
+  }
+
+  // What the viewer's camera looks at is in the middle of the free part.
+  centre() {
+    const { clientWidth: w, clientHeight: h } = this.canvas, { x, y } = this.part;
+    this.camera.setViewOffset(w, h, (-x * w) / 2, (y * h) / 2, w, h);
   }
 
   followed() {
@@ -216,9 +249,34 @@ class View {
 
   sizeLabels() {
     const high = 2 / this.camera.projectionMatrix.elements[5]; // of the view at depth 1
-    const size = (LABEL * high) / Math.max(this.canvas.clientHeight, 1);
+    const { clientWidth, clientHeight } = this.canvas;
+    const size = (LABEL * high) / Math.max(clientHeight, 1);
     for (const label of this.runs.flatMap((run) => run.labels)) {
       label.scale.set(size * label.userData.aspect, size, 1);
+    }
+    this.spreadNames(clientWidth / 2, clientHeight / 2);
+  }
+
+  // Names that would cover one another are moved up.
+  spreadNames(halfWidth, halfHeight) {
+    this.camera.updateMatrixWorld();
+    const names = this.runs[0].layers.names?.children.filter((name) => name.visible) ?? [];
+    const at = names.map((name) => name.position.clone().project(this.camera));
+    const order = names.map((_, i) => i).filter((i) => Math.abs(at[i].z) < 1);
+    order.sort((i, j) => at[i].y - at[j].y || i - j);
+    const taken = [];
+    for (const i of order) {
+      const x = at[i].x * halfWidth, aside = (LABEL * names[i].userData.aspect) / 2;
+      const start = at[i].y * halfHeight;
+      let y = start;
+      for (const other of taken) { // From the lowest on.
+        if (Math.abs(other.x - x) < other.aside + aside && Math.abs(other.y - y) < LABEL) {
+          y = other.y + LABEL;
+        }
+      }
+      names[i].center.set(0.5, 0.5 - (y - start) / LABEL);
+      taken.push({ x, y, aside });
+      taken.sort((a, b) => a.y - b.y);
     }
   }
 
