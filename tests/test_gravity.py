@@ -85,7 +85,7 @@ def test_standing_feet_correct_trunks_that_all_lean(lean, left):
     found = find_upright(*cues(walker(way()), lean))
     assert off(found.up) < left * np.linalg.norm(lean)
     assert np.degrees(found.trunks) > (1 - left) * np.linalg.norm(lean)
-    assert found.sigma < np.radians(3.0)
+    assert found.sigma < np.radians(4.5)
 
 
 def test_the_ground_of_the_map_corrects_them_where_nobody_walks():
@@ -112,6 +112,16 @@ def test_on_a_hill_up_stays_where_trunks_point():
     # Bodies that were fitted to keypoints may be what is wrong: less is sure.
     loose = find_upright(*cues(feet, (0.0, 0, 0), fitted=True))
     assert loose.sigma > np.radians(2.5)
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.8, 1.6, 2.4])
+def test_the_error_that_is_claimed_holds_on_a_slope(direction):
+    """Up is taken to be nearly normal to a floor that slopes by 4 degrees, as most
+    floors are level; what is claimed allows for that."""
+    slope = np.tan(np.radians(4.0)) * np.array([np.cos(direction), np.sin(direction)])
+    feet = walker(way(), floor=lambda x, z: slope[0] * x + slope[1] * z)
+    found = find_upright(*cues(feet, (0.0, 0, 0), fitted=False))
+    assert 1.0 < off(found.up) < 2.0 * np.degrees(found.sigma)
 
 
 def test_a_floor_of_steps_says_less_of_gravity_than_a_level_one():
@@ -152,7 +162,7 @@ def test_many_people_who_lean_alike_do_not_outvote_the_floor(count):
     )
     found = find_upright(*cues(feet, [9, 0, 0]))
     assert off(found.up) < 3.0
-    assert found.sigma < np.radians(4.0)
+    assert found.sigma < np.radians(6.0)
 
 
 @pytest.mark.parametrize("floor", [True, False])

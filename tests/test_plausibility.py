@@ -6,13 +6,14 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.diagnostics import figures
+from bodyslam_jax.diagnostics import figures, standing_height
 from bodyslam_jax.diagnostics.checks import (
     Reason,
     judge,
     status_of,
 )
 from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
+from bodyslam_jax.types import Result
 
 FPS = 30.0
 
@@ -142,6 +143,48 @@ def test_people_who_float_or_sink_are_doubted(walk):
     time = np.arange(len(walk))[:, None] / FPS
     swaying[..., 1] += 0.12 * np.sin(2 * np.pi * time / 3.0)
     assert "feet_off_ground" in doubts(swaying)
+
+
+def _with_floor(walk, height):
+    """The figures of standing feet over landmarks of a floor, of somebody who walks on
+    it or not."""
+    low, high = walk[..., 0].min() - 3, walk[..., 0].max() + 3
+    far = walk[..., 2].max() + 3
+    rng = np.random.default_rng(0)
+    at = rng.uniform([low, walk[..., 2].min() - 3], [high, far], (20_000, 2))
+    t = len(walk)
+    T_WC = np.tile(np.eye(4), (t, 1, 1))
+    T_WC[:, :3, 3] = walk[:, 0] * [1, 0, 1] + [0.0, 2.2, -2.5]
+    present = np.ones(t, bool)
+    made = Result(
+        timestamps=np.arange(t) / FPS,
+        T_WC=T_WC,
+        scale=1.0,
+        intrinsics=np.array([500.0, 500.0, 320.0, 240.0]),
+        landmarks=np.column_stack([at[:, 0], height(at), at[:, 1]]),
+        poses=np.zeros((1, t, 72)),
+        trans=np.zeros((1, t, 3)),
+        betas=np.zeros((1, 10)),
+        joints=walk[None],
+        present=present[None],
+    )
+    ground = standing_height.ground_heights(made, 0, present)
+    found = standing_height.standing_height_figures(walk, present, FPS, ground)
+    return {reason.name for reason in judge(PERSON_CHECKS, found)}
+
+
+def test_people_on_uneven_ground_are_not_doubted_and_those_who_float_are(walk):
+    """Ground that rises and sinks by 24 cm, of which the map has landmarks; then the
+    same walk over a level floor."""
+    waves = lambda at: 0.12 * np.sin(2 * np.pi * at[..., 0] / 3.0)
+    level = lambda at: np.zeros(at.shape[:-1])
+    turned = walk if np.ptp(walk[:, 0, 0]) > 2 else walk[..., [2, 1, 0]]
+    over = turned.copy()
+    feet = turned[:, [10, 11]]
+    lower = feet[np.arange(len(feet)), feet[..., 1].argmin(axis=1)]
+    over[..., 1] += waves(lower[:, [0, 2]])[:, None]
+    assert _with_floor(over, waves) == set()
+    assert "feet_off_ground" in _with_floor(over, level)
 
 
 def test_people_who_crouch_are_doubted(walk):

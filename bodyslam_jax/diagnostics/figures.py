@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.diagnostics.gait import Gait, gait_of_joints
+from bodyslam_jax.diagnostics.standing_height import standing_height_figures
 from bodyslam_jax.diagnostics.statistics import runs as runs_of
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.stances import find_stances
@@ -18,8 +19,6 @@ _MOMENT = 0.2
 """Interval, s, in which nobody turns round or reverses a run."""
 _FEWEST = 15
 """Least length of a stretch that is judged, frames."""
-_FLOOR = 1.0
-"""Least extent of standing feet for a slope of the ground, m."""
 
 _STANDS_OUT = 2.2
 
@@ -37,10 +36,15 @@ _GETS_ON = 0.8
 
 
 def person_figures(
-    joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
+    joints: Float[np.ndarray, "t 24 3"],
+    present: Bool[np.ndarray, " t"],
+    fps: float,
+    ground: Float[np.ndarray, "t 2"] | None = None,
 ) -> dict[str, float]:
     """One person's posture, feet and motion; y is up, in m.
 
+    `ground` is the height of the map's ground under the toe joints
+    (`standing_height.ground_heights`); without it feet are compared with a plane.
     Medians and means are over all stretches of frames in which the person is present;
     differences are never taken across a gap.
     """
@@ -74,7 +78,7 @@ def person_figures(
             "turn_of_walker": found["turn"],
             "velocity_jump_of_walker": found["velocity_jump"],
         }
-        found |= _ground_under_feet(joints, present, fps)
+        found |= standing_height_figures(joints, present, fps, ground)
     return found
 
 
@@ -169,23 +173,3 @@ def _goes_on_foot(steps: Gait | None, speed: Float[np.ndarray, " u"]) -> bool:
     if slow < np.median(speed) < fast:
         return True
     return steps is not None and steps.step > _STEP and bool(speed.mean() < fast)
-
-
-def _ground_under_feet(
-    joints: Float[np.ndarray, "t 24 3"], present: Bool[np.ndarray, " t"], fps: float
-) -> dict[str, float]:
-    """Slope of the ground under standing feet, degrees, and scatter about it, m."""
-    feet = joints[None, :, list(FEET)]
-    (stances,) = find_stances(feet, present[None], fps)
-    if len(stances) < 3:
-        return {}
-    height = stances[:, 1] - np.median(stances[:, 1])
-    flat = stances[:, [0, 2]] - stances[:, [0, 2]].mean(axis=0)
-    along = flat @ np.linalg.svd(flat, full_matrices=False)[2][0]
-    found = {}
-    if np.ptp(along) > _FLOOR:
-        rise = float(np.polyfit(along, height, 1)[0])
-        found["ground_slope"] = float(np.degrees(np.arctan(abs(rise))))
-        height = height - rise * along
-    found["feet_off_ground"] = float(np.ptp(np.percentile(height, [5, 95])))
-    return found

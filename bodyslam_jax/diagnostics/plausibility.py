@@ -10,6 +10,7 @@ from bodyslam_jax.diagnostics import figures
 from bodyslam_jax.diagnostics.checks import Reason, judge
 from bodyslam_jax.diagnostics.reprojection import projected_keypoints
 from bodyslam_jax.diagnostics.scale_uncertainty import cue_discrepancy
+from bodyslam_jax.diagnostics.standing_height import ground_heights
 from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
@@ -57,7 +58,8 @@ def implausible(
     misfits = _misfits(sequence, body, joint)
     present = result.present & measurable[:, None]
     for h, there in enumerate(present):
-        of_person = figures.person_figures(result.joints[h], there, fps)
+        ground = ground_heights(result, h, there)
+        of_person = figures.person_figures(result.joints[h], there, fps, ground)
         walking |= "trunk_lean" in of_person
         if there.any():
             stature = statures[h]

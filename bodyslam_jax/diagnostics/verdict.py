@@ -57,6 +57,8 @@ class Verdict:
     """As of `reprojection.per_frame`."""
     joint_sigma: Float[np.ndarray, "h t 24"]
     """As of `measured.Measured`."""
+    up: Upright
+    """How the vertical was found."""
 
 
 def assess(
@@ -116,6 +118,7 @@ def assess(
         people=tuple(people),
         per_frame=per_frame(sequence, body, cameras, joint),
         joint_sigma=found.joint_sigma,
+        up=up,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
 from bodyslam_jax.diagnostics.verdict import Verdict
+from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, ScaleStart, Sequence, SfmResult
 
 
@@ -46,6 +47,7 @@ def summarise(
             **_cues(joint.start),
             "ground_factor": verdict.ground_factor,
         },
+        "up": _up(verdict.up),
         "people": [_person(person) for person in verdict.people],
         # The first and the last.
         "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),
@@ -145,6 +147,17 @@ def _length_error(relative: float, cameras: SfmResult) -> str:
     if relative >= 1:
         return ", of no known size,"
     return f" ± {max(1, 100 * relative):.0f} %"
+
+
+def _up(up: Upright) -> dict[str, float | None]:
+    """How sure the vertical is, how far trunks are from it, and the ground's slope."""
+    angles = {
+        "sigma_degrees": up.sigma,
+        "from_trunks_degrees": up.trunks,
+        "slope_of_ground_degrees": up.ground,
+    }
+    degrees = lambda x: float(np.degrees(x)) if np.isfinite(x) else None
+    return {name: degrees(angle) for name, angle in angles.items()}
 
 
 def _person(person: PersonVerdict) -> dict[str, Any]:

@@ -91,8 +91,8 @@ class Upright:
     up: Float[np.ndarray, " 3"]
     """Unit vector."""
     sigma: float
-    """Standard deviation of `up` along its less certain axis, rad; infinite without any
-    cue."""
+    """Standard deviation of `up` along its less certain axis, rad, that holds on level
+    and on sloping ground; infinite without any cue."""
     trunks: float
     """Angle between `up` and the mean direction of trunks, rad; NaN without people."""
     ground: float
@@ -392,7 +392,11 @@ def _combined(
     up_tilts: list[tuple[float, np.ndarray, np.ndarray]], ground: Plane | None
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
     """The tilt of up, the slope of the ground, and the standard deviation of the less
-    sure direction of up, rad."""
+    sure direction of up, rad.
+
+    The standard deviation is at least that about the same tilt if the ground slopes:
+    most ground is level, and trunks are not exact enough to tell which ground is not.
+    """
     unknown = np.full(2, np.nan)
     if not up_tilts:
         if ground is None:
@@ -423,9 +427,13 @@ def _combined(
     weight[-1] += 1e-300
     weight = weight / weight.sum()
     tilt = weight @ np.array(tilts)
-    scatter = [np.outer(t - tilt, t - tilt) for t in tilts]
-    covariance = np.tensordot(weight, np.array(covariances) + np.array(scatter), 1)
-    return tilt, weight @ np.array(slopes), _largest(covariance)
+    spread = [c + np.outer(t - tilt, t - tilt) for c, t in zip(covariances, tilts)]
+    sloping_only = weight * np.array([0, 1, 0, 1])
+    sigma = max(
+        _largest(np.tensordot(share / share.sum(), np.array(spread), 1))
+        for share in (weight, sloping_only)
+    )
+    return tilt, weight @ np.array(slopes), sigma
 
 
 def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:

@@ -50,7 +50,7 @@ def find_stances(
     if standing is None:
         standing = np.zeros(feet.shape[:3], bool)
         for h, one in enumerate(present):
-            standing[h] = _standing(feet[h], one, fps)
+            standing[h] = standing_by_speed(feet[h], one, fps)
     frames = max(2, _SHORTEST_STANCE * fps)
     return [
         _stances(f, s & p[:, None], frames)
@@ -58,8 +58,11 @@ def find_stances(
     ]
 
 
-def _standing(feet, present, fps) -> Bool[np.ndarray, "t 2"]:
-    """By the speed of the lower foot, in each run of present frames."""
+def standing_by_speed(
+    feet: Float[np.ndarray, "t 2 3"], present: Bool[np.ndarray, " t"], fps: float
+) -> Bool[np.ndarray, "t 2"]:
+    """Feet of one person that stand, by the speed of the lower foot (`standing_feet`),
+    in each run of present frames; y is up."""
     found = np.zeros(feet.shape[:2], bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
     for start, stop in edges.reshape(-1, 2):
