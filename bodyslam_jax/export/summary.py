@@ -150,10 +150,11 @@ def _length_error(relative: float, cameras: SfmResult) -> str:
 
 
 def _up(up: Upright) -> dict[str, float | None]:
-    """How sure the vertical is, how far trunks are from it, and the ground's slope."""
+    """How sure the vertical is, its angle to trunks and edges, the ground's slope."""
     angles = {
         "sigma_degrees": up.sigma,
         "from_trunks_degrees": up.trunks,
+        "from_edges_degrees": up.edges,
         "slope_of_ground_degrees": up.ground,
     }
     degrees = lambda x: float(np.degrees(x)) if np.isfinite(x) else None

@@ -404,13 +404,14 @@ def _combined(
         level = ground.covariance + _LEVEL**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
     sloping, steep = _SLOPES
-    density, tilts, slopes, covariances = [], [], [], []
+    density, tilts, slopes, covariances, is_sloping = [], [], [], [], []
     for p, mean, own in up_tilts:
         if ground is None:
             density.append(p)
             tilts.append(mean)
             slopes.append(unknown)
             covariances.append(own)
+            is_sloping.append(True)
             continue
         # Up is `mean + e`, with covariance `own`; the ground's gradient is
         # `slope - up`.
@@ -421,6 +422,7 @@ def _combined(
             density.append(p * q * likelihood)
             tilts.append(mean - own @ explained)
             slopes.append(sigma**2 * explained)
+            is_sloping.append(sigma == steep)
             covariances.append(own - own @ np.linalg.solve(total, own))
     # If all likelihoods underflow the widest combination, the last, is taken.
     weight = np.array(density)
@@ -428,7 +430,7 @@ def _combined(
     weight = weight / weight.sum()
     tilt = weight @ np.array(tilts)
     spread = [c + np.outer(t - tilt, t - tilt) for c, t in zip(covariances, tilts)]
-    sloping_only = weight * np.array([0, 1, 0, 1])
+    sloping_only = weight * np.array(is_sloping)
     sigma = max(
         _largest(np.tensordot(share / share.sum(), np.array(spread), 1))
         for share in (weight, sloping_only)

@@ -64,6 +64,7 @@ class Legend:
 
     def __init__(self, result: Result, styles: list[PersonStyle]):
         shown = [style for style, p in zip(styles, result.present) if p.any()]
+        self.entries: dict[str, tuple[int, int] | None]
         self.entries = {s.words: s.dash for s in shown if s.dash is not None}
         if inferred_bones(result).any():
             self.entries["pale: hidden, inferred"] = None
