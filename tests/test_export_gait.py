@@ -124,7 +124,12 @@ def test_a_warning_of_slow_motion_respects_the_error_of_lengths(walk):
     assert "person 1 takes" in line and "25 fps is not its frame rate" in line
     assert f"about {steps.slowness:.1f} times as fast" in line
     assert cadence_warning(1, steps, 0.1, 25.0)
+    a_little = changed(walk, timestamps=1.3 * walk.timestamps)
     for unsure in (0.6, np.inf):
-        assert not cadence_warning(1, steps, unsure, 25.0)
+        # Step length may be wrong then, but not how often a step is taken.
+        (line,) = cadence_warning(1, steps, unsure, 25.0)
+        assert f"takes {steps.frequency:.1f} steps a second: of 76" in line
+        assert "about" not in line and "25 fps is not" in line
+        assert not cadence_warning(1, diagnostics.gait(a_little, 0), unsure, 25.0)
     assert not cadence_warning(0, diagnostics.gait(walk, 0), np.nan, 25.0)
     assert not cadence_warning(0, None, 0.1, 25.0)

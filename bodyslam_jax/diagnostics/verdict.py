@@ -172,8 +172,17 @@ def cadence_warning(
             f"{1 / steps.slowness:.1f} times as slow. If {fps:g} fps is not the "
             "video's frame rate, speeds are too high by that factor."
         ]
-    if steps is None or not steps.is_slow_motion(length_error):
+    if steps is None:
         return []
+    if not steps.is_slow_motion(length_error):
+        if not steps.is_seldom():
+            return []
+        return [
+            f"person {person} takes {steps.frequency:.1f} steps a second: of 76 "
+            f"recorded walks one has fewer than 1.2. If this is slow motion, or {fps:g} fps is "
+            "not the video's frame rate, speeds are too low, and steps are predicted "
+            "worse; give --fps."
+        ]
     return [
         f"person {person} takes {steps.frequency:.1f} steps a second, each "
         f"{steps.step:.1f} of a leg long: people do that about {steps.slowness:.1f} "
