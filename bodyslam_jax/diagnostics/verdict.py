@@ -179,9 +179,9 @@ def cadence_warning(
             return []
         return [
             f"person {person} takes {steps.frequency:.1f} steps a second: of 76 "
-            f"recorded walks one has fewer than 1.2. If this is slow motion, or {fps:g} fps is "
-            "not the video's frame rate, speeds are too low, and steps are predicted "
-            "worse; give --fps."
+            "recorded walks one has fewer than 1.2. If this is slow motion, or "
+            f"{fps:g} fps is not the video's frame rate, speeds are too low, and steps "
+            "are predicted worse; give --fps."
         ]
     return [
         f"person {person} takes {steps.frequency:.1f} steps a second, each "
