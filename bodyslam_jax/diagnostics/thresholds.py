@@ -286,11 +286,12 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "floors_apart",
         "difference between the heights at which people stand",
         "m",
-        0.35,
+        0.18,
         "if they do not stand on different floors, sizes of people are off: check the "
         "focal length, or give their bodies (--bodies)",
         "a judgement: a step or kerb is lower. True people of five simulated "
-        "sequences are within 0.01; of estimates it was not measured",
+        "sequences are within 0.01; estimates from pixels of six rendered "
+        "sequences with two people within 0.04, but for one: 0.19, a person 0.1 m off",
     ),
     Check(
         "up_against_trunks",
