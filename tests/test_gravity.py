@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.geometry.gravity import (
-    feet_plane,
-    find_upright,
-    map_plane,
-)
+from bodyslam_jax.geometry.gravity import find_upright
+from bodyslam_jax.geometry.ground_slope import feet_plane, map_plane
 from bodyslam_jax.geometry.stances import find_stances, standing_feet
 from bodyslam_jax.geometry.vertical_edges import Vertical
 

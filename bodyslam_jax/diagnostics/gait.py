@@ -75,7 +75,7 @@ class Gait:
         relative error `unsure`."""
         return self.step > _STEP and self.slowness > _SLOW * (1 + unsure)
 
-    def is_seldom(self) -> bool:
+    def has_low_cadence(self) -> bool:
         """Whether steps are taken more rarely than in nearly all walks, whatever the
         scale."""
         return self.step > _STEP and self.frequency < _SELDOM

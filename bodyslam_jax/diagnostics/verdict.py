@@ -175,7 +175,7 @@ def cadence_warning(
     if steps is None:
         return []
     if not steps.is_slow_motion(length_error):
-        if not steps.is_seldom():
+        if not steps.has_low_cadence():
             return []
         return [
             f"person {person} takes {steps.frequency:.1f} steps a second: of 76 "

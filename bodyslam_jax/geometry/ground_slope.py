@@ -1,0 +1,167 @@
+"""The slope of the ground, from standing feet and from the landmarks of the map.
+
+Both cues are planes in a frame whose y axis is nearly up, each with the covariance of
+its slope; `fused` combines them.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bodyslam_jax.geometry.ground_plane import find_ground
+
+_DEGREE = np.pi / 180
+CAUCHY = 2.4
+"""Scale of the Cauchy loss in standard deviations: 95 % as efficient as least squares
+where errors are normal."""
+_FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
+"""Standard deviations of the systematic errors of slope, of the plane through feet and
+of the map's plane: more feet or points do not reduce them."""
+_AUTOCORRELATION = 0.9
+"""Greatest autocorrelation of the residuals of stances: few stances determine no
+larger one."""
+_HEIGHT_SIGMA = 0.02
+"""Least standard deviation of the height of a foot that stands, m."""
+_HEIGHT_SCATTER = 0.04
+"""Scatter of stances about the map's plane that errors of estimates explain, m."""
+_OFF_THE_PLANE = 0.25
+"""People do not stand on the map's plane if the median stance is further from it than
+this share of the camera's height."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plane:
+    """The slope of a plane `y = gradient · (x, z) + const`, in a frame whose y axis is
+    nearly up."""
+
+    gradient: Float[np.ndarray, " 2"]
+    """dy/dx and dy/dz."""
+    covariance: Float[np.ndarray, "2 2"]
+    """Of `gradient`, rad²."""
+
+
+def feet_plane(
+    stances: list[Float[np.ndarray, "_ 3"]], person_sigma: float
+) -> Plane | None:
+    """Robust least-squares plane through the positions of standing feet, m.
+
+    `None` with fewer than three stances. One height offset per person, with the prior
+    standard deviation `person_sigma` (m), is estimated with the plane: a wrong size of
+    a person shifts all of that person's feet alike. Iteratively reweighted with a
+    Cauchy loss, whose scale is estimated from the median absolute residual. Residuals
+    of stances that follow one another are alike where the ground is not a plane, as on
+    stairs: the covariance grows with their autocorrelation.
+    """
+    people = np.concatenate(
+        [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
+    ).astype(int)
+    if len(people) < 3:
+        return None
+    points = np.concatenate(stances)
+    centre = points.mean(axis=0)
+    x = points - centre
+    design = np.column_stack(
+        [x[:, [0, 2]], np.ones(len(x)), people[:, None] == np.arange(len(stances))]
+    )
+    # A weak prior (slope of 45 degrees, any height) makes the system regular.
+    prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
+
+    def fit(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The weighted least-squares solution, its information matrix first."""
+        scaled = design * weight[:, None]
+        information = design.T @ scaled + prior
+        return information, np.linalg.solve(information, scaled.T @ x[:, 1])
+
+    information, solution = fit(np.full(len(x), (5 * _HEIGHT_SIGMA) ** -2))
+    for _ in range(19):
+        residual = x[:, 1] - design @ solution
+        spread = 1.4826 * np.median(np.abs(residual))
+        sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
+        cauchy = 1 / (1 + (residual / (CAUCHY * sigma)) ** 2)
+        information, solution = fit(cauchy / sigma**2)
+    covariance = np.linalg.inv(information)[:2, :2]
+    covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
+    return Plane(solution[:2], covariance + _FEET_SYSTEMATIC**2 * np.eye(2))
+
+
+def _variance_factor(
+    residual: Float[np.ndarray, " n"], people: Int[np.ndarray, " n"]
+) -> float:
+    """Factor by which an autoregressive error of first order enlarges the variance of
+    a mean; 1 without positive autocorrelation."""
+    spread = 1.4826 * np.median(np.abs(residual))
+    r = np.clip(residual, -3 * spread, 3 * spread)
+    same = people[1:] == people[:-1]
+    if same.sum() < 4 or not spread:
+        return 1.0
+    rho = np.sum(r[1:] * r[:-1] * same) / np.sum((r[1:] ** 2 + r[:-1] ** 2) / 2 * same)
+    rho = np.clip(rho, 0.0, _AUTOCORRELATION)
+    return float((1 + rho) / (1 - rho))
+
+
+def map_plane(
+    landmarks: Float[np.ndarray, "l 3"],
+    eyes: Float[np.ndarray, "t 3"],
+    stances: list[Float[np.ndarray, "_ 3"]],
+) -> Plane | None:
+    """The ground plane of the map's landmarks (m).
+
+    `None` if there is none, or if people do not stand on it. Where few stances are at
+    one height over it, it may lie across steps: its covariance grows by their scatter.
+    """
+    up = np.array([0.0, 1.0, 0.0])
+    plane = find_ground(landmarks, eyes, up) if len(landmarks) else None
+    if plane is None:
+        return None
+    normal, offset = plane[:3], plane[3]
+    height = float(np.median(eyes @ normal + offset))
+    every = np.concatenate([np.zeros((0, 3)), *stances])
+    excess = 0.0
+    if len(every):
+        away = every @ normal + offset
+        if height <= 0 or abs(np.median(away)) > _OFF_THE_PLANE * height:
+            return None
+        excess = max(_scatter_of_level(away) ** 2 - _HEIGHT_SCATTER**2, 0.0)
+    away = landmarks @ normal + offset
+    near = np.abs(away) < 0.05 * height
+    flat = landmarks[near][:, [0, 2]]
+    flat = flat - flat.mean(axis=0)
+    # Errors of neighbouring points are correlated: ten count as one.
+    information = flat.T @ flat / 10 / max(float(np.var(away[near])), 1e-12)
+    covariance = np.linalg.inv(information + np.eye(2))
+    if excess:
+        covariance += excess * np.linalg.inv(flat.T @ flat / len(flat) + np.eye(2))
+    return Plane(
+        -normal[[0, 2]] / normal[1],
+        covariance + _MAP_SYSTEMATIC**2 * np.eye(2),
+    )
+
+
+def _scatter_of_level(heights: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of the heights at the most frequent level, by the shortest
+    interval with 40 % of them: half of its length is 0.524 σ of a normal distribution.
+    """
+    ordered = np.sort(heights)
+    count = max(1, round(0.4 * len(ordered)))
+    length = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
+    return float(length.min()) / 2 / 0.524
+
+
+def fused(planes: list[Plane]) -> Plane | None:
+    """The planes' mean weighted by information (inverse covariance).
+
+    Its covariance is enlarged by the squared Birge ratio where the planes disagree.
+    """
+    if not planes:
+        return None
+    weights = [np.linalg.inv(plane.covariance) for plane in planes]
+    covariance = np.linalg.inv(sum(weights))
+    gradient = covariance @ sum(
+        w @ plane.gradient for w, plane in zip(weights, planes, strict=True)
+    )
+    if len(planes) > 1:
+        apart = [plane.gradient - gradient for plane in planes]
+        chi2 = sum(d @ w @ d for w, d in zip(weights, apart, strict=True))
+        covariance = covariance * max(1.0, chi2 / (2 * (len(planes) - 1)))
+    return Plane(gradient, covariance)
