@@ -7,8 +7,8 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.diagnostics.gait import Gait, gait_of_joints
 from bodyslam_jax.diagnostics.standing_height import standing_height_figures
-from bodyslam_jax.diagnostics.statistics import runs as runs_of
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.runs import runs as runs_of
 from bodyslam_jax.geometry.stances import find_stances
 
 _WALKING = (0.7, posture.RUNNING)

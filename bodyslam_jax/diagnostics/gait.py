@@ -11,8 +11,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.diagnostics.statistics import runs
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
 _GRAVITY = 9.81

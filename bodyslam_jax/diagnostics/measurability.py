@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.diagnostics.measured import LIMBS, Measured, pixels_per_metre
-from bodyslam_jax.diagnostics.statistics import runs
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, DETECTOR_FLOOR
 from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence

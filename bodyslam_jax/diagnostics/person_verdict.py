@@ -14,10 +14,10 @@ from bodyslam_jax.diagnostics.plausibility import Doubts
 from bodyslam_jax.diagnostics.statistics import (
     PathStatistics,
     person_statistics,
-    runs,
     stature_and_sigma,
 )
 from bodyslam_jax.diagnostics.thresholds import MEASURABLE_CHECKS
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import JointEstimate, Result, Sequence
 
 PersonStatus = Literal["ok", "doubtful", "not_measurable", "absent"]

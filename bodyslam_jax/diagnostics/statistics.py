@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
 _UP = 1
@@ -66,12 +67,6 @@ def _path_statistics(
             speed[run] = np.append(rate, rate[-1])
     height = float(points[present, _UP].mean()) if present.any() else 0.0
     return PathStatistics(seconds, distance, speed, height)
-
-
-def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
-    """The stretches of consecutive frames in `present`."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
-    return [slice(a, b) for a, b in edges.reshape(-1, 2)]
 
 
 def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, "t d"]:

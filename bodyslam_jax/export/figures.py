@@ -14,7 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from bodyslam_jax.diagnostics.statistics import PathStatistics, runs
+from bodyslam_jax.diagnostics.statistics import PathStatistics
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
 # Colours that stand for CSS variables; replaced in the SVG text.

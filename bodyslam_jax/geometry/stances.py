@@ -6,6 +6,8 @@ A foot stands while its toe joint is slow. Positions are of toe joints, m.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.geometry.runs import runs
+
 STANDING_SPEED = 0.6
 """The lower foot stands where it is slower than this, m/s: assumes that toe joints over
 `_SPEED_WINDOW` err by well below 6 cm."""
@@ -14,6 +16,8 @@ _SPEED_WINDOW = 0.1
 averaged out."""
 _SHORTEST_STANCE = 0.1
 """s"""
+_PROBABLE = 0.7
+"""Probability above which a toe is taken to stand, for gravity and the floor."""
 
 
 def standing_feet(
@@ -64,10 +68,9 @@ def standing_by_speed(
     """Feet of one person that stand, by the speed of the lower foot (`standing_feet`),
     in each run of present frames; y is up."""
     found = np.zeros(feet.shape[:2], bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
-    for start, stop in edges.reshape(-1, 2):
-        stands, lower = standing_feet(feet[start:stop], np.array([0.0, 1.0, 0.0]), fps)
-        found[start + np.arange(stop - start), lower] = stands
+    for run in runs(present):
+        stands, lower = standing_feet(feet[run], np.array([0.0, 1.0, 0.0]), fps)
+        found[np.arange(run.start, run.stop), lower] = stands
     return found
 
 
@@ -75,11 +78,17 @@ def _stances(feet, standing, frames) -> Float[np.ndarray, "s 3"]:
     """Median positions of both feet while they stand, in the order of time."""
     found = []
     for foot in range(2):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, foot], [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            if stop - start >= frames:
-                place = np.median(feet[start:stop, foot], axis=0)
-                found.append((start, place))
+        for run in runs(standing[:, foot]):
+            if run.stop - run.start >= frames:
+                place = np.median(feet[run, foot], axis=0)
+                found.append((run.start, place))
     return np.array([place for _, place in sorted(found, key=lambda s: s[0])]).reshape(
         -1, 3
     )
+
+
+def toes_standing(
+    contacts: Float[np.ndarray, "h t 4"] | None,
+) -> Bool[np.ndarray, "h t 2"] | None:
+    """Left and right toes that stand, by the contact network's probabilities."""
+    return None if contacts is None else contacts[..., ::2] > _PROBABLE

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from bodyslam_jax.geometry.runs import runs
+
 _SAMPLES = 320
 """Samples along the longer side of the images that are compared."""
 _BLOCK = 16
@@ -76,7 +78,8 @@ def repeated(
         near = np.sort(near[np.isfinite(near)])
         usual = np.median(near[len(near) // 2 :]) if len(near) else 0.0
         found[k + 1] = usual >= _MOVING and change < _SAME * usual
-    for first, last in _runs(found):
+    for run in runs(found):
+        first, last = run.start, run.stop - 1
         # What moves goes on just before and after; people stop little by little.
         sides = [first - 2, last]  # changes into the frame before, and after the last
         sides = [k for k in sides if 0 <= k < len(most)]
@@ -111,12 +114,6 @@ def repeats_warning(name: str, found: Bool[np.ndarray, " t"], fps: float) -> str
         f"{name}: {found.sum()} of {len(found)} frames only repeat the one before, as "
         f"after a conversion of the frame rate: left out, {fps:.4g} frames/s remain."
     )
-
-
-def _runs(found: np.ndarray) -> list[tuple[int, int]]:
-    """First and last of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], found.astype(int), [0]])))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _change(a: np.ndarray | None, b: np.ndarray | None) -> tuple[float, float]:

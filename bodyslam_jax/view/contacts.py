@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.geometry.stances import standing_feet
 from bodyslam_jax.types import Result
 
@@ -15,9 +16,8 @@ def feet_on_the_ground(result: Result) -> Bool[np.ndarray, "h t 2"]:
     while it is slow (`geometry.stances`)."""
     stands = np.zeros((*result.present.shape, 2), bool)
     for h, present in enumerate(result.present):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], present, [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            feet = result.joints[h, start:stop][:, list(FEET)]
+        for run in runs(present):
+            feet = result.joints[h, run][:, list(FEET)]
             slow, lower = standing_feet(feet, _UP, result.fps)
-            stands[h, np.arange(start, stop), lower] = slow
+            stands[h, np.arange(run.start, run.stop), lower] = slow
     return stands

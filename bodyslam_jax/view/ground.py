@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.contacts import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE, Image
@@ -40,8 +41,7 @@ class Ground:
         curves = []
         uv, before = self._seen(self.lines, frame)
         for line, shown in zip(uv, before, strict=True):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], shown, [0]])))
-            curves += [_sixteenths(line[a:b]) for a, b in edges.reshape(-1, 2)]
+            curves += [_sixteenths(line[run]) for run in runs(shown)]
         cv2.polylines(drawn, curves, False, _WHITE, 1, cv2.LINE_AA, 4)
         drawn = cv2.addWeighted(drawn, 0.4, image, 0.6, 0)
         h, side = np.nonzero(self.stands[:, frame])

@@ -17,6 +17,7 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import statistics
 from bodyslam_jax.diagnostics.reported_status import inferred_bones, reported_status
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.contacts import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE
@@ -175,7 +176,7 @@ def _footprints(result: Result, h: int, stands: np.ndarray) -> list[list[int | f
     """First frame and place (x, z, m) of each stance of a foot."""
     found = []
     for foot, joint in enumerate(FEET):
-        for run in statistics.runs(stands[:, foot]):
+        for run in runs(stands[:, foot]):
             x, _, z = np.median(result.joints[h, run, joint], axis=0)
             found.append([int(run.start), round(float(x), 3), round(float(z), 3)])
     return sorted(found)

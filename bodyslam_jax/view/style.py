@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from bodyslam_jax.geometry.runs import runs
+
 Image = UInt8[np.ndarray, "y x 3"]
 Color = tuple[int, int, int]
 """BGR"""
@@ -73,5 +75,4 @@ def _dashes(
     at = np.arange(0.0, along[-1], 1.0)
     points = np.stack([np.interp(at, along, axis) for axis in curve.T], axis=-1)
     drawn = at % sum(dash) < dash[0]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], drawn, [0]])))
-    return [np.round(points[a:b]).astype(int) for a, b in edges.reshape(-1, 2)]
+    return [np.round(points[run]).astype(int) for run in runs(drawn)]
