@@ -312,6 +312,9 @@ class JointEstimate:
     contacts: Float[np.ndarray, "h t 4"] | None = None
     """Probability that left toe, left heel, right toe, right heel stand; `None` if it
     was not estimated."""
+    on_floor: Bool[np.ndarray, " h"] | None = None
+    """People whom the estimate holds on one plane before a camera that does not move;
+    `None` where there is no such plane."""
 
 
 @dataclasses.dataclass(frozen=True)

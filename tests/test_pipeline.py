@@ -10,7 +10,7 @@ from bodyslam_jax import evaluation, export, pipeline, simulation, view
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import before_after
-from bodyslam_jax.pipeline import to_metric
+from bodyslam_jax.geometry.levelling import upright
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 
 CONTRACT = {
@@ -106,7 +106,7 @@ def test_upright_turns_a_direction_up_and_keeps_distances():
     rng = np.random.default_rng(0)
     T_WC = np.tile(np.eye(4), (5, 1, 1))
     T_WC[:, :3, 3] = rng.normal(size=(5, 3))
-    turn = to_metric.upright(T_WC, np.array([0.6, 0.0, 0.8]))
+    turn = upright(T_WC, np.array([0.6, 0.0, 0.8]))
     np.testing.assert_allclose(turn[:3, :3] @ [0.6, 0.0, 0.8], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)

@@ -7,9 +7,11 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import evaluation, graph
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.evaluation import Trajectories
-from bodyslam_jax.pipeline import to_metric
+from bodyslam_jax.geometry.levelling import level
 from bodyslam_jax.pipeline.case import trajectories
+from bodyslam_jax.pipeline.to_metric import floor_height
 
 NAMES = (
     "c_ate_se3",
@@ -75,19 +77,17 @@ def _upright(
     if not present.any():
         return estimate
     T_WC, joints = np.asarray(estimate.T_WC), np.asarray(estimate.joints)
-    turn, _ = to_metric.level(
+    turn, _ = level(
         T_WC,
         np.asarray(graph.world_from_root(state)),
-        joints[:, :, to_metric.FEET],
+        joints[:, :, FEET],
         present,
         np.asarray(state.scale * state.landmarks),
         fps,
         np.zeros(len(present), bool),
     )
     at = lambda points: np.asarray(points) @ turn[:3, :3].T + turn[:3, 3]
-    floor = to_metric.floor_height(
-        body, np.asarray(state.shapes), at(joints), present, fps
-    )
+    floor = floor_height(body, np.asarray(state.shapes), at(joints), present, fps)
     turn[1, 3] -= floor
     return Trajectories(
         T_WC=jnp.asarray(turn @ T_WC),

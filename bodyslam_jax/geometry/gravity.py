@@ -63,12 +63,19 @@ _SIZE = 0.05
 has all stances too low or too high by that share of the camera's height above them."""
 
 
+_HELD = 0.01
+"""Standard deviation of a person's height over a plane that the estimate holds them on,
+m."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Upright:
     """The estimated up direction, in the frame in which the cues were given."""
 
     up: Float[np.ndarray, " 3"]
     """Unit vector."""
+    normal: Float[np.ndarray, " 3"]
+    """Upwards unit normal of the ground's plane; `up` if no plane was found."""
     sigma: float
     """Standard deviation of `up` along its less certain axis, rad, that holds on level
     and on sloping ground; infinite without any cue."""
@@ -91,6 +98,7 @@ def find_upright(
     measured_up: Float[np.ndarray, " 3"] | None = None,
     standing: Bool[np.ndarray, "h t 2"] | None = None,
     edges: Vertical | None = None,
+    on_floor: Bool[np.ndarray, " h"] | None = None,
 ) -> Upright:
     """Up from all available cues, in a frame whose y axis is roughly up.
 
@@ -103,21 +111,25 @@ def find_upright(
         measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
         standing: toes that stand; without it, by their speed (`find_stances`).
         edges: the vertical by edges in the images.
+        on_floor: people whom an estimate holds on one plane, so that a wrong size does
+            not put them above or below it.
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps, standing)
     height = _height_of_camera(eyes, stances)
-    planes = [feet_plane(stances, _SIZE * height)]
+    size = np.full(len(stances), _SIZE * height)
+    if on_floor is not None:
+        size = np.where(on_floor, _HELD, size)
+    planes = [feet_plane(stances, size, np.median(eyes, axis=0))]
     planes.append(map_plane(landmarks, eyes, stances))
     ground = fused([plane for plane in planes if plane is not None])
     worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
     if measured_up is not None:
         trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
     tilt, slope, sigma = _combined(_tilts(trunk_tilt, worse, edges), ground)
-    up = np.array([tilt[0], 1.0, tilt[1]])
-    up /= np.linalg.norm(up)
     return Upright(
-        up=up,
+        up=_direction(tilt),
+        normal=_direction(tilt if ground is None else tilt - slope),
         sigma=sigma,
         trunks=np.nan
         if trunk_tilt is None
@@ -125,6 +137,12 @@ def find_upright(
         ground=float(np.arctan(np.linalg.norm(slope))),
         edges=np.nan if edges is None else float(np.linalg.norm(edges.tilt - tilt)),
     )
+
+
+def _direction(tilt: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 3"]:
+    """The unit vector of a tilt."""
+    found = np.array([tilt[0], 1.0, tilt[1]])
+    return found / np.linalg.norm(found)
 
 
 def _with_measured(trunk_tilt, up):

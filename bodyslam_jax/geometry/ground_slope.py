@@ -23,6 +23,9 @@ _AUTOCORRELATION = 0.9
 larger one."""
 _HEIGHT_SIGMA = 0.02
 """Least standard deviation of the height of a foot that stands, m."""
+_DEPTH = 0.02
+"""Standard deviation of the distance of a stance from the camera, as a share of it:
+that which changes from stance to stance."""
 _HEIGHT_SCATTER = 0.04
 """Scatter of stances about the map's plane that errors of estimates explain, m."""
 _OFF_THE_PLANE = 0.25
@@ -42,7 +45,9 @@ class Plane:
 
 
 def feet_plane(
-    stances: list[Float[np.ndarray, "_ 3"]], person_sigma: float
+    stances: list[Float[np.ndarray, "_ 3"]],
+    person_sigma: float | Float[np.ndarray, " h"],
+    eye: Float[np.ndarray, " 3"] | None = None,
 ) -> Plane | None:
     """Robust least-squares plane through the positions of standing feet, m.
 
@@ -52,6 +57,10 @@ def feet_plane(
     Cauchy loss, whose scale is estimated from the median absolute residual. Residuals
     of stances that follow one another are alike where the ground is not a plane, as on
     stairs: the covariance grows with their autocorrelation.
+
+    Seen from `eye`, an error of distance moves a stance along the line of sight, up as
+    it moves away. Where people hardly move, the plane therefore leans towards that
+    line: its covariance grows by the square of what `_DEPTH` explains.
     """
     people = np.concatenate(
         [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
@@ -65,7 +74,8 @@ def feet_plane(
         [x[:, [0, 2]], np.ones(len(x)), people[:, None] == np.arange(len(stances))]
     )
     # A weak prior (slope of 45 degrees, any height) makes the system regular.
-    prior = np.diag([1.0, 1.0, 1e-6] + [person_sigma**-2.0] * len(stances))
+    offsets = np.broadcast_to(np.asarray(person_sigma) ** -2.0, len(stances))
+    prior = np.diag([1.0, 1.0, 1e-6, *offsets])
 
     def fit(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The weighted least-squares solution, its information matrix first."""
@@ -82,7 +92,30 @@ def feet_plane(
         information, solution = fit(cauchy / sigma**2)
     covariance = np.linalg.inv(information)[:2, :2]
     covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
-    return Plane(solution[:2], covariance + _FEET_SYSTEMATIC**2 * np.eye(2))
+    covariance = covariance + _FEET_SYSTEMATIC**2 * np.eye(2)
+    if eye is not None:
+        own = (
+            points
+            - np.array([s.mean(axis=0) for s in stances if len(s)])[
+                np.unique(people, return_inverse=True)[1]
+            ]
+        )
+        lean = _lean(own[:, [0, 2]], points - eye)
+        covariance = covariance + np.outer(lean, lean)
+    return Plane(solution[:2], covariance)
+
+
+def _lean(
+    places: Float[np.ndarray, "n 2"], sight: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " 2"]:
+    """The gradient that errors of distance give a plane through level places: that of
+    least squares with errors in the places.
+
+    `places` are about each person's mean, `sight` is from the eye to the places, m.
+    """
+    error = _DEPTH * sight
+    spread = places.T @ places / len(places) + 1e-6 * np.eye(2)
+    return np.linalg.solve(spread, error[:, [0, 2]].T @ error[:, 1] / len(error))
 
 
 def _variance_factor(

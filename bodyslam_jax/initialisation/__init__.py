@@ -35,4 +35,5 @@ from bodyslam_jax.initialisation.placement import first_state as first_state
 from bodyslam_jax.initialisation.placement import free_people as free_people
 from bodyslam_jax.initialisation.placement import no_people as no_people
 from bodyslam_jax.initialisation.scale import scale_start as scale_start
+from bodyslam_jax.initialisation.upright import mean_up as mean_up
 from bodyslam_jax.initialisation.upright import upright_factor as upright_factor

@@ -23,7 +23,10 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry.local_ground import wander
 from bodyslam_jax.pipeline.joint_problem import Prepared
-from bodyslam_jax.pipeline.motion_prediction import contact_predictor, predict
+from bodyslam_jax.pipeline.motion_prediction import (
+    contact_predictor,
+    contact_probability,
+)
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Sequence, SfmResult
 
@@ -73,19 +76,18 @@ def hold_standing_feet(
             "prepared.problem.factors: no FootContact; expected a problem of "
             "`prepare(..., feet=True)`."
         )
-    probability = predict(predictor, best)
+    probability = contact_probability(predictor, best, sequence.fps)
     present[list(prepared.passengers)] = False
     contact = initialisation.contact_factor(
-        probability, best, present, sequence.fps, body, config.weights
+        jnp.asarray(probability), best, present, sequence.fps, body, config.weights
     )
     alone = graph.disable(prepared.problem, graph.Reprojection, graph.LandmarkPrior)
-    chance = np.asarray(probability)
 
     def weighed(factor: graph.Factor) -> graph.Factor:
         if isinstance(factor, graph.FootContact):
             return contact
         if isinstance(factor, graph.GroundContact):
-            return stand_on_plane(factor, best, chance, sequence.fps)
+            return stand_on_plane(factor, best, probability, sequence.fps)
         return factor
 
     held = ("scale", "cameras", "landmarks", "intrinsics", "shapes")
@@ -98,7 +100,7 @@ def hold_standing_feet(
     found = solution.state
     moved = dataclasses.replace(best, roots=found.roots, poses=found.poses)
     valid = bool(jnp.isfinite(found.roots).all() & jnp.isfinite(found.poses).all())
-    return Standing(moved if valid else best, chance, (stage,))
+    return Standing(moved if valid else best, probability, (stage,))
 
 
 def stand_on_plane(

@@ -46,8 +46,6 @@ def with_ground_of(
 
 def is_uneven(problem: graph.Problem) -> bool:
     """Whether people stand on ground that is not one plane."""
-    return any(
-        isinstance(factor, graph.GroundContact)
-        and np.ptp(np.asarray(factor.offset)[np.isfinite(np.asarray(factor.sigma))]) > 0
-        for factor in problem.factors
-    )
+    grounds = [f for f in problem.factors if isinstance(f, graph.GroundContact)]
+    used = [np.asarray(f.offset)[np.isfinite(np.asarray(f.sigma))] for f in grounds]
+    return any(len(offset) > 0 and np.ptp(offset) > 0 for offset in used)

@@ -12,16 +12,27 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PATH_SIGMA, Config, Measured
+from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,
+    contact_probability,
     motion_predictor,
     predict,
+)
+from bodyslam_jax.pipeline.people_floor import (
+    View,
+    on_floor,
+    people_on_floor,
+    without_floor,
 )
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
+
+_TRIPODS = ("static", "rotation")
+"""Kinds of camera motion that show no map, so that people alone show the floor."""
 
 Passengers = dict[int, tuple[float, float]]
 """People whose steps are no measurement of scale, as something carries them: their
@@ -69,12 +80,14 @@ def prepare(
     *,
     body_only_solve: bool = True,
     feet: bool = True,
+    edges: Edges | None = None,
 ) -> Prepared:
     """The body-only solve, the first scale in closed form, then the whole graph.
 
     Without `body_only_solve` nothing is solved: people start as their bodies are given.
     With `feet` the problem has the factor of standing feet, without weight, which
-    `contact_stage.hold_standing_feet` replaces.
+    `contact_stage.hold_standing_feet` replaces. `edges` are straight edges in the world
+    of a camera that does not move, which tell how the floor lies there.
 
     Body poses are fitted to keypoints before the motion model reads them: a regressor's
     errors in orientation bias the displacements that are predicted from it.
@@ -96,6 +109,10 @@ def prepare(
         free=None if moving else initialisation.free_people(state),
     )
     factors = _camera_factors(cameras, config) if moving else []
+    floor = None
+    if cameras.kind in _TRIPODS and anybody and weights.ground_sigma is not None:
+        floor = without_floor(body, roots.present)
+        factors.append(floor)
     start, passengers, stages, prediction = ScaleStart(), {}, (), None
     if anybody:
         prediction = predict(predictor, state)
@@ -103,7 +120,8 @@ def prepare(
             sequence, cameras, crowd, state, prediction, body, config
         )
         factors += people_factors
-        if feet and contact_predictor(sequence, roots, body, config) is not None:
+        stands = contact_predictor(sequence, roots, body, config)
+        if feet and stands is not None:
             factors.append(
                 initialisation.without_contacts(state, sequence.fps, body, weights)
             )
@@ -121,6 +139,22 @@ def prepare(
             state, stage = solve_body_only(problem, state, config)
             stages = (stage,)
             prediction = predict(predictor, state)
+        if floor is not None:
+            found = on_floor(
+                state,
+                stands and contact_probability(stands, state, sequence.fps),
+                View(
+                    present,
+                    sequence.keypoints,
+                    crowd.fitted,
+                    sequence.fps,
+                    config.gravity,
+                    edges,
+                ),
+                body,
+                weights,
+            )
+            factors = [found if factor is floor else factor for factor in factors]
         if contact is not None:
             rough = initialisation.with_wander(contact, state, sequence.fps)
             factors = [rough if factor is contact else factor for factor in factors]
@@ -335,10 +369,16 @@ def _make_problem(
     free: graph.Step | None,
 ) -> graph.Problem:
     """The problem, with cameras beyond a cut of the video held constant: no factor
-    determines them."""
+    determines them. Before a camera that does not move the scale is free where there is
+    a floor."""
+    if free is not None and any(isinstance(f, graph.GroundContact) for f in factors):
+        free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
     problem = graph.make_problem(
         factors, state, motion=predictor, free=free, common_sizes=True
     )
+    if free is not None and people_on_floor(problem) is None:
+        constant = graph.set_constant(problem.free, "scale")
+        problem = dataclasses.replace(problem, free=constant)
     within = cameras.within
     if within.all() or cameras.kind != "moving":
         return problem

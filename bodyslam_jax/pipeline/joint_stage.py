@@ -16,9 +16,11 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
 )
+from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
+from bodyslam_jax.pipeline.people_floor import people_on_floor
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
 
@@ -40,6 +42,7 @@ def estimate(
     bodies: Bodies,
     body: BodyModel,
     config: Config,
+    edges: Edges | None = None,
 ) -> JointEstimate:
     """The paper's graph: two steps, then the optimum of everything.
 
@@ -48,7 +51,7 @@ def estimate(
     searched = sequence.detected is not None and sequence.keypoints is None
     if searched and cameras.kind != "moving" and not len(bodies.present):
         return empty_estimate(cameras)
-    prepared = prepare(sequence, cameras, bodies, body, config)
+    prepared = prepare(sequence, cameras, bodies, body, config, edges=edges)
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
     stages = (*prepared.stages, stage)
     if is_uneven(prepared.problem):
@@ -89,7 +92,8 @@ def of_state(
     """The estimate that a state of the prepared problem is, `contacts` those of the
     contact stage."""
     return JointEstimate(
-        scale=float(state.scale),
+        # Before a camera that does not move it is the height of the floor.
+        scale=float(state.scale) if prepared.moving else 1.0,
         start=prepared.scale,
         scale_sigma=uncertainty.scale_sigma,
         shape_covariance=uncertainty.shape_covariance,
@@ -107,6 +111,7 @@ def of_state(
         status=status,
         stages=stages,
         contacts=contacts,
+        on_floor=None if prepared.moving else people_on_floor(prepared.problem),
     )
 
 

@@ -4,10 +4,13 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
-from bodyslam_jax import graph, motion
+from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
+from bodyslam_jax.geometry.free_fall import in_free_fall
 from bodyslam_jax.geometry.lengths import padded_length, shortened
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.solver.compilation import compiled
@@ -51,6 +54,20 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> Any:
     state = graph.extend_state(state, longer - frames)
     found = _predict(predictor.lengthened(longer), state)
     return shortened(found, frames, axis=1)
+
+
+def contact_probability(
+    predictor: graph.MotionPredictor, state: graph.State, fps: float
+) -> Float[np.ndarray, "h t 4"]:
+    """Probabilities that toes and heels stand; 0 while a person falls freely, which
+    postures do not tell from a stance (`geometry.free_fall`)."""
+    found = np.array(predict(predictor, state))
+    present = np.asarray(predictor.present)
+    pelvis = np.asarray(graph.world_from_root(state))[..., :3, 3]
+    up = initialisation.mean_up(state, present)
+    for h, there in enumerate(present):
+        found[h, in_free_fall(pelvis[h], there, up, fps)] = 0.0
+    return found
 
 
 _predict = compiled(lambda predictor, state: predictor(state))

@@ -63,15 +63,20 @@ def run_stages(
     everybody = sequence
     sequence = people.select_people(sequence, config.person)
     refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+    edges = None
+    if cameras.kind != "moving":  # They show how the floor lies.
+        with watch("edges"):
+            edges = find_edges(everybody, cameras, cache=cache)
     with watch("joint"):
         joint = cache.stage(
             "joint",
             key,
             JointEstimate,
-            lambda: joint_stage.estimate(refined, cameras, bodies, body, config),
+            lambda: joint_stage.estimate(refined, cameras, bodies, body, config, edges),
         )
-    with watch("edges"):
-        edges = find_edges(everybody, cameras, joint, cache)
+    if cameras.kind == "moving":
+        with watch("edges"):
+            edges = find_edges(everybody, cameras, joint, cache)
     result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
     return result, cameras, refined
 

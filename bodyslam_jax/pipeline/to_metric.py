@@ -10,15 +10,13 @@ from bodyslam_jax import people
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.gravity import Upright, find_upright
+from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.geometry.lengths import lengthened, padded_length
-from bodyslam_jax.geometry.stances import find_stances
-from bodyslam_jax.geometry.vertical_edges import Edges, find_vertical
+from bodyslam_jax.geometry.levelling import level
+from bodyslam_jax.geometry.stances import find_stances, toes_standing
+from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
-
-_STANDS = 0.7
-"""Probability above which a toe is taken to stand, for gravity and the floor."""
 
 
 def to_metric(
@@ -49,6 +47,7 @@ def to_metric(
         config.gravity,
         standing,
         edges,
+        joint.on_floor,
     )
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
@@ -122,13 +121,6 @@ def floor_height(
     return float(np.quantile(lowest, 0.05) - sole)
 
 
-def toes_standing(
-    contacts: Float[np.ndarray, "h t 4"] | None,
-) -> Bool[np.ndarray, "h t 2"] | None:
-    """Left and right toes that stand, by the contact network's probabilities."""
-    return None if contacts is None else contacts[..., ::2] > _STANDS
-
-
 def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
     """Height of the toe joints above the sole of a standing body, m."""
     template = np.asarray(body.template, np.float64)[:, 1]
@@ -148,59 +140,3 @@ def _smoothed(sequence, config, present, poses, pelvis):
         poses[h] = low_pass_rotations(joints, frames, *how).reshape(-1, 72)
         pelvis[h] = low_pass(pelvis[h], frames, *how)
     return poses, pelvis
-
-
-def level(
-    T_WC: Float[np.ndarray, "t 4 4"],
-    T_WH: Float[np.ndarray, "h t 4 4"],
-    feet: Float[np.ndarray, "h t 2 3"],
-    present: Bool[np.ndarray, "h t"],
-    landmarks: Float[np.ndarray, "l 3"],
-    fps: float,
-    fitted: Bool[np.ndarray, " h"],
-    gravity: tuple[float, ...] = (),
-    standing: Bool[np.ndarray, "h t 2"] | None = None,
-    edges: Edges | None = None,
-) -> tuple[Float[np.ndarray, "4 4"], Upright]:
-    """The rigid motion to a world whose y axis is up, and the cues it is based on.
-
-    Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
-    opposite to `gravity` (in the first camera's axes) if that is measured, else the
-    mean direction of people's trunks, or, without people, the first camera's -y.
-    """
-    up = -T_WC[0, :3, 1]
-    if gravity:
-        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
-    elif present.any():
-        up = T_WH[present][:, :3, 1].sum(axis=0)
-    rough = upright(T_WC, up / np.linalg.norm(up))
-    at = lambda points: points @ rough[:3, :3].T + rough[:3, 3]
-    found = find_upright(
-        T_WH[..., :3, 1] @ rough[:3, :3].T,
-        at(feet),
-        present,
-        at(T_WC[:, :3, 3]),
-        at(landmarks),
-        fps,
-        fitted,
-        np.array([0.0, 1.0, 0.0]) if gravity else None,
-        standing,
-        None if edges is None else find_vertical(edges.rotated(rough[:3, :3])),
-    )
-    return upright(rough @ T_WC, found.up) @ rough, found
-
-
-def upright(
-    T_WC: Float[np.ndarray, "t 4 4"], up: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion to a world with y along the unit vector `up` and z ahead of the
-    first camera, which is its origin."""
-    y = up
-    ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
-    if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.
-        ahead = T_WC[0, :3, 1] - y * (y @ T_WC[0, :3, 1])
-    z = ahead / np.linalg.norm(ahead)
-    turn = np.eye(4)
-    turn[:3, :3] = np.stack([np.cross(y, z), y, z])
-    turn[:3, 3] = -turn[:3, :3] @ T_WC[0, :3, 3]
-    return turn

@@ -15,11 +15,11 @@ _IMAGES = 24
 def find_edges(
     sequence: Sequence,
     cameras: SfmResult,
-    joint: JointEstimate,
+    joint: JointEstimate | None = None,
     cache: Cache = Cache(None),
 ) -> Edges | None:
-    """Segments that are on no person, in the world of `joint`; `None` without images or
-    cameras. `sequence` is the input, with its zoom.
+    """Segments that are on no person, in the world of the cameras, of `joint` if it is
+    given; `None` without images or cameras. `sequence` is the input, with its zoom.
 
     **Raises:** `ValueError` if an image cannot be read.
     """
@@ -33,12 +33,14 @@ def find_edges(
         lambda: sfm.find_segments(sequence, wanted),
     )
     ends = segments.ends
+    T_WC, intrinsics = cameras.T_WC, cameras.intrinsics
+    if joint is not None:
+        T_WC, intrinsics = joint.cameras, joint.intrinsics
     if cameras.zoom is not None:
-        centre = joint.intrinsics[2:4]
+        centre = intrinsics[2:4]
         size = np.exp(cameras.zoom[segments.frame])[:, None, None]
         ends = centre + (ends - centre) / size
-    R_WC = joint.cameras[:, :3, :3]
-    return make_edges(segments.frame, ends, wanted, R_WC, joint.intrinsics)
+    return make_edges(segments.frame, ends, wanted, T_WC[:, :3, :3], intrinsics)
 
 
 def _spread(cameras: SfmResult) -> Int[np.ndarray, " n"]:

@@ -1,0 +1,72 @@
+"""A world whose y axis is up, from cues in any world."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bodyslam_jax.geometry.gravity import Upright, find_upright
+from bodyslam_jax.geometry.vertical_edges import Edges, find_vertical
+
+
+def level(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    T_WH: Float[np.ndarray, "h t 4 4"],
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    landmarks: Float[np.ndarray, "l 3"],
+    fps: float,
+    fitted: Bool[np.ndarray, " h"],
+    gravity: tuple[float, ...] = (),
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
+    edges: Edges | None = None,
+    on_floor: Bool[np.ndarray, " h"] | None = None,
+) -> tuple[Float[np.ndarray, "4 4"], Upright]:
+    """The rigid motion to a world whose y axis is up, and the cues it is based on.
+
+    Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
+    opposite to `gravity` (in the first camera's axes) if that is measured, else the
+    mean direction of people's trunks, or, without people, the first camera's -y.
+    `up` and `normal` of the cues are in the world that is given.
+    """
+    up = -T_WC[0, :3, 1]
+    if gravity:
+        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
+    elif present.any():
+        up = T_WH[present][:, :3, 1].sum(axis=0)
+    rough = upright(T_WC, up / np.linalg.norm(up))
+    turn = rough[:3, :3]
+    at = lambda points: points @ turn.T + rough[:3, 3]
+    found = find_upright(
+        T_WH[..., :3, 1] @ turn.T,
+        at(feet),
+        present,
+        at(T_WC[:, :3, 3]),
+        at(landmarks),
+        fps,
+        fitted,
+        np.array([0.0, 1.0, 0.0]) if gravity else None,
+        standing,
+        None if edges is None else find_vertical(edges.rotated(turn)),
+        on_floor,
+    )
+    whole = upright(rough @ T_WC, found.up) @ rough
+    return whole, dataclasses.replace(
+        found, up=turn.T @ found.up, normal=turn.T @ found.normal
+    )
+
+
+def upright(
+    T_WC: Float[np.ndarray, "t 4 4"], up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion to a world with y along the unit vector `up` and z ahead of the
+    first camera, which is its origin."""
+    y = up
+    ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
+    if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.
+        ahead = T_WC[0, :3, 1] - y * (y @ T_WC[0, :3, 1])
+    z = ahead / np.linalg.norm(ahead)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([np.cross(y, z), y, z])
+    turn[:3, 3] = -turn[:3, :3] @ T_WC[0, :3, 3]
+    return turn
