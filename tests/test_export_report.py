@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from scipy.signal import savgol_filter
 from bodyslam_jax import export, view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.diagnostics import statistics, thresholds
+from bodyslam_jax.export.figures import person_variable
 from bodyslam_jax.export.plain_words import in_plain_words
 from bodyslam_jax.types import Result
+from bodyslam_jax.view.style import PEOPLE
 
 
 @pytest.fixture(scope="module")
@@ -315,3 +318,11 @@ def test_nothing_is_cut_off_in_a_browser(tmp_path, body, width):
         assert frame.is_hidden("header")
         page.close()
     assert heard == []
+
+
+def test_as_many_people_as_are_estimated_have_colours_of_their_own():
+    """In the report, in its light and its dark style, and in what is drawn."""
+    style = (resources.files("bodyslam_jax.export") / "report.css").read_text()
+    names = {person_variable(h) for h in range(8)}
+    assert len(names) == len(set(PEOPLE)) == 8
+    assert all(style.count(f"--{name}:") == 2 for name in names)

@@ -9,6 +9,7 @@ import numpy as np
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import statistics
 from bodyslam_jax.diagnostics.reported_status import reported_status
+from bodyslam_jax.export.figures import person_variable
 from bodyslam_jax.types import Result
 
 _MOST_ROWS = 5
@@ -26,7 +27,7 @@ def answers(
     """Four cards, as one section of HTML."""
     shown = [h for h, present in enumerate(result.present) if present.any()]
     name = lambda h: "person" if len(people) == 1 else f"person {h}"
-    rows = lambda text: [(f"person-{h % 4}", name(h), text(h)) for h in shown]
+    rows = lambda text: [(person_variable(h), name(h), text(h)) for h in shown]
     kind = _STILL.get(str(summary.get("camera_motion")))
     if shown:
         known = [h for h in shown if reported_status(summary, h).measurable]

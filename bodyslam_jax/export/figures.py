@@ -21,7 +21,10 @@ from bodyslam_jax.types import Result
 # Colours that stand for CSS variables; replaced in the SVG text.
 _INK, _GRID, _POINTS = "#010203", "#040506", "#070809"
 CAMERA = "#0a0b0c"
-_PEOPLE = ("#0d0e0f", "#101112", "#131415", "#161718")
+_PEOPLE = (
+    *("#0d0e0f", "#101112", "#131415", "#161718"),
+    *("#191a1b", "#1c1d1e", "#1f2021", "#222324"),
+)
 _VARIABLES = {
     _INK: "var(--ink-2)",
     _GRID: "var(--grid)",
@@ -52,6 +55,11 @@ _STYLE: Any = {
     "lines.solid_capstyle": "round",
     "svg.hashsalt": "report",
 }
+
+
+def person_variable(person: int) -> str:
+    """The name of the CSS variable that is a person's colour."""
+    return f"person-{person % len(_PEOPLE)}"
 
 
 def person_color(person: int) -> str:
