@@ -193,6 +193,7 @@ def test_a_browser_shows_the_runs_that_are_chosen(run, result, body, tmp_path):
     with chromium() as browser, opened(browser, page_file, (900, 600)) as page:
         visible = "bodyslam.runs.map((run) => run.root.visible)"
         assert scene(page).evaluate(visible) == [True, False]
+        page.click("#panel summary")  # folded where the window is small
         page.check("input[name=run-1]")
         page.uncheck("input[name=run-0]")
         assert page.evaluate(visible) == [False, True]

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax import motion
 from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.body.skeleton import ANKLES
+from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem
 
 _DEGREE = np.pi / 180
@@ -34,9 +35,10 @@ _STANDS = 0.6
 """Probability of heel and toe from which a leg stands."""
 _LEAST = 0.1
 """Share of the frames in which each leg must stand alone, for a person to walk."""
-_SLOWEST = 0.4
-"""Speed at which the pelvis must pass over the foot that stands, leg lengths a second:
-people who dance, box or walk backwards bend their knees otherwise."""
+_SHORTEST = 0.2
+"""By how much the pelvis must pass over the foot that stands, leg lengths: people who
+dance, box or walk backwards bend their knees otherwise. (A share of time, as in slow
+motion, does not count.)"""
 _RESPONSE = 0.6
 """By how much the knees of the fit follow those of the guess."""
 _ROUNDS = 2
@@ -76,7 +78,7 @@ def with_walking_knees(
     if contacts.body != body.kind:
         return solved
     clock = motion.make_clock(np.arange(len(problem.sigma)) / fps, contacts.fps)
-    look = lambda chain: find_walk(problem, chain, (contacts, clock), body, fps)
+    look = lambda chain: find_walk(problem, chain, (contacts, clock), body)
     walk = look(solved[0])
     if walk is None:
         return solved
@@ -105,7 +107,6 @@ def find_walk(
     chain: Chain,
     contacts: tuple[motion.ContactModel, motion.Clock],
     body: BodyModel,
-    fps: float,
 ) -> Walk | None:
     """How a person walks; `None` where legs do not stand in turns, or the pelvis does
     not go forwards over them."""
@@ -120,19 +121,22 @@ def find_walk(
     alone = (stands > _STANDS) & (stands[:, ::-1] <= _STANDS)
     if (alone[present].mean(axis=0) < _LEAST).any():
         return None
-    if _speed(np.asarray(ahead), alone, fps) < _SLOWEST:
+    if _stride(np.asarray(ahead), alone) < _SHORTEST:
         return None
     bend = np.asarray(poses)[:, [3, 4], 0]
     mean = np.mean([bend[alone[:, leg], leg].mean() for leg in range(2)])
     return Walk(float(mean), stands)
 
 
-def _speed(
-    ahead: Float[np.ndarray, "t 2"], alone: Bool[np.ndarray, "t 2"], fps: float
-) -> float:
-    """Median speed of the pelvis over the ankle that stands, leg lengths a second."""
-    both = alone[1:] & alone[:-1]
-    return float(np.median(-np.diff(ahead, axis=0)[both]) * fps) if both.any() else 0.0
+def _stride(ahead: Float[np.ndarray, "t 2"], alone: Bool[np.ndarray, "t 2"]) -> float:
+    """By how much the pelvis passes over the ankle of a leg while that alone stands,
+    leg lengths; the median over stances."""
+    found = [
+        ahead[stance.start, leg] - ahead[stance.stop - 1, leg]
+        for leg in range(2)
+        for stance in runs(alone[:, leg])
+    ]
+    return float(np.median(found))
 
 
 def _crouches(basis: Float[np.ndarray, "63 k"]) -> Float[np.ndarray, "2 k"]:
