@@ -259,3 +259,16 @@ def test_edges_that_contradict_people_and_ground_are_believed_less():
     alone = find_upright(*cues(nobody, (0.0, 0, 0)), edges=vertical_edges(2.0, 0.0))
     assert off(alone.up) == pytest.approx(2.0, abs=0.1)
     assert np.isfinite(alone.sigma)
+
+
+def test_a_level_floor_outweighs_trunks_that_lean_a_little():
+    """Over 20 m a slope of 0.3 degrees is 10 cm: floors of buildings have none."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack(
+        [rng.uniform(-10, 10, 600), rng.normal(0, 0.01, 600), rng.uniform(-10, 10, 600)]
+    )
+    path = 8.0 * np.column_stack(
+        [np.sin(np.linspace(0, 6, 900)), np.cos(np.linspace(0, 6, 900))]
+    )
+    found = find_upright(*cues(walker(path), (1.5, 0, 0), floor, fitted=False))
+    assert off(found.up) < 0.2

@@ -4,7 +4,7 @@ Without an accelerometer four cues determine it, each with an error of its own:
 
 - People keep their trunk upright, to some degrees. Lean across the view is observed in
   the image; lean along the view is mostly inferred and less accurate.
-- Most ground that people walk on is level, to a degree or so, and some of it slopes.
+- Floors are level, most ground outdoors to a degree or so, and some of it slopes.
   Its plane is estimated twice: from the feet that stand on it, and from the points of
   the map that lie in one plane below the camera.
 - Walls and posts are vertical to some tenths of a degree, where there are any
@@ -54,10 +54,10 @@ fitted to keypoints, and the factor by which its standard deviation is then larg
 _WRONG_EDGES = (0.1, 5.0 * _DEGREE)
 """Probability that edges which agree are not vertical, and the standard deviation of
 their direction in that case. Assumed: of 21 clips with such edges none was wrong."""
-_LEVEL = 0.7 * _DEGREE
-_SLOPES = (0.25, 4.0 * _DEGREE)
-"""Standard deviation of the slope of level ground; probability that the ground is not
-level, and the standard deviation of its slope in that case."""
+_LEVEL, _STEEP = 0.7 * _DEGREE, 4.0 * _DEGREE
+_GROUNDS = ((0.5, 0.2 * _DEGREE), (0.25, _LEVEL), (0.25, _STEEP))
+"""Kinds of ground, each with its probability and the standard deviation of its slope:
+floors of buildings, level ground outdoors, ground that slopes."""
 _SIZE = 0.05
 """Relative standard deviation of a person's size. A person who is estimated too large
 has all stances too low or too high by that share of the camera's height above them."""
@@ -274,7 +274,6 @@ def _combined(
             return np.zeros(2), unknown, np.inf
         level = ground.covariance + _LEVEL**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
-    sloping, steep = _SLOPES
     density, tilts, slopes, covariances, is_sloping = [], [], [], [], []
     for p, mean, own in up_tilts:
         if ground is None:
@@ -287,13 +286,13 @@ def _combined(
         # Up is `mean + e`, with covariance `own`; the ground's gradient is
         # `slope - up`.
         apart = ground.gradient + mean
-        for q, sigma in [(1 - sloping, _LEVEL), (sloping, steep)]:
+        for q, sigma in _GROUNDS:
             total = own + ground.covariance + sigma**2 * np.eye(2)
             likelihood, explained = _agreement(apart, total)
             density.append(p * q * likelihood)
             tilts.append(mean - own @ explained)
             slopes.append(sigma**2 * explained)
-            is_sloping.append(sigma == steep)
+            is_sloping.append(sigma == _STEEP)
             covariances.append(own - own @ np.linalg.solve(total, own))
     # If all likelihoods underflow the widest combination, the last, is taken.
     weight = np.array(density)
