@@ -16,6 +16,9 @@ from bodyslam_jax.initialisation.contact_factors import (
     without_contacts as without_contacts,
 )
 from bodyslam_jax.initialisation.ground import ground_contact as ground_contact
+from bodyslam_jax.initialisation.ground import (
+    with_visible_feet as with_visible_feet,
+)
 from bodyslam_jax.initialisation.ground import with_wander as with_wander
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,

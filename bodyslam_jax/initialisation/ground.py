@@ -57,10 +57,7 @@ def ground_contact(
     height of these landmarks, in frames in which there are enough, if people then have
     one scale more nearly than on the plane. Up is the mean direction of their trunks.
     """
-    visible = roots.present & registered
-    if keypoints is not None:
-        feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
-        visible &= (feet > _MIN_CONFIDENCE).any(axis=-1)
+    visible = with_visible_feet(roots.present & registered, keypoints)
     if weights.ground_sigma is None or visible.sum() < 2:
         return None
     contact, used = _ground(state, visible, body, fps)
@@ -71,6 +68,16 @@ def ground_contact(
         return None
     sigma = np.where(used, weights.ground_sigma * np.sqrt(used.sum()), np.inf)
     return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma))
+
+
+def with_visible_feet(
+    present: Bool[np.ndarray, "h t"], keypoints: Keypoints | None
+) -> Bool[np.ndarray, "h t"]:
+    """The frames in which a foot is seen; all of `present` without keypoints."""
+    if keypoints is None:
+        return present
+    feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
+    return present & (feet > _MIN_CONFIDENCE).any(axis=-1)
 
 
 def with_wander(

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import graph
+from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET, FEET
+from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.geometry.levelling import level
@@ -35,6 +35,8 @@ _FOOT, _TILT = 0.04, 0.05
 rad."""
 _FEWEST = 10
 """Frames with standing feet, for a person to be on the floor."""
+_LOWEST_CAMERA = 0.1
+"""Height of the camera over the feet from which the floor tells distances, m."""
 _OFF = 2.5
 """Standard deviations from the others by which somebody stands on another floor."""
 
@@ -77,10 +79,7 @@ def on_floor(
     speed. Whoever stands higher or lower than the others by more than errors of sizes
     explain is on no floor.
     """
-    present = view.present.copy()
-    if view.keypoints is not None:
-        feet = view.keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
-        present &= (feet > 0.2).any(axis=-1)
+    present = initialisation.with_visible_feet(view.present, view.keypoints)
     none = without_floor(body, present)
     assert weights.ground_sigma is not None
     stands = present
@@ -105,7 +104,7 @@ def on_floor(
     # against keypoints whose errors are correlated; so has what else tells sizes.
     own = weights.ground_sigma * np.where(view.fitted, weights.shape_sigma, 1.0)
     sigma = np.where(used, own[:, None] * np.sqrt(count), np.inf)
-    if not used.any() or level > -0.1:  # The camera must be above the feet.
+    if not used.any() or level > -_LOWEST_CAMERA:
         return none
     return eqx.tree_at(
         lambda f: (f.offset, f.sigma),
