@@ -272,3 +272,34 @@ def test_a_level_floor_outweighs_trunks_that_lean_a_little():
     )
     found = find_upright(*cues(walker(path), (1.5, 0, 0), floor, fitted=False))
     assert off(found.up) < 0.2
+
+
+def test_who_hardly_moves_says_little_of_the_floor_along_the_line_of_sight():
+    """Errors of distance move feet along it, upwards as they go away."""
+    eye = np.array([0.0, 1.5, 0.0])
+    sight = np.array([0.0, -1.5, 4.0])
+    jumps = np.array([eye + (1 + s) * sight for s in np.linspace(-0.04, 0.04, 8)])
+    jumps[::2, 0] += 0.3
+    (walk,) = find_stances(walker(way()), np.ones((1, 240), bool), FPS)
+
+    def along(places, eye):
+        plane = feet_plane([places], 0.08, eye)
+        assert plane is not None
+        return plane.covariance[1, 1] ** 0.5
+
+    slope = np.arctan(1.5 / 4.0)
+    assert along(jumps, eye) > 0.5 * slope
+    assert along(walk, eye) < 1.2 * along(walk, None)
+
+
+def test_people_who_are_held_on_one_floor_show_how_it_lies():
+    near, far = walker(way(bend=2.0)), walker(way(bend=2.0) + [0.0, 6.0])
+    trunks, _, *rest = cues(np.concatenate([near, far]), (0, 0, 0))
+    feet = np.concatenate([near, far + [0, 0.2, 0]])
+    both = np.array([True, True])
+    found, free = (
+        find_upright(trunks, feet, *rest, on_floor=held) for held in (both, None)
+    )
+    rise = lambda normal: np.degrees(np.arctan(-normal[2] / normal[1]))
+    assert rise(found.normal) > 3 * abs(rise(free.normal)), (found, free)
+    np.testing.assert_allclose(np.linalg.norm(found.normal), 1.0)

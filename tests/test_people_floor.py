@@ -14,6 +14,10 @@ from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.diagnostics.figures import floors_apart
 from bodyslam_jax.geometry.free_fall import in_free_fall
 from bodyslam_jax.people import PersonState
+from bodyslam_jax.pipeline.motion_prediction import (
+    contact_predictor,
+    contact_probability,
+)
 from bodyslam_jax.pipeline.people_floor import (
     View,
     common_height,
@@ -21,6 +25,7 @@ from bodyslam_jax.pipeline.people_floor import (
     people_on_floor,
 )
 from bodyslam_jax.simulation import sequences
+from bodyslam_jax.types import Intrinsics, Sequence
 
 T, HEIGHT, PITCH = 30, 1.5, 0.2
 Y = np.array([0.0, 1.0, 0.0])
@@ -127,6 +132,30 @@ def test_a_jump_is_free_fall_and_a_walk_is_not(fps):
     moved = np.where(t > 1.5, -0.5, 0.0)[:, None] * up
     assert in_free_fall(moved, present, up, fps).any()
     assert not in_free_fall(moved, np.abs(t - 1.5) > 0.05, up, fps).any()
+
+
+def test_feet_do_not_stand_in_a_jump(body):
+    state = standing(body, [0.0], [(0.0, -4.0)])
+    present = np.ones((1, T), bool)
+    people = PersonState(
+        present,
+        np.asarray(state.roots),
+        np.asarray(state.poses),
+        np.asarray(state.shapes),
+    )
+    lens = Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480)
+    time = np.arange(T) / 30
+    sequence = Sequence("jump", None, time, lens)
+    predictor = contact_predictor(sequence, people, body, Config())
+    assert predictor is not None
+    assert (contact_probability(predictor, state, 30.0).max(axis=-1) > 0.5).all()
+    flies = (time > 0.3) & (time < 0.7)
+    high = np.where(flies, 9.81 / 2 * (time - 0.3) * (0.7 - time), 0.0)
+    up = high[:, None] * (R_CW @ Y)
+    jump = dataclasses.replace(state, roots=state.roots.at[0, :, :3, 3].add(up))
+    stands = contact_probability(predictor, jump, 30.0)[0].max(axis=-1)
+    middle = np.abs(time - 0.5) < 0.1
+    assert (stands[middle] == 0).all() and (stands[~flies] > 0.5).all()
 
 
 @pytest.mark.slow
