@@ -5,8 +5,9 @@
 
 Recorded jumps (CMU, in the format of `motion.read_motion`) of a person of random shape
 on level ground, seen by a camera in the hand or on a tripod at 4 m, with simulated
-measurements. `height` and `share` are of the truth: the greatest height of both feet
-over the ground, and the share of frames in which they are above 5 cm.
+measurements. Of the truth are: `height`, the greatest height of both feet over the
+ground; `share`, the share of frames in which they are above 5 cm; `found` and `false`,
+the shares of these and of the other frames that are free fall by the pelvis.
 """
 
 import argparse
@@ -16,14 +17,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from bench_static import looking
+from bench_static import UP, looking
 
 from bodyslam_jax import evaluation, motion, pipeline, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.geometry.free_fall import in_free_fall
 from bodyslam_jax.motion.capture.clips import leg_length
 from bodyslam_jax.simulation import sequences
-from bodyslam_jax.simulation.camera_paths import HANDLING, film_room
+from bodyslam_jax.simulation.camera_paths import FPS, HANDLING, film_room
 from bodyslam_jax.simulation.gait_synthesis import Soles, Walk
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.room import furnish
@@ -67,7 +69,14 @@ def scene(
         settings, clip.name, person, walk, T_WC, room, (key, bodies, points)
     )
     feet = Soles(person)(walk.poses, walk.pelvis)[..., 1].min(axis=1)
-    return simulated, {"height": feet.max(), "share": (feet > 0.05).mean()}
+    air = feet > 0.05
+    falls = in_free_fall(walk.pelvis, np.ones(len(air), bool), UP, FPS)
+    return simulated, {
+        "height": feet.max(),
+        "share": air.mean(),
+        "found": falls[air].mean(),
+        "false": falls[~air].mean(),
+    }
 
 
 def figures(

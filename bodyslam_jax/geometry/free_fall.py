@@ -12,7 +12,7 @@ from bodyslam_jax.geometry.runs import runs
 
 _FALLS = 6.0
 """Downwards acceleration from which nothing carries a person, m/s². Of recorded jumps
-it finds 41 of 47 frames in flight, and none in walks."""
+it finds 41 of 49 frames in flight, and no other (`benchmarks/bench_jumps.py`)."""
 _WINDOW = 0.2
 """Length over which the acceleration is measured, s. Places that err by 1 cm give 2
 m/s²."""

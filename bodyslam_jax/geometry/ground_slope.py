@@ -94,12 +94,7 @@ def feet_plane(
     covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
     covariance = covariance + _FEET_SYSTEMATIC**2 * np.eye(2)
     if eye is not None:
-        own = (
-            points
-            - np.array([s.mean(axis=0) for s in stances if len(s)])[
-                np.unique(people, return_inverse=True)[1]
-            ]
-        )
+        own = np.concatenate([s - s.mean(axis=0) for s in stances if len(s)])
         lean = _lean(own[:, [0, 2]], points - eye)
         covariance = covariance + np.outer(lean, lean)
     return Plane(solution[:2], covariance)

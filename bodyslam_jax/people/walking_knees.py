@@ -27,7 +27,8 @@ _DEGREE = np.pi / 180
 _USUAL, _AMONG_PEOPLE = 21.0 * _DEGREE, 4.0 * _DEGREE
 """Mean and standard deviation, among the eleven subjects of CMU's walks that train the
 motion model, of the first coordinate of the knee's rotation while that leg alone
-stands. (The leg of the body model at rest is bent by 4 degrees the other way.)"""
+stands: `tools/walking_knees.py` gives 20.4 ± 3.6, of which these are upper bounds. (The
+leg of the body model at rest is bent by 4 degrees the other way.)"""
 _GUESS = 7.0 * _DEGREE
 """Standard deviation of the lasting error of the guess: 3 degrees in rendered people,
 up to 11 in real ones."""
@@ -37,8 +38,8 @@ _LEAST = 0.1
 """Share of the frames in which each leg must stand alone, for a person to walk."""
 _SHORTEST = 0.2
 """By how much the pelvis must pass over the foot that stands, leg lengths: people who
-dance, box or walk backwards bend their knees otherwise. (A share of time, as in slow
-motion, does not count.)"""
+dance, box or walk backwards bend their knees otherwise. A length and not a speed, so
+that slow motion does not matter."""
 _RESPONSE = 0.6
 """By how much the knees of the fit follow those of the guess."""
 _ROUNDS = 2
@@ -117,15 +118,34 @@ def find_walk(
     probability, ahead = _legs(
         contacts, body, fit.orientation, poses, shape, jnp.asarray(present)
     )
-    stands = np.asarray(probability).reshape(-1, 2, 2).min(axis=-1)
-    alone = (stands > _STANDS) & (stands[:, ::-1] <= _STANDS)
+    stands = _stands(np.asarray(probability))
+    alone = alone_of(np.asarray(probability))
     if (alone[present].mean(axis=0) < _LEAST).any():
         return None
     if _stride(np.asarray(ahead), alone) < _SHORTEST:
         return None
-    bend = np.asarray(poses)[:, [3, 4], 0]
-    mean = np.mean([bend[alone[:, leg], leg].mean() for leg in range(2)])
-    return Walk(float(mean), stands)
+    return Walk(bend_of(np.asarray(poses), alone), stands)
+
+
+def _stands(probability: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 2"]:
+    """Probability of each leg to stand on toe and heel."""
+    return probability.reshape(-1, 2, 2).min(axis=-1)
+
+
+def alone_of(probability: Float[np.ndarray, "t 4"]) -> Bool[np.ndarray, "t 2"]:
+    """Frames in which each leg stands and the other does not, by the contact network's
+    probabilities."""
+    stands = _stands(probability)
+    return (stands > _STANDS) & (stands[:, ::-1] <= _STANDS)
+
+
+def bend_of(
+    body_pose: Float[np.ndarray, "t 23 3"], alone: Bool[np.ndarray, "t 2"]
+) -> float:
+    """Bend of the knee of the leg that alone stands: the first coordinate of its
+    rotation, mean over frames and of both legs, rad."""
+    bend = body_pose[:, [3, 4], 0]
+    return float(np.mean([bend[alone[:, leg], leg].mean() for leg in range(2)]))
 
 
 def _stride(ahead: Float[np.ndarray, "t 2"], alone: Bool[np.ndarray, "t 2"]) -> float:
