@@ -21,6 +21,7 @@ from bodyslam_jax.batch.job import (
 )
 from bodyslam_jax.batch.worker import CallersJax, prepared
 from bodyslam_jax.config import Config, Distribution
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 
 log = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ def run_many(
             keeps compiled programs in the user's cache if it has none here.
         estimate: in place of the pipeline, what computes a clip.
 
-    **Raises:** `ValueError`, before anything runs, if inputs or settings have mistakes,
+    **Raises:** `InputError`, before anything runs, if inputs or settings have mistakes,
     a line for each.
     """
     jobs = plan(inputs, config, Path(out), part)
@@ -87,7 +88,7 @@ def plan(
             continue
         jobs.append(Job(_absolute(one), settings, out / one.name))
     if mistakes:
-        raise ValueError("\n".join(mistakes))
+        raise InputError("\n".join(mistakes))
     _mark(out, found)
     return jobs
 
@@ -135,7 +136,7 @@ def _inputs(
     if not ready:
         return find_inputs([str(one) for one in items], config)
     if len(ready) < len(items):
-        raise ValueError("inputs: expected paths or `Input`s, not both.")
+        raise InputError("inputs: expected paths or `Input`s, not both.")
     return ready
 
 
@@ -150,7 +151,7 @@ def _absolute(one: Input) -> Input:
 def _mark(out: Path, inputs: Sequence[Input]) -> None:
     """Writes `batch.json`: the clips of the batch, which a folder shows to be one.
 
-    **Raises:** `ValueError` if the folder cannot be written.
+    **Raises:** `InputError` if the folder cannot be written.
     """
     clips = {one.name: str(one.path) for one in inputs}
     text = json.dumps({"clips": clips}, indent=0)
@@ -158,4 +159,4 @@ def _mark(out: Path, inputs: Sequence[Input]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         atomic.write_text(out / MARK, text)
     except OSError as error:
-        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from bodyslam_jax.config import Config, field_names, with_values
+from bodyslam_jax.config.errors import InputError
 
 SCALE = "scale"
 _WEIGHTS = "weights."
@@ -34,11 +35,11 @@ class Axis:
 def parse_axes(texts: Sequence[str], config: Config = Config()) -> list[Axis]:
     """The axes that texts such as `weights.human_motion=10,100` describe.
 
-    **Raises:** `ValueError` for a name that is none, a value that cannot be, or an axis
+    **Raises:** `InputError` for a name that is none, a value that cannot be, or an axis
     that repeats.
     """
     if not texts:
-        raise ValueError("--grid: found none, expected NAME=VALUE,VALUE,...")
+        raise InputError("--grid: found none, expected NAME=VALUE,VALUE,...")
     settings = set(field_names(config))
     axes: list[Axis] = []
     for text in texts:
@@ -46,9 +47,9 @@ def parse_axes(texts: Sequence[str], config: Config = Config()) -> list[Axis]:
         name = name.strip().replace("-", "_")
         values = tuple(value.strip() for value in listed.split(",") if value.strip())
         if not sign or not values:
-            raise ValueError(f"--grid {text}: expected NAME=VALUE,VALUE,...")
+            raise InputError(f"--grid {text}: expected NAME=VALUE,VALUE,...")
         if name in (axis.name for axis in axes):
-            raise ValueError(f"--grid {name}: given twice.")
+            raise InputError(f"--grid {name}: given twice.")
         is_weight = name.startswith(_WEIGHTS) and name not in settings
         axis = Axis(name, values, is_setting=not is_weight and name != SCALE)
         for value in values:
@@ -62,14 +63,14 @@ def _check(axis: Axis, value: str, config: Config) -> None:
         try:
             with_values(config, {axis.name: value.split()})
         except ValueError as error:
-            raise ValueError(f"--grid {axis.name}={value}: {error}") from None
+            raise InputError(f"--grid {axis.name}={value}: {error}") from None
         return
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not 0 < number < math.inf:
-        raise ValueError(
+        raise InputError(
             f"--grid {axis.name}: found {value!r}, expected a number above 0."
         )
 

@@ -16,6 +16,7 @@ from bodyslam_jax.batch.rows import error_columns
 from bodyslam_jax.batch.sweep_job import ERRORS, SweepJob, run_sweep
 from bodyslam_jax.batch.table import Column, Row, present
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 
 log = logging.getLogger(__name__)
@@ -35,12 +36,12 @@ def sweep(
     A clip at one point of the settings is one job: its weights and scales are solved by
     one program, and its rows are kept in `out/rows`, so that the same call continues.
 
-    **Raises:** `ValueError` if inputs have mistakes, or nothing could be solved.
+    **Raises:** `InputError` if inputs have mistakes, or nothing could be solved.
     """
     try:
         (out / "rows").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
     jobs = list(_jobs(find_inputs(inputs, config), axes, config, out.resolve()))
     files = {job.label: _file(out, job) for job in jobs}
     found = {job.label: _kept(files[job.label]) for job in jobs}
@@ -58,7 +59,7 @@ def sweep(
             log.info("%s: %d points", job.label, len(value))
     rows = [row for job in jobs for row in found[job.label] or []]
     if not rows:
-        raise ValueError(failed[0] if failed else f"{out}: nothing to solve.")
+        raise InputError(failed[0] if failed else f"{out}: nothing to solve.")
     columns = present(_columns(axes), rows)
     written = write_tables(out, columns, rows)
     sweep_plots.draw(out / "plots.png", rows, axes, columns)

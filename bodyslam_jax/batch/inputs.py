@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from bodyslam_jax.config import Config, with_options
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.io.video import VIDEO_SUFFIXES
 
@@ -35,7 +36,7 @@ class Input:
     def settings(self, config: Config) -> Config:
         """The settings of this clip.
 
-        **Raises:** `ValueError` for options that do not exist.
+        **Raises:** `InputError` for options that do not exist.
         """
         return with_options(config, self.options) if self.options else config
 
@@ -49,7 +50,7 @@ def find_inputs(
     pattern of such, or a manifest (`.csv`). Run folders and folders of batches are left
     out. Clips of the same name get the name of their folder in front.
 
-    **Raises:** `ValueError` if a source does not exist or has no clips, or if the
+    **Raises:** `InputError` if a source does not exist or has no clips, or if the
     manifest has mistakes: a line for each.
     """
     from bodyslam_jax.batch.manifest import read_manifest
@@ -64,19 +65,19 @@ def find_inputs(
             else:
                 found += [Input(safe_name(p), p) for p in _clips(path)]
     if not found:
-        raise ValueError("no inputs: expected folders, videos or a manifest (.csv).")
+        raise InputError("no inputs: expected folders, videos or a manifest (.csv).")
     return _distinct(found)
 
 
 def shard(inputs: Sequence[Input], which: str) -> list[Input]:
     """Part `I/N` of the inputs, I from 1: every N-th, so that parts are alike.
 
-    **Raises:** `ValueError` if it is no such part.
+    **Raises:** `InputError` if it is no such part.
     """
     match = re.fullmatch(r"(\d+)/(\d+)", which)
     part, parts = map(int, match.groups()) if match else (0, 0)
     if not 1 <= part <= parts:
-        raise ValueError(f"--shard {which}: expected I/N with I from 1 to N, as 2/8.")
+        raise InputError(f"--shard {which}: expected I/N with I from 1 to N, as 2/8.")
     return list(inputs[part - 1 :: parts])
 
 
@@ -96,8 +97,8 @@ def _matching(source: str | Path) -> list[Path]:
         clips = [p for p in found if p.is_dir() or _is_video(p) or p.suffix == ".csv"]
         if clips:
             return clips
-        raise ValueError(f"{source}: matches no folder, video or manifest.")
-    raise ValueError(f"{source}: no such file or folder.")
+        raise InputError(f"{source}: matches no folder, video or manifest.")
+    raise InputError(f"{source}: no such file or folder.")
 
 
 def _clips(path: Path) -> list[Path]:
@@ -108,7 +109,7 @@ def _clips(path: Path) -> list[Path]:
     children = [] if _is_result(path) else children
     found = [p for p in children if (p.is_dir() and _is_clip(p)) or _is_video(p)]
     if not found:
-        raise ValueError(
+        raise InputError(
             f"{path}: no clip, nor a folder of clips: expected videos or sequence "
             "folders in it."
         )

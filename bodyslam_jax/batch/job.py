@@ -13,6 +13,7 @@ from typing import Any, Literal
 from bodyslam_jax.batch import record
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.error_line import error_line
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
     try:
         home = job.out.parent
         if not home.is_dir():
-            raise ValueError(
+            raise InputError(
                 f"{home}: no such folder on {socket.gethostname()}; expected one that "
                 "all machines share."
             )

@@ -17,6 +17,7 @@ from typing import Any
 
 from bodyslam_jax.batch.devices import cores, gpus, memory
 from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
+from bodyslam_jax.config.errors import InputError
 
 MEMORY = 3 << 30
 """Memory that a process may need, bytes; measured in benchmarks/batch.md."""
@@ -114,7 +115,7 @@ class _Worker:
             self.process.join()
             raise _Ended(_describe(self.process.exitcode)) from None
         if kind == "setup":
-            raise ValueError(value)
+            raise InputError(value)
         self.busy = False
         return value
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from bodyslam_jax.batch.inputs import RESERVED, Input, safe_name
 from bodyslam_jax.config import Config, with_options
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera.calibration import read_camera
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.io.video import VIDEO_SUFFIXES
@@ -34,13 +35,13 @@ Row = dict[str, str]
 def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     """The inputs that a manifest lists.
 
-    **Raises:** `ValueError` with a line for each mistake: file, line, column, what was
+    **Raises:** `InputError` with a line for each mistake: file, line, column, what was
     found, what was expected.
     """
     header, lines = _table(path)
     mistakes = [f"{path}:1: {text}" for text in _wrong_header(header)]
     if mistakes:
-        raise ValueError("\n".join(mistakes))
+        raise InputError("\n".join(mistakes))
     found: list[Input] = []
     first: dict[str, int] = {}
     for number, cells in lines:
@@ -58,7 +59,7 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     if not lines:
         mistakes.append(f"{path}: no lines below the header.")
     if mistakes:
-        raise ValueError("\n".join(mistakes))
+        raise InputError("\n".join(mistakes))
     return found
 
 
@@ -67,9 +68,9 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text (byte {error.start}).") from None
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start}).") from None
     if "\0" in text:
-        raise ValueError(f"{path}: not a text table (it has zero bytes).")
+        raise InputError(f"{path}: not a text table (it has zero bytes).")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[tuple[int, list[str]]] = []
     try:
@@ -79,9 +80,9 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
                 rows.append((start, cells))
             start = reader.line_num + 1
     except csv.Error as error:
-        raise ValueError(f"{path}:{reader.line_num}: not CSV ({error}).") from None
+        raise InputError(f"{path}:{reader.line_num}: not CSV ({error}).") from None
     if not rows:
-        raise ValueError(f"{path}: empty, expected a header with the column video.")
+        raise InputError(f"{path}: empty, expected a header with the column video.")
     (_, header), *lines = rows
     return [cell.strip().lower() for cell in header], lines
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
+from bodyslam_jax.config.errors import InputError
 
 _READY = object()
 """Stands for an item where an actor is being prepared."""
@@ -40,7 +41,7 @@ class RayEngine:
                     address=self.address, log_to_driver=False, logging_level="ERROR"
                 )
             except ConnectionError as error:
-                raise ValueError(f"--ray-address {self.address}: {error}") from None
+                raise InputError(f"--ray-address {self.address}: {error}") from None
         try:
             yield from self._map(ray, function, items, setup)
         finally:
@@ -73,7 +74,7 @@ class RayEngine:
                     idle.append(actor)
                 except ray.exceptions.RayTaskError as error:
                     if item is _READY:
-                        raise ValueError(str(error.cause)) from None
+                        raise InputError(str(error.cause)) from None
                     value = Failure(" ".join(str(error.cause).split()))
                     idle.append(actor)
                 except ray.exceptions.RayError as error:
@@ -130,7 +131,7 @@ def _import_ray() -> Any:
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise ValueError(
+        raise InputError(
             "--engine ray: Ray is not installed; pip install 'bodyslam-jax[ray]'."
         ) from None
     return ray

@@ -9,6 +9,7 @@ from typing import Any
 from bodyslam_jax.batch import failures
 from bodyslam_jax.batch.inputs import MARK
 from bodyslam_jax.batch.table import Column, Row
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import ROWS
 from bodyslam_jax.evaluation.before_after import JOINT
 
@@ -63,10 +64,10 @@ def _error_key(name: str) -> str:
 def read_rows(folder: Path) -> list[Row]:
     """Rows of all clips of a batch, or of all run folders in a folder, by name.
 
-    **Raises:** `ValueError` if there are none.
+    **Raises:** `InputError` if there are none.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder.")
+        raise InputError(f"{folder}: no such folder.")
     found = {}
     for summary in sorted(folder.glob("*/summary.json")):
         row = _row(summary)
@@ -83,7 +84,7 @@ def read_rows(folder: Path) -> list[Row]:
     for name in _planned(folder):
         found.setdefault(name, {"name": name, "status": MISSING})
     if not found:
-        raise ValueError(f"{folder}: no run folders in it (no */summary.json).")
+        raise InputError(f"{folder}: no run folders in it (no */summary.json).")
     return [found[name] for name in sorted(found)]
 
 

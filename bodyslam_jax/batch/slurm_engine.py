@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
+from bodyslam_jax.config.errors import InputError
 
 log = logging.getLogger(__name__)
 TASKS = 16
@@ -121,7 +122,7 @@ class SlurmEngine:
     def _executor(self, home: Path) -> Any:
         submitit = _import_submitit()
         if self.cluster == "slurm" and shutil.which("sbatch") is None:
-            raise ValueError(
+            raise InputError(
                 "--engine slurm: no sbatch on this machine; run it on a login node of "
                 "the cluster, or use --engine local."
             )
@@ -141,7 +142,7 @@ class SlurmEngine:
             executor.update_parameters(**given)
         except (TypeError, NameError) as error:
             text = " ".join(str(error).split())
-            raise ValueError(f"--slurm: {text}") from None
+            raise InputError(f"--slurm: {text}") from None
         return executor
 
 
@@ -203,21 +204,21 @@ def read_values(file: Path, start: int) -> tuple[list[tuple[int, Any]], int]:
 
 
 def _raise_setup_error(job: Any) -> None:
-    """**Raises:** `ValueError` if the task ended because it could not be prepared."""
+    """**Raises:** `InputError` if the task ended because it could not be prepared."""
     try:
         text = str(job.exception())
     except Exception:  # Lost without a result.
         return
     lines = [line for line in text.splitlines() if SetupError.__name__ in line]
     if lines:
-        raise ValueError(lines[-1].partition(f"{SetupError.__name__}: ")[2])
+        raise InputError(lines[-1].partition(f"{SetupError.__name__}: ")[2])
 
 
 def _import_submitit() -> Any:
     try:
         import submitit  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise ValueError(
+        raise InputError(
             "--engine slurm: submitit is not installed; pip install "
             "'bodyslam-jax[slurm]'."
         ) from None

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from bodyslam_jax.config.errors import InputError
+
 _TAILS = {
     "body_pose": ((23, 3), "axis-angle of joints 1 to 23, without the root"),
     "pose": ((72,), "axis-angle of 24 joints, root first, in one axis"),
@@ -16,7 +18,7 @@ _TAILS = {
 def batch_of(function: str, **arguments: Array) -> tuple[int, ...]:
     """The shape to which the leading axes of the arguments broadcast.
 
-    **Raises:** `ValueError` naming the argument whose last axes are others than its
+    **Raises:** `InputError` naming the argument whose last axes are others than its
     own, or all leading axes if they do not broadcast.
     """
     leads = {}
@@ -25,7 +27,7 @@ def batch_of(function: str, **arguments: Array) -> tuple[int, ...]:
         shape = jnp.shape(x)
         if shape[-len(tail) :] != tail:
             expected = ", ".join(map(str, tail))
-            raise ValueError(
+            raise InputError(
                 f"{function}: `{name}` has shape {shape}, expected (..., {expected}): "
                 f"{meaning}."
             )
@@ -34,6 +36,6 @@ def batch_of(function: str, **arguments: Array) -> tuple[int, ...]:
         return np.broadcast_shapes(*leads.values())
     except ValueError:
         found = ", ".join(f"`{name}` {lead}" for name, lead in leads.items())
-        raise ValueError(
+        raise InputError(
             f"{function}: leading axes {found}, expected axes that broadcast."
         ) from None

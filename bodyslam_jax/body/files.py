@@ -25,6 +25,7 @@ from bodyslam_jax.body.skeleton import (
 )
 from bodyslam_jax.body.smpl_pickle import read_pickle
 from bodyslam_jax.body.validate import checked
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
@@ -84,7 +85,7 @@ def load_body_model(
         not contradict the name of a file. Without it a folder's neutral file.
     - `dtype`: of the arrays; by default JAX's default.
 
-    **Raises:** `ValueError`, with the paths that were tried if there is no file, or
+    **Raises:** `InputError`, with the paths that were tried if there is no file, or
     what is wrong with the file.
     """
     file = _find(path, gender)
@@ -100,7 +101,7 @@ def check(path: str | Path, gender: str | None = None) -> str:
 
     The arguments are those of `load_body_model`.
 
-    **Raises:** `ValueError`, one line, if it is not usable as a body model.
+    **Raises:** `InputError`, one line, if it is not usable as a body model.
     """
     file = _find(path, gender)
     raw = checked(file, read_arrays(file))
@@ -120,12 +121,12 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
     Pose blend shapes that the model lacks are written as zeros. The file is written
     atomically.
 
-    **Raises:** `ValueError` if the suffix of the path is not `.npz`; `OSError`, naming
+    **Raises:** `InputError` if the suffix of the path is not `.npz`; `OSError`, naming
     the path, if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
-        raise ValueError(f"{path}: suffix {path.suffix!r}, expected '.npz'.")
+        raise InputError(f"{path}: suffix {path.suffix!r}, expected '.npz'.")
     v = model.num_vertices
     weights = np.zeros((v, 24), np.asarray(model.skin_weight).dtype)
     rows = np.arange(v)[:, None]
@@ -164,10 +165,10 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
                             raise
         except Exception as error:
             found = " ".join(str(error).split())[:120]
-            raise ValueError(f"{file}: a damaged .npz file ({found}).") from None
+            raise InputError(f"{file}: a damaged .npz file ({found}).") from None
         return arrays
     if file.suffix == ".npz":
-        raise ValueError(f"{file}: not a .npz file, or cut short (no zip archive).")
+        raise InputError(f"{file}: not a .npz file, or cut short (no zip archive).")
     return read_pickle(file)
 
 
@@ -180,7 +181,7 @@ def _locations() -> list[Path]:
 def candidates(location: Path, gender: str) -> list[Path]:
     """The files of one gender that `location`, a file or folder, may stand for."""
     if gender not in _GENDERS:
-        raise ValueError(f"gender {gender!r}, expected neutral, female or male.")
+        raise InputError(f"gender {gender!r}, expected neutral, female or male.")
     if location.suffix in (".npz", ".pkl") or location.is_file():
         return [location]
     short = gender if gender == "neutral" else gender[0]
@@ -199,14 +200,14 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
         if candidate.is_file():
             of = named_gender(candidate)
             if gender and of not in (gender, None):
-                raise ValueError(
+                raise InputError(
                     f"{candidate}{note}: by its name a {of} body, expected {gender}."
                 )
             return candidate
     if path is None and wanted == "neutral" and not is_set:
         return DEFAULT
     tried = ", ".join(_tried(location, wanted) for location in locations)
-    raise ValueError(f"No {wanted} body model found{note}; tried {tried}.")
+    raise InputError(f"No {wanted} body model found{note}; tried {tried}.")
 
 
 def named_gender(file: Path) -> str | None:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import KEYPOINT_NAMES
+from bodyslam_jax.config.errors import InputError
 
 _Offsets = dict[str, tuple[float, float, float]]
 """By name without its side: out (away from the body's middle plane; to the left for a
@@ -80,11 +81,11 @@ def definition_offsets(definition: str) -> Float[np.ndarray, "25 3"]:
     """From the joint or vertex of each keypoint of BODY_25 to where a detector puts it,
     in the axes of the joint that it moves with, as a share of the stature.
 
-    **Raises:** `ValueError` for a name that is not in `KEYPOINT_DEFINITIONS`.
+    **Raises:** `InputError` for a name that is not in `KEYPOINT_DEFINITIONS`.
     """
     if definition not in _OFFSETS:
         names = ", ".join(KEYPOINT_DEFINITIONS)
-        raise ValueError(
+        raise InputError(
             f"keypoint definition {definition!r}, expected one of {names}."
         )
     out = np.zeros((25, 3))

@@ -28,6 +28,7 @@ from bodyslam_jax.body.skeleton import (
     SURFACE_POINTS,
     ancestors,
 )
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 
 _PARENT = np.array(PARENTS[1:])
@@ -39,7 +40,7 @@ def rest_joints(
 ) -> Float[Array, "*b 24 3"]:
     """Joints at rest for SMPL β, m, in the model's own frame (pelvis at `J_0(β)`).
 
-    **Raises:** `ValueError` naming an argument of another shape.
+    **Raises:** `InputError` naming an argument of another shape.
     """
     batch_of("rest_joints", shape=shape)
     moved = shape @ model.joint_shape_dirs.reshape(72, 10).T
@@ -57,7 +58,7 @@ def local_joints(
     `body_pose` holds the axis-angle rotations of joints 1 to 23, rad, each in its
     parent's frame; `shape` is SMPL β. Leading axes broadcast.
 
-    **Raises:** `ValueError` naming an argument of another shape.
+    **Raises:** `InputError` naming an argument of another shape.
     """
     batch = batch_of("local_joints", body_pose=body_pose, shape=shape)
     R = _under_root(flatten(body_pose, batch, 2))
@@ -75,7 +76,7 @@ def joints(
 
     The pelvis is at `J_0(β) + trans` whatever the pose. Leading axes broadcast.
 
-    **Raises:** `ValueError` naming an argument of another shape.
+    **Raises:** `InputError` naming an argument of another shape.
     """
     batch_of("joints", pose=pose, shape=shape, trans=trans)
     return _placed(model, pose, shape, trans, lambda posed, shape: posed.x)
@@ -98,7 +99,7 @@ def local_keypoints(
         shoulders where detectors trained on COCO put them (`DETECTOR_BIAS`); keypoints
         are linear in it.
 
-    **Raises:** `ValueError` naming an argument of another shape.
+    **Raises:** `InputError` naming an argument of another shape.
     """
     batch = batch_of("local_keypoints", body_pose=body_pose, shape=shape)
     beta = flatten(shape, batch, 1)
@@ -212,7 +213,7 @@ def _detected(model, posed, shape, layout, bias):
     """Keypoints (k, 3, n) about the pelvis."""
     if layout not in KEYPOINT_NAMES:
         layouts = ", ".join(KEYPOINT_NAMES)
-        raise ValueError(f"keypoint layout {layout!r}, expected one of {layouts}.")
+        raise InputError(f"keypoint layout {layout!r}, expected one of {layouts}.")
     names = KEYPOINT_NAMES[layout]
     surface = [n for n in names if n in SURFACE_POINTS]
     inner = [n for n in names if n not in SURFACE_POINTS]

@@ -12,6 +12,7 @@ import numpy as np
 from bodyslam_jax.body.model import BodyModel
 from bodyslam_jax.body.skeleton import JOINT_NAMES
 from bodyslam_jax.body.skinning import vertices
+from bodyslam_jax.config.errors import InputError
 
 NUM_SHAPES = 4
 """Shape components shown at ±2 standard deviations."""
@@ -53,7 +54,7 @@ POSTURES: dict[str, dict[str, tuple[float, float, float]]] = {
 def save_picture(model: BodyModel, path: str | Path) -> None:
     """Draws shape components at ±2σ and postures to an image file.
 
-    **Raises:** `ValueError` if the path has not the suffix of an image format.
+    **Raises:** `InputError` if the path has not the suffix of an image format.
     """
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
@@ -61,7 +62,7 @@ def save_picture(model: BodyModel, path: str | Path) -> None:
     suffix, formats = Path(path).suffix, sorted(figure.canvas.get_supported_filetypes())
     if suffix[1:].lower() not in formats:
         expected = ", ".join(f".{kind}" for kind in formats)
-        raise ValueError(f"{path}: suffix {suffix!r}, expected one of {expected}.")
+        raise InputError(f"{path}: suffix {suffix!r}, expected one of {expected}.")
     rows = figure.subplots(2, 1)
     trans, zero = jnp.zeros(3, model.dtype), jnp.zeros(10, model.dtype)
     columns = [(0.0, 0)] + [(s, k) for k in range(NUM_SHAPES) for s in (-2.0, 2.0)]

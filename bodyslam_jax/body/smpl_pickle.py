@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.safe_pickle import StandIn, restricted_load
 
 _LIBRARIES = ("chumpy", "scipy.sparse")
@@ -20,18 +21,18 @@ _MAX_DEPTH = 8
 def read_pickle(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a pickled dictionary, by name; what is not an array is left out.
 
-    **Raises:** `ValueError`, one line that names the file, if it is not a pickle of a
+    **Raises:** `InputError`, one line that names the file, if it is not a pickle of a
     dictionary, is cut short, or asks for anything but plain data.
     """
     content = restricted_load(path, stand_ins=_LIBRARIES)
     if not isinstance(content, dict):
         found = type(content).__name__
-        raise ValueError(f"{path}: holds a {found}, expected a dictionary of arrays.")
+        raise InputError(f"{path}: holds a {found}, expected a dictionary of arrays.")
     try:
         arrays = {str(key): _array(value) for key, value in content.items()}
     except Exception as error:  # a damaged state can fail anywhere, with any error
         what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise ValueError(f"{path}: a damaged pickle ({what}).") from None
+        raise InputError(f"{path}: a damaged pickle ({what}).") from None
     return {key: value for key, value in arrays.items() if value is not None}
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.body.skeleton import PARENTS, SURFACE_POINTS
+from bodyslam_jax.config.errors import InputError
 
 _NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 
@@ -16,13 +17,13 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     `parents` (parent of each joint, -1 for the root) is added, and `picks` (vertices of
     `SURFACE_POINTS`) if the file has a header that names them.
 
-    **Raises:** `ValueError`, one line: the file, what was found, what was expected.
+    **Raises:** `InputError`, one line: the file, what was found, what was expected.
     """
     missing = [name for name in _NEEDED if name not in raw]
     if missing:
         found = ", ".join(sorted(raw)[:12]) or "nothing"
         lacks = ", ".join(missing)
-        raise ValueError(f"{file}: not a body model: no {lacks}; found {found}.")
+        raise InputError(f"{file}: not a body model: no {lacks}; found {found}.")
     number = lambda name: _numbers(file, name, raw[name])
     template, weights = number("v_template"), number("weights")
     v = len(template)
@@ -30,7 +31,7 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     j = weights.shape[-1]
     _expect(file, "weights", weights, weights.shape == (v, j), f"({v}, joints)")
     if j not in (24, 52, 55):
-        raise ValueError(
+        raise InputError(
             f"{file}: {j} joints, expected 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)."
         )
     out = {"v_template": template, "weights": weights}
@@ -48,16 +49,16 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     _sums_to_one(file, "weights", weights, 1e-3)
     _sums_to_one(file, "J_regressor", regressor, 2e-2)
     if (weights < -1e-6).any():
-        raise ValueError(f"{file}: weights has negative entries, expected 0 to 1.")
+        raise InputError(f"{file}: weights has negative entries, expected 0 to 1.")
     stature = float(np.ptp(template[:, 1]))
     if not 0.2 < stature < 4:
-        raise ValueError(
+        raise InputError(
             f"{file}: the body is {stature:.3g} m tall (y axis), expected 0.2 to 4 m."
         )
     out["f"] = faces = _integers(file, "f", raw["f"])
     _expect(file, "f", faces, faces.ndim == 2 and faces.shape[1] == 3, "(faces, 3)")
     if faces.size and (faces.min() < 0 or faces.max() >= v):
-        raise ValueError(
+        raise InputError(
             f"{file}: f names vertex {faces.max()}, expected 0 to {v - 1}."
         )
     out["parents"] = np.array(_parents(file, raw["kintree_table"], j))
@@ -68,7 +69,7 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _expect(file, name, array, is_right, expected) -> None:
     if not is_right:
-        raise ValueError(
+        raise InputError(
             f"{file}: {name} has shape {array.shape}, expected {expected}."
         )
 
@@ -76,13 +77,13 @@ def _expect(file, name, array, is_right, expected) -> None:
 def _numbers(file, name, array) -> np.ndarray:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
-        raise ValueError(f"{file}: {name} is of type {found}, expected real numbers.")
+        raise InputError(f"{file}: {name} is of type {found}, expected real numbers.")
     if array.ndim == 0:
-        raise ValueError(f"{file}: {name} is a single number, expected an array.")
+        raise InputError(f"{file}: {name} is a single number, expected an array.")
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
         count = int((~np.isfinite(array)).sum())
-        raise ValueError(
+        raise InputError(
             f"{file}: {name} has {count} entries that are NaN or infinite."
         )
     return array
@@ -91,14 +92,14 @@ def _numbers(file, name, array) -> np.ndarray:
 def _integers(file, name, array) -> np.ndarray:
     array = _numbers(file, name, array)
     if (array != np.round(array)).any():
-        raise ValueError(f"{file}: {name} has fractions, expected whole numbers.")
+        raise InputError(f"{file}: {name} has fractions, expected whole numbers.")
     return array.astype(np.int64)
 
 
 def _sums_to_one(file, name, rows, tolerance) -> None:
     worst = float(np.abs(rows.sum(-1) - 1).max())
     if worst > tolerance:
-        raise ValueError(
+        raise InputError(
             f"{file}: rows of {name} sum to 1 only within {worst:.2g}, "
             f"expected {tolerance:g}."
         )
@@ -117,13 +118,13 @@ def _parents(file, table, num_joints) -> list[int]:
         while joint > 0 and steps <= num_joints:
             joint, steps = parents[joint], steps + 1
         if steps > num_joints:
-            raise ValueError(
+            raise InputError(
                 f"{file}: kintree_table is not a tree: joint {start} never reaches "
                 "the root (a cycle)."
             )
     count = 24 if num_joints == 24 else 22
     if tuple([-1, *parents[1:count]]) != PARENTS[:count] or parents[0] not in (-1, 0):
-        raise ValueError(
+        raise InputError(
             f"{file}: kintree_table is not SMPL's tree: parents {parents[:count]}, "
             f"expected {list(PARENTS[:count])}."
         )
@@ -136,9 +137,9 @@ def _picks(file, header, num_vertices) -> np.ndarray:
         named = json.loads(str(header))["keypoints"]
         picks = np.array([named[name] for name in SURFACE_POINTS], np.int64)
     except (ValueError, KeyError, TypeError, OverflowError):
-        raise ValueError(f"{file}: its header does not name the keypoints.") from None
+        raise InputError(f"{file}: its header does not name the keypoints.") from None
     if picks.min() < 0 or picks.max() >= num_vertices:
-        raise ValueError(
+        raise InputError(
             f"{file}: its header names vertex {picks.max()} of {num_vertices}."
         )
     return picks

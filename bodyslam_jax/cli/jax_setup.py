@@ -10,6 +10,7 @@ from typing import Any
 from bodyslam_jax.batch.program_cache import user_folder
 from bodyslam_jax.cli import interrupts
 from bodyslam_jax.cli.memory import return_memory
+from bodyslam_jax.config.errors import InputError
 
 _COLLECT_AFTER = 50_000
 """New objects between two collections of reference cycles. Tracing makes millions of
@@ -22,7 +23,7 @@ def prepare(device: str | None) -> None:
     Args:
         device: `cpu`, `gpu`, or `None` for JAX's default device.
 
-    **Raises:** `ValueError` if a GPU is requested and JAX finds none.
+    **Raises:** `InputError` if a GPU is requested and JAX finds none.
     """
     set_compiler_flags()
     with interrupts.deferred():
@@ -69,7 +70,7 @@ def _choose_device(device: str | None) -> None:
         try:
             jax.config.update("jax_default_device", jax.devices("gpu")[0])
         except RuntimeError:
-            raise ValueError(
+            raise InputError(
                 "--device gpu: JAX finds no GPU; install its build for one "
                 "(pip install 'jax[cuda13]'), or leave the option out."
             ) from None

@@ -12,12 +12,13 @@ from typing import Any
 
 from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.config import Config, MotionTraining
+from bodyslam_jax.config.errors import InputError
 
 
 def base_config(argv: list[str]) -> Config:
     """The settings that `--preset` and `--settings` select.
 
-    **Raises:** `ValueError` if the file is not a config.yaml.
+    **Raises:** `InputError` if the file is not a config.yaml.
     """
 
     config = Config.paper() if _is_paper(argv) else Config()
@@ -43,20 +44,20 @@ def option(argv: list[str], flag: str) -> str | None:
 def read_settings(path: Path, base: Config) -> Config:
     """`base` changed by a config.yaml.
 
-    **Raises:** `ValueError`, naming file and key, if it is not one.
+    **Raises:** `InputError`, naming file and key, if it is not one.
     """
     import yaml
 
     try:
         found = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not YAML ({error}).") from error
+        raise InputError(f"{path}: not YAML ({error}).") from error
     return _merged(found, base, str(path))
 
 
 def _merged(found: Any, base: Any, where: str) -> Any:
     if not isinstance(found, dict):
-        raise ValueError(f"{where}: found {found!r}, expected settings by name.")
+        raise InputError(f"{where}: found {found!r}, expected settings by name.")
     known = {field.name for field in dataclasses.fields(base)}
     hints = typing.get_type_hints(type(base))
     changes = {}
@@ -64,7 +65,7 @@ def _merged(found: Any, base: Any, where: str) -> Any:
         if name not in known:
             close = difflib.get_close_matches(str(name), known, n=1)
             hint = f"did you mean `{close[0]}`?" if close else ""
-            raise ValueError(
+            raise InputError(
                 f"{where}: no setting `{name}`; "
                 f"{hint or f'expected one of {sorted(known)}.'}"
             )
@@ -77,7 +78,7 @@ def _merged(found: Any, base: Any, where: str) -> Any:
         elif isinstance(old, tuple) and isinstance(value, list):
             value = tuple(value)
         elif old is not None and value is not None and type(value) is not type(old):
-            raise ValueError(
+            raise InputError(
                 f"{where}: {name}: found {value!r}, expected {type(old).__name__} as "
                 f"in {old!r}."
             )
@@ -85,7 +86,7 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     try:
         return dataclasses.replace(base, **changes)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        raise InputError(f"{where}: {error}") from None
 
 
 def prepared(

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Literal
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, check
+from bodyslam_jax.config.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +38,12 @@ class Distribution:
     def slurm_parameters(self) -> dict[str, int | str]:
         """`slurm` by name, whole numbers as such.
 
-        **Raises:** `ValueError` for an entry without `=`.
+        **Raises:** `InputError` for an entry without `=`.
         """
         found: dict[str, int | str] = {}
         for entry in self.slurm:
             name, sign, value = entry.partition("=")
             if not sign or not name or not value:
-                raise ValueError(f"slurm: found {entry!r}, expected NAME=VALUE.")
+                raise InputError(f"slurm: found {entry!r}, expected NAME=VALUE.")
             found[name] = int(value) if value.isdigit() else value
         return found

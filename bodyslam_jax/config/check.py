@@ -8,6 +8,8 @@ import typing
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from bodyslam_jax.config.errors import InputError
+
 Range = tuple[int | float, int | float]
 SHARE: Range = (0, 1)
 NOT_NEGATIVE: Range = (0, math.inf)
@@ -25,7 +27,7 @@ def check(
     the largest value. Those named in `infinite` may be infinite: a standard deviation
     that disables a term. Arrays are not checked: JAX may be tracing them.
 
-    **Raises:** `ValueError` that names the setting, what was found and what was
+    **Raises:** `InputError` that names the setting, what was found and what was
     expected.
     """
     hints = typing.get_type_hints(type(settings))
@@ -39,7 +41,7 @@ def check(
             continue
         expected = _refused(found, hints[field.name], ranges.get(field.name))
         if expected:
-            raise ValueError(f"{field.name}: found {found!r}, expected {expected}.")
+            raise InputError(f"{field.name}: found {found!r}, expected {expected}.")
 
 
 def _refused(found: Any, kind: Any, within: Range | None) -> str | None:

@@ -11,6 +11,7 @@ import re
 from typing import Literal, NamedTuple
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, check
+from bodyslam_jax.config.errors import InputError
 
 HEIGHT_SIGMA = 0.02
 """m. Self-reported statures are 1 cm too tall on average and scatter by 2 cm
@@ -86,34 +87,34 @@ class Known:
     def check_known(self) -> None:
         """Refuses impossible values and combinations.
 
-        **Raises:** `ValueError` that names the option, what was found and what was
+        **Raises:** `InputError` that names the option, what was found and what was
         expected.
         """
         check(self, RANGES)
         self.heights()
         if self.focal is not None and self.fov is not None:
-            raise ValueError("focal and fov: both given, expected one of them.")
+            raise InputError("focal and fov: both given, expected one of them.")
         self.focal_length(1000)
         if self.start is not None and self.end is not None and self.end <= self.start:
-            raise ValueError(
+            raise InputError(
                 f"end: found {self.end:g} s, expected more than start, "
                 f"{self.start:g} s."
             )
         if self.gravity and (len(self.gravity) != 3 or not any(self.gravity)):
-            raise ValueError(
+            raise InputError(
                 f"gravity: found {self.gravity}, expected a direction of 3 numbers."
             )
         if self.camera_path_metric and self.camera_path is None:
-            raise ValueError("camera_path_metric: expected a camera_path beside it.")
+            raise InputError("camera_path_metric: expected a camera_path beside it.")
         if self.static_camera and self.camera_path is not None:
-            raise ValueError("static_camera and camera_path: expected one of them.")
+            raise InputError("static_camera and camera_path: expected one of them.")
 
     def heights(self) -> dict[int | None, Measured]:
         """Statures, m, by the person's number.
 
         A stature given without a number applies to all other people; its key is `None`.
 
-        **Raises:** `ValueError` if an entry cannot be parsed, is not between 0.4 and
+        **Raises:** `InputError` if an entry cannot be parsed, is not between 0.4 and
         2.8 m, or repeats a person.
         """
         found: dict[int | None, Measured] = {}
@@ -122,17 +123,17 @@ class Known:
             person = None
             if who:
                 if not who.strip().isdigit():
-                    raise ValueError(
+                    raise InputError(
                         f"height: found {text!r}, expected PERSON=METRES as in 0=1.78."
                     )
                 person = int(who)
             height = _measured("height", number, HEIGHT_SIGMA, "METRES or METRES±SIGMA")
             if not 0.4 <= height.value <= 2.8:
-                raise ValueError(
+                raise InputError(
                     f"height: found {height.value:g}, expected 0.4 to 2.8 m."
                 )
             if person in found:
-                raise ValueError(f"height: {text!r}, but that person's was given.")
+                raise InputError(f"height: {text!r}, but that person's was given.")
             found[person] = height
         return found
 
@@ -141,13 +142,13 @@ class Known:
         if self.focal is not None:
             found = _measured("focal", self.focal, None, "PIXELS or PIXELS±SIGMA")
             if not 0 < found.value < math.inf:
-                raise ValueError(f"focal: found {found.value:g}, expected more than 0.")
+                raise InputError(f"focal: found {found.value:g}, expected more than 0.")
             return _or_share(found, FOCAL_SIGMA)
         if self.fov is None:
             return None
         angle = _measured("fov", self.fov, None, "DEGREES or DEGREES±SIGMA")
         if not _NARROWEST <= angle.value <= _WIDEST:
-            raise ValueError(
+            raise InputError(
                 f"fov: found {angle.value:g}, expected {_NARROWEST:g} to {_WIDEST:g} "
                 "degrees."
             )
@@ -172,9 +173,9 @@ def _measured(name: str, text: str, sigma: float | None, expected: str) -> Measu
     except ValueError:
         numbers = []
     if len(numbers) not in (1, 2) or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{name}: found {text!r}, expected {expected}.")
+        raise InputError(f"{name}: found {text!r}, expected {expected}.")
     if len(numbers) == 1:
         return Measured(numbers[0], math.nan if sigma is None else sigma)
     if numbers[1] <= 0:
-        raise ValueError(f"{name}: {text!r} has no positive standard deviation.")
+        raise InputError(f"{name}: {text!r} has no positive standard deviation.")
     return Measured(*numbers)

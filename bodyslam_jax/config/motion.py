@@ -4,6 +4,7 @@ import dataclasses
 from typing import Literal
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, SHARE, check
+from bodyslam_jax.config.errors import InputError
 
 _SHARES = "future averaging clean_share"
 _MAY_BE_0 = (
@@ -83,7 +84,7 @@ class MotionTraining:
         # The range of JAX's random keys.
         check(self, ranges | {"seed": (-(2**63), 2**63 - 1)})
         if not self.sliding and self.steps > 1:
-            raise ValueError(
+            raise InputError(
                 f"steps: found {self.steps}, expected 1 where windows may not overlap "
                 "(`sliding` false): those of a segment do."
             )

@@ -8,6 +8,8 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
+from bodyslam_jax.config.errors import InputError
+
 S = TypeVar("S")
 _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 
@@ -15,12 +17,12 @@ _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 def with_options(settings: S, text: str) -> S:
     """The settings changed by options as the command line has them.
 
-    **Raises:** `ValueError`, one line, for an option or value that does not exist.
+    **Raises:** `InputError`, one line, for an option or value that does not exist.
     """
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise ValueError(f"options: found {text!r} ({error}).") from None
+        raise InputError(f"options: found {text!r} ({error}).") from None
     return with_values(settings, dict(_grouped(words)))
 
 
@@ -63,7 +65,7 @@ def _grouped(words: Sequence[str]) -> list[tuple[str, list[str]]]:
         elif found:
             found[-1][1].append(word)
         else:
-            raise ValueError(f"options: found {word!r}, expected --OPTION VALUE.")
+            raise InputError(f"options: found {word!r}, expected --OPTION VALUE.")
     return found
 
 
@@ -84,7 +86,7 @@ def _parsed_field(settings: Any, name: str, texts: list[str]) -> list[Any]:
         wrong = ".".join([*stages, field])
         close = difflib.get_close_matches(wrong, field_names(settings), n=1)
         hint = f"; did you mean --{close[0].replace('_', '-')}?" if close else "."
-        raise ValueError(f"no option --{name}{hint}")
+        raise InputError(f"no option --{name}{hint}")
     kind = typing.get_type_hints(type(within))[field]
     return [*stages, field, _parsed(kind, texts, name)]
 
@@ -112,16 +114,16 @@ def _parsed(kind: Any, values: Sequence[str], name: str) -> Any:
     if kind is bool and not values:
         return True
     if len(values) != 1:
-        raise ValueError(f"--{name}: found {' '.join(values)!r}, expected one value.")
+        raise InputError(f"--{name}: found {' '.join(values)!r}, expected one value.")
     (text,) = values
     if kind is bool:
         if text.lower() not in _SWITCH:
-            raise ValueError(f"--{name}: found {text!r}, expected yes or no.")
+            raise InputError(f"--{name}: found {text!r}, expected yes or no.")
         return _SWITCH[text.lower()]
     if kind in (int, float):
         try:
             return kind(text)
         except ValueError:
             what = "a whole number" if kind is int else "a number"
-            raise ValueError(f"--{name}: found {text!r}, expected {what}.") from None
+            raise InputError(f"--{name}: found {text!r}, expected {what}.") from None
     return text

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 
 Alignment = Literal["A1", "A2", "A3", "A4"]
@@ -181,11 +182,11 @@ def align(
     appendix B. Frames of weight 0 are ignored; the others have weight 1. A4 aligns a
     single pose, which does not determine a scale.
 
-    **Raises:** `ValueError` for A4 with scale and for any other name.
+    **Raises:** `InputError` for A4 with scale and for any other name.
     """
     if alignment == "A4":
         if with_scale:
-            raise ValueError("Alignment A4 sets one pose, which fixes no scale.")
+            raise InputError("Alignment A4 sets one pose, which fixes no scale.")
         both = align_first(true_cameras, cameras, camera_weights)
         return both, both
     y, x = true_cameras[:, :3, 3], cameras[:, :3, 3]
@@ -202,4 +203,4 @@ def align(
         return camera, camera
     if alignment == "A1":
         return camera, umeyama(true_centres, centres, centre_weights, with_scale)
-    raise ValueError(f"Alignment {alignment!r}, not one of A1, A2, A3, A4.")
+    raise InputError(f"Alignment {alignment!r}, not one of A1, A2, A3, A4.")

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.body import BodyModel, joints, keypoints
 from bodyslam_jax.body.skeleton import ANKLES_AND_FEET, BODY25_TOES_AND_HEELS, PELVIS
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.alignment import align
 from bodyslam_jax.evaluation.errors import (
     NOBODY,
@@ -48,13 +49,13 @@ def evaluate(
     `jax.jit(jax.vmap(evaluate))(*stack_pairs(pairs))`. Lengths are padded to a few
     (`padding.bucket`), each compiled once.
 
-    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other,
+    **Raises:** `InputError` if no frame of one is at the time of a frame of the other,
     or the two are of different kinds.
     """
     if isinstance(result, Trajectories) and isinstance(truth, Trajectories):
         return _evaluate(to_bucket(result), to_bucket(truth))
     if not isinstance(result, Result) or not isinstance(truth, Result):
-        raise ValueError("Evaluate two `Result`s or two `Trajectories`, not one each.")
+        raise InputError("Evaluate two `Result`s or two `Trajectories`, not one each.")
     pair = _associate(result, truth, body, offset)
     length = bucket(len(pair.estimate.available))
     found = _evaluate(
@@ -75,11 +76,11 @@ def stack_pairs(
     Pairs with fewer frames or people than others get masked ones; errors of people whom
     a pair lacks are NaN.
 
-    **Raises:** `ValueError` if there is no pair, and as `associate`.
+    **Raises:** `InputError` if there is no pair, and as `associate`.
     """
     associated = [associate(result, truth, body) for result, truth in pairs]
     if not associated:
-        raise ValueError("No pair of a result and a truth to stack.")
+        raise InputError("No pair of a result and a truth to stack.")
     frames = bucket(max(len(truth.camera_valid) for _, truth in associated))
     people = max(len(truth.present) for _, truth in associated)
     estimates, truths = (
@@ -111,7 +112,7 @@ def associate(
     Feet: toes and heels of `body` if both sides' joints are that body's, else the ankle
     and foot joints.
 
-    **Raises:** `ValueError` if no frame of one is at the time of a frame of the other.
+    **Raises:** `InputError` if no frame of one is at the time of a frame of the other.
     """
     pair = _associate(result, truth, body, offset)
     return pair.estimate.trajectories(pair.fps), pair.truth.trajectories(pair.fps)
@@ -142,7 +143,7 @@ def _associate(
     true = resample(samples_of(truth, true_feet), truth.timestamps, at)
     overlap = np.flatnonzero(found.available & true.available)
     if not len(overlap):
-        raise ValueError(
+        raise InputError(
             f"The result spans {_span(times)}, the ground truth "
             f"{_span(truth.timestamps)}: no frame of one is within half a frame of the "
             "other; `offset` (s; `--offset`) shifts the result's clock."

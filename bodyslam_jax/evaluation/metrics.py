@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.alignment import (
     Similarity,
     similarity_from_moments,
@@ -176,7 +177,7 @@ def _chunks(valid: Bool[Array, " t"], chunking: Chunking):
     if chunking == "wham":
         return rank // CHUNK, rank % CHUNK, valid
     if chunking != "tram":
-        raise ValueError(f"Chunking {chunking!r}, not 'wham' or 'tram'.")
+        raise InputError(f"Chunking {chunking!r}, not 'wham' or 'tram'.")
     num_valid = jnp.sum(valid)
     num_chunks = (num_valid - 1) // CHUNK
     end = jnp.where(num_valid % CHUNK == 0, num_chunks * CHUNK, num_valid - 1)

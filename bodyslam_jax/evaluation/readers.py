@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.resampling import bracket, interpolate_poses
 from bodyslam_jax.io import read_tum as read_tum
 from bodyslam_jax.types import Result
@@ -43,7 +44,7 @@ def read_result(path: Path) -> Result:
     arrays = load_npz(file)
     missing = [name for name in _RUN_FIELDS if name not in arrays]
     if missing:
-        raise ValueError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
+        raise InputError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
     sizes: dict[str, int] = {}
     for name, axes in _RUN_FIELDS.items():
         shape = arrays[name].shape
@@ -52,7 +53,7 @@ def read_result(path: Path) -> Result:
             for n, axis in zip(shape, axes, strict=True)
         )
         if not fits:
-            raise ValueError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
+            raise InputError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
         _check_finite(file, name, arrays[name])
     summary_file = file.with_name("summary.json")
     summary = _read_summary(summary_file) if summary_file.exists() else {}
@@ -69,9 +70,9 @@ def _read_summary(file: Path) -> dict[str, Any]:
     try:
         summary = json.loads(file.read_text())
     except ValueError as error:
-        raise ValueError(f"{file}: not readable as JSON ({error}).") from None
+        raise InputError(f"{file}: not readable as JSON ({error}).") from None
     if not isinstance(summary, dict):
-        raise ValueError(f"{file}: {type(summary).__name__}, expected an object.")
+        raise InputError(f"{file}: {type(summary).__name__}, expected an object.")
     return summary
 
 
@@ -104,7 +105,7 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     else:
         cameras, bodies, landmarks = [path], [], None
     if not cameras and not bodies:
-        raise ValueError(f"{path}: neither camera.txt nor body.npz in this folder.")
+        raise InputError(f"{path}: neither camera.txt nor body.npz in this folder.")
     people = [read_body(file, body) for file in bodies]
     camera = read_tum(cameras[0]) if cameras else None
     times, T_WC = _timeline(camera, people)
@@ -198,37 +199,37 @@ def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
     rate = next((n for n in _RATES if n in arrays), None)
     if missing or rate is None:
         missing += [] if rate else [_RATES[0]]
-        raise ValueError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
+        raise InputError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
     for name in {"poses", "trans", "betas", "joints", "present", rate} & set(arrays):
         if arrays[name].dtype.kind not in "fiub":
-            raise ValueError(
+            raise InputError(
                 f"{path}: {name} is of type {arrays[name].dtype}, no number."
             )
     if arrays[rate].size != 1:
-        raise ValueError(f"{path}: {rate} is {arrays[rate].tolist()}, not one number.")
+        raise InputError(f"{path}: {rate} is {arrays[rate].tolist()}, not one number.")
     poses, trans = _float(arrays["poses"]), _float(arrays["trans"])
     betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate].item())
     num = len(poses) if poses.ndim == 2 else -1
     if num < 1 or poses.shape[1] < 66 or trans.shape != (num, 3):
-        raise ValueError(
+        raise InputError(
             f"{path}: poses {poses.shape}, trans {trans.shape}, not (t, 72), (t, 3)."
         )
     if not 1 <= fps <= 1000:
-        raise ValueError(f"{path}: {rate} is {fps}, not a frame rate in 1/s.")
+        raise InputError(f"{path}: {rate} is {fps}, not a frame rate in 1/s.")
     if poses.shape[1] != 72:
         poses = np.concatenate([poses[:, :66], np.zeros((num, 6))], 1)
     betas = np.pad(betas[:10], (0, max(0, 10 - len(betas))))
     if "joints" in arrays:
         found = _float(arrays["joints"])
         if found.shape != (num, 24, 3):
-            raise ValueError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
+            raise InputError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
     else:
         found = posed_joints(body, poses, betas, trans)
     for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
         _check_finite(path, name, array)
     present = np.ravel(arrays.get("present", np.ones(num))).astype(bool)
     if len(present) != num:
-        raise ValueError(f"{path}: present {present.shape}, not {(num,)}.")
+        raise InputError(f"{path}: present {present.shape}, not {(num,)}.")
     return {
         "poses": poses,
         "trans": trans,
@@ -268,9 +269,9 @@ def _landmarks(path: Path | None) -> np.ndarray:
     try:
         found = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: not a readable .npy file ({error}).") from None
+        raise InputError(f"{path}: not a readable .npy file ({error}).") from None
     if found.ndim != 2 or found.shape[1] != 3:
-        raise ValueError(f"{path}: shape {found.shape}, expected (landmarks, 3).")
+        raise InputError(f"{path}: shape {found.shape}, expected (landmarks, 3).")
     _check_finite(path, "landmarks", found)
     return _float(found)
 
@@ -282,7 +283,7 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as archive:
             return {n: archive[n] for n in archive.files if n not in _OBJECTS}
     except _UNREADABLE as error:
-        raise ValueError(f"{path}: not a readable .npz file ({error}).") from None
+        raise InputError(f"{path}: not a readable .npz file ({error}).") from None
 
 
 _UNREADABLE = (
@@ -301,4 +302,4 @@ def _float(array: Any) -> np.ndarray:
 
 def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
     if array.dtype.kind not in "fiub" or not np.all(np.isfinite(array)):
-        raise ValueError(f"{path}: {name} holds values that are not finite numbers.")
+        raise InputError(f"{path}: {name} holds values that are not finite numbers.")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.errors import Trajectories
 from bodyslam_jax.evaluation.padding import padded_frames
 from bodyslam_jax.geometry import so3_numpy as so3
@@ -129,10 +130,10 @@ def resample(
 ) -> Samples:
     """The samples, which are at `times` (s), at the moments of `at` (s).
 
-    **Raises:** `ValueError` if there is no frame.
+    **Raises:** `InputError` if there is no frame.
     """
     if not len(times):
-        raise ValueError("A result without frames cannot be evaluated.")
+        raise InputError("A result without frames cannot be evaluated.")
     between = bracket(times, at)
     before, after, weight = between.before, between.after, between.weight
 

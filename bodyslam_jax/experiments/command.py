@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bodyslam_jax.batch.engine import Engine, Failure, Setup
 from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.jobs import Plan, check_files
 from bodyslam_jax.experiments.plans import PLANS
 from bodyslam_jax.experiments.row_cache import Journal, Row
@@ -32,17 +33,17 @@ def run_experiment(
         engine: computes the rows elsewhere, in processes that `setup` prepares; `out`
             is then a folder that they see. Without it, this process does.
 
-    **Raises:** `ValueError` if there is no such experiment, if `out` cannot be written,
+    **Raises:** `InputError` if there is no such experiment, if `out` cannot be written,
     or if no row could be computed; `ValueError` or `FileNotFoundError`, before anything
     is computed, if a file that the settings name cannot be used.
     """
     if name not in PLANS:
-        raise ValueError(f"no experiment {name!r}; expected one of {sorted(PLANS)}.")
+        raise InputError(f"no experiment {name!r}; expected one of {sorted(PLANS)}.")
     check_files(experiment, config)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
     if engine is not None:
         out = out.resolve()
     plan = PLANS[name](experiment, config, out / "stages")
@@ -84,7 +85,7 @@ def run_experiment(
         if job in missing or job is plan.jobs[-1]:
             written = plan.write(out, rows)
     if not rows:
-        raise ValueError(f"{name}: no row could be computed; see above.")
+        raise InputError(f"{name}: no row could be computed; see above.")
     return written or plan.write(out, rows)
 
 

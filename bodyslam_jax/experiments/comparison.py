@@ -11,6 +11,7 @@ import numpy as np
 
 from bodyslam_jax import evaluation, graph, people
 from bodyslam_jax.body.skeleton import BODY25_ANKLES
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.ablation import as_published
 from bodyslam_jax.experiments.problems import with_scale, without_map
 from bodyslam_jax.experiments.scenario import score_of
@@ -45,7 +46,7 @@ def compare_methods(case: Case) -> dict[str, Any]:
     prepared = case.prepare()
     alone = prepared.state
     if not prepared.moving:
-        raise ValueError(f"{case.name}: the camera does not move; nothing to compare.")
+        raise InputError(f"{case.name}: the camera does not move; nothing to compare.")
     solution, stage = solve_stage(prepared.problem, alone, case.config, "joint")
     full = hold_standing_feet(
         prepared, solution.state, case.sequence, case.cameras, case.body, case.config
@@ -122,7 +123,7 @@ def depth_scale(case: Case) -> float:
     """
     cameras, keypoints = case.cameras, case.sequence.keypoints
     if keypoints is None:
-        raise ValueError(f"{case.name}: no keypoints, so no feet to look for.")
+        raise InputError(f"{case.name}: no keypoints, so no feet to look for.")
     tracks, T_WC = cameras.tracks, cameras.T_WC
     pelvis = people.roots_from_bodies(case.bodies, case.body).T_CH[0, :, 2, 3]
     found = []

@@ -9,6 +9,7 @@ from typing import Any
 from bodyslam_jax import body as body_
 from bodyslam_jax import motion
 from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.pipeline.case import Case, simulate_case
@@ -46,7 +47,7 @@ def check_files(experiment: Experiment, config: Config) -> None:
     **Raises:** `FileNotFoundError` or `ValueError`, naming the file or the option.
     """
     if experiment.frames is not None and experiment.frames < 2:
-        raise ValueError(
+        raise InputError(
             f"--frames {experiment.frames}: a sequence needs 2 frames or more."
         )
     if experiment.motion is not None:
@@ -59,7 +60,7 @@ def check_files(experiment: Experiment, config: Config) -> None:
         try:
             motion.check_compatible(model, body, model.fps)
         except ValueError as error:
-            raise ValueError(f"{file or 'the default'}: {error}") from None
+            raise InputError(f"{file or 'the default'}: {error}") from None
 
 
 def named(settings: Simulation) -> str:

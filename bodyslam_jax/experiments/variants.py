@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool
 from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.problems import rebuild
 from bodyslam_jax.initialisation import upright_factor
 
@@ -104,7 +105,7 @@ def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
     for factor in problem.factors:  # with frozen predictions there is no motion model
         if isinstance(factor, graph.KeypointReprojection):
             return factor.body, jnp.isfinite(factor.sigma).any(axis=-1)
-    raise ValueError("the problem has no people; expected a moving person.")
+    raise InputError("the problem has no people; expected a moving person.")
 
 
 FULL = "full"

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.problems import without_map
 from bodyslam_jax.experiments.scoring import errors
 from bodyslam_jax.pipeline import stage_cache
@@ -107,11 +108,11 @@ def reweighted(
 ) -> graph.Problem:
     """The problem with the standard deviations of its terms times `exp(log)`.
 
-    **Raises:** `ValueError` for a name that is not among `WEIGHTS`.
+    **Raises:** `InputError` for a name that is not among `WEIGHTS`.
     """
     unknown = set(names) - set(WEIGHTS)
     if unknown:
-        raise ValueError(f"weights {sorted(unknown)}, expected of {list(WEIGHTS)}.")
+        raise InputError(f"weights {sorted(unknown)}, expected of {list(WEIGHTS)}.")
     factors = list(problem.factors)
     for name, value in zip(names, log, strict=True):
         kind, field = WEIGHTS[name]
@@ -188,10 +189,10 @@ def learn_weights(
     each step is stored in the file `progress`, from which interrupted learning resumes
     with the same result.
 
-    **Raises:** `ValueError` if there is no trial, or if `progress` has other weights.
+    **Raises:** `InputError` if there is no trial, or if `progress` has other weights.
     """
     if not trials:
-        raise ValueError("no sequence to learn from.")
+        raise InputError("no sequence to learn from.")
     names = names or names_of(trials[0].problem)
     value = jnp.zeros(len(names))
     method = optax.adam(rate)
@@ -254,6 +255,6 @@ def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
         log.warning("%s: not readable (%s); learnt from the start", progress, error)
         return None
     if kept.names != names:
-        raise ValueError(f"{progress}: weights {kept.names}, expected {names}.")
+        raise InputError(f"{progress}: weights {kept.names}, expected {names}.")
     log.info("weights: %d steps taken from an earlier run", len(kept.history))
     return kept

@@ -21,6 +21,7 @@ import trimesh
 import yaml
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
 from bodyslam_jax.types import Result
 
@@ -40,21 +41,21 @@ def check_folder(
         source: the input of the run, with the keys of `input` in `summary.json`.
         begun_for: the input of an unfinished run in `folder`.
 
-    **Raises:** `ValueError` naming the folder and what is wrong with it: not writable,
+    **Raises:** `InputError` naming the folder and what is wrong with it: not writable,
     a full disk, files that are not of a run, or the run of another input.
     """
     owner = begun_for or _finished_for(folder)
     if owner is None:
         theirs = sorted(file.name for p in _OWN for file in folder.glob(p))
         if theirs:
-            raise ValueError(
+            raise InputError(
                 f"{folder}: has {', '.join(theirs[:3])}, but is not the folder of a "
                 "run; give another folder."
             )
     elif source and (differ := [k for k in source if owner.get(k) != source[k]]):
         was = ", ".join(f"{k} {owner.get(k)}" for k in differ)
         now = ", ".join(f"{k} {source[k]}" for k in differ)
-        raise ValueError(
+        raise InputError(
             f"{folder}: is the run of another input ({was}, not {now}); give another "
             "folder, or delete this one."
         )
@@ -77,7 +78,7 @@ def run_folder(folder: Path) -> Iterator[Path]:
     Files of an earlier run are then removed, others (the stage cache) are kept. If the
     block raises, what it wrote is deleted and `folder` is as it was.
 
-    **Raises:** `ValueError` if the folder cannot be written or the disk is full.
+    **Raises:** `InputError` if the folder cannot be written or the disk is full.
     """
     with _partial(folder) as partial:
         yield partial
@@ -103,7 +104,7 @@ def _partial(folder: Path) -> Iterator[Path]:
             reason = f"cannot be written ({os.strerror(error.errno or 0)})"
         else:
             raise
-        raise ValueError(f"{folder}: {reason}; give a writable folder.") from error
+        raise InputError(f"{folder}: {reason}; give a writable folder.") from error
 
 
 _NOT_WRITABLE = (

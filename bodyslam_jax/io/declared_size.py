@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.frame_index import InvalidContent, Warn
 
 Size = tuple[float, float]
@@ -23,7 +24,7 @@ def size_in(path: Path, data: Any) -> Size | None:
     one name: `image_size` and `resolution` with the width first, `img_shape` and
     `ori_shape`, as MMPose and NumPy have it, with the height first.
 
-    **Raises:** `ValueError` if images of one file differ in size.
+    **Raises:** `InputError` if images of one file differ in size.
     """
     if not isinstance(data, dict):
         return None
@@ -35,7 +36,7 @@ def size_in(path: Path, data: Any) -> Size | None:
     }
     if len(found) > 1:
         (a, b), (c, d) = sorted(found)[:2]
-        raise ValueError(f"{path}: images of {a:g}x{b:g} px and of {c:g}x{d:g} px.")
+        raise InputError(f"{path}: images of {a:g}x{b:g} px and of {c:g}x{d:g} px.")
     if found:
         return found.pop()
     for part in (data, *(data.get(k) for k in ("meta_info", "dataset_meta", "info"))):

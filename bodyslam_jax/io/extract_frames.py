@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.video import frames, list_images, look_at, picked
 
 _QUALITY = 95
@@ -33,7 +34,7 @@ def extract_frames(
         timestamps: of all frames of the result, s from the first frame of the video.
         chosen: which of them are written, increasing.
 
-    **Raises:** `ValueError`, naming the video, if it is another one.
+    **Raises:** `InputError`, naming the video, if it is another one.
     """
     rate = (len(timestamps) - 1) / max(np.ptp(timestamps), 1e-9)
     times = look_at(video, rate).timestamps
@@ -44,7 +45,7 @@ def extract_frames(
         at = np.abs(times[:, None] - timestamps).argmin(axis=0)
         away = np.abs(times[at] - timestamps).max()
         if away > 0.5 / rate or len(np.unique(at)) < len(at):
-            raise ValueError(
+            raise InputError(
                 f"{video}: {len(times)} frames in {times[-1]:.2f} s, expected the "
                 f"run's {len(timestamps)}, to {timestamps[-1]:.2f} s: another video."
             )

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import open_npz
 from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
@@ -56,7 +57,7 @@ def read_masks(
     same aspect ratio are resized, both with a warning. If masks do not cover the
     people, or some frames have none, regions around keypoints are masked, too.
 
-    **Raises:** `ValueError`, naming folder or file, if masks are missing and the
+    **Raises:** `InputError`, naming folder or file, if masks are missing and the
     numbers in their names do not tell which, or if their aspect ratio is not that of
     the images.
     """
@@ -82,19 +83,19 @@ def read_masks(
 def mask_names(source: Path) -> list[str]:
     """Names of the images in a folder, or the numbers of the masks in an `.npz`.
 
-    **Raises:** `ValueError`, naming the file, if it is neither.
+    **Raises:** `InputError`, naming the file, if it is neither.
     """
     if source.is_dir():
         return [path.name for path in list_images(source)]
     if source.suffix != ".npz":
-        raise ValueError(f"{source}: neither a folder of mask images nor an .npz.")
+        raise InputError(f"{source}: neither a folder of mask images nor an .npz.")
     return [str(k) for k in range(len(_stack(source)))]
 
 
 def read_named(source: Path, name: str) -> Bool[np.ndarray, "y x"]:
     """One of the masks that `mask_names` lists.
 
-    **Raises:** `ValueError`, naming the file, if it is no image.
+    **Raises:** `InputError`, naming the file, if it is no image.
     """
     return read_mask(source / name) if source.is_dir() else _stack(source)[int(name)]
 
@@ -104,16 +105,16 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
     """The masks of an `.npz`: `masks` (t, y, x), or the only array in it; several
     people's masks (t, h, y, x) become one.
 
-    **Raises:** `ValueError`, naming the file, if there is no such array.
+    **Raises:** `InputError`, naming the file, if there is no such array.
     """
     with open_npz(path) as archive:
         names = archive.files
         name = "masks" if "masks" in names or len(names) != 1 else names[0]
         if name not in names:
-            raise ValueError(f"{path}: arrays {', '.join(names)}, expected `masks`.")
+            raise InputError(f"{path}: arrays {', '.join(names)}, expected `masks`.")
         stack = archive[name]
     if stack.ndim not in (3, 4) or stack.dtype.kind not in "biuf":
-        raise ValueError(
+        raise InputError(
             f"{path}: `{name}` {stack.dtype}{stack.shape}, expected numbers (frames, "
             "height, width) or (frames, people, height, width)."
         )
@@ -125,12 +126,12 @@ def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
     """Where a mask is not zero; in a lossy format, where it is bright. An image of one
     colour with a varying alpha channel is read by that channel.
 
-    **Raises:** `ValueError`, naming the file, if it is no image.
+    **Raises:** `InputError`, naming the file, if it is no image.
     """
     data = np.fromfile(path, dtype=np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None:
-        raise ValueError(f"{path}: not an image that OpenCV can read.")
+        raise InputError(f"{path}: not an image that OpenCV can read.")
     if image.ndim == 3 and image.shape[2] == 4:
         color, alpha = image[..., :3].max(axis=2), image[..., 3]
         image = alpha if np.ptp(color) == 0 and np.ptp(alpha) > 0 else color
@@ -145,11 +146,11 @@ def resized_to(
 ) -> Bool[np.ndarray, "h w"]:
     """The mask resized to `size` (width, height; px).
 
-    **Raises:** `ValueError`, naming the file, if its aspect ratio is another.
+    **Raises:** `InputError`, naming the file, if its aspect ratio is another.
     """
     height, width = mask.shape
     if abs(np.log(width / height * size[1] / size[0])) > _ASPECT_TOLERANCE:
-        raise ValueError(
+        raise InputError(
             f"{path}: {width}x{height} px, but the video is {size[0]}x{size[1]} px."
         )
     found = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
@@ -165,7 +166,7 @@ def _by_frame(
         return [(name,) for name in names], set()
     count = f"{len(names)} masks, but the video has {num_frames} frames"
     if not names or len(names) > num_frames:
-        raise ValueError(f"{folder}: {count}.")
+        raise InputError(f"{folder}: {count}.")
     try:
         quiet = lambda _: None
         frames = frames_of_names(
@@ -177,11 +178,11 @@ def _by_frame(
             warn=quiet,
         )
     except InvalidContent as error:
-        raise ValueError(f"{folder}: {count}, and {error}.") from None
+        raise InputError(f"{folder}: {count}, and {error}.") from None
     of_frame = {frame: name for name, frame in frames.items()}
     own = np.array(sorted(of_frame))
     if len(own) == own[-1] - own[0] + 1 and not set(names) <= set(images):
-        raise ValueError(
+        raise InputError(
             f"{folder}: {count}, and no gaps in their numbers to say which are missing."
         )
     files = []

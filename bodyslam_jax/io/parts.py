@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.video import VIDEO_SUFFIXES, list_images
 
 _OVERLAYS = ("overlay.webm", "overlay.mp4")
@@ -27,11 +28,11 @@ class Parts:
 def find_parts(path: Path) -> Parts:
     """The parts of a sequence folder; or a lone video file or folder of images.
 
-    **Raises:** `ValueError` if `path` does not exist, or holds several videos of which
+    **Raises:** `InputError` if `path` does not exist, or holds several videos of which
     none is called `video`.
     """
     if not path.exists():
-        raise ValueError(f"{path}: no such file or folder.")
+        raise InputError(f"{path}: no such file or folder.")
     if path.is_file():
         return Parts(name=path.stem, footage=path)
     within = lambda name: path / name if (path / name).exists() else None
@@ -60,7 +61,7 @@ def _other_footage(folder: Path) -> Path | None:
     candidates = [file for file in videos if file.stem == "video"] or videos
     if len(candidates) > 1:
         names = ", ".join(file.name for file in candidates[:4])
-        raise ValueError(f"{folder}: which video? {names}; give the file itself.")
+        raise InputError(f"{folder}: which video? {names}; give the file itself.")
     if candidates:
         return candidates[0]
     return folder if list_images(folder) else None

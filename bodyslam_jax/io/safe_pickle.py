@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
+
 _MAX_BYTES = 8 << 30
 """A larger array or archive is refused as a decompression bomb."""
 _TEXT_PICKLES = (b"(d", b"(l", b"}", b"]")
@@ -85,7 +87,7 @@ def restricted_load(path: Path, stand_ins: tuple[str, ...] = ()) -> Any:
         stand_ins: packages, such as `"scipy.sparse"`, whose objects become `StandIn`s
             instead of being refused. The packages are not imported.
 
-    **Raises:** `ValueError`, one line that names the file, if it is damaged or holds
+    **Raises:** `InputError`, one line that names the file, if it is damaged or holds
     anything else.
     """
     allowed = _Names(stand_ins)
@@ -100,15 +102,15 @@ def restricted_load(path: Path, stand_ins: tuple[str, ...] = ()) -> Any:
             stream = _decompressed(file, head)
             start = stream.tell()
             if not stream.read(2).startswith((b"\x80", *_TEXT_PICKLES)):
-                raise ValueError("neither a pickle nor an archive")
+                raise InputError("neither a pickle nor an archive")
             stream.seek(start)
             return _Unpickler(stream, allowed).load()
     except Refused as error:
-        raise ValueError(f"{path}: refused, {error}.") from None
+        raise InputError(f"{path}: refused, {error}.") from None
     except (MemoryError, RecursionError, Exception) as error:
         # A damaged pickle can fail anywhere, with any error.
         what = f"{type(error).__name__}: {error}".splitlines()[0][:150]
-        raise ValueError(f"{path}: not a readable result file ({what}).") from None
+        raise InputError(f"{path}: not a readable result file ({what}).") from None
 
 
 def _load_array(file: io.BufferedIOBase, allowed: _Names) -> Any:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.config import Known
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.types import DetectedPeople, Sequence, Tracks
 
 _ROUNDING = 1e-6
@@ -17,7 +18,7 @@ def in_interval(
 ) -> Int[np.ndarray, " k"] | None:
     """Indices of the frames from `known.start` to `known.end` (s); `None` for all.
 
-    **Raises:** `ValueError`, naming the video, if there is no frame in the interval.
+    **Raises:** `InputError`, naming the video, if there is no frame in the interval.
     """
     if known.start is None and known.end is None:
         return None
@@ -26,7 +27,7 @@ def in_interval(
     inside = (timestamps >= start - _ROUNDING) & (timestamps <= end + _ROUNDING)
     (chosen,) = np.nonzero(inside)
     if not len(chosen):
-        raise ValueError(
+        raise InputError(
             f"{name}: no frame between {start:g} and {end:g} s, the video is "
             f"{timestamps[-1]:.2f} s long."
         )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config import Association, Known
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.aspect import aspect_warnings, at_size_of
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import guess_camera, read_camera, with_focal
@@ -64,7 +65,7 @@ def read_sequence(
             (t, height, width).
         known: what the user knows: focal length, camera path, frame rate, interval.
 
-    **Raises:** `ValueError`, one line that names the file, what was found and what was
+    **Raises:** `InputError`, one line that names the file, what was found and what was
     expected. All arrays of the result are finite and all indices in range.
     """
     given = {
@@ -77,7 +78,7 @@ def read_sequence(
     chosen = {k: Path(v) for k, v in given.items() if v is not None}
     parts = dataclasses.replace(find_parts(Path(path)), **chosen)
     if parts.footage is None and parts.tracks is None:
-        raise ValueError(
+        raise InputError(
             f"{path}: no video.mp4, images/ or tracks.npz, nor one other video "
             f"({' '.join(VIDEO_SUFFIXES)}) or images ({' '.join(IMAGE_SUFFIXES)})."
         )
@@ -226,7 +227,7 @@ def _intrinsics(
     """The calibration at the size of the video, or a guess; with the user's focal
     length, if there is one.
 
-    **Raises:** `ValueError` if the calibration is of another size, or there is neither
+    **Raises:** `InputError` if the calibration is of another size, or there is neither
     a calibration nor a video.
     """
     if calibrated is not None:
@@ -241,7 +242,7 @@ def _intrinsics(
         size = (footage.width, footage.height)
         intrinsics = guess_camera(*size, first, footage.pixel_aspect)
     else:
-        raise ValueError(f"{path}: tracks without a video need a camera.json.")
+        raise InputError(f"{path}: tracks without a video need a camera.json.")
     if footage:
         for text in aspect_warnings(intrinsics, footage):
             warn(text)
@@ -253,7 +254,7 @@ def _intrinsics(
 
 def _check_size(parts: Parts, intrinsics: Intrinsics, footage: Footage) -> None:
     if (intrinsics.width, intrinsics.height) != (footage.width, footage.height):
-        raise ValueError(
+        raise InputError(
             f"{parts.camera}: for {intrinsics.width}x{intrinsics.height} px, but "
             f"{footage.path.name} has {footage.width}x{footage.height} px."
         )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import numbers, open_npz
 from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.types import Tracks
@@ -25,12 +26,12 @@ def read_tracks(
 
     Observations that are not finite are left out, with a warning.
 
-    **Raises:** `ValueError`, naming the file, if they do not fit the video.
+    **Raises:** `InputError`, naming the file, if they do not fit the video.
     """
     with open_npz(path) as archive:
         missing = [k for k in ("frame", "landmark", "uv") if k not in archive.files]
         if missing:
-            raise ValueError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
+            raise InputError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
         frame, landmark, uv = (
             numbers(path, archive, k, finite=False) for k in ("frame", "landmark", "uv")
         )
@@ -39,7 +40,7 @@ def read_tracks(
         or uv.shape[1] != 2
         or not frame.shape == landmark.shape == (len(uv),)
     ):
-        raise ValueError(
+        raise InputError(
             f"{path}: frame {frame.shape}, landmark {landmark.shape}, uv {uv.shape}; "
             "expected (m,), (m,), (m, 2)."
         )
@@ -47,26 +48,26 @@ def read_tracks(
     if not finite.all():
         text = f"{int((~finite).sum())} of {len(uv)} observations not finite"
         if finite.mean() < _MIN_FINITE:
-            raise ValueError(f"{path}: {text}.")
+            raise InputError(f"{path}: {text}.")
         warn(f"tracks: {text}: left out.")
         frame, landmark, uv = frame[finite], landmark[finite], uv[finite]
     if not len(uv):
-        raise ValueError(f"{path}: no observation.")
+        raise InputError(f"{path}: no observation.")
     if (frame % 1 != 0).any() or (landmark % 1 != 0).any() or frame.min() < 0:
-        raise ValueError(f"{path}: frame and landmark must be whole numbers from 0.")
+        raise InputError(f"{path}: frame and landmark must be whole numbers from 0.")
     if num_frames is not None and frame.max() >= num_frames:
-        raise ValueError(
+        raise InputError(
             f"{path}: tracks up to frame {frame.max():.0f}, but the video has "
             f"{num_frames} frames."
         )
     outside = ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
     if outside > 0.1:
-        raise ValueError(
+        raise InputError(
             f"{path}: {100 * outside:.0f} % of the points outside the image of "
             f"{size[0]}x{size[1]} px: of another video?"
         )
     _, index = np.unique(landmark, return_inverse=True)
     frame = frame.astype(np.int64)
     if len(np.unique(frame * (index.max() + 1) + index)) < len(frame):
-        raise ValueError(f"{path}: a landmark observed twice in one frame.")
+        raise InputError(f"{path}: a landmark observed twice in one frame.")
     return Tracks(frame, index.astype(np.int64), uv)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.repeats import Repeats, repeats_warning, without_repeats
 from bodyslam_jax.types import Sequence
 
@@ -60,11 +61,11 @@ def look_at(path: Path, fps: float | None = None) -> Footage:
     Args:
         fps: of a folder of images (1/s), 30 if not given; a video brings its own times.
 
-    **Raises:** `ValueError`, naming the file, if it is not a readable video.
+    **Raises:** `InputError`, naming the file, if it is not a readable video.
     """
     footage = _look_at_images(path, fps) if path.is_dir() else _look_at_video(path)
     if min(footage.width, footage.height) < _MIN_SIDE:
-        raise ValueError(
+        raise InputError(
             f"{path}: images of {footage.width}x{footage.height} px are too small; "
             f"expected at least {_MIN_SIDE}x{_MIN_SIDE}."
         )
@@ -78,11 +79,11 @@ def frames(
 
     Of a `Sequence` only the frames it uses, of a file or folder all.
 
-    **Raises:** `ValueError` if the sequence has no images or one cannot be read.
+    **Raises:** `InputError` if the sequence has no images or one cannot be read.
     """
     path = source.frames if isinstance(source, Sequence) else source
     if path is None:
-        raise ValueError(f"{getattr(source, 'name', source)}: has no video or images.")
+        raise InputError(f"{getattr(source, 'name', source)}: has no video or images.")
     picks = source.picks if isinstance(source, Sequence) else None
     images = _read_images(path, gray) if path.is_dir() else _read_video(path, gray)
     yield from images if picks is None else picked(images, picks)
@@ -125,18 +126,18 @@ def _open(path: Path) -> cv2.VideoCapture:
     # FFmpeg only: OpenCV's other backends take `a.txt` for a pattern of image names.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
-        raise ValueError(f"{path}: not a video that OpenCV can read.")
+        raise InputError(f"{path}: not a video that OpenCV can read.")
     return capture
 
 
 def _look_at_video(path: Path) -> Footage:
     if not path.is_file():
-        raise ValueError(f"{path}: no such file.")
+        raise InputError(f"{path}: no such file.")
     capture = _open(path)
     try:
         ok, image = capture.read()
         if not ok:
-            raise ValueError(f"{path}: a video without a readable frame.")
+            raise InputError(f"{path}: a video without a readable frame.")
         nominal = float(capture.get(cv2.CAP_PROP_FPS))
         announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         aspect = _pixel_aspect(capture)
@@ -232,7 +233,7 @@ def at_rate(footage: Footage, fps: float) -> Footage:
 def _look_at_images(folder: Path, fps: float | None) -> Footage:
     images = list_images(folder)
     if not images:
-        raise ValueError(f"{folder}: no images ({' '.join(IMAGE_SUFFIXES)}).")
+        raise InputError(f"{folder}: no images ({' '.join(IMAGE_SUFFIXES)}).")
     height, width = _read_image(images[0], gray=True).shape
     warnings: tuple[str, ...] = ()
     if fps is None:
@@ -258,7 +259,7 @@ def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:
         size = size or image.shape
         if image.shape != size:
             found, expected = _size(image.shape), _size(size)
-            raise ValueError(f"{path}: {found}, but the first image is {expected}.")
+            raise InputError(f"{path}: {found}, but the first image is {expected}.")
         yield image
 
 
@@ -268,7 +269,7 @@ def _read_image(path: Path, gray: bool) -> np.ndarray:
     data = np.fromfile(path, dtype=np.uint8)
     image = cv2.imdecode(data, flag) if data.size else None
     if image is None:
-        raise ValueError(f"{path}: not an image that OpenCV can read.")
+        raise InputError(f"{path}: not an image that OpenCV can read.")
     return image
 
 

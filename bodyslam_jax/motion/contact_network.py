@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.network import (
     Layer,
     Normalisation,
@@ -93,10 +94,10 @@ def predict_contact(
         present: the frames to be used. Near the ends of a run of frames the first or
             the last one is repeated.
 
-    **Raises:** `ValueError` if the weights belong to another body model.
+    **Raises:** `InputError` if the weights belong to another body model.
     """
     if model.body != body.kind:
-        raise ValueError(
+        raise InputError(
             f"the contact network was trained on body {model.body!r}, not "
             f"{body.kind!r}; train one with `motion.train_contact`."
         )

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion.contact_network import ContactModel
 
@@ -51,7 +52,7 @@ def load_contact_model(path: Path | str | None = None) -> ContactModel:
             header = json.loads(str(archive["header"]))
             arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
         if header.get("format") != _FORMAT:
-            raise ValueError(f"format {header.get('format')!r}, expected {_FORMAT!r}")
+            raise InputError(f"format {header.get('format')!r}, expected {_FORMAT!r}")
         half, width = int(header["half"]), tuple(header["width"])
         init = lambda key: ContactModel.init(
             key, header["body"], float(header["fps"]), half, width
@@ -59,11 +60,11 @@ def load_contact_model(path: Path | str | None = None) -> ContactModel:
         like = eqx.filter_eval_shape(init, jax.random.key(0))
         expected = [leaf.shape for leaf in jax.tree.leaves(like)]
         if expected != [array.shape for array in arrays]:
-            raise ValueError("arrays do not fit the header's sizes")
+            raise InputError("arrays do not fit the header's sizes")
         if not all(np.isfinite(array).all() for array in arrays):
-            raise ValueError("NaN or infinite weights")
+            raise InputError("NaN or infinite weights")
     except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path}: not a contact network ({error}).") from None
+        raise InputError(f"{path}: not a contact network ({error}).") from None
     leaves = [jnp.asarray(array, jnp.float32) for array in arrays]
     model = jax.tree.unflatten(jax.tree.structure(like), leaves)
     return dataclasses.replace(model, about=json.dumps(header["about"]))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.function_network import FunctionNetwork, Step
 from bodyslam_jax.motion.network import Window
 from bodyslam_jax.motion.prediction import MotionModel
@@ -31,15 +32,15 @@ def make_motion_model(
         fps: frames per second at which `step` expects its frames.
         past: how many frames before k a window has, 1 or more.
 
-    **Raises:** `ValueError` if `parameters` hold anything but floating-point arrays, or
+    **Raises:** `InputError` if `parameters` hold anything but floating-point arrays, or
     what `step` returns has other shapes.
     """
     if past < 1:
-        raise ValueError(f"past: found {past}, expected 1 or more.")
+        raise InputError(f"past: found {past}, expected 1 or more.")
     for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
         if not eqx.is_inexact_array_like(leaf):
             where = jax.tree_util.keystr(path)
-            raise ValueError(
+            raise InputError(
                 f"parameters{where}: found {leaf!r:.40}, expected a floating-point "
                 "array; let the function hold all else."
             )
@@ -61,7 +62,7 @@ def _check(network: FunctionNetwork, past: int) -> None:
         translation = found[0]
     shape = getattr(translation, "shape", None)
     if shape != (3,):
-        raise ValueError(
+        raise InputError(
             f"step: a displacement of shape {shape}, expected (3,) and a standard "
             "deviation, or a `Guess`."
         )

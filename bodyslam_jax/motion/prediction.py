@@ -10,6 +10,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import MotionNetwork, Window
 from bodyslam_jax.motion.position_network import MetricNetwork
@@ -89,14 +90,14 @@ def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:
 
 
 def check_compatible(model: MotionModel, body: BodyModel, fps: float) -> None:
-    """**Raises:** `ValueError` if the weights are for another body or frame rate."""
+    """**Raises:** `InputError` if the weights are for another body or frame rate."""
     if model.body != body.kind:
-        raise ValueError(
+        raise InputError(
             f"the motion model was trained on body {model.body!r}, not {body.kind!r}; "
             "train one with `bodyslam train-motion`."
         )
     if abs(model.fps - fps) > 0.01 * model.fps:
-        raise ValueError(
+        raise InputError(
             f"the motion model works at {model.fps:g} frames per second, not {fps:g}; "
             "resample the sequence."
         )
@@ -123,7 +124,7 @@ def predict(
     uses orientations up to 1.5 s ahead; the paper's network and users' functions see
     the orientations as they are.
 
-    **Raises:** `ValueError` if the weights belong to another body model.
+    **Raises:** `InputError` if the weights belong to another body model.
     """
     check_compatible(model, body, model.fps)
     t, past, dtype = len(body_pose), model.past, body_pose.dtype

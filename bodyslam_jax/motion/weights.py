@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
@@ -32,12 +33,12 @@ def save_motion_model(
     `half` stores the weights of layers in float16, in half the space; they are of order
     1 and lose their fourth digit. All else stays in float32.
 
-    **Raises:** `ValueError` for a custom network, whose class no reader would know.
+    **Raises:** `InputError` for a custom network, whose class no reader would know.
     """
     path = Path(path)
     network = model.network
     if not isinstance(network, PaperNetwork | MetricNetwork):
-        raise ValueError(
+        raise InputError(
             f"{path}: found a network of class {type(network).__name__}, expected one "
             "of the package; save a custom one with `eqx.tree_serialise_leaves`."
         )
@@ -85,9 +86,9 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
             header = json.loads(str(archive["header"]))
             arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
     except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path}: not a motion model ({error}).") from None
+        raise InputError(f"{path}: not a motion model ({error}).") from None
     if header.get("format") != _FORMAT:
-        raise ValueError(
+        raise InputError(
             f"{path}: format {header.get('format')!r}; expected {_FORMAT!r}."
         )
     try:
@@ -95,20 +96,20 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
         body, fps, about = header["body"], float(header["fps"]), header["about"]
         past = int(header["sizes"]["past"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: header lacks or misstates {error}.") from None
+        raise InputError(f"{path}: header lacks or misstates {error}.") from None
     if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(
+        raise InputError(
             f"{path}: {fps:g} frames per second; expected a positive number."
         )
     wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
     found = [array.shape for array in arrays]
     if wanted != found:
-        raise ValueError(
+        raise InputError(
             f"{path}: arrays {found[:3]}... do not fit the header's sizes; "
             f"expected {wanted[:3]}..."
         )
     if not all(np.isfinite(array).all() for array in arrays):
-        raise ValueError(f"{path}: NaN or infinite weights.")
+        raise InputError(f"{path}: NaN or infinite weights.")
     network = jax.tree.unflatten(
         jax.tree.structure(like), [jnp.asarray(a, jnp.float32) for a in arrays]
     )

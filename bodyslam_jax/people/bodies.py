@@ -7,6 +7,7 @@ from jaxtyping import Bool
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.clean_regressed import prepare_bodies
 from bodyslam_jax.people.fit import fit_bodies
 from bodyslam_jax.people.sides import correct_left_right
@@ -45,7 +46,7 @@ def estimate_bodies(
 def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
     """The sequence with these people only, in this order; all of them for `()`.
 
-    **Raises:** `ValueError` if the sequence lacks one of them.
+    **Raises:** `InputError` if the sequence lacks one of them.
     """
     if not people:
         return sequence
@@ -58,7 +59,7 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
     beyond = [h for h in people if h >= count]
     if beyond:
         found = f"people 0 to {count - 1}" if count else "nobody"
-        raise ValueError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
+        raise InputError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
     index = list(dict.fromkeys(people))
     if keypoints is not None:
         depth = None if keypoints.depth is None else keypoints.depth[index]

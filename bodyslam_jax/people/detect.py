@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Detect
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import BODY25_FROM, atomic
 from bodyslam_jax.people.networks import check_onnxruntime, make_session
 
@@ -83,7 +84,7 @@ def detect_people(
         offline: never use the network; models must be in the cache, or one's own.
         progress: called with the number of images done.
 
-    **Raises:** `ValueError` if onnxruntime is not installed, or if a model is not
+    **Raises:** `InputError` if onnxruntime is not installed, or if a model is not
     available or not of the expected kind.
     """
     detector = _session(settings.detector, DETECTOR, offline)
@@ -102,29 +103,29 @@ def model_path(own: str | None, model: Model, offline: bool) -> Path:
     """The file of a model: `own`, the user's, or that in the cache, which is downloaded
     if it is missing.
 
-    **Raises:** `ValueError` with what to do if the file is not available.
+    **Raises:** `InputError` with what to do if the file is not available.
     """
     if own is not None:
         if not Path(own).is_file():
-            raise ValueError(f"{own}: no such file; expected an ONNX model.")
+            raise InputError(f"{own}: no such file; expected an ONNX model.")
         return Path(own)
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     path = Path(home) / "bodyslam" / "models" / model.name
     advice = f"put {model.url} there, or give keypoints/ instead"
     if not path.is_file():
         if offline:
-            raise ValueError(f"{path}: file not found, and offline is set; {advice}.")
+            raise InputError(f"{path}: file not found, and offline is set; {advice}.")
         log.info("fetching %s (%d MB) to %s", model.url, model.megabytes, path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             _fetch(model, path)
         except OSError as error:
             reason = getattr(error, "reason", error)
-            raise ValueError(
+            raise InputError(
                 f"{path}: cannot be fetched ({reason}); {advice}."
             ) from error
     if (digest := _sha256(path)) != model.sha256:
-        raise ValueError(
+        raise InputError(
             f"{path}: SHA-256 {digest[:12]}..., expected {model.sha256[:12]}...; "
             "delete the file to fetch it again."
         )
@@ -165,7 +166,7 @@ def decode_yolox(
         strides.append(np.full((x.size, 1), stride))
     cell, stride = np.concatenate(cells), np.concatenate(strides)
     if raw.ndim != 2 or len(raw) != len(cell) or raw.shape[1] < 6:
-        raise ValueError(
+        raise InputError(
             f"detector: output of shape {raw.shape}, expected ({len(cell)}, 85) of a "
             f"YOLOX without decoding for {size[1]}x{size[0]}."
         )
@@ -234,7 +235,7 @@ def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
     """
     count = len(points)
     if count not in (17, 26, 133):
-        raise ValueError(f"pose: {count} keypoints, expected 17, 26 or 133.")
+        raise InputError(f"pose: {count} keypoints, expected 17, 26 or 133.")
     index = np.asarray(BODY25_FROM[count])
     found = np.where((index >= 0)[:, None], points[index], 0.0)
     for target, pair in ((1, (2, 5)), (8, (9, 12))):

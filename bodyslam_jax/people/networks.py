@@ -12,6 +12,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.config.errors import InputError
+
 _FOLDER = Path(__file__).parent / "assets" / "networks"
 _MOST_THREADS = 4
 """Convolutions of this size gain nothing from more."""
@@ -46,7 +48,7 @@ def open_network(network: Network) -> Any:
     It uses the processor cores that this process may use, four at most, and none of
     them while it waits.
 
-    **Raises:** `ValueError` if the file is missing or is not the one that was shipped,
+    **Raises:** `InputError` if the file is missing or is not the one that was shipped,
     or onnxruntime is not installed.
     """
     check_onnxruntime()
@@ -55,17 +57,17 @@ def open_network(network: Network) -> Any:
 
 
 def check_network(network: Network) -> None:
-    """**Raises:** `ValueError` if the file is missing or its checksum is another."""
+    """**Raises:** `InputError` if the file is missing or its checksum is another."""
     advice = "install bodyslam-jax again, or give keypoints/"
     try:
         digest = hashlib.sha256(network.path.read_bytes()).hexdigest()
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"{network.path}: cannot be read ({error.strerror}); expected the network "
             f"that finds people: {advice}."
         ) from error
     if digest != network.sha256:
-        raise ValueError(
+        raise InputError(
             f"{network.path}: SHA-256 {digest[:12]}..., expected "
             f"{network.sha256[:12]}...: {advice}."
         )
@@ -87,7 +89,7 @@ def network_status() -> list[tuple[str, str]]:
 def make_session(path: Path) -> Any:
     """An onnxruntime session of an ONNX file on the CPU.
 
-    **Raises:** `ValueError` if onnxruntime is missing or does not read the file.
+    **Raises:** `InputError` if onnxruntime is missing or does not read the file.
     """
     onnxruntime = check_onnxruntime()
     options = onnxruntime.SessionOptions()
@@ -101,17 +103,17 @@ def make_session(path: Path) -> Any:
             str(path), options, providers=["CPUExecutionProvider"]
         )
     except Exception as error:  # onnxruntime's own errors have no common public base
-        raise ValueError(
+        raise InputError(
             f"{path}: not a model that onnxruntime reads ({error})."
         ) from error
 
 
 def check_onnxruntime() -> Any:
-    """The module. **Raises:** `ValueError` if it is not installed."""
+    """The module. **Raises:** `InputError` if it is not installed."""
     try:
         return importlib.import_module("onnxruntime")
     except ImportError as error:
-        raise ValueError(
+        raise InputError(
             "detect: onnxruntime is not installed; `pip install onnxruntime`, or give "
             "keypoints/ instead."
         ) from error

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Measured
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.person_state import PersonState
 
 _UP = 1
@@ -35,11 +36,11 @@ def statures_of(
     """Statures by index among the people with these `numbers`; that under the key
     `None` applies to everybody without one of their own.
 
-    **Raises:** `ValueError` if a stature is given for a number that nobody has.
+    **Raises:** `InputError` if a stature is given for a number that nobody has.
     """
     beyond = [h for h in heights if h is not None and h not in numbers]
     if beyond and len(numbers):
-        raise ValueError(
+        raise InputError(
             f"height: given for person {beyond[0]}, expected one of "
             f"{', '.join(map(str, numbers))}."
         )

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry.local_ground import wander
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.motion_prediction import (
@@ -64,7 +65,7 @@ def hold_standing_feet(
     Nothing changes without people, without `weights.contact_sigma`, or with a body
     model that the contact network was not trained on.
 
-    **Raises:** `ValueError` if `prepared` was made with `feet=False`.
+    **Raises:** `InputError` if `prepared` was made with `feet=False`.
     """
     roots = prepared.roots
     present = roots.present & cameras.registered
@@ -72,7 +73,7 @@ def hold_standing_feet(
     if predictor is None or not present.any():
         return Standing(best)
     if not any(isinstance(f, graph.FootContact) for f in prepared.problem.factors):
-        raise ValueError(
+        raise InputError(
             "prepared.problem.factors: no FootContact; expected a problem of "
             "`prepare(..., feet=True)`."
         )

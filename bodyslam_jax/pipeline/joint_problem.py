@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PATH_SIGMA, Config, Measured
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
@@ -92,7 +93,7 @@ def prepare(
     Body poses are fitted to keypoints before the motion model reads them: a regressor's
     errors in orientation bias the displacements that are predicted from it.
 
-    **Raises:** `ValueError` if there is neither a moving camera nor a person.
+    **Raises:** `InputError` if there is neither a moving camera nor a person.
     """
     weights, moving = config.weights, cameras.kind == "moving"
     crowd = _starting_people(sequence, cameras, bodies, body, config)
@@ -170,7 +171,7 @@ def prepare(
     if moving and (anybody or np.isfinite(cameras.path_scale)):
         state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(start.value))
     if not factors:
-        raise ValueError(
+        raise InputError(
             f"{sequence.name}: no landmarks and no people; expected a camera moving "
             "before a textured background, or people's keypoints."
         )

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from bodyslam_jax import io, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.pipeline.progress import Counter, Stopwatch
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
 from bodyslam_jax.types import Bodies, Sequence
@@ -30,7 +31,7 @@ class Detections:
 def check_people(sequence: Sequence, config: Config) -> None:
     """Refuses an input in which nobody can be found, before anything is computed.
 
-    **Raises:** `ValueError` if people are to be estimated, but there are neither
+    **Raises:** `InputError` if people are to be estimated, but there are neither
     keypoints nor bodies, nor images to find them in.
     """
     given = sequence.keypoints is not None or sequence.bodies is not None
@@ -38,7 +39,7 @@ def check_people(sequence: Sequence, config: Config) -> None:
         return
     if sequence.frames is not None and config.detect != "none":
         return
-    raise ValueError(
+    raise InputError(
         f"{sequence.name}: neither keypoints nor bodies, nor images to find people "
         "in (or --detect none), so nobody to estimate; give one of them, or leave "
         "people out with --no-people."

@@ -5,6 +5,7 @@ import dataclasses
 from bodyslam_jax import diagnostics, graph, people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.pipeline import before_joint, find_people
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
@@ -31,11 +32,11 @@ def build(
             fields of `State`: `scale`, `cameras`, `roots`, `poses`, `shapes`,
             `landmarks`, `intrinsics`.
 
-    **Raises:** `ValueError` as `run`, and for a name in `hold` that is none of these.
+    **Raises:** `InputError` as `run`, and for a name in `hold` that is none of these.
     """
     unknown = sorted(set(hold) - set(graph.VARIABLES))
     if isinstance(hold, str) or unknown:
-        raise ValueError(
+        raise InputError(
             f"hold: found {hold!r}, expected a tuple of names among "
             f"{list(graph.VARIABLES)}."
         )

@@ -8,6 +8,7 @@ import dataclasses
 from bodyslam_jax import diagnostics, motion, people, sfm
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
@@ -35,7 +36,7 @@ def run(
 ) -> Result:
     """Estimates cameras, people and map in metres; `cache` keeps finished stages.
 
-    **Raises:** `ValueError`, in one line, if the sequence holds nothing that cameras or
+    **Raises:** `InputError`, in one line, if the sequence holds nothing that cameras or
     people can be estimated from.
     """
     config, warnings = with_compatible_body(config)
@@ -143,7 +144,7 @@ def assemble(
 
 def _check_length(sequence: Sequence) -> None:
     if sequence.num_frames < _FEWEST_FRAMES:
-        raise ValueError(
+        raise InputError(
             f"{sequence.name}: {sequence.num_frames} frames, expected at least "
             f"{_FEWEST_FRAMES}: size and motion come from what moves."
         )

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyslam_jax.body import search_paths
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 
 T = TypeVar("T")
@@ -167,7 +168,7 @@ def save(path: Path, value: Any) -> None:
 def load(path: Path, kind: type[T]) -> T:
     """Reads what `save` wrote.
 
-    **Raises:** `ValueError` if `kind` has other fields now than when it was saved.
+    **Raises:** `InputError` if `kind` has other fields now than when it was saved.
     """
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         header = json.loads(archive["__header__"].tobytes())
@@ -207,7 +208,7 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
         # A default of a new field need not be what was computed, so it does not count.
         is_class = isinstance(kind, type) and dataclasses.is_dataclass(kind)
         if not is_class or fields.keys() != {f.name for f in dataclasses.fields(kind)}:
-            raise ValueError(f"fields {', '.join(fields)} of another version")
+            raise InputError(f"fields {', '.join(fields)} of another version")
         kinds = typing.get_type_hints(kind)
         return kind(
             **{n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}

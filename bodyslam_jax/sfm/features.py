@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from bodyslam_jax.config.errors import InputError
+
 _NO_BRISK = (
     f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
     "opencv-contrib-python-headless."
@@ -18,11 +20,11 @@ _NO_BRISK = (
 def make_brisk(threshold: int, octaves: int) -> Any:
     """OpenCV's BRISK, wherever this build of OpenCV keeps it.
 
-    **Raises:** `ValueError`, saying how to get it, if it is in neither place.
+    **Raises:** `InputError`, saying how to get it, if it is in neither place.
     """
     home = _home_of_brisk()
     if home is None:
-        raise ValueError(_NO_BRISK)
+        raise InputError(_NO_BRISK)
     return home.BRISK_create(threshold, octaves)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.config import Structure
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views, errors
 from bodyslam_jax.sfm.camera_motion import (
@@ -99,7 +100,7 @@ def reconstruct(
         path: camera poses that are known: points are triangulated from them.
         static: whether the camera is known not to move.
 
-    **Raises:** `ValueError` if the points do not fit a path that is known.
+    **Raises:** `InputError` if the points do not fit a path that is known.
     """
     K, distortion = as_opencv(intrinsics.params)
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
@@ -190,7 +191,7 @@ def _along(
 ) -> Reconstruction:
     """The map along a given camera path, and poses of frames that the path lacks.
 
-    **Raises:** `ValueError` if most points fit no place in the scene.
+    **Raises:** `InputError` if most points fit no place in the scene.
     """
     size = (problem.num_frames, problem.num_landmarks)
     builder = Builder(problem.views, *size, problem.focal, config, refine)
@@ -225,7 +226,7 @@ def _along(
         )
         every = np.ones(len(shot.frame), bool)
         return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
-    raise ValueError(
+    raise InputError(
         f"camera path: {100 * share:.0f} % of the points in the images fit it, "
         f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
         "world to camera, with other axes, or another focal length?"

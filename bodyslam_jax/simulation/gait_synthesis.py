@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, resample
 from bodyslam_jax.motion.capture.clips import leg_length, mirror
@@ -41,7 +42,7 @@ class Walk:
 def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
     """The walking trials among `clips` at 30 fps, of validation subjects if any is.
 
-    **Raises:** `ValueError`, naming `source`, if none is long enough to be joined.
+    **Raises:** `InputError`, naming `source`, if none is long enough to be joined.
     """
     long = [
         c
@@ -52,7 +53,7 @@ def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
     ]
     kept = [c for c in long if c.split == "val"] or long
     if not kept:
-        raise ValueError(
+        raise InputError(
             f"{source}: no walk of more than 1.4 s among {len(clips)} clips; expected "
             "walking to make long walks of."
         )

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.atlas import LEVELS, pack, pyramid
@@ -348,13 +349,13 @@ def write_video(
 ) -> None:
     """Writes frames (BGR) to an .mp4, whole or not at all.
 
-    **Raises:** `ValueError` if OpenCV cannot write one.
+    **Raises:** `InputError` if OpenCV cannot write one.
     """
     code = cv2.VideoWriter.fourcc(*"mp4v")
     with atomic.replacing(path) as partial:
         writer = cv2.VideoWriter(str(partial), code, fps, size)
         if not writer.isOpened():
-            raise ValueError(f"{path}: OpenCV cannot write MPEG-4 video there.")
+            raise InputError(f"{path}: OpenCV cannot write MPEG-4 video there.")
         try:
             for frame in frames:
                 writer.write(frame)

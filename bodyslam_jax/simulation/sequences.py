@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Simulation
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, read_motion
 from bodyslam_jax.simulation.camera_paths import (
@@ -150,27 +151,27 @@ def simulate(
     length = settings.length
     num_frames = LENGTH[settings.sequence] if length is None else length
     if num_frames < 2:
-        raise ValueError(f"length {num_frames}: a sequence needs 2 frames or more.")
+        raise InputError(f"length {num_frames}: a sequence needs 2 frames or more.")
     if settings.seed is not None and settings.seed < 0:
-        raise ValueError(f"seed {settings.seed}: expected 0 or more.")
+        raise InputError(f"seed {settings.seed}: expected 0 or more.")
     for name in ("keypoint_errors", "body_errors", "body_jitter"):
         if not 0 <= (factor := getattr(settings, name)) < np.inf:
-            raise ValueError(f"{name} {factor}: expected 0 or more.")
+            raise InputError(f"{name} {factor}: expected 0 or more.")
     for name in ("outliers", "exchanged"):
         if (share := getattr(settings, name)) is not None and not 0 <= share < 1:
-            raise ValueError(f"{name} {share}: expected a share, 0 to 1.")
+            raise InputError(f"{name} {share}: expected a share, 0 to 1.")
     if not np.isfinite(settings.detector_bias):
-        raise ValueError(
+        raise InputError(
             f"detector bias {settings.detector_bias}: expected a finite number."
         )
     if not 1 <= settings.people <= _MOST_PEOPLE:
-        raise ValueError(
+        raise InputError(
             f"people {settings.people}: expected 1 to {_MOST_PEOPLE} walkers."
         )
     for what in ("exposure", "readout"):
         value = getattr(settings, what)
         if not 0 <= value <= 1 / FPS:
-            raise ValueError(f"{what} {value}: expected 0 to {1 / FPS:.4f} s, a frame.")
+            raise InputError(f"{what} {value}: expected 0 to {1 / FPS:.4f} s, a frame.")
     name = f"{settings.sequence}-{settings.family}"
     seed = _seed_of(settings)
     # One stream each, so that the noise level does not change the truth

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.config import Simulation
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
 from bodyslam_jax.simulation.as_types import shapes_regressed
 from bodyslam_jax.simulation.camera_paths import FPS
@@ -62,7 +63,7 @@ def write_sequence(
     - `people`: whether keypoints and bodies are written; without them people are found
         in the video.
 
-    **Raises:** `ValueError` if `folder` holds something else or cannot be written.
+    **Raises:** `InputError` if `folder` holds something else or cannot be written.
     """
     folder = Path(folder)
     with _partial(folder, simulated.settings) as partial:
@@ -136,22 +137,22 @@ def _partial(folder: Path, settings: Simulation) -> Iterator[Path]:
             yield partial
     except OSError as error:
         reason = error.strerror or error
-        raise ValueError(f"{folder}: cannot be written ({reason}).") from None
+        raise InputError(f"{folder}: cannot be written ({reason}).") from None
 
 
 def _check(folder: Path, settings: Simulation) -> None:
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: a file; expected a folder to write.")
+        raise InputError(f"{folder}: a file; expected a folder to write.")
     if not folder.exists():
         return
     earlier = _earlier(folder)
     if earlier is None:
         if any(not entry.name.startswith(_PARTIAL) for entry in folder.iterdir()):
-            raise ValueError(
+            raise InputError(
                 f"{folder}: not empty and not a simulation; choose another."
             )
     elif settings.render and not earlier.get("render") and (folder / _FILM).exists():
-        raise ValueError(
+        raise InputError(
             f"{folder}: has {_FILM}, which no simulation wrote; choose another folder."
         )
 

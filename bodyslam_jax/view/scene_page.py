@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.scene_data import scene_data
@@ -53,7 +54,7 @@ def read_runs(path: Path) -> list[dict[str, Any]]:
     """
     found = _RUNS.findall(path.read_text(encoding="utf-8"))
     if not found:
-        raise ValueError(f"{path}: no runs in it, expected a scene.html of a run.")
+        raise InputError(f"{path}: no runs in it, expected a scene.html of a run.")
     return [json.loads(run) for run in found]
 
 

@@ -7,6 +7,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.config.errors import InputError
+
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".webm": "video/webm",
@@ -23,13 +25,13 @@ def page_server(page: str, folder: Path, port: int = 0) -> ThreadingHTTPServer:
 
     It listens to this machine only. Port 0 is a free one; `address_of` has it.
 
-    **Raises:** `ValueError` if the port is taken.
+    **Raises:** `InputError` if the port is taken.
     """
     handler = functools.partial(_Handler, page.encode(), folder)
     try:
         return ThreadingHTTPServer((_LOOPBACK, port), handler)
     except (OSError, OverflowError) as error:
-        raise ValueError(
+        raise InputError(
             f"--port {port}: {error}; expected a free port, 0 for any."
         ) from None
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 import cv2
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.view.style import Image
 
 Codec = Literal["VP8", "VP9", "H264"]
@@ -21,9 +22,9 @@ _QUALITY = "24"
 
 
 def check_codec(codec: Codec) -> None:
-    """**Raises:** `ValueError`, which says how to get it, if H.264 is not installed."""
+    """**Raises:** `InputError`, which says how to get it, if H.264 is not installed."""
     if codec == "H264" and importlib.util.find_spec("av") is None:
-        raise ValueError(
+        raise InputError(
             "overlay_video mp4: PyAV is not installed, expected the extra `video`; "
             "pip install 'bodyslam-jax[video]'."
         )
@@ -38,7 +39,7 @@ def write_video(
 ) -> int:
     """Writes pictures of one size (width, height: even numbers); returns their number.
 
-    **Raises:** `ValueError` if there is no such encoder; `OSError` if the video could
+    **Raises:** `InputError` if there is no such encoder; `OSError` if the video could
     not be written whole.
     """
     check_codec(codec)
@@ -66,7 +67,7 @@ def _opencv(path: Path, size: tuple[int, int], fps: float, codec: Codec) -> Iter
     with _quiet():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, float(fps), size)
     if not writer.isOpened():
-        raise ValueError(f"{path}: OpenCV cannot write {codec} here.")
+        raise InputError(f"{path}: OpenCV cannot write {codec} here.")
     try:
         yield writer.write
     finally:

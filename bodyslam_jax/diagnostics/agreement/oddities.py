@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.agreement.explanations import ImageMap
 from bodyslam_jax.diagnostics.agreement.facing import opposed, shares, trunk_directions
 from bodyslam_jax.diagnostics.agreement.image_points import (
@@ -39,7 +40,7 @@ def warn_of_oddities(
     Args:
         sides: whether to warn of left and right sides that contradict.
 
-    **Raises:** `ValueError` if most bodies are outside the image.
+    **Raises:** `InputError` if most bodies are outside the image.
     """
     projected = project(people.camera, people.bodies)
     for h in range(min(people.keypoints.shape[1], people.bodies.shape[1])):
@@ -173,7 +174,7 @@ def _check_bodies_alone(people: People, projected, warn) -> None:
     inside = ((u >= 0) & (u < width) & (v >= 0) & (v < height)).any(-1)
     share = 100 * float((~inside[present]).mean())
     if share > 70:
-        raise ValueError(
+        raise InputError(
             f"bodies are outside the image of {width}x{height} px in {share:.0f} % of "
             "their frames; expected bodies in the frame of the camera, x right, y "
             "down, "

@@ -19,6 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.agreement.exchanges import put_back_exchanges
 from bodyslam_jax.diagnostics.agreement.explanations import (
     Explanation,
@@ -75,7 +76,7 @@ def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
     Args:
         body: the model whose joints are compared; any of a person's size is adequate.
 
-    **Raises:** `ValueError`, one line with both sides and the figure, where they
+    **Raises:** `InputError`, one line with both sides and the figure, where they
     contradict each other and it is ambiguous which is right.
     """
     if sequence.keypoints is None and sequence.bodies is None:
@@ -84,7 +85,7 @@ def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
     try:
         settled = _settle(sequence, body, new_warnings.append)
     except ValueError as error:
-        raise ValueError(f"{sequence.name}: {error}") from None
+        raise InputError(f"{sequence.name}: {error}") from None
     if not new_warnings:
         return settled
     new = [text for text in new_warnings if text not in sequence.warnings]
@@ -137,7 +138,7 @@ def _made_to_meet(
         sequence = undone(sequence, body, crowd, chosen, given, best, warn)
         return sequence, chosen.kind == "sides"
     if given > _CONTRADICTION:
-        raise ValueError(_apart(crowd, given))
+        raise InputError(_apart(crowd, given))
     if given > _DOUBT:
         warn(f"bodies lie {given:.2f} of a person's size from the keypoints (median).")
     return sequence, False

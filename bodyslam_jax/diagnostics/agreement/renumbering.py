@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.agreement.person_rows import have_any
 from bodyslam_jax.diagnostics.agreement.timing import Timing
 from bodyslam_jax.diagnostics.agreement.undo import retimed
@@ -22,7 +23,7 @@ def settle_times(
     A shift is undone if it can be of one kind only, as it would move the other out of
     the video.
 
-    **Raises:** `ValueError` if it is ambiguous which of the two was renumbered.
+    **Raises:** `InputError` if it is ambiguous which of the two was renumbered.
     """
     with_keypoints, with_bodies = (np.any(x, axis=0) for x in have_any(sequence))
     figures = (
@@ -42,7 +43,7 @@ def settle_times(
         bundle = retimed(getattr(sequence, what), lambda k: n * k)
         return dataclasses.replace(sequence, **{what: bundle})
     if found.rate != 1:
-        raise ValueError(
+        raise InputError(
             "keypoints and bodies are not of the same frames: frame k of the "
             "keypoints "
             f"fits frame {found.rate:.3g} k of the bodies ({figures}); expected both "
@@ -76,7 +77,7 @@ def _shifted_back(
         f"({figures}); expected both numbered by the frames of the video"
     )
     if abs(shift) >= _CLEAR:
-        raise ValueError(f"{text}.")
+        raise InputError(f"{text}.")
     warn(f"{text}.")
     return sequence
 

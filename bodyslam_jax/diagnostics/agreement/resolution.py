@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.agreement.explanations import Explanation
 from bodyslam_jax.diagnostics.agreement.facing import shares, trunk_directions
 from bodyslam_jax.diagnostics.agreement.image_points import People, people_of, sizes
@@ -33,7 +34,7 @@ def undone(
 ) -> Sequence:
     """The sequence with the effect of the explanation undone, where that is safe.
 
-    **Raises:** `ValueError` if it is ambiguous which side is right.
+    **Raises:** `InputError` if it is ambiguous which side is right.
     """
     figures = (
         f"distance {best:.2f} of a person's size then, {given:.2f} as they are (median)"
@@ -53,7 +54,7 @@ def undone(
         if not found.reason:
             if abs(np.log(found.factor)) < np.log(_TOO_FAR):
                 return sequence  # a warning follows
-            raise ValueError(
+            raise InputError(
                 f"people are {found.factor:.2f} times as large in the keypoints as in "
                 f"the bodies, in the same place ({figures}); expected bodies with "
                 "`trans` in m."
@@ -102,7 +103,7 @@ def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence
         )
         return sequence
     resized = f"times {found.factor:.2f} and " if found.kind == "copy" else ""
-    raise ValueError(
+    raise InputError(
         f"keypoints are where the bodies are only if those are {resized}moved by "
         f"({shift[0]:.0f}, {shift[1]:.0f}) px in all frames ({figures}); expected "
         "keypoints in pixels of this video, not of a cropped or padded copy, and "
@@ -119,7 +120,7 @@ def _turned_back(
     if found.kind == "axes":
         about_sight = found.R[2, 2] == 1
         if about_sight and upright < 0.5:
-            raise ValueError(
+            raise InputError(
                 "keypoints and bodies are turned in the image against each other "
                 f"(bodies fit if {found.name}: {figures}), and in neither are people "
                 "upright; expected both in the video's own orientation."
@@ -137,13 +138,13 @@ def _turned_back(
         turned = f", {found.name}" if found.name else ""
         what = f"a copy of {size}{turned}"
         if not found.reason:
-            raise ValueError(
+            raise InputError(
                 f"keypoints are of {what}, {found.factor:.3f} times this video of "
                 f"{width}x{height} px, as the bodies have it ({figures}); expected "
                 "keypoints in pixels of the video."
             )
     if "mirrored" in found.name:
-        raise ValueError(
+        raise InputError(
             f"keypoints fit the bodies only as of {what} ({figures}): one of the two "
             "is "
             "of a mirrored copy; expected both of the video as it is."
@@ -157,7 +158,7 @@ def _turned_back(
     back = with_keypoints_mapped_back(sequence, found.image)
     righted = shares(trunk_directions(people_of(back, body).keypoints))[1]["upright"]
     if not righted > max(0.5, upright):
-        raise ValueError(
+        raise InputError(
             f"keypoints fit the bodies only as of {what} ({figures}), but people are "
             f"upright in {100 * upright:.0f} % of the keypoints as they are and in "
             f"{100 * righted:.0f} % then; expected both of the video as it is."

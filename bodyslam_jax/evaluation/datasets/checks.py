@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax import io
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.safe_pickle import restricted_load
 
 _HOME = {
@@ -34,10 +35,10 @@ def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[st
     """`data`, called `name` in `file`, if it is a dictionary with the keys `needed`."""
     where = f"{file}: {name + ' is ' if name else ''}"
     if not isinstance(data, dict):
-        raise ValueError(f"{where}a {type(data).__name__}, not a dictionary.")
+        raise InputError(f"{where}a {type(data).__name__}, not a dictionary.")
     missing = [f"{name}.{key}" if name else key for key in needed if key not in data]
     if missing:
-        raise ValueError(f"{file}: no {', '.join(missing)}, only {[*data]}.")
+        raise InputError(f"{file}: no {', '.join(missing)}, only {[*data]}.")
     return data
 
 
@@ -45,10 +46,10 @@ def entries(file: Path, name: str, data: Any, count: int | None = None) -> list[
     """The entries of `name`, one for each of `count` people; at least one."""
     is_list = isinstance(data, list | tuple)
     if not is_list and not (isinstance(data, np.ndarray) and data.ndim):
-        raise ValueError(f"{file}: {name}: a {type(data).__name__}, not a list.")
+        raise InputError(f"{file}: {name}: a {type(data).__name__}, not a list.")
     if not len(data) or len(data) != (count or len(data)):
         wanted = "at least one person" if count is None else f"{count} people"
-        raise ValueError(f"{file}: {name}: {len(data)} entries, not of {wanted}.")
+        raise InputError(f"{file}: {name}: {len(data)} entries, not of {wanted}.")
     return list(data)
 
 
@@ -60,7 +61,7 @@ def array(
         found = np.asarray(values, np.float64)
     except (TypeError, ValueError):
         kind = type(values).__name__
-        raise ValueError(
+        raise InputError(
             f"{file}: {name}: a {kind}, not an array of numbers."
         ) from None
     fits = found.ndim == len(shape) and all(
@@ -69,7 +70,7 @@ def array(
     )
     if not fits or not np.all(np.isfinite(found)):
         wanted = str(shape).replace("None", "any")
-        raise ValueError(
+        raise InputError(
             f"{file}: {name}: {found.shape} values, not {wanted} finite numbers."
         )
     return found
@@ -88,7 +89,7 @@ def whole(file: Path, name: str, value: Any) -> int:
     """A whole number above 0."""
     number = float(array(file, name, value, ()))
     if number < 1 or number != round(number):
-        raise ValueError(f"{file}: {name}: {number:g}, not a whole number above 0.")
+        raise InputError(f"{file}: {name}: {number:g}, not a whole number above 0.")
     return int(number)
 
 
@@ -96,7 +97,7 @@ def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarra
     """World-to-camera matrices, which can be inverted."""
     found = array(file, name, values, (num, 4, 4))
     if np.any(abs(np.linalg.det(found)) < 1e-6):
-        raise ValueError(f"{file}: {name}: matrices without an inverse, not poses.")
+        raise InputError(f"{file}: {name}: matrices without an inverse, not poses.")
     return found
 
 
@@ -111,9 +112,9 @@ def images(folder: Path, num: int = 1) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     listed = sorted(found, key=lambda file: file.name)
     if not listed:
-        raise ValueError(f"{folder}: no image in it.")
+        raise InputError(f"{folder}: no image in it.")
     if len(listed) < num:
-        raise ValueError(f"{folder}: {len(listed)} images, not one for {num} frames.")
+        raise InputError(f"{folder}: {len(listed)} images, not one for {num} frames.")
     return listed
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.datasets import checks, folder
 from bodyslam_jax.evaluation.datasets.gender import body_for, gender_of
 from bodyslam_jax.evaluation.readers import posed_joints
@@ -39,7 +40,7 @@ def convert_emdb(source: Path, out: Path, body_model: Path | None = None) -> Pat
     size = (size, checks.whole(file, "camera.height", camera["height"]))
     gender = gender_of(data["gender"])
     if gender is None:
-        raise ValueError(f"{file}: gender is {data['gender']!r}, not female or male.")
+        raise InputError(f"{file}: gender is {data['gender']!r}, not female or male.")
     checks.images(source / "images", num)
     body = body_for(file, gender, "smpl", body_model)
     person = {

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
 
 FPS = 30.0
@@ -26,11 +27,11 @@ def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
     It replaces what an earlier conversion wrote; other files in `out` stay. If the
     block raises, `out` is unchanged.
 
-    **Raises:** `ValueError` if `out` cannot be written, or has files of the same names
+    **Raises:** `InputError` if `out` cannot be written, or has files of the same names
     that no conversion wrote.
     """
     if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: a file; expected a folder to write.")
+        raise InputError(f"{out}: a file; expected a folder to write.")
     try:
         with atomic.hidden_folder(out.resolve().parent, ".conversion-") as partial:
             yield partial
@@ -39,7 +40,7 @@ def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
             partial.chmod(0o755)
             _move(partial, out)
     except OSError as error:
-        raise ValueError(f"{out}: cannot be written ({error.strerror}).") from None
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
 
 
 def _move(partial: Path, out: Path) -> None:
@@ -49,7 +50,7 @@ def _move(partial: Path, out: Path) -> None:
     written = sorted(partial.iterdir(), key=lambda entry: entry.name == _MARK)
     theirs = [e.name for e in written if os.path.lexists(out / e.name)]
     if theirs and not (out / _MARK).exists():
-        raise ValueError(
+        raise InputError(
             f"{out}: has {', '.join(theirs)}, which no conversion wrote; choose "
             "another folder."
         )

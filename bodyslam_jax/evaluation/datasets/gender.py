@@ -14,6 +14,7 @@ import numpy as np
 
 from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
 from bodyslam_jax.body.files import VARIABLE, candidates, named_gender
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.readers import load_npz, read_groundtruth
 from bodyslam_jax.types import Result
 
@@ -48,13 +49,13 @@ def body_for(
     `body_model` is a file, or a folder with a file for each gender, and for other kinds
     too; without it one is looked for where `load_body_model` does.
 
-    **Raises:** `ValueError` if there is no such body.
+    **Raises:** `InputError` if there is no such body.
     """
     is_found = body_model or os.environ.get(VARIABLE) or _is_installed(gender)
     place = body_model if is_found else DEFAULT
     body, wrong = _load(place, gender, gender, (kind,))
     if wrong:
-        raise ValueError(
+        raise InputError(
             f"{file}: its joints need {_NAMES[kind]}, {gender}, not {wrong}; name its "
             "file or folder with --body-model."
         )

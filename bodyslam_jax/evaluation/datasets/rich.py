@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.datasets import checks, folder
 from bodyslam_jax.evaluation.datasets.gender import body_for, gender_of
 from bodyslam_jax.evaluation.readers import posed_joints
@@ -49,7 +50,7 @@ def convert_rich(
     num = len(files)
     subjects = sorted({file.stem for file in bodies.glob("*/*.pkl")})
     if not subjects:
-        raise ValueError(f"{bodies}: no <frame>/<subject>.pkl in it.")
+        raise InputError(f"{bodies}: no <frame>/<subject>.pkl in it.")
     people = []
     for subject, gender in _genders(root, genders, subjects).items():
         person = _person(sorted(bodies.glob(f"*/{subject}.pkl")), row, num)
@@ -81,7 +82,7 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
     try:
         table = json.loads(file.read_text())
     except ValueError as error:
-        raise ValueError(f"{file}: not JSON ({error}).") from None
+        raise InputError(f"{file}: not JSON ({error}).") from None
     table = checks.fields(file, "", table, ())
     found = {}
     for subject in subjects:
@@ -89,7 +90,7 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
         gender = gender_of(table.get(number))
         if gender is None:
             text = repr(table[number]) if number in table else "no entry"
-            raise ValueError(
+            raise InputError(
                 f"{file}: subject {number}: {text}, not female, male or neutral."
             )
         found[subject] = gender
@@ -116,7 +117,7 @@ def _number(file: Path, name: str) -> int:
     """The number that a name begins with."""
     found = re.match(r"\d+", name)
     if found is None:
-        raise ValueError(f"{file}: {name!r} does not begin with a number.")
+        raise InputError(f"{file}: {name!r} does not begin with a number.")
     return int(found[0])
 
 
@@ -131,7 +132,7 @@ def _camera(xml: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
         K = np.reshape(numbers("Intrinsics"), (3, 3))
         distortion = (*numbers("Distortion"), 0.0, 0.0, 0.0, 0.0)[:4]
     except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"{xml}: not a calibration with CameraMatrix, Intrinsics and Distortion "
             f"({error})."
         ) from None

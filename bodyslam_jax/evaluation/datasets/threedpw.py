@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.datasets import checks, folder
 from bodyslam_jax.evaluation.datasets.gender import gender_of
 
@@ -24,7 +25,7 @@ def convert_3dpw(source: Path, out: Path) -> Path:
     data = checks.dictionary(source, _NEEDED)
     name = str(data["sequence"])
     if Path(name).name != name:  # it names files, and must not lead elsewhere
-        raise ValueError(f"{source}: sequence: {name!r}, not the name of a folder.")
+        raise InputError(f"{source}: sequence: {name!r}, not the name of a folder.")
     T_CW = checks.extrinsics(source, "cam_poses", data["cam_poses"], None)
     K = checks.array(source, "cam_intrinsics", data["cam_intrinsics"], (3, 3))
     people = _people(source, data, len(T_CW))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.body import JOINT_NAMES
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 
 _BLOCK = 512
@@ -26,13 +27,13 @@ _CHAR, _INT, _FLOAT = -1, 2, 4
 def write(path: Path, scene: Scene) -> None:
     """Writes the only person of a scene; absent frames are missing points.
 
-    **Raises:** `ValueError` if there are more frames than the format can count.
+    **Raises:** `InputError` if there are more frames than the format can count.
     """
     scene = at_constant_rate(scene)
     result = scene.result
     num, rate = len(result.timestamps), result.fps
     if num > _LONGEST:
-        raise ValueError(f"--to c3d: {num} frames, expected at most {_LONGEST}.")
+        raise InputError(f"--to c3d: {num} frames, expected at most {_LONGEST}.")
     points = np.zeros((num, 24, 4), "<f4")
     points[..., :3] = 1000 * result.joints[0]
     points[~result.present[0]] = [0, 0, 0, -1]

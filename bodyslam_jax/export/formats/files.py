@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.registry import FORMATS, Format
 from bodyslam_jax.export.formats.scene import Scene, Up, make_scene
@@ -49,7 +50,7 @@ def export(
 
     Returns the files and folders that were written.
 
-    **Raises:** `ValueError`, in one line, for unknown formats, missing extras, nobody
+    **Raises:** `InputError`, in one line, for unknown formats, missing extras, nobody
     to write, another body model, or a folder whose content is no earlier export.
     """
     names = _names(path, to)
@@ -57,7 +58,7 @@ def export(
     writers = [_writer(format) for format in formats]
     several = len(formats) > 1
     if several and path.suffix in {f.suffix for f in FORMATS.values() if f.suffix}:
-        raise ValueError(
+        raise InputError(
             f"{path}: a file, expected a folder for {len(formats)} formats."
         )
     if body is None:
@@ -102,15 +103,15 @@ def _origin(format: Format, scene: Scene) -> dict[str, str]:
 
 
 def _check_target(format: Format, target: Path) -> None:
-    """**Raises:** `ValueError` if something that is no earlier export would be lost."""
+    """**Raises:** `InputError` if something that is no earlier export would be lost."""
     if format.suffix and target.is_dir():
-        raise ValueError(f"{target}: a folder, expected a file ({format.suffix}).")
+        raise InputError(f"{target}: a folder, expected a file ({format.suffix}).")
     if format.suffix or not target.exists():
         return
     if not target.is_dir():
-        raise ValueError(f"{target}: a file, expected a folder for {format.name}.")
+        raise InputError(f"{target}: a file, expected a folder for {format.name}.")
     if any(target.iterdir()) and not (target / _MARK).exists():
-        raise ValueError(
+        raise InputError(
             f"{target}: has files in it that are no earlier export, expected a new "
             "folder; give another one."
         )
@@ -121,7 +122,7 @@ def _names(path: Path, to: str | tuple[str, ...] | None) -> tuple[str, ...]:
         known = {f.suffix: f.name for f in FORMATS.values() if f.suffix}
         found = (known | _MORE_SUFFIXES).get(path.suffix.lower())
         if found is None:
-            raise ValueError(
+            raise InputError(
                 f"{path}: suffix {path.suffix!r} names no format, expected one of "
                 f"{', '.join(known)}; or name the format (--to)."
             )
@@ -129,17 +130,17 @@ def _names(path: Path, to: str | tuple[str, ...] | None) -> tuple[str, ...]:
     names = (to,) if isinstance(to, str) else tuple(dict.fromkeys(to))
     unknown = [name for name in names if name not in FORMATS]
     if unknown or not names:
-        raise ValueError(
+        raise InputError(
             f"--to {' '.join(unknown)}: unknown, expected of {', '.join(FORMATS)}."
         )
     return names
 
 
 def _writer(format: Format) -> Callable[[Path, Scene], None]:
-    """**Raises:** `ValueError` that says how to get what is not installed."""
+    """**Raises:** `InputError` that says how to get what is not installed."""
     module = importlib.import_module(format.module)
     if format.extra is not None and not module.is_installed():
-        raise ValueError(
+        raise InputError(
             f"--to {format.name}: not installed, expected the extra `{format.extra}`; "
             f"pip install 'bodyslam-jax[{format.extra}]'."
         )
@@ -151,7 +152,7 @@ def _parts(format: Format, base: Path, scene: Scene) -> list[tuple[Path, Scene]]
     if not format.per_person:
         return [(base, scene)]
     if not scene.people:
-        raise ValueError(f"--to {format.name}: nobody is in this run, expected people.")
+        raise InputError(f"--to {format.name}: nobody is in this run, expected people.")
     found = []
     for k, number in enumerate(scene.people):
         fields = ("poses", "trans", "betas", "joints", "present")

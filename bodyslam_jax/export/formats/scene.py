@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.body import PARENTS, BodyModel, joints, rest_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
@@ -140,14 +141,14 @@ def make_scene(
 ) -> Scene:
     """The people asked for (all who are present at all), in a world with that axis up.
 
-    **Raises:** `ValueError` if there is no such person, or if `body` is not the body
+    **Raises:** `InputError` if there is no such person, or if `body` is not the body
     model of the result.
     """
     seen = np.flatnonzero(result.present.any(axis=1))
     chosen = np.atleast_1d(seen if person is None else np.array(person, int))
     if missing := [str(h) for h in chosen if h not in seen]:
         known = ", ".join(map(str, seen)) or "nobody"
-        raise ValueError(
+        raise InputError(
             f"--person {' '.join(missing)}: not in this run, expected {known}."
         )
     fields = ("poses", "trans", "betas", "joints", "present")
@@ -256,7 +257,7 @@ def _check_body(result: Result, body: BodyModel) -> None:
         )
         away = np.linalg.norm(np.asarray(posed) - result.joints[h, k], axis=-1).max()
         if not away < _OTHER_BODY:
-            raise ValueError(
+            raise InputError(
                 f"body model {body.name}: its joints are {100 * away:.0f} cm off the "
                 "run's, expected the body model of the run; give it by --body-model."
             )

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.config import Association
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.bodies.amass import body_pose, is_smplx
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, join, whole_of
@@ -54,11 +55,11 @@ def read_bodies(
         times: of each of the video's frames, s.
         images: names of the video's frames, if it is a folder of images.
 
-    **Raises:** `ValueError`, naming the file, if it is none of the known kinds, has NaN
+    **Raises:** `InputError`, naming the file, if it is none of the known kinds, has NaN
     or infinity in it, or belongs to another video.
     """
     if not path.exists():
-        raise ValueError(f"{path}: no such file.")
+        raise InputError(f"{path}: no such file.")
     video = Video(intrinsics, num_frames, fps, times, images, config, warn)
     if path.is_dir():
         rows = _read_tram_folder(path, video)
@@ -71,7 +72,7 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
     if isinstance(data, dict) and set(data) == {"results"}:
         data = data["results"]
     if not isinstance(data, dict) or not data:
-        raise ValueError(f"{path}: no named arrays in it, so not bodies.")
+        raise InputError(f"{path}: no named arrays in it, so not bodies.")
     try:
         if {"frame", "poses", "betas"} <= set(data):
             return _from_contract(data, video)
@@ -79,13 +80,13 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
             if recognise(data):
                 return read(data, video)
     except InvalidContent as error:
-        raise ValueError(f"{path}: {error}.") from None
+        raise InputError(f"{path}: {error}.") from None
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
-        raise ValueError(f"{path}: incomplete or damaged bodies ({what}).") from None
+        raise InputError(f"{path}: incomplete or damaged bodies ({what}).") from None
     supported = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
     keys = ", ".join(str(k) for k in list(data)[:6])
-    raise ValueError(
+    raise InputError(
         f"{path}: not bodies of {supported} or bodies.npz; it holds {keys}."
     )
 
@@ -149,7 +150,7 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
     """TRAM's `hps/` (one file per person), with `camera.npy` beside or above it."""
     tracks = sorted(folder.glob("**/hps_track_*.npy"))
     if not tracks:
-        raise ValueError(f"{folder}: a folder without TRAM's hps_track_*.npy.")
+        raise InputError(f"{folder}: a folder without TRAM's hps_track_*.npy.")
     cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
     camera_file = next((p for p in cameras if p.is_file()), None)
     camera = restricted_load(camera_file) if camera_file else {}
@@ -158,7 +159,7 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
     for track in tracks:
         data = restricted_load(track)
         if not isinstance(data, dict):
-            raise ValueError(f"{track}: not a dictionary of arrays.")
+            raise InputError(f"{track}: not a dictionary of arrays.")
         one = _read(track, {**data, **shared}, video)
         number = int(re.findall(r"\d+", track.stem)[-1])
         person = np.full(len(one.frame), number)
@@ -169,7 +170,7 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
 def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
     """The bodies that are finite; others are absent in their frames, with a warning.
 
-    **Raises:** `ValueError` if most are not finite.
+    **Raises:** `InputError` if most are not finite.
     """
     names = ("poses", "betas", "trans")
     fine = {name: np.isfinite(getattr(rows, name)).all(axis=1) for name in names}
@@ -179,7 +180,7 @@ def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
     broken = " and ".join(f"`{name}`" for name in names if not fine[name].all())
     text = f"{broken} has NaN or infinity in {(~kept).sum()} of {len(kept)} bodies"
     if kept.mean() < _MIN_FINITE:
-        raise ValueError(f"{path}: {text}.")
+        raise InputError(f"{path}: {text}.")
     warn(f"{text}: taken as absent in those frames.")
     arrays = {n: getattr(rows, n)[kept] for n in ("frame", "person", *names)}
     return dataclasses.replace(rows, **arrays)
@@ -190,11 +191,11 @@ def _gather(
 ) -> Bodies:
     """Checks the rows and sorts them by person and frame."""
     if not len(rows.frame):
-        raise ValueError(f"{path}: no body in any frame.")
+        raise InputError(f"{path}: no body in any frame.")
     for name in ("person", "poses", "betas", "trans"):
         array = getattr(rows, name)
         if len(array) != len(rows.frame):
-            raise ValueError(
+            raise InputError(
                 f"{path}: {len(rows.frame)} frames for {len(array)} of `{name}`."
             )
     rows = _finite(path, rows, warn)
@@ -202,22 +203,22 @@ def _gather(
     if num_frames is None:
         num_frames = high + 1
     if low < 0 or high >= num_frames:
-        raise ValueError(
+        raise InputError(
             f"{path}: bodies of frames {low} to {high}, but the video has {num_frames}."
         )
     distance = float(np.linalg.norm(rows.trans, axis=-1).max())
     if distance > _MAX_DISTANCE:
-        raise ValueError(f"{path}: a body {distance:.0f} m away; `trans` is in m.")
+        raise InputError(f"{path}: a body {distance:.0f} m away; `trans` is in m.")
     if (rows.trans[:, 2] < -0.5).all():
-        raise ValueError(f"{path}: all bodies behind the camera; z is forward.")
+        raise InputError(f"{path}: all bodies behind the camera; z is forward.")
     turn = float(np.linalg.norm(rows.poses.reshape(-1, 3), axis=-1).max())
     if turn > 20:
-        raise ValueError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
+        raise InputError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
     people, index = np.unique(rows.person, return_inverse=True)
     size = (len(people), num_frames)
     present = np.zeros(size, dtype=bool)
     if len(np.unique(index * num_frames + rows.frame)) < len(index):
-        raise ValueError(f"{path}: two bodies of one `person` in the same `frame`.")
+        raise InputError(f"{path}: two bodies of one `person` in the same `frame`.")
     poses, shapes = np.zeros((*size, 72)), np.zeros((*size, 10))
     trans = np.zeros((*size, 3))
     at = (index, rows.frame)

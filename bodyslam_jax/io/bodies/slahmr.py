@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
@@ -40,7 +41,7 @@ def with_track_info(path: Path, data: Any) -> Any:
             try:
                 return {**data, _INFO: json.loads(file.read_text())}
             except (OSError, ValueError) as error:
-                raise ValueError(f"{file}: not a JSON file ({error}).") from None
+                raise InputError(f"{file}: not a JSON file ({error}).") from None
     return data
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.colmap import FoundCamera
 
@@ -47,7 +48,7 @@ def read_arkit_poses(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
     """Times since the first pose (s) and poses T_WC (m, OpenCV's axes).
 
-    **Raises:** `ValueError`, naming the file, if it is of none of these recorders.
+    **Raises:** `InputError`, naming the file, if it is of none of these recorders.
     """
     if path.suffix == ".csv":
         table = _table(path)
@@ -60,9 +61,9 @@ def read_arkit_poses(
             times = np.asarray(data["frameTimestamps"], float)
             times = times - times[0]
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise ValueError(f"{path}: not Record3D's metadata ({error!r}).") from None
+        raise InputError(f"{path}: not Record3D's metadata ({error!r}).") from None
     if rows.ndim != 2 or rows.shape[1] != 7 or len(times) != len(rows):
-        raise ValueError(
+        raise InputError(
             f"{path}: poses of shape {rows.shape} at {len(times)} times, expected rows "
             "of `qx qy qz qw x y z`."
         )
@@ -74,15 +75,15 @@ def read_arkit_poses(
 def read_arkit_camera(path: Path, size: tuple[int, int] | None) -> FoundCamera:
     """The camera of a recording; Stray Scanner's file lacks the image's `size`, px.
 
-    **Raises:** `ValueError`, naming the file, if it is of none of these recorders.
+    **Raises:** `InputError`, naming the file, if it is of none of these recorders.
     """
     if path.suffix == ".csv":
         try:
             K = np.loadtxt(path, delimiter=",", ndmin=2)
         except ValueError as error:
-            raise ValueError(f"{path}: not a matrix ({error}).") from None
+            raise InputError(f"{path}: not a matrix ({error}).") from None
         if size is None:
-            raise ValueError(f"{path}: of what image size? It needs the video.")
+            raise InputError(f"{path}: of what image size? It needs the video.")
         width, height = size
     else:
         data = _metadata(path)
@@ -90,9 +91,9 @@ def read_arkit_camera(path: Path, size: tuple[int, int] | None) -> FoundCamera:
             K = np.asarray(data["K"], float).reshape(3, 3).T
             width, height = int(data["w"]), int(data["h"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: not Record3D's metadata ({error!r}).") from None
+            raise InputError(f"{path}: not Record3D's metadata ({error!r}).") from None
     if K.shape != (3, 3) or not np.isfinite(K).all():
-        raise ValueError(
+        raise InputError(
             f"{path}: a matrix of shape {K.shape}, expected 3 x 3 numbers."
         )
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
@@ -105,10 +106,10 @@ def _table(path: Path) -> Float[np.ndarray, "n 9"]:
         rows = [line.split(",") for line in lines if line.strip()]
         table = np.asarray(rows, float)
     except (ValueError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not Stray Scanner's odometry ({error}).") from None
+        raise InputError(f"{path}: not Stray Scanner's odometry ({error}).") from None
     names = tuple(word.strip() for word in head.split(","))[: len(_COLUMNS)]
     if names != _COLUMNS or table.ndim != 2 or table.shape[1] < len(_COLUMNS):
-        raise ValueError(
+        raise InputError(
             f"{path}: columns {', '.join(names)}, expected {', '.join(_COLUMNS)}."
         )
     return table[:, : len(_COLUMNS)]
@@ -119,7 +120,7 @@ def _poses(
 ) -> Float[np.ndarray, "n 4 4"]:
     length = np.linalg.norm(xyzw, axis=1)
     if not np.isfinite(position).all() or not (abs(length - 1) < 0.05).all():
-        raise ValueError(f"{path}: a pose that is no rotation and position.")
+        raise InputError(f"{path}: a pose that is no rotation and position.")
     T_WC = np.tile(np.eye(4), (len(xyzw), 1, 1))
     T_WC[:, :3, :3] = so3.from_quaternion(xyzw)
     T_WC[:, :3, 3] = position
@@ -134,9 +135,9 @@ def _metadata(path: Path) -> dict[str, Any]:
         else:
             found = json.loads(path.read_text())
     except (KeyError, ValueError, UnicodeDecodeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not Record3D's metadata ({error}).") from None
+        raise InputError(f"{path}: not Record3D's metadata ({error}).") from None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: a JSON object expected, found a list.")
+        raise InputError(f"{path}: a JSON object expected, found a list.")
     return found
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
 from bodyslam_jax.types import Intrinsics
@@ -37,17 +38,17 @@ def read_camera(
     Args:
         size: of the video, px; it selects the camera of a file that holds several.
 
-    **Raises:** `ValueError`, naming the file, if something is missing or impossible.
+    **Raises:** `InputError`, naming the file, if something is missing or impossible.
     """
     if path.is_dir():
         names = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
         names = (*names, *arkit.CAMERA_FILES)
         inside = [p for name in names if (p := path / name).exists()]
         if not inside:
-            raise ValueError(f"{path}: none of {', '.join(names)} in this folder.")
+            raise InputError(f"{path}: none of {', '.join(names)} in this folder.")
         path = inside[0]
     if not path.exists():
-        raise ValueError(f"{path}: no such file, expected a camera's.")
+        raise InputError(f"{path}: no such file, expected a camera's.")
     if arkit.is_camera(path):
         return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
     if path.suffix in (".txt", ".bin"):
@@ -55,19 +56,19 @@ def read_camera(
     try:
         data = json.loads(path.read_text())
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not a JSON file ({error}).") from None
+        raise InputError(f"{path}: not a JSON file ({error}).") from None
     if not isinstance(data, dict):
-        raise ValueError(
+        raise InputError(
             f"{path}: a JSON object expected, {type(data).__name__} found."
         )
     if "model" not in data and ("fl_x" in data or "frames" in data):
         return _from_cameras(path, read_cameras(path), size), None
     missing = [k for k in ("model", "width", "height", "params") if k not in data]
     if missing:
-        raise ValueError(f"{path}: no {', '.join(missing)}; only {', '.join(data)}.")
+        raise InputError(f"{path}: no {', '.join(missing)}; only {', '.join(data)}.")
     model = data["model"]
     if not isinstance(model, str) or model not in _NUM_PARAMS:
-        raise ValueError(
+        raise InputError(
             f"{path}: model {model!r}, not one of {', '.join(_NUM_PARAMS)}."
         )
     try:
@@ -75,15 +76,15 @@ def read_camera(
         width, height = (_whole(data[k], k) for k in ("width", "height"))
         fps = None if data.get("fps") is None else float(data["fps"])
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: numbers expected ({error}).") from None
+        raise InputError(f"{path}: numbers expected ({error}).") from None
     if params.shape != (_NUM_PARAMS[model],):
         found = (
             f"{params.size} params" if params.ndim == 1 else "params in no plain list"
         )
-        raise ValueError(f"{path}: {found} for {model}, not {_NUM_PARAMS[model]}.")
+        raise InputError(f"{path}: {found} for {model}, not {_NUM_PARAMS[model]}.")
     intrinsics = _intrinsics(path, model, params, width, height)
     if fps is not None and not 0.1 <= fps <= 1000:
-        raise ValueError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
+        raise InputError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
     return intrinsics, fps
 
 
@@ -95,12 +96,12 @@ def _from_cameras(
     chosen = fitting or cameras
     same = {(c.model, c.width, c.height, tuple(c.params)) for c in chosen}
     if len(same) > 1:
-        raise ValueError(
+        raise InputError(
             f"{path}: {len(same)} different cameras, expected the one of this video."
         )
     found = chosen[0]
     if found.model not in (*_NUM_PARAMS, "RADIAL"):
-        raise ValueError(
+        raise InputError(
             f"{path}: camera model {found.model}, expected one of "
             f"{', '.join(_NUM_PARAMS)} or RADIAL: undistort the images first."
         )
@@ -113,15 +114,15 @@ def _intrinsics(
 ) -> Intrinsics:
     """Checked intrinsics in OpenCV's model.
 
-    **Raises:** `ValueError`, naming the file, if no camera has such parameters.
+    **Raises:** `InputError`, naming the file, if no camera has such parameters.
     """
     params = _from_colmap(model, params)
     if not np.isfinite(params).all() or (params[:2] <= 0).any():
-        raise ValueError(f"{path}: params {params.tolist()} are not those of a camera.")
+        raise InputError(f"{path}: params {params.tolist()} are not those of a camera.")
     if width <= 0 or height <= 0:
-        raise ValueError(f"{path}: size {width}x{height} px is not that of an image.")
+        raise InputError(f"{path}: size {width}x{height} px is not that of an image.")
     if not (-width < params[2] < 2 * width and -height < params[3] < 2 * height):
-        raise ValueError(
+        raise InputError(
             f"{path}: principal point {params[2]:g}, {params[3]:g} far outside the "
             f"image of {width}x{height} px."
         )
@@ -130,7 +131,7 @@ def _intrinsics(
 
 def _whole(value: Any, name: str) -> int:
     if isinstance(value, bool) or not float(value).is_integer():
-        raise ValueError(f"{name} {value} is no whole number of pixels")
+        raise InputError(f"{name} {value} is no whole number of pixels")
     return int(value)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 
 _HALF = 0.5
@@ -50,16 +51,16 @@ class FoundCamera:
 def read_cameras(path: Path) -> list[FoundCamera]:
     """Cameras of `cameras.txt`, `cameras.bin` or `transforms.json`.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these.
+    **Raises:** `InputError`, naming the file, if it is none of these.
     """
     if path.suffix == ".json":
         return [_nerfstudio_camera(path, _load(path))]
     try:
         found = list(_binary_cameras(path) if path.suffix == ".bin" else _text(path))
     except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not COLMAP's cameras ({error}).") from None
+        raise InputError(f"{path}: not COLMAP's cameras ({error}).") from None
     if not found:
-        raise ValueError(f"{path}: no camera in it, expected COLMAP's cameras.")
+        raise InputError(f"{path}: no camera in it, expected COLMAP's cameras.")
     return [_centred(camera) for camera in found]
 
 
@@ -67,23 +68,23 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     """Names of images and their poses T_WC, of `images.txt`, `images.bin` or
     `transforms.json`.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these.
+    **Raises:** `InputError`, naming the file, if it is none of these.
     """
     if path.suffix == ".json":
         return _nerfstudio_poses(path, _load(path))
     try:
         rows = list(_binary_images(path) if path.suffix == ".bin" else _images(path))
     except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not COLMAP's images ({error}).") from None
+        raise InputError(f"{path}: not COLMAP's images ({error}).") from None
     if not rows:
-        raise ValueError(f"{path}: no image in it, expected COLMAP's images.")
+        raise InputError(f"{path}: no image in it, expected COLMAP's images.")
     names, numbers = zip(*rows, strict=True)
     numbers = np.asarray(numbers, float)
     if not np.isfinite(numbers).all():
-        raise ValueError(f"{path}: a pose that is not finite numbers.")
+        raise InputError(f"{path}: a pose that is not finite numbers.")
     length = np.linalg.norm(numbers[:, :4], axis=1)
     if (abs(length - 1) > 0.05).any():
-        raise ValueError(f"{path}: a quaternion of length {length.max():.3g}, not 1.")
+        raise InputError(f"{path}: a quaternion of length {length.max():.3g}, not 1.")
     R_CW = so3.from_quaternion(numbers[:, [1, 2, 3, 0]])
     T_WC = np.tile(np.eye(4), (len(numbers), 1, 1))
     T_WC[:, :3, :3] = np.swapaxes(R_CW, 1, 2)
@@ -136,7 +137,7 @@ def _binary_cameras(path: Path) -> Iterator[FoundCamera]:
     for _ in range(reader.take("Q")[0]):
         _, model, width, height = reader.take("iiQQ")
         if not 0 <= model < len(_MODELS):
-            raise ValueError(f"camera model number {model}")
+            raise InputError(f"camera model number {model}")
         name, count = _MODELS[model]
         yield FoundCamera(name, width, height, list(reader.take(f"{count}d")))
 
@@ -157,9 +158,9 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text())
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not a JSON file ({error}).") from None
+        raise InputError(f"{path}: not a JSON file ({error}).") from None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: a JSON object expected, found a list.")
+        raise InputError(f"{path}: a JSON object expected, found a list.")
     return found
 
 
@@ -174,10 +175,10 @@ def _nerfstudio_camera(path: Path, data: dict[str, Any]) -> FoundCamera:
     needed = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     missing = [name for name in needed if value(name) is None]
     if missing:
-        raise ValueError(f"{path}: no {', '.join(missing)}, expected nerfstudio's.")
+        raise InputError(f"{path}: no {', '.join(missing)}, expected nerfstudio's.")
     model = str(value("camera_model") or "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"):
-        raise ValueError(
+        raise InputError(
             f"{path}: camera_model {model}, expected OPENCV or PINHOLE: "
             "undistort the images first."
         )
@@ -186,7 +187,7 @@ def _nerfstudio_camera(path: Path, data: dict[str, Any]) -> FoundCamera:
         bent = [float(value(n) or 0.0) for n in ("k1", "k2", "p1", "p2")]
         width, height = int(value("w")), int(value("h"))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: numbers expected ({error}).") from None
+        raise InputError(f"{path}: numbers expected ({error}).") from None
     params = [fx, fy, cx - _HALF, cy - _HALF]
     if any(bent):
         return FoundCamera("OPENCV", width, height, params + bent)
@@ -201,12 +202,12 @@ def _nerfstudio_poses(
         names = [str(row["file_path"]) for row in rows]
         T_WC = np.asarray([row["transform_matrix"] for row in rows], float)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not nerfstudio's frames ({error!r}).") from None
+        raise InputError(f"{path}: not nerfstudio's frames ({error!r}).") from None
     if T_WC.ndim != 3 or T_WC.shape[1:] not in ((4, 4), (3, 4)) or not len(T_WC):
-        raise ValueError(f"{path}: transform_matrix of shape {T_WC.shape[1:]}.")
+        raise InputError(f"{path}: transform_matrix of shape {T_WC.shape[1:]}.")
     found = np.tile(np.eye(4), (len(T_WC), 1, 1))
     found[:, :3] = T_WC[:, :3] * [1.0, -1.0, -1.0, 1.0]
     rigid = found[:, :3, :3] @ np.swapaxes(found[:, :3, :3], 1, 2)
     if not np.isfinite(found).all() or np.abs(rigid - np.eye(3)).max() > 0.01:
-        raise ValueError(f"{path}: a transform_matrix that is no rigid motion.")
+        raise InputError(f"{path}: a transform_matrix that is no rigid motion.")
     return names, found

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import read_poses
@@ -37,17 +38,17 @@ def read_camera_path(
         metric: whether the poses are in metres.
         images: names of the video's frames, if it is a folder of images.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these or belongs to
+    **Raises:** `InputError`, naming the file, if it is none of these or belongs to
     another video.
     """
     if not path.exists():
-        raise ValueError(f"{path}: no such file, expected a camera path.")
+        raise InputError(f"{path}: no such file, expected a camera path.")
     if path.is_dir():
         names = ("images.bin", "images.txt", "transforms.json", *arkit.PATH_FILES)
         inside = [path / n for n in names]
         path = next((p for p in inside if p.exists()), inside[0])
         if not path.exists():
-            raise ValueError(f"{path.parent}: no {', '.join(names)} in this folder.")
+            raise InputError(f"{path.parent}: no {', '.join(names)} in this folder.")
     count = len(timestamps)
     if arkit.is_path(path):
         metric = True
@@ -65,17 +66,17 @@ def read_camera_path(
                 warn=warn,
             )
         except InvalidContent as error:
-            raise ValueError(f"{path}: {error}.") from None
+            raise InputError(f"{path}: {error}.") from None
         T_WC, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
         at = [frames[name] for name in names]
         T_WC[at], known[at] = poses, True
     else:
         times, poses = read_tum(path)
         if len(times) < _FEWEST:
-            raise ValueError(f"{path}: one pose, expected {_FEWEST} or more.")
+            raise InputError(f"{path}: one pose, expected {_FEWEST} or more.")
         T_WC, known = _at_times(times, poses, timestamps)
     if known.sum() < _FEWEST:
-        raise ValueError(
+        raise InputError(
             f"{path}: poses for {known.sum()} of the video's {count} frames, expected "
             f"{_FEWEST} or more: of another video, or another clock?"
         )

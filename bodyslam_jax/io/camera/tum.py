@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
     """Timestamps (s) and poses (camera to world, m) of a TUM trajectory, sorted.
 
-    **Raises:** `ValueError` naming the file, what was found and what was expected.
+    **Raises:** `InputError` naming the file, what was found and what was expected.
     """
     rows = []
     try:
         lines = path.read_text().splitlines()
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: a binary file, not a TUM trajectory.") from None
+        raise InputError(f"{path}: a binary file, not a TUM trajectory.") from None
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
@@ -30,21 +31,21 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
         except ValueError:
             row = []
         if len(row) != 8 or not np.all(np.isfinite(row)):
-            raise ValueError(
+            raise InputError(
                 f"{path}, line {number}: {line.strip()[:60]!r}, not eight numbers "
                 "`timestamp tx ty tz qx qy qz qw`."
             )
         rows.append(row)
     if not rows:
-        raise ValueError(f"{path}: no pose in it; expected TUM lines of eight numbers.")
+        raise InputError(f"{path}: no pose in it; expected TUM lines of eight numbers.")
     table = np.array(rows)
     table = table[np.argsort(table[:, 0], kind="stable")]
     if np.any(np.diff(table[:, 0]) <= 0):
-        raise ValueError(f"{path}: two poses have the same timestamp.")
+        raise InputError(f"{path}: two poses have the same timestamp.")
     length = np.linalg.norm(table[:, 4:], axis=1)
     if np.any(abs(length - 1) > 0.05):
         worst = float(length[np.argmax(abs(length - 1))])
-        raise ValueError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
+        raise InputError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
     T_WC = np.tile(np.eye(4), (len(table), 1, 1))
     T_WC[:, :3, :3] = so3.from_quaternion(table[:, 4:])
     T_WC[:, :3, 3] = table[:, 1:4]

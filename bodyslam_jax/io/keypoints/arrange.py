@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import BODY25_FACE
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.io.keypoints.files import Listed
 from bodyslam_jax.io.keypoints.layout_evidence import choose_layout
@@ -36,7 +37,7 @@ def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "
     layout of that number of keypoints, unless the distances between them clearly favour
     another one (`layout_evidence`). Keypoints with a non-finite value are missing.
 
-    **Raises:** `ValueError`, naming the file, if most detections are lost to such
+    **Raises:** `InputError`, naming the file, if most detections are lost to such
     values, or no known order of as many points fits a body.
     """
     raw = [points for _, points, _ in listed.rows]
@@ -73,7 +74,7 @@ def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
         lost += bool(bad.any()) and int((finite & (points[:, 2] > 0)).sum()) < _USABLE
         whole.append(np.where(finite[:, None], points, 0.0))
     if lost > _MAX_LOST * len(raw):
-        raise ValueError(
+        raise InputError(
             f"{path}: {broken} of {total} keypoints with NaN or infinity, so that "
             f"{lost} of {len(raw)} people have fewer than {_USABLE} left."
         )
@@ -96,7 +97,7 @@ def _in_order(
     num = points.shape[1]
     if layout is not None and listed.parts is not None:
         if len(layout) != num:
-            raise ValueError(
+            raise InputError(
                 f"{path}: names of {len(layout)} keypoints, but {num} a person."
             )
         return from_layout(points, layout), layout
@@ -106,7 +107,7 @@ def _in_order(
     choice = choose_layout(points, layouts)
     usual = next(iter(layouts))
     if not choice.plausible:
-        raise ValueError(
+        raise InputError(
             f"{path}: {num} keypoints a person in no known order: as "
             f"{', '.join(layouts)} limbs are too long for a body; give them in "
             f"{usual}'s order, or in a file that names them (`keypoint_names`)."

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import numbers, open_npz
 from bodyslam_jax.io.declared_size import Size, size_in
 from bodyslam_jax.io.keypoints.names import names_in
@@ -44,11 +45,11 @@ class Listed:
 def read_openpose(folder: Path) -> Listed:
     """OpenPose's folder of `*_keypoints.json`, one file per frame.
 
-    **Raises:** `ValueError`, naming the file, if it is not OpenPose's.
+    **Raises:** `InputError`, naming the file, if it is not OpenPose's.
     """
     files = sorted(folder.glob(f"*{_JSON_SUFFIX}")) or sorted(folder.glob("*.json"))
     if not files:
-        raise ValueError(f"{folder}: no *{_JSON_SUFFIX} in this folder.")
+        raise InputError(f"{folder}: no *{_JSON_SUFFIX} in this folder.")
     rows = []
     for file in files:
         rows += [(file.name, *found) for found in _read_openpose_frame(file)]
@@ -60,14 +61,14 @@ def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
     data = _load_json(file)
     people = data.get("people") if isinstance(data, dict) else None
     if not isinstance(people, list):
-        raise ValueError(f"{file}: no list `people`, so not OpenPose's output.")
+        raise InputError(f"{file}: no list `people`, so not OpenPose's output.")
     found = []
     for person in people:
         if not isinstance(person, dict):
-            raise ValueError(f"{file}: `people` holds {type(person).__name__}s.")
+            raise InputError(f"{file}: `people` holds {type(person).__name__}s.")
         flat = person.get("pose_keypoints_2d", person.get("pose_keypoints"))
         if flat is None:
-            raise ValueError(f"{file}: a person without `pose_keypoints_2d`.")
+            raise InputError(f"{file}: a person without `pose_keypoints_2d`.")
         found.append((_triples(file, flat), _who(file, person, "person_id")))
     return found
 
@@ -75,14 +76,14 @@ def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
 def read_json(path: Path) -> Listed:
     """A JSON file of AlphaPose, MMPose, COCO or easy_ViTPose, recognised by content.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these or incomplete.
+    **Raises:** `InputError`, naming the file, if it is none of these or incomplete.
     """
     data = _load_json(path)
     for recognise, read in _JSON_READERS:
         if recognise(data):
             return read(path, data)
     what = list(data)[:5] if isinstance(data, dict) else type(data).__name__
-    raise ValueError(
+    raise InputError(
         f"{path}: neither AlphaPose, MMPose, COCO nor easy_ViTPose keypoints, but "
         f"{what}."
     )
@@ -128,7 +129,7 @@ def _read_coco(path: Path, data: Any) -> Listed:
             if "keypoints" in a
         ]
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: incomplete COCO annotations ({error}).") from None
+        raise InputError(f"{path}: incomplete COCO annotations ({error}).") from None
     return Listed(
         rows,
         list(name.values()),
@@ -147,14 +148,14 @@ def _read_mmpose(path: Path, data: Any) -> Listed:
                 xy = _array(path, person["keypoints"])
                 score = _array(path, person["keypoint_scores"])
                 if xy.shape != (len(score), 2):
-                    raise ValueError(
+                    raise InputError(
                         f"{path}: {xy.shape} keypoints, {len(score)} scores."
                     )
                 points = np.concatenate([xy, score[:, None]], axis=-1)
                 who = _who(path, person, "track_id")
                 rows.append((names[-1], points, who))
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: incomplete MMPose result ({error!r}).") from None
+        raise InputError(f"{path}: incomplete MMPose result ({error!r}).") from None
     return Listed(
         rows,
         names,
@@ -228,20 +229,20 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
                 numbers(path, archive, k, finite=False) for k in ("uv", "confidence")
             )
             if uv.shape != (*confidence.shape, 2):
-                raise ValueError(
+                raise InputError(
                     f"{path}: uv {uv.shape}, confidence {confidence.shape}."
                 )
             points = np.concatenate([uv, confidence[..., None]], axis=-1)
         else:
-            raise ValueError(f"{path}: no array `keypoints`, only {archive.files}.")
+            raise InputError(f"{path}: no array `keypoints`, only {archive.files}.")
         header = {k: archive[k] for k in archive.files if archive[k].size < _SMALL}
     header = {k: v.tolist() for k, v in header.items() if v.dtype.kind in "fiuU"}
     if points.ndim == 3:
         points = points[None]
     if points.ndim != 4 or points.shape[-1] != 3:
-        raise ValueError(f"{path}: keypoints {points.shape}, not (t, j, 3).")
+        raise InputError(f"{path}: keypoints {points.shape}, not (t, j, 3).")
     if num_frames is not None and points.shape[1] != num_frames:
-        raise ValueError(
+        raise InputError(
             f"{path}: keypoints of {points.shape[1]} frames, but the video has "
             f"{num_frames}."
         )
@@ -262,14 +263,14 @@ def _load_json(file: Path) -> Any:
     try:
         return json.loads(file.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{file}: not a JSON file ({error}).") from None
+        raise InputError(f"{file}: not a JSON file ({error}).") from None
 
 
 def _array(path: Path, values: Any) -> np.ndarray:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{path}: keypoints that are not numbers.") from None
+        raise InputError(f"{path}: keypoints that are not numbers.") from None
     return array
 
 
@@ -278,7 +279,7 @@ def _triples(path: Path, flat: Any) -> np.ndarray:
     if array.ndim == 1 and array.size and array.size % 3 == 0:
         array = array.reshape(-1, 3)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"{path}: {array.shape} keypoints, not triples (u, v, score).")
+        raise InputError(f"{path}: {array.shape} keypoints, not triples (u, v, score).")
     return array
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.body.skeleton import BODY25
+from bodyslam_jax.config.errors import InputError
 
 _COCO17 = [0, -1, 6, 8, 10, 5, 7, 9, -1, 12, 14, 16, 11, 13, 15, 2, 1, 4, 3]
 _COCO18 = [0, 1, 2, 3, 4, 5, 6, 7, -1, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17]
@@ -68,13 +69,13 @@ _MIDPOINTS = (
 def to_body25(path: Path, points: np.ndarray) -> np.ndarray:
     """BODY_25 of keypoints (..., j, 3) in the usual layout of `j` points.
 
-    **Raises:** `ValueError`, naming the file, if there is none.
+    **Raises:** `InputError`, naming the file, if there is none.
     """
     num = points.shape[-2]
     if num not in BODY25_FROM:
         *others, last = BODY25_FROM
         expected = f"{', '.join(map(str, others))} or {last}"
-        raise ValueError(f"{path}: {num} keypoints a person, not {expected}.")
+        raise InputError(f"{path}: {num} keypoints a person, not {expected}.")
     return _gathered(points, np.asarray(BODY25_FROM[num]))
 
 

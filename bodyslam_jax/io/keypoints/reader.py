@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
@@ -58,11 +59,11 @@ def read_detections(
         num_frames: of the video; None for as many as the file has.
         images: names of the video's frames, if it is a folder of images.
 
-    **Raises:** `ValueError`, naming the file, if it is none of these, is mostly NaN, is
+    **Raises:** `InputError`, naming the file, if it is none of these, is mostly NaN, is
     in no known order, or belongs to another video.
     """
     if not path.exists():
-        raise ValueError(f"{path}: no such file or folder.")
+        raise InputError(f"{path}: no such file or folder.")
     if path.is_dir():
         listed = read_openpose(path)
     elif path.suffix.lower() == ".npz":
@@ -80,7 +81,7 @@ def read_detections(
             warn=warn,
         )
     except InvalidContent as error:
-        raise ValueError(f"{path}: {error}.") from None
+        raise InputError(f"{path}: {error}.") from None
     if num_frames is None:
         num_frames = max(frames.values(), default=-1) + 1
     by_frame: list[list[tuple[np.ndarray, int]]] = [[] for _ in range(num_frames)]
@@ -126,11 +127,11 @@ def _to_pixels(
     phone's video; sets missing points to 0."""
     counts = [len(d) for d in detections]
     if not sum(counts):
-        raise ValueError(f"{path}: no person in any frame.")
+        raise InputError(f"{path}: no person in any frame.")
     points = np.concatenate(detections)
     present = points[..., 2] > 0
     if not present.any():
-        raise ValueError(f"{path}: all confidences are zero.")
+        raise InputError(f"{path}: all confidences are zero.")
     sure = points[..., 2] > _SURE
     sure = sure if sure.any() else present
     if (uv := _relative(points, sure, size, warn)) is not None:
@@ -139,14 +140,14 @@ def _to_pixels(
         try:
             factor = factor_to(declared, size, points[sure][:, :2], "keypoints", warn)
         except InvalidContent as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise InputError(f"{path}: {error}") from None
         points[..., :2] = scaled(points[..., :2], factor)
     at = points[points[..., 2] > _SURE][:, :2]
     outside = ((at < 0) | (at > size)).any(axis=-1)
     if (turned := turned_back(points, sure, size, warn)) is not None:
         points[..., :2] = turned
     elif len(at) and outside.mean() > 0.3:
-        raise ValueError(
+        raise InputError(
             f"{path}: {100 * outside.mean():.0f} % of the keypoints outside the image "
             f"of {size[0]}x{size[1]} px: of another video?"
         )

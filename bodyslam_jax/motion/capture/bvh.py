@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import PARENTS
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import (
     Clip,
@@ -71,13 +72,13 @@ def read_bvh(path: Path) -> Clip:
 
     The unit of length is the one that makes the legs 0.55 to 1.15 m long.
 
-    **Raises:** `ValueError` if the file is not BVH, is truncated, contains NaN, unknown
+    **Raises:** `InputError` if the file is not BVH, is truncated, contains NaN, unknown
     channels or an impossible frame time, or lacks a joint of the legs.
     """
     path = Path(path)
     joints, values, fps = _parse(path)
     if not np.isfinite(values).all():
-        raise ValueError(f"{path}: NaN or infinite channel; expected numbers.")
+        raise InputError(f"{path}: NaN or infinite channel; expected numbers.")
     index = {joint.name: i for i, joint in enumerate(joints)}
     source = [
         next((index[name] for name in names.split(",") if name in index), None)
@@ -85,7 +86,7 @@ def read_bvh(path: Path) -> Clip:
     ]
     for joint in (0, 1, 2, 4, 5, 7, 8):
         if source[joint] is None:
-            raise ValueError(
+            raise InputError(
                 f"{path}: no joint {_NAMES[joint].replace(',', ' or ')}; found "
                 f"{', '.join(list(index)[:8])}, ..."
             )
@@ -105,7 +106,7 @@ def read_bvh(path: Path) -> Clip:
     legs = float(leg_length(smpl_rest))
     unit = next((u for u in _UNITS if 0.55 < legs * u < 1.15), None)
     if unit is None:
-        raise ValueError(
+        raise InputError(
             f"{path}: legs {legs:.3g} units long fit no known unit of length."
         )
     smpl_rest, position = smpl_rest * unit, position * unit
@@ -203,28 +204,28 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
         step = float(words[time + 1])
         values = np.array(words[time + 2 :], float)
     except (ValueError, IndexError):
-        raise ValueError(f"{path}: not a BVH file (HIERARCHY and MOTION).") from None
+        raise InputError(f"{path}: not a BVH file (HIERARCHY and MOTION).") from None
     for joint in joints:
         if not np.isfinite(joint.offset).all():
-            raise ValueError(
+            raise InputError(
                 f"{path}: OFFSET {joint.offset.tolist()} of {joint.name}; expected "
                 "numbers."
             )
         for channel in joint.channels:
             if channel not in (*_POSITIONS, *_ROTATIONS):
-                raise ValueError(
+                raise InputError(
                     f"{path}: channel {channel!r} of {joint.name}; expected Xposition, "
                     "Xrotation and the like."
                 )
     if not 0.001 <= step <= 1:
-        raise ValueError(
+        raise InputError(
             f"{path}: Frame Time {step:g}; expected 0.001 to 1 s from one to the next."
         )
     width = sum(len(joint.channels) for joint in joints)
     if frames < 1:
-        raise ValueError(f"{path}: {frames} frames; expected one or more.")
+        raise InputError(f"{path}: {frames} frames; expected one or more.")
     if values.size != frames * width:
-        raise ValueError(
+        raise InputError(
             f"{path}: {values.size} numbers; expected {frames} frames of {width}."
         )
     return joints, values.reshape(frames, width), 1 / step

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.clips import Clip, leg_length, root_matrices
 
 _LEGS = (0.6, 1.1)
@@ -21,15 +22,15 @@ class NoLegs(ValueError):
 def leg_from_joints(path: Path, joints: np.ndarray, num_frames: int) -> float:
     """Leg length (m), the median over the frames.
 
-    **Raises:** `ValueError`, naming the file, if they are not those of a person.
+    **Raises:** `InputError`, naming the file, if they are not those of a person.
     """
     if joints.shape != (num_frames, 24, 3):
-        raise ValueError(
+        raise InputError(
             f"{path}: joints {joints.shape}; expected {(num_frames, 24, 3)}."
         )
     leg = float(np.median(leg_length(joints)))
     if not _LEGS[0] <= leg <= _LEGS[1]:
-        raise ValueError(
+        raise InputError(
             f"{path}: legs of {leg:.3g} by its joints; expected {_LEGS[0]} to "
             f"{_LEGS[1]} m."
         )

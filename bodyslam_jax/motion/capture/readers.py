@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.bvh import read_bvh
 from bodyslam_jax.motion.capture.clips import Clip, leg_length, rest_from_offsets
 from bodyslam_jax.motion.capture.legs import NoLegs, leg_from_height, leg_from_joints
@@ -43,7 +44,7 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
             return clips
         with np.load(path, allow_pickle=False) as archive:
             names = ", ".join(archive.files[:8]) or "nothing"
-        raise ValueError(
+        raise InputError(
             f"{path}: no motion, but {names}; expected `poses` and `trans` of AMASS, "
             "or a CMU archive."
         )
@@ -70,7 +71,7 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
             legless[0],
         )
     if not clips:
-        raise ValueError(
+        raise InputError(
             f"{path}: no usable motion among {len(files)} .npz and .bvh files; "
             "expected AMASS sequences, a CMU archive or BVH."
         )
@@ -85,7 +86,7 @@ def _read_file(path: Path) -> tuple[Clip, ...]:
             archive = np.load(file, allow_pickle=False)
             names = set(archive.files)
         except (OSError, EOFError, AttributeError, ValueError, BadZipFile):
-            raise ValueError(f"{path}: not a readable .npz file.") from None
+            raise InputError(f"{path}: not a readable .npz file.") from None
         if "seq_start" in names:
             return _read_cmu(path, _taker(path, archive))
         if "trans" in names and names & {"poses", "root_orient", "pose_body"}:
@@ -98,13 +99,13 @@ def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
 
     def take(name: str) -> np.ndarray:
         if name not in archive.files:
-            raise ValueError(f"{path}: no array `{name}`, only {archive.files}.")
+            raise InputError(f"{path}: no array `{name}`, only {archive.files}.")
         try:
             return archive[name]
         except (BadZipFile, zlib.error, EOFError):
-            raise ValueError(f"{path}: `{name}` is damaged; copy it again.") from None
+            raise InputError(f"{path}: `{name}` is damaged; copy it again.") from None
         except ValueError:
-            raise ValueError(
+            raise InputError(
                 f"{path}: `{name}` is a pickled object; expected a plain array."
             ) from None
 
@@ -113,7 +114,7 @@ def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
 
 def _numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "fiub":
-        raise ValueError(
+        raise InputError(
             f"{path}: `{name}` is of type {array.dtype}; expected real numbers."
         )
     return array
@@ -121,7 +122,7 @@ def _numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:
 
 def _rate(path: Path, fps: np.ndarray) -> float:
     if fps.size != 1 or not 1 <= fps.item() <= 1000:
-        raise ValueError(
+        raise InputError(
             f"{path}: frame rate {fps.tolist()}; expected one number of 1 to 1000."
         )
     return float(fps.item())
@@ -129,13 +130,13 @@ def _rate(path: Path, fps: np.ndarray) -> float:
 
 def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
     if len(poses) != len(trans):
-        raise ValueError(
+        raise InputError(
             f"{path}: {name} has {len(poses)} poses but {len(trans)} positions."
         )
     for what, array in (("pose", poses), ("position", trans)):
         bad = ~np.isfinite(array.reshape(len(array), -1)).all(-1)
         if bad.any():
-            raise ValueError(
+            raise InputError(
                 f"{path}: {name} has a NaN or infinite {what} in frame "
                 f"{int(bad.argmax())} ({int(bad.sum())} frames); expected numbers."
             )
@@ -148,7 +149,7 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
         _numbers(path, name, data[name])
     poses, trans = data["poses"], data["trans"]
     if poses.ndim != 3 or poses.shape[1:] != (24, 3) or trans.shape[1:] != (3,):
-        raise ValueError(
+        raise InputError(
             f"{path}: poses {poses.shape}, trans {trans.shape}; expected (n, 24, 3) "
             "and (n, 3)."
         )
@@ -164,7 +165,7 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
         _check(path, str(names[i]), poses[rows], trans[rows])
         subject = str(data["seq_subject"][i])
         if subject not in subjects:
-            raise ValueError(f"{path}: no skeleton of subject {subject!r}.")
+            raise InputError(f"{path}: no skeleton of subject {subject!r}.")
         offsets = np.array(data["subject_offsets"][subjects[subject]])
         clips.append(
             Clip(
@@ -182,7 +183,7 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
             )
         )
     if not clips:
-        raise ValueError(f"{path}: the archive holds no sequence.")
+        raise InputError(f"{path}: the archive holds no sequence.")
     return tuple(clips)
 
 
@@ -196,7 +197,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
     number = lambda name: _numbers(path, name, take(name))
     rate = next((name for name in _RATES if name in names), None)
     if rate is None:
-        raise ValueError(f"{path}: no `mocap_framerate`; expected frames per second.")
+        raise InputError(f"{path}: no `mocap_framerate`; expected frames per second.")
     fps = _rate(path, number(rate))
     parts = ("poses",) if "poses" in names else ("root_orient", "pose_body")
     angles = [_rows(number(name)) for name in parts]
@@ -204,15 +205,15 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
     if any(a.ndim != 2 for a in angles) or len({len(a) for a in angles}) > 1:
         shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(parts, angles, strict=True))
         wanted = "(t, 3) and (t, 63)" if len(parts) > 1 else "(t, 66 or more)"
-        raise ValueError(f"{path}: {shapes}; expected {wanted}.")
+        raise InputError(f"{path}: {shapes}; expected {wanted}.")
     poses = np.concatenate(angles, -1)
     if poses.shape[1] < 66 or trans.shape[1:] != (3,):
-        raise ValueError(
+        raise InputError(
             f"{path}: poses {poses.shape}, trans {trans.shape}; expected (t, 66 or "
             "more) and (t, 3)."
         )
     if len(poses) == 0:
-        raise ValueError(f"{path}: the sequence has no frame.")
+        raise InputError(f"{path}: the sequence has no frame.")
     run = slice(None)
     if "present" in names:
         run = _longest(path, take("present"), len(poses))
@@ -243,7 +244,7 @@ def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
     """The longest run of frames in which the person is present."""
     flags = present.dtype.kind in "biu" and np.isin(present, (0, 1)).all()
     if present.shape != (num_frames,) or not flags or not present.any():
-        raise ValueError(
+        raise InputError(
             f"{path}: present is {present.dtype} {present.shape}; expected bool "
             f"{(num_frames,)}, true somewhere."
         )

@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion.training.sampling import Corpus
 
@@ -40,16 +41,16 @@ def save_checkpoint(path: Path, progress: object, mark: str) -> None:
 def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:
     """Reads what `save_checkpoint` wrote.
 
-    **Raises:** `ValueError` if it is damaged or of another run.
+    **Raises:** `InputError` if it is damaged or of another run.
     """
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             found = str(archive["mark"])
             leaves = [archive[f"leaf_{i}"] for i in range(len(archive.files) - 1)]
     except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path}: not a training checkpoint ({error}).") from None
+        raise InputError(f"{path}: not a training checkpoint ({error}).") from None
     if found != mark:
-        raise ValueError(
+        raise InputError(
             f"{path}: checkpoint of other settings or data; remove it to start anew."
         )
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, leaves))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.clips import split
 from bodyslam_jax.motion.capture.readers import read_motion
 from bodyslam_jax.motion.training.figures import draw_history
@@ -59,16 +60,16 @@ def train_from_data(
 def _check_writable(out: Path) -> None:
     """Fails before hours of training, not after them; leaves nothing behind."""
     if out.suffix != ".npz":
-        raise ValueError(f"{out}: weights are an .npz file; name it so.")
+        raise InputError(f"{out}: weights are an .npz file; name it so.")
     if out.is_dir():
-        raise ValueError(f"{out}: is a folder; expected a file to write weights to.")
+        raise InputError(f"{out}: is a folder; expected a file to write weights to.")
     # Folders that are missing will be made: what counts is where.
     folder = next(p for p in out.parents if p.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"{out}: {folder} cannot be written ({error.strerror}); expected a "
             "writable folder."
         ) from None

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
@@ -143,7 +144,7 @@ def evaluate_model(
     displacement, as the model does not) over all, and `constant`, a displacement in
     H_{k-1} (m) that is always predicted, if there is one.
 
-    **Raises:** `ValueError` if no clip is long enough for a prediction.
+    **Raises:** `InputError` if no clip is long enough for a prediction.
     """
     clips = [clip for clip in dataset if clip.phase == 0]
     clips = resample(clips, FPS)
@@ -158,7 +159,7 @@ def evaluate_model(
     valid[:, : max(skip, 2)] = False
     steps = steps._replace(valid=valid)
     if not valid.any():
-        raise ValueError(
+        raise InputError(
             f"no usable sequence among {len(clips)}: a prediction needs "
             f"{model.past + 1} frames at {FPS:g} frames per second."
         )

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import PARENTS, BodyModel, local_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import place
 from bodyslam_jax.motion.continuation import Rollout
@@ -39,10 +40,10 @@ def compare(
     One row per model, drift and motion class; constant velocity once; the mean
     displacement of `training` clips, if given. `write_table` writes them.
 
-    **Raises:** `ValueError` without models or drifts.
+    **Raises:** `InputError` without models or drifts.
     """
     if not len(models) or not len(drifts):
-        raise ValueError(
+        raise InputError(
             f"compare: {len(models)} models and {len(drifts)} drifts, expected one of "
             "each or more."
         )

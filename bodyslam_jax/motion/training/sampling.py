@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel, local_joints, rest_joints
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import (
     FPS,
@@ -75,13 +76,13 @@ class Batch(eqx.Module):
 def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
     """Gathers clips at `DENSE` times the model's rate.
 
-    **Raises:** `ValueError` if no clip of a wanted class is as long as one window.
+    **Raises:** `InputError` if no clip of a wanted class is as long as one window.
     """
     share = {"walk": 1.0, "run": settings.run_weight}
     share_of = lambda clip: share.get(clip.motion, settings.other_weight)
     wanted = [clip for clip in clips if share_of(clip) > 0]
     if not wanted:
-        raise ValueError(
+        raise InputError(
             f"no usable sequence among {len(clips)}: none is named walk, run or jog; "
             "train on all motion with a positive `other_weight`."
         )
@@ -100,7 +101,7 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
     weight = np.concatenate(weights)
     if len(weight) == 0:
         longest = max(len(clip.poses) / clip.fps for clip in dense)
-        raise ValueError(
+        raise InputError(
             f"no usable sequence among {len(clips)}: the longest lasts "
             f"{longest:.2f} s; a window needs {span / DENSE / FPS:.2f} s."
         )

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
 from bodyslam_jax.motion.function_network import FunctionNetwork
@@ -219,7 +220,7 @@ def train(
     after each epoch. The same seed gives the same weights on the same machine.
     `network` is a custom one to be trained, in place of that which `settings` ask for.
 
-    **Raises:** `ValueError` if no clip is long enough, if a checkpoint belongs to
+    **Raises:** `InputError` if no clip is long enough, if a checkpoint belongs to
     other settings or data, or if training diverges.
     """
     body = in_dtype(body, jnp.float32)
@@ -244,7 +245,7 @@ def train(
         progress = run_epoch(progress, data, body, settings, steps, settings.epochs)
         measures = {"loss": float(progress.history[epoch, 0])}
         if not np.isfinite(measures["loss"]):
-            raise ValueError(
+            raise InputError(
                 f"training diverged in epoch {epoch + 1}: loss is not finite."
             )
         last = epoch + 1 == settings.epochs
