@@ -27,6 +27,7 @@ from bodyslam_jax.body.smpl_pickle import read_pickle
 from bodyslam_jax.body.validate import checked
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.safe_pickle import restricted_load
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
 VARIABLE = "BODYSLAM_BODY_MODEL"
@@ -153,20 +154,11 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
     """The arrays of a `.npz` or a pickle, recognised by content; not yet checked."""
     if zipfile.is_zipfile(file):
-        arrays = {}
-        try:
-            with open(file, "rb") as opened, np.load(opened) as archive:
-                for name in archive.files:
-                    try:
-                        arrays[name] = archive[name]
-                    except ValueError as error:
-                        # SMPL-X has objects beside its arrays, which are not needed.
-                        if "Object arrays" not in str(error):
-                            raise
-        except Exception as error:
-            found = " ".join(str(error).split())[:120]
-            raise InputError(f"{file}: a damaged .npz file ({found}).") from None
-        return arrays
+        # SMPL-X has objects beside its arrays, which are not needed.
+        found = restricted_load(file, objects=False)
+        if not isinstance(found, dict):
+            raise InputError(f"{file}: no .npz file, expected arrays of a body model.")
+        return {k: x for k, x in found.items() if isinstance(x, np.ndarray)}
     if file.suffix == ".npz":
         raise InputError(f"{file}: not a .npz file, or cut short (no zip archive).")
     return read_pickle(file)
