@@ -11,7 +11,6 @@ The instructions are those of protocols 0 to 5, documented in CPython's `picklet
 """
 
 import codecs
-import dataclasses
 import re
 import struct
 from collections.abc import Callable
@@ -20,6 +19,16 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.io import plain_arrays
+from bodyslam_jax.io.pickle_names import CALLS, INERT, set_type
+from bodyslam_jax.io.pickle_values import (
+    ArrayToFill,
+    Blob,
+    JoblibArray,
+    Name,
+    Plain,
+    StandIn,
+    content_of,
+)
 from bodyslam_jax.io.plain_arrays import (
     VALUE_BYTES,
     Account,
@@ -29,8 +38,6 @@ from bodyslam_jax.io.plain_arrays import (
     shown,
 )
 
-MAX_DEPTH = 64
-"""Levels of nesting; results of tools have 10 at most."""
 MAX_PICKLES = 4
 """Pickles within pickles, as joblib's arrays of objects are."""
 MAX_LINE_BYTES = 65_536
@@ -43,53 +50,6 @@ BLOB_BYTES = 4096
 """Bytes and Python 2's texts from this length on stay in the file until used."""
 
 Persistent = Callable[[Any], Any]
-
-
-class StandIn:
-    """An object of a library that is not imported: keeps its state, does nothing."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        """Of its class, with the module."""
-        self.state: Any = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Name:
-    """What a pickle refers to by module and name; inert."""
-
-    key: str
-    is_stand_in: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Storage:
-    """The numbers that PyTorch's tensors are views of."""
-
-    of: ArrayType
-    numbers: np.ndarray
-    is_bfloat16: bool = False
-
-
-class _Array:
-    """Stands for an array between its creation and the instruction that fills it."""
-
-    value: Any = None
-
-
-class _JoblibArray:
-    """Stands for joblib's `NumpyArrayWrapper`: a head, with the bytes behind it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Blob:
-    """Bytes, or a text of Python 2, that lie in the file."""
-
-    view: memoryview
-    is_text: bool
-
-
-_ATOMS = frozenset({int, float, bool, type(None)})
 
 
 class Machine:
@@ -145,7 +105,7 @@ class Machine:
             step(self)
         if len(self.stack) != 1 or self.marked:
             raise Damaged(f"it ends with {len(self.stack)} objects, not with one")
-        return _Plain(account).of(self.stack[0])
+        return Plain(account).of(self.stack[0])
 
     # What instructions are made of
 
@@ -192,7 +152,7 @@ class Machine:
         root = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(root, root)
         key = ".".join([root, rest, name] if rest else [root, name])
         key = key.replace("numpy._core.", "numpy.core.")
-        if key in _CALLS or key in _INERT:
+        if key in CALLS or key in INERT:
             found = Name(key)
         elif any(f"{module}.".startswith(f"{package}.") for package in self.stand_ins):
             self.account.spend(OBJECT_BYTES + len(key))
@@ -208,15 +168,15 @@ class Machine:
             raise Refused(f"it wants to call {shown(function)}")
         if function.is_stand_in:
             return self.push(StandIn(function.key), 2 * OBJECT_BYTES)
-        make = _CALLS.get(function.key)
+        make = CALLS.get(function.key)
         if make is None:
             raise Refused(f"it wants to call {function.key}")
         self.push(make(self, *arguments), OBJECT_BYTES)
 
     def key(self, value: Any) -> Any:
         """A value as the key of a dictionary or the element of a set."""
-        if isinstance(value, _Blob):
-            value = _content(value, self.account)
+        if isinstance(value, Blob):
+            value = content_of(value, self.account)
         if type(value) in (str, int, float, bool, bytes, type(None)):
             return value
         simple = (str, int, float, bool, bytes)
@@ -262,10 +222,10 @@ class Machine:
                 state = state[0]
             target.state = state
         elif isinstance(target, ArrayType):
-            _set_type(target, state)
-        elif isinstance(target, _Array):
+            set_type(target, state)
+        elif isinstance(target, ArrayToFill):
             target.value = self._array(state)
-        elif isinstance(target, _JoblibArray):
+        elif isinstance(target, JoblibArray):
             # joblib writes an array's bytes behind the object that describes it.
             self.stack[-1] = self._joblib_array(state)
         else:
@@ -293,7 +253,7 @@ class Machine:
         """An array of bytes that the pickle holds."""
         if not isinstance(of, ArrayType):
             raise Refused("an array without a type")
-        if isinstance(content, _Blob):
+        if isinstance(content, Blob):
             content = content.view
         elif type(content) is str:  # as Python 2 wrote bytes
             self.account.spend(len(content))
@@ -321,334 +281,6 @@ class Machine:
             self.bytes_at(self.bytes_at(1)[0])
         content = self.bytes_at(plain_arrays.num_bytes(of, shape, self.account))
         return plain_arrays.array_of(content, of, shape, self.account, order == "F")
-
-
-def _set_type(of: ArrayType, state: Any) -> None:
-    """What `numpy.dtype.__setstate__` would do: only the order of bytes may change.
-
-    The state is (version, order, subtype, names, fields, item size, alignment, flags).
-    """
-    if type(state) is not tuple or len(state) not in (8, 9):
-        raise Refused("an array's type with an unknown state")
-    version, order, subtype, names, fields, size, alignment, flags, *metadata = state
-    known = (
-        version in (3, 4)
-        and order in ("<", ">", "|", "=")
-        and subtype is names is fields is None
-        and metadata in ([], [None])
-        and size in (-1, of.size)
-        and alignment in (-1, 1, 2, 4, 8)
-        and flags in {"O": (63,), "U": (8, 0)}.get(of.kind, (0,))
-    )
-    if not known:
-        raise Refused("an array's type with fields, flags or sizes of its own")
-    of.order = ">" if order == ">" else "<"
-
-
-def _content(blob: _Blob, account: Account) -> str | bytes:
-    account.spend(len(blob.view))
-    return str(blob.view, "latin1") if blob.is_text else bytes(blob.view)
-
-
-class _Plain:
-    """Replaces stand-ins in what a pickle made, and measures it.
-
-    Parts may be shared, so the size is counted as if every reference were written out:
-    a few bytes can stand for more than a reader could walk through.
-    """
-
-    def __init__(self, account: Account) -> None:
-        self.account = account
-        self.done: dict[int, tuple[Any, Any, int, int]] = {}
-        """By identity: the object itself, kept alive; what replaces it; its size in
-        bytes and its levels of nesting, both with all that it refers to."""
-        self.open: set[int] = set()
-
-    def of(self, value: Any) -> Any:
-        """**Raises:** `Refused` if the data contain themselves, are nested too deeply,
-        are too large or hold what is not plain."""
-        return self._visit(value, 0)[0]
-
-    def _visit(self, value: Any, depth: int) -> tuple[Any, int, int]:
-        kind = type(value)
-        if kind in _ATOMS or kind is complex or kind is slice:
-            return value, VALUE_BYTES, 0
-        if kind is str or kind is bytes:
-            return value, VALUE_BYTES + len(value), 0
-        if kind is np.ndarray:
-            return value, 2 * VALUE_BYTES + value.nbytes, 0
-        identity = id(value)
-        if identity in self.done:
-            _, found, size, levels = self.done[identity]
-        elif identity in self.open:
-            raise Refused("data that contain themselves")
-        else:
-            if depth >= MAX_DEPTH:
-                raise Refused(f"data nested more than {MAX_DEPTH} deep")
-            self.open.add(identity)
-            found, size, levels = self._replace(value, depth)
-            self.open.discard(identity)
-            self.account.check(size, "repeated data")
-            self.done[identity] = (value, found, size, levels)
-        if depth + levels > MAX_DEPTH:
-            raise Refused(f"data nested more than {MAX_DEPTH} deep")
-        return found, size, levels
-
-    def _replace(self, value: Any, depth: int) -> tuple[Any, int, int]:
-        kind = type(value)
-        if kind is list or kind is tuple:
-            if _ATOMS.issuperset(map(type, value)):
-                return value, VALUE_BYTES * (len(value) + 2), 1
-            items, size, levels = self._visit_all(value, depth)
-            if kind is tuple:
-                return tuple(items), size, levels
-            value[:] = items
-            return value, size, levels
-        if kind is dict:
-            items, size, levels = self._visit_all(value.values(), depth)
-            for key, item in zip(value, items, strict=True):
-                value[key] = item
-            size += sum(
-                VALUE_BYTES + (len(k) if type(k) in (str, bytes) else 0) for k in value
-            )
-            return value, size, levels
-        if kind is set or kind is frozenset:
-            return value, *self._visit_all(value, depth)[1:]
-        if kind is StandIn:
-            (value.state,), size, levels = self._visit_all([value.state], depth)
-            return value, size, levels
-        if kind is _Array and value.value is not None:
-            return self._visit(value.value, depth)
-        if kind is _Blob:
-            found = _content(value, self.account)
-            return found, VALUE_BYTES + len(found), 0
-        if kind is Name:
-            return value.key, VALUE_BYTES + len(value.key), 0
-        if kind is ArrayType:
-            return value.code, VALUE_BYTES, 0
-        raise Refused(f"{kind.__name__.lstrip('_')} without content")
-
-    def _visit_all(self, values: Any, depth: int) -> tuple[list[Any], int, int]:
-        items, size, levels = [], 2 * VALUE_BYTES, 0
-        self.account.spend(8 * len(values))
-        for value in values:
-            item, more, deep = self._visit(value, depth + 1)
-            items.append(item)
-            size += more
-            levels = max(levels, deep)
-        return items, size, levels + 1
-
-
-# What stands for the functions that result files name
-
-
-def _type(_: Machine, code: Any = None, *flags: Any) -> ArrayType:
-    if len(flags) > 2 or any(type(flag) not in (bool, int) for flag in flags):
-        raise Refused("an array's type with fields, flags or sizes of its own")
-    return plain_arrays.array_type(code)
-
-
-def _reconstruct(_: Machine, kind: Any, shape: Any, code: Any) -> _Array:
-    """An empty array, whose state follows; shape and type given here are not used."""
-    if kind != Name("numpy.ndarray"):
-        raise Refused(f"an array of class {shown(getattr(kind, 'key', kind))}")
-    return _Array()
-
-
-def _from_buffer(
-    machine: Machine,
-    content: Any,
-    of: Any,
-    shape: Any,
-    order: Any,
-    axes: Any = None,
-) -> np.ndarray:
-    if order not in ("C", "F", "A", "K"):
-        raise Refused(f"an array in the order {shown(order)}")
-    if order != "K" or axes is None:
-        return machine.array(content, of, shape, order == "F")
-    axes = plain_arrays.shape_of(axes)
-    array = machine.array(content, of, shape)
-    if sorted(axes) != list(range(array.ndim)):
-        raise Refused(f"an array with the axes {axes}")
-    machine.account.spend(array.nbytes)
-    return np.ascontiguousarray(array.transpose(axes))
-
-
-def _scalar(machine: Machine, of: Any, content: Any = b"") -> Any:
-    return machine.array(content, of, ()).item()
-
-
-def _joblib(_: Machine, *arguments: Any) -> _JoblibArray:
-    return _JoblibArray()
-
-
-def _encode(machine: Machine, text: Any, encoding: Any = "latin1") -> bytes:
-    """Bytes, as protocols up to 2 hold them."""
-    if type(text) is not str or encoding not in ("latin1", "latin-1"):
-        raise Refused(f"{shown(text)} in the encoding {shown(encoding)}")
-    machine.account.spend(len(text))
-    return text.encode("latin1")
-
-
-def _dict(machine: Machine, *arguments: Any) -> dict:
-    """A dictionary, ordered or not, of pairs."""
-    pairs = arguments[0] if arguments else []
-    if len(arguments) > 1 or type(pairs) not in (list, tuple):
-        raise Refused(f"a dictionary of {shown(pairs)}")
-    found: dict[Any, Any] = {}
-    for pair in pairs:
-        if type(pair) not in (list, tuple) or len(pair) != 2:
-            raise Refused("a dictionary of other things than pairs")
-        machine.set_items(found, list(pair))
-    return found
-
-
-def _default_dict(machine: Machine, *arguments: Any) -> dict:
-    """A dictionary; what it makes of missing keys is lost."""
-    return _dict(machine, *arguments[1:])
-
-
-def _sequence(make: Callable[[Any], Any]) -> Callable[..., Any]:
-    def made(machine: Machine, items: Any = (), *more: Any) -> Any:
-        if type(items) not in (list, tuple):
-            raise Refused(f"a sequence of {shown(items)}")
-        machine.account.spend(VALUE_BYTES * len(items))
-        return make(items)
-
-    return made
-
-
-def _set(machine: Machine, items: Any = ()) -> set:
-    if type(items) not in (list, tuple):
-        raise Refused(f"a set of {shown(items)}")
-    return machine.set_of(items)
-
-
-def _bytes(machine: Machine, content: Any = b"") -> bytes | _Blob:
-    if type(content) is bytes or isinstance(content, _Blob):
-        return content
-    raise Refused(f"bytes of {shown(content)}")
-
-
-def _number(machine: Machine, value: Any = 0) -> int | float:
-    if type(value) in (int, float, bool):
-        return value
-    raise Refused(f"a number of {shown(value)}")
-
-
-def _complex(machine: Machine, real: Any, imaginary: Any) -> complex:
-    return complex(_number(machine, real), _number(machine, imaginary))
-
-
-def _slice(machine: Machine, *limits: Any) -> slice:
-    if len(limits) != 3 or any(type(n) not in (int, type(None)) for n in limits):
-        raise Refused("a slice of other things than whole numbers")
-    return slice(*limits)
-
-
-def _path(machine: Machine, *parts: Any) -> str:
-    if not all(type(part) is str for part in parts):
-        raise Refused("a path of other things than text")
-    machine.account.spend(sum(len(part) + 1 for part in parts))
-    return "/".join(parts)
-
-
-def _reconstructor(machine: Machine, of: Any, base: Any, state: Any) -> StandIn:
-    """An instance of a new-style class, as Python 2 pickles it."""
-    if isinstance(of, Name) and of.is_stand_in and base == Name("builtins.object"):
-        return StandIn(of.key)
-    raise Refused(f"it wants to make {shown(getattr(of, 'key', of))}")
-
-
-def _tensor(
-    machine: Machine, storage: Any, offset: Any, size: Any, stride: Any, *_: Any
-) -> np.ndarray:
-    """A copy of a strided view, checked to lie within its storage."""
-    if not isinstance(storage, Storage) or type(offset) is not int or offset < 0:
-        raise Refused("a tensor without numbers")
-    size, stride = plain_arrays.shape_of(size), plain_arrays.shape_of(stride)
-    if len(size) != len(stride):
-        raise Refused(f"a tensor of shape {size} with the strides {stride}")
-    wanted = plain_arrays.num_bytes(storage.of, size, machine.account)
-    numbers = storage.numbers
-    if wanted > max(numbers.nbytes, MAX_REPEATED_BYTES):
-        raise Refused(f"a tensor of shape {size}, larger than its storage")
-    machine.account.spend(wanted * (3 if storage.is_bfloat16 else 1))
-    if wanted:
-        last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
-        if last >= len(numbers):
-            raise Refused(f"a tensor of shape {size}, larger than its storage")
-        steps = [s * numbers.itemsize for s in stride]
-        view = np.lib.stride_tricks.as_strided(numbers[offset:], size, steps)
-        array = np.array(view, order="C")
-    else:
-        array = np.zeros(size, numbers.dtype)
-    if not storage.is_bfloat16:
-        return array
-    # The upper half of a float32.
-    return (array.astype(np.uint32) << np.uint32(16)).view(np.float32)
-
-
-MAX_REPEATED_BYTES = 16_000_000
-"""Of a tensor that repeats its numbers: ten β for each of 400,000 frames."""
-
-
-def _parameter(machine: Machine, data: Any, *_: Any) -> np.ndarray:
-    if isinstance(data, np.ndarray):
-        return data
-    raise Refused("a parameter without a tensor")
-
-
-_CALLS: dict[str, Callable[..., Any]] = {
-    "numpy.dtype": _type,
-    "numpy.core.multiarray._reconstruct": _reconstruct,
-    "numpy.core.multiarray.scalar": _scalar,
-    "numpy.core.numeric._frombuffer": _from_buffer,
-    "joblib.numpy_pickle.NumpyArrayWrapper": _joblib,
-    "torch._utils._rebuild_tensor": _tensor,
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": _parameter,
-    "torch.Size": _sequence(tuple),
-    "collections.OrderedDict": _dict,
-    "collections.defaultdict": _default_dict,
-    "collections.deque": _sequence(list),
-    "copyreg._reconstructor": _reconstructor,
-    "_codecs.encode": _encode,
-    "pathlib.PosixPath": _path,
-    "pathlib._local.PosixPath": _path,
-    "builtins.list": _sequence(list),
-    "builtins.tuple": _sequence(tuple),
-    "builtins.dict": _dict,
-    "builtins.set": _set,
-    "builtins.frozenset": _set,
-    "builtins.bytes": _bytes,
-    "builtins.bytearray": _bytes,
-    "builtins.int": _number,
-    "builtins.long": _number,
-    "builtins.float": _number,
-    "builtins.complex": _complex,
-    "builtins.slice": _slice,
-}
-"""What is done for each name that may be called; every other one is refused."""
-STORAGES = {
-    "torch.DoubleStorage": "f8",
-    "torch.FloatStorage": "f4",
-    "torch.HalfStorage": "f2",
-    "torch.BFloat16Storage": "u2",
-    "torch.LongStorage": "i8",
-    "torch.IntStorage": "i4",
-    "torch.ShortStorage": "i2",
-    "torch.CharStorage": "i1",
-    "torch.ByteStorage": "u1",
-    "torch.BoolStorage": "b1",
-}
-"""The types of PyTorch's storages, by name."""
-_INERT = {"numpy.ndarray", "builtins.object", "builtins.str", *STORAGES}
-"""Names that may be given as arguments, but not called."""
-
-
-# The instructions
 
 
 def _whole(value: int) -> int:
@@ -730,7 +362,7 @@ def _sized(layout: str, kind: type, is_text: bool = False) -> Callable[[Machine]
             machine.account.spend(4 * count if is_wide else count)
             return machine.push(str(view, "utf-8"))
         if count >= BLOB_BYTES:
-            return machine.push(_Blob(view, is_text), OBJECT_BYTES)
+            return machine.push(Blob(view, is_text), OBJECT_BYTES)
         value = str(view, "latin1") if is_text else bytes(view)
         machine.push(value, VALUE_BYTES + count)
 

@@ -127,7 +127,7 @@ def num_bytes(of: ArrayType, shape: tuple[int, ...], account: Account) -> int:
 
     **Raises:** `Refused` if they exceed the budget, also by an axis of an empty array.
     """
-    what = f"an array {of.kind}{shape}"
+    what = f"an array {of.code}{shape}"
     account.check(math.prod(n or 1 for n in shape) * max(of.size, 1), what)
     return math.prod(shape) * of.size
 

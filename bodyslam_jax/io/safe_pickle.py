@@ -17,7 +17,9 @@ from typing import Any
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import plain_arrays
-from bodyslam_jax.io.pickle_machine import STORAGES, Machine, Name, StandIn, Storage
+from bodyslam_jax.io.pickle_machine import Machine
+from bodyslam_jax.io.pickle_names import STORAGES
+from bodyslam_jax.io.pickle_values import Name, StandIn, Storage
 from bodyslam_jax.io.plain_arrays import Account, Damaged, Refused, shown
 
 __all__ = ["StandIn", "restricted_load"]
@@ -67,10 +69,10 @@ def restricted_load(
             f"{path}: refused, {error}; expected plain data (numbers, text, lists, "
             "dictionaries, arrays)."
         ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     except (MemoryError, RecursionError, Exception) as error:
         # A damaged file can fail anywhere, with any error.
+        if isinstance(error, OSError) and error.filename is not None:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
         kind = "" if isinstance(error, Damaged) else f"{type(error).__name__}: "
         what = " ".join(f"{kind}{error}".split())[:150]
         raise InputError(
