@@ -14,6 +14,11 @@ import numpy as np
 
 MAX_BYTES = 1_000_000_000
 """Of a file after it is unpacked, and of each part of it."""
+MAX_UNPACKED_FREELY = 100_000_000
+"""Bytes that even the smallest compressed file may unpack to."""
+MAX_RATIO = 100
+"""Ratio of larger content to the file: measurements are compressed to a half or a
+fifth; 1,000, which zlib reaches for zeros, only makes a small file large."""
 MAX_AXES = 32
 """Of an array, as in every version of NumPy."""
 MAX_TEXT_WIDTH = 65_536
@@ -45,6 +50,8 @@ class Account:
 
     def __init__(self, disk_bytes: int, max_bytes: int = MAX_BYTES) -> None:
         self.max_bytes = max_bytes
+        self.max_unpacked = min(max_bytes, MAX_UNPACKED_FREELY + MAX_RATIO * disk_bytes)
+        """Bytes that a compressed file may unpack to."""
         # A file is held as a whole while arrays are made of it: half as much again,
         # so that a file of nearly the largest size cannot take twice its size.
         self.left = max_bytes * 3 // 2
@@ -57,6 +64,12 @@ class Account:
         if size > self.max_bytes:
             limit = f"more than {self.max_bytes / 1e9:.3g} GB"
             raise Refused(f"{what} of {size} bytes ({limit})")
+
+    def check_unpacked(self, size: int) -> None:
+        """**Raises:** `Refused` if a compressed file unpacks to too much."""
+        if size > self.max_unpacked:
+            limit = f"{self.max_unpacked / 1e9:.3g} GB for a file of its size"
+            raise Refused(f"it unpacks to {size / 1e9:.3g} GB (more than {limit})")
 
     def spend(self, size: int) -> None:
         """Counts what is about to be made.

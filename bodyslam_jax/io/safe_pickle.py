@@ -29,9 +29,8 @@ _MAX_INDEX_BYTES = 16_000_000
 """Of the list of files in a zip archive: some 200,000 names."""
 _LZMA_BYTES = 256 << 20
 """Working memory of xz and lzma; their highest preset takes 65 MiB."""
-_TEXT_PICKLES = (b"(d", b"(l", b"(i", b"(c", b"}", b"]")
-"""How dictionaries, lists and objects begin in protocols 0 and 1, which have no magic
-number."""
+_TEXT_PICKLES = (b"(", b"c", b"}", b"]")
+"""How containers and objects begin in protocols 0 and 1, which have no magic number."""
 _OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
 
 
@@ -125,7 +124,7 @@ def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
         # What does not fit one step is kept by bz2 and xz, and handed back by zlib.
         while block or not getattr(unpacker, "needs_input", True):
             out += unpacker.decompress(block, _BLOCK)
-            account.check(len(out), "unpacked content")
+            account.check_unpacked(len(out))
             block = getattr(unpacker, "unconsumed_tail", b"")
             if unpacker.eof:
                 break
@@ -207,7 +206,7 @@ def _load_zip(
         packings = {entry.compress_type for entry in members.values()}
         if not packings <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             raise Refused("an archive packed otherwise than by deflate")
-        account.check(sum(m.file_size for m in members.values()), "unpacked content")
+        account.check_unpacked(sum(entry.file_size for entry in members.values()))
         pickles = [name for name in members if name.endswith("/data.pkl")]
         if len(pickles) > 1:
             raise Refused(f"{len(pickles)} pickles in one archive")
