@@ -33,8 +33,8 @@ def as_array(
     *shapes: Shape,
     kind: Kind = "number",
     finite: bool = True,
-    low: float = -MAX_MAGNITUDE,
-    high: float = MAX_MAGNITUDE,
+    low: float | int = -MAX_MAGNITUDE,
+    high: float | int = MAX_MAGNITUDE,
     sizes: Sizes | None = None,
 ) -> np.ndarray:
     """The value as a float64, int64 or bool array of one of the shapes (of any shape
@@ -92,8 +92,8 @@ def as_number(
     path: Path,
     name: str,
     value: Any,
-    low: float = -MAX_MAGNITUDE,
-    high: float = MAX_MAGNITUDE,
+    low: float | int = -MAX_MAGNITUDE,
+    high: float | int = MAX_MAGNITUDE,
 ) -> float:
     """One finite number.
 
@@ -156,7 +156,10 @@ class Fields:
         )
 
     def number(
-        self, name: str, low: float = -MAX_MAGNITUDE, high: float = MAX_MAGNITUDE
+        self,
+        name: str,
+        low: float | int = -MAX_MAGNITUDE,
+        high: float | int = MAX_MAGNITUDE,
     ) -> float:
         """A finite number within the range."""
         return as_number(self.path, self._at(name), self.value(name), low, high)
@@ -295,7 +298,7 @@ def _shape_text(shape: Shape, sizes: Sizes) -> str:
     return f"({', '.join(words)}{',' if len(words) == 1 else ''})"
 
 
-def _range(low: float, high: float) -> str:
+def _range(low: float | int, high: float | int) -> str:
     if low == -MAX_MAGNITUDE or low == -math.inf:
         return f"{high:g} or less"
     if high in (MAX_MAGNITUDE, 10**12, math.inf):

@@ -16,7 +16,7 @@ import stat
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import budget
@@ -44,7 +44,7 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         raise InputError(f"{path}: {found}; expected {expected}.") from None
 
 
-def open_binary(path: Path, what: str = "") -> BinaryIO:
+def open_binary(path: Path, what: str = "") -> io.BufferedReader:
     """The file, opened, after it was seen to be a plain file within the budget.
 
     **Raises:** `InputError`, naming the file, if it is missing, cannot be read, is a
@@ -66,6 +66,15 @@ def open_binary(path: Path, what: str = "") -> BinaryIO:
         return open(path, "rb")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}, expected {expected}.") from None
+
+
+def is_zip(path: Path) -> bool:
+    """Whether a file begins as zip archives do.
+
+    **Raises:** `InputError` as `open_binary`.
+    """
+    with open_binary(path) as file, reading(path, "a readable file"):
+        return file.read(4) == b"PK\x03\x04"
 
 
 def read_bytes(path: Path, what: str = "") -> bytes:
@@ -324,6 +333,10 @@ def _too_deep(path: Path, what: str) -> str:
     return f"{path}: nested more than {budget.MAX_DEPTH} deep, expected {what}."
 
 
+def _mapping(loader: Any, node: Any) -> Any:
+    return loader.construct_mapping(node, deep=True)
+
+
 def _plain_yaml() -> Any:
     """A loader of text, numbers, lists and mappings."""
     import yaml
@@ -345,6 +358,6 @@ def _plain_yaml() -> Any:
     }
     Loader.add_constructor(
         "tag:yaml.org,2002:opencv-matrix",
-        lambda loader, node: Loader.construct_mapping(loader, node, deep=True),
+        _mapping,
     )
     return Loader

@@ -7,6 +7,7 @@ import numpy as np
 
 from bodyslam_jax import io
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.safe_pickle import restricted_load
 
 _HOME = {
@@ -59,7 +60,7 @@ def array(
     """`values` as finite float64 of this shape; `None` is any length but 0."""
     try:
         found = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         kind = type(values).__name__
         raise InputError(
             f"{file}: {name}: a {kind}, not an array of numbers."
@@ -68,7 +69,7 @@ def array(
         n == wanted or (wanted is None and n > 0)
         for n, wanted in zip(found.shape, shape, strict=True)
     )
-    if not fits or not np.all(np.isfinite(found)):
+    if not fits or not np.all(np.abs(found) <= MAX_MAGNITUDE):
         wanted = str(shape).replace("None", "any")
         raise InputError(
             f"{file}: {name}: {found.shape} values, not {wanted} finite numbers."

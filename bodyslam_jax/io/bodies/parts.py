@@ -9,6 +9,7 @@ from jaxtyping import Float
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
+from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
 from bodyslam_jax.io.keypoints.associate import identify
 from bodyslam_jax.types import Intrinsics
@@ -33,9 +34,10 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
         raise InvalidContent(f"no `{key}`")
     try:
         array = np.asarray(data[key], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         raise InvalidContent(f"`{key}` does not hold numbers") from None
-    array = np.where(np.isfinite(array), array, np.nan)
+    with np.errstate(invalid="ignore"):
+        array = np.where(np.abs(array) <= MAX_MAGNITUDE, array, np.nan)
     if shape is not None:
         fits = array.ndim == len(shape) and all(
             want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
@@ -48,7 +50,9 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
 
 def betas_of(data: dict, key: str, n: int) -> np.ndarray:
     """The first ten β of each of `n` bodies; one row may stand for all."""
-    betas = numbers_of(data, key, None)
+    betas = np.atleast_1d(numbers_of(data, key, None))
+    if betas.size == 0 or betas.size // betas.shape[-1] not in (1, n):
+        raise InvalidContent(f"`{key}` is {betas.shape}, not (10,) or ({n}, 10)")
     betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
     if betas.shape[1] < 10:
         raise InvalidContent(

@@ -17,9 +17,16 @@ from bodyslam_jax.config import Association
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.bodies.amass import body_pose, is_smplx
 from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, join, whole_of
+from bodyslam_jax.io.bodies.parts import (
+    PELVIS_SMPL,
+    PELVIS_SMPLX,
+    join,
+    numbers_of,
+    whole_of,
+)
 from bodyslam_jax.io.bodies.slahmr import with_track_info
 from bodyslam_jax.io.bodies.tools import READERS, from_spin
+from bodyslam_jax.io.budget import check_bytes, last_frame_problem
 from bodyslam_jax.io.frame_index import InvalidContent, Warn
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.types import Bodies, Intrinsics
@@ -81,8 +88,11 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
                 return read(data, video)
     except InvalidContent as error:
         raise InputError(f"{path}: {error}.") from None
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+    except InputError:
+        raise
+    except Exception as error:
+        # Dictionaries of other tools, nested in any way: whatever fails is theirs.
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise InputError(f"{path}: incomplete or damaged bodies ({what}).") from None
     supported = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
     keys = ", ".join(str(k) for k in list(data)[:6])
@@ -99,7 +109,7 @@ def _from_contract(data: dict, video: Video) -> Rows:
         rows = from_spin({**data, "pose": data["poses"]}, video)
         return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
-    n = len(np.atleast_1d(np.asarray(data["frame"])))
+    n = numbers_of(data, "frame", None).size
     data = _as_smpl(data)
     person = data.get("person", np.zeros(n))
     for name, value, shape in (
@@ -154,6 +164,8 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
     cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
     camera_file = next((p for p in cameras if p.is_file()), None)
     camera = restricted_load(camera_file) if camera_file else {}
+    if not isinstance(camera, dict):
+        raise InputError(f"{camera_file}: not a dictionary, expected TRAM's camera.")
     shared = {k: camera[k] for k in ("img_focal", "img_center") if k in camera}
     rows = []
     for track in tracks:
@@ -161,7 +173,10 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
         if not isinstance(data, dict):
             raise InputError(f"{track}: not a dictionary of arrays.")
         one = _read(track, {**data, **shared}, video)
-        number = int(re.findall(r"\d+", track.stem)[-1])
+        digits = re.findall(r"\d{1,9}", track.stem)
+        if not digits:
+            raise InputError(f"{track}: no number of a person in its name.")
+        number = int(digits[-1])
         person = np.full(len(one.frame), number)
         rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
     return join(rows)
@@ -201,6 +216,9 @@ def _gather(
     rows = _finite(path, rows, warn)
     low, high = int(rows.frame.min()), int(rows.frame.max())
     if num_frames is None:
+        observed = len(np.unique(rows.frame))
+        if problem := last_frame_problem(high, observed, "bodies"):
+            raise InputError(f"{path}: {problem}.")
         num_frames = high + 1
     if low < 0 or high >= num_frames:
         raise InputError(
@@ -216,6 +234,7 @@ def _gather(
         raise InputError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
     people, index = np.unique(rows.person, return_inverse=True)
     size = (len(people), num_frames)
+    check_bytes(path, 8 * 85 * len(people) * num_frames, "as a table ")
     present = np.zeros(size, dtype=bool)
     if len(np.unique(index * num_frames + rows.frame)) < len(index):
         raise InputError(f"{path}: two bodies of one `person` in the same `frame`.")

@@ -15,7 +15,11 @@ from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
 from bodyslam_jax.io.keypoints.detector import UNKNOWN, definition_of
-from bodyslam_jax.io.keypoints.files import read_json, read_npz, read_openpose
+from bodyslam_jax.io.keypoints.files import (
+    read_json_keypoints,
+    read_npz_keypoints,
+    read_openpose,
+)
 from bodyslam_jax.io.keypoints.turned import turned_back
 
 _log = logging.getLogger(__name__)
@@ -67,10 +71,10 @@ def read_detections(
     if path.is_dir():
         listed = read_openpose(path)
     elif path.suffix.lower() == ".npz":
-        listed = read_npz(path, num_frames)
+        listed = read_npz_keypoints(path, num_frames)
         images = ()  # its frames are rows, not names
     else:
-        listed = read_json(path)
+        listed = read_json_keypoints(path)
     try:
         frames = frames_of_names(
             listed.names,

@@ -1,0 +1,66 @@
+"""Image files -> pixels, by OpenCV, after a look at their headers."""
+
+import io
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import budget
+from bodyslam_jax.io.files import open_binary, read_bytes, reading
+
+_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF", "WEBP", "GIF", "PPM", "JPEG2000")
+"""Formats, by Pillow's names, of which both Pillow and OpenCV know the header."""
+
+
+def read_image(path: Path, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
+    """The pixels of an image, BGR or as OpenCV's `flag` says.
+
+    **Raises:** `InputError`, naming the file, if it is no image, is damaged, or has
+    more pixels by its header than the budget allows; those are never decoded.
+    """
+    # Through memory: `imread` cannot open every path and warns on standard error.
+    data = read_bytes(path, "an image")
+    _check_header(path, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flag) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{path}: not an image that OpenCV can read.")
+    return image
+
+
+def exif_focal_35mm(path: Path) -> float | None:
+    """The focal length in a photo's EXIF data, mm for film of 35 mm, or `None`."""
+    from PIL import Image  # comes with matplotlib
+
+    try:
+        with open_binary(path, "an image") as file, reading(path, "an image"):
+            with Image.open(file, formats=_FORMATS) as opened:
+                found = float(opened.getexif().get_ifd(0x8769).get(0xA405) or 0)
+    except InputError:  # what no one needs must not stop a run
+        return None
+    return found if 5 <= found <= 500 else None
+
+
+def _check_header(path: Path, data: bytes) -> None:
+    """Refuses an absurd size; a header that Pillow does not know is OpenCV's to judge,
+    which decodes at most 2^30 pixels of it."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=_FORMATS) as opened:
+                size = opened.size
+    except Image.DecompressionBombError:
+        raise InputError(
+            f"{path}: an image of absurd size by its header, expected at most "
+            f"{budget.MAX_PIXELS / 1e6:.0f} million pixels."
+        ) from None
+    except Exception:
+        raise InputError(f"{path}: not an image that OpenCV can read.") from None
+    budget.check_pixels(path, *size)
