@@ -8,6 +8,7 @@ import pytest
 
 from bodyslam_jax import evaluation, export
 from bodyslam_jax.body import joints, load_body_model
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import read_groundtruth, read_result, read_tum
 
 WALK = Path(__file__).parents[2] / "shared" / "sequences" / "walk"
@@ -138,11 +139,11 @@ def test_bad_bodies_are_refused(tmp_path, body, arrays, message):
 
 
 def test_what_is_not_there_is_said(tmp_path, body):
-    with pytest.raises(FileNotFoundError, match="no such ground truth"):
+    with pytest.raises(InputError, match="no such ground truth"):
         read_groundtruth(tmp_path / "nowhere", body)
     with pytest.raises(ValueError, match="neither camera.txt nor body.npz"):
         read_groundtruth(tmp_path, body)
-    with pytest.raises(FileNotFoundError, match="result.npz"):
+    with pytest.raises(InputError, match="result.npz"):
         read_result(tmp_path)
     (tmp_path / "result.npz").write_text("text")
     with pytest.raises(ValueError, match="not a readable .npz"):

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 import bodyslam_jax.graph as g
 from bodyslam_jax import cli, experiments, motion, simulation, solver
 from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments import (
     ablation,
     figures,
@@ -337,7 +338,7 @@ def test_missing_files_are_told_before_anything_is_computed(tmp_path):
         (Experiment(motion=gone), Config()),
         (Experiment(), Config(motion_model=gone)),
     ):
-        with pytest.raises(FileNotFoundError, match="gone.npz: no such"):
+        with pytest.raises(InputError, match="gone.npz: no such"):
             experiments.run_experiment("ablation", tmp_path / "out", on, config)
     (tmp_path / "bad.npz").write_bytes(b"")
     bad = Experiment(motion_models=(str(tmp_path / "bad.npz"),))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.body import PARENTS, load_body_model, rest_joints
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion import disturb, drift, fit_shape, place, read_motion, resample
 from bodyslam_jax.motion.capture.clips import (
@@ -170,7 +171,7 @@ def test_a_folder_without_motion(tmp_path):
     write_amass(tmp_path / "s" / "walk.npz")
     assert len(read_motion(tmp_path)) == 1  # beside something else
     (tmp_path / "s" / "walk.npz").unlink()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(InputError):
         read_motion(tmp_path / "nowhere")
     write_amass(tmp_path / "broken.npz")
     whole = (tmp_path / "broken.npz").read_bytes()

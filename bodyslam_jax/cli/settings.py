@@ -13,6 +13,7 @@ from typing import Any
 from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.config import Config, MotionTraining
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import budget
 from bodyslam_jax.io.declared import as_number, shown
 from bodyslam_jax.io.files import read_yaml
 
@@ -110,10 +111,11 @@ def prepared(
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
-        device = getattr(kwargs.get("config"), "device", None)
+        config = kwargs.get("config")
         elsewhere = in_workers or kwargs.get("engine") is not None
-        jax_setup.prepare("cpu" if elsewhere else device)
-        return command(*args, **kwargs)
+        jax_setup.prepare("cpu" if elsewhere else getattr(config, "device", None))
+        with budget.granted(getattr(config, "limits", budget.current())):
+            return command(*args, **kwargs)
 
     # `inspect` reads it; typeshed does not declare it.
     run.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]

@@ -37,7 +37,7 @@ _RUN_FIELDS = {
 def read_result(path: Path) -> Result:
     """Reads `result.npz` (or the run folder around it) and its `summary.json`.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    **Raises:** `InputError`, naming the file, what was found and
     what was expected.
     """
     file = path / "result.npz" if path.is_dir() else path
@@ -75,11 +75,11 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     first timestamp. Bodies without joints are posed with `body`. Without a camera
     `summary["has_camera"]` is false; without bodies there are no people.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    **Raises:** `InputError`, naming the file, what was found and
     what was expected.
     """
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such ground truth.")
+        raise InputError(f"{path}: no such ground truth.")
     if path.is_dir():
         if (path / "groundtruth").is_dir():
             path = path / "groundtruth"

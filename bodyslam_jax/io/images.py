@@ -3,6 +3,7 @@
 import io
 import warnings
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -35,11 +36,9 @@ def read_image(path: Path, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
 
 def exif_focal_35mm(path: Path) -> float | None:
     """The focal length in a photo's EXIF data, mm for film of 35 mm, or `None`."""
-    from PIL import Image  # comes with matplotlib
-
     try:
         with open_binary(path, "an image") as file, reading(path, "an image"):
-            with Image.open(file, formats=_FORMATS) as opened:
+            with _header(file) as opened:
                 found = float(opened.getexif().get_ifd(0x8769).get(0xA405) or 0)
     except InputError:  # what no one needs must not stop a run
         return None
@@ -47,14 +46,13 @@ def exif_focal_35mm(path: Path) -> float | None:
 
 
 def _check_header(path: Path, data: bytes) -> None:
-    """Refuses an absurd size; a header that Pillow does not know is OpenCV's to judge,
-    which decodes at most 2^30 pixels of it."""
+    """Refuses what is no image, and one of absurd size."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data), formats=_FORMATS) as opened:
+            with _header(io.BytesIO(data)) as opened:
                 size = opened.size
     except Image.DecompressionBombError:
         raise InputError(
@@ -64,3 +62,11 @@ def _check_header(path: Path, data: bytes) -> None:
     except Exception:
         raise InputError(f"{path}: not an image that OpenCV can read.") from None
     budget.check_pixels(path, *size)
+
+
+def _header(file: BinaryIO) -> Any:
+    """The image, of which Pillow has read no more than the header."""
+    from PIL import Image  # comes with matplotlib
+
+    Image.init()
+    return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])

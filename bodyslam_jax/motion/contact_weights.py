@@ -43,11 +43,11 @@ def save_contact_model(path: Path | str, model: ContactModel) -> None:
 def load_contact_model(path: Path | str | None = None) -> ContactModel:
     """Reads a contact network (float32); without a path, the one that ships.
 
-    **Raises:** `FileNotFoundError`; `ValueError` if the file holds none.
+    **Raises:** `InputError` if the file holds none.
     """
     path = _SHIPPED if path is None else Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such contact network.")
+        raise InputError(f"{path}: no such contact network.")
     archive = read_npz(path, "a contact network (.npz)")
     header = archive.json("header")
     header.text("format", among=(_FORMAT,))

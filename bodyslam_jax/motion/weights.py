@@ -79,12 +79,12 @@ def save_motion_model(
 def load_motion_model(path: Path | str | None = None) -> MotionModel:
     """Reads a model's weights (float32): of a file, or by name of `SHIPPED`.
 
-    **Raises:** `FileNotFoundError`; `ValueError` if the file holds no motion model.
+    **Raises:** `InputError` if the file holds no motion model.
     """
     name = "default" if path is None else str(path)
     path = _ASSETS / f"{name}.npz" if name in SHIPPED else Path(name)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such motion model.")
+        raise InputError(f"{path}: no such motion model.")
     archive = read_npz(path, "a motion model (.npz)")
     header = archive.json("header")
     header.text("format", among=(_FORMAT,))

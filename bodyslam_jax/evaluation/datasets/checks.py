@@ -19,9 +19,9 @@ _HOME = {
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
-def not_there(path: Path, dataset: str) -> FileNotFoundError:
+def not_there(path: Path, dataset: str) -> InputError:
     """The error for a missing file, with the address where to register."""
-    return FileNotFoundError(
+    return InputError(
         f"{path}: not there; {dataset} is given to researchers who register at "
         f"{_HOME[dataset]}."
     )
@@ -109,7 +109,7 @@ def images(folder: Path, num: int = 1) -> list[Path]:
     to wrong frames.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of images.")
+        raise InputError(f"{folder}: no such folder of images.")
     found = (p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     listed = sorted(found, key=lambda file: file.name)
     if not listed:

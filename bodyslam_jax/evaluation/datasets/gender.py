@@ -71,7 +71,7 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
     **Raises:** as `read_groundtruth` and `load_body_model`.
     """
     if body_model and not body_model.exists():
-        raise FileNotFoundError(f"{body_model}: no such body model.")
+        raise InputError(f"{body_model}: no such body model.")
     files = _bodies(path)
     needs = [None if "joints" in x else _needed(x) for x in files]
     wanted = sorted({need for need in needs if need})

@@ -75,7 +75,7 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
     paths = [folder / "gender.json" for folder in folders] if file is None else [file]
     file = next((path for path in paths if path.is_file()), None)
     if file is None:
-        raise FileNotFoundError(
+        raise InputError(
             f"{paths[0]}: not there, and RICH's own files do not name genders; it is "
             f"in {_GENDERS_FROM}, and can be named with --genders."
         )

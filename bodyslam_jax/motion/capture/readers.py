@@ -33,12 +33,12 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
     In a folder, `.npz` files of other things are passed over, and so, with a warning,
     are sequences without bone lengths in which nobody stands.
 
-    **Raises:** `FileNotFoundError` if there is nothing at `path`; `ValueError` if a
-    file is damaged or if no file holds a usable sequence.
+    **Raises:** `InputError` if there is nothing at `path`, if a file is damaged
+    or if no file holds a usable sequence.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder of motion data.")
+        raise InputError(f"{path}: no such file or folder of motion data.")
     if path.is_file():
         if clips := _read_file(path):
             return clips
