@@ -65,7 +65,8 @@ def as_array(
     if finite and not is_finite.all():
         bad = int((~is_finite).sum())
         raise InputError(
-            f"{path}: {bad} of {found.size} numbers of `{name}` not finite."
+            f"{path}: {bad} of {found.size} numbers of `{name}` not finite (NaN or "
+            "infinite)."
         )
     outside = is_finite & ~((found >= low) & (found <= high))
     if not finite:
@@ -100,7 +101,7 @@ def as_number(
     **Raises:** `InputError`, one line, if the value is anything else or out of range.
     """
     if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.flat[0]
+        value = value.item()
     is_number = isinstance(value, int | float | np.integer | np.floating)
     if not is_number or isinstance(value, bool) or value != value:
         raise InputError(f"{path}: `{name}` is {shown(value)}, expected a number.")
@@ -219,6 +220,8 @@ def fields(path: Path, data: Any, place: str = "") -> Fields:
 def shown(value: Any) -> str:
     """A value of a file in a few words, for messages in one line."""
     if isinstance(value, list | tuple):
+        if len(value) <= 4 and all(isinstance(x, int | float) for x in value):
+            return f"{[float(f'{x:.6g}') for x in value]}"
         return f"a list of {len(value)}"
     if isinstance(value, dict):
         names = ", ".join(str(name)[:30] for name in list(value)[:5])

@@ -41,7 +41,7 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         # of recursion, of the compression.
         words = " ".join(str(error).split())[:120]
         found = f"{type(error).__name__}: {words}" if words else type(error).__name__
-        raise InputError(f"{path}: {found}; expected {expected}.") from None
+        raise InputError(f"{path}: not {expected}, or damaged ({found}).") from None
 
 
 def open_binary(path: Path, what: str = "") -> io.BufferedReader:
@@ -284,7 +284,7 @@ class Members:
     @contextlib.contextmanager
     def _opened(self) -> Iterator[zipfile.ZipFile]:
         with open_binary(self.path, self.what) as file:
-            with reading(self.path, f"{self.what}, whole"):
+            with reading(self.path, self.what):
                 with zipfile.ZipFile(file) as archive:
                     yield archive
 

@@ -3,7 +3,7 @@
 import io
 import warnings
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,7 +64,7 @@ def _check_header(path: Path, data: bytes) -> None:
     budget.check_pixels(path, *size)
 
 
-def _header(file: BinaryIO) -> Any:
+def _header(file: Any) -> Any:
     """The image, of which Pillow has read no more than the header."""
     from PIL import Image  # comes with matplotlib
 
