@@ -122,9 +122,18 @@ BAD_BODIES = {
     "no poses": (_without("poses"), "no array poses"),
     "no rate": (_person(5), "no array mocap_framerate"),
     "zero rate": (_good | {"mocap_framerate": 0.0}, "is 0.0, expected 1 to 1000"),
-    "lengths": (_good | {"trans": np.zeros((4, 3))}, r"`trans` of shape \(4, 3\), expected \(5, 3\)"),
-    "nan": (_good | {"trans": np.full((5, 3), np.nan)}, "15 of 15 numbers of `trans` not finite"),
-    "joints": (_good | {"joints": np.zeros((5, 22, 3))}, r"`joints` of shape \(5, 22, 3\)"),
+    "lengths": (
+        _good | {"trans": np.zeros((4, 3))},
+        r"`trans` of shape \(4, 3\), expected \(5, 3\)",
+    ),
+    "nan": (
+        _good | {"trans": np.full((5, 3), np.nan)},
+        "15 of 15 numbers of `trans` not finite",
+    ),
+    "joints": (
+        _good | {"joints": np.zeros((5, 22, 3))},
+        r"`joints` of shape \(5, 22, 3\)",
+    ),
     "two rates": (_good | {"mocap_framerate": [30.0, 60.0]}, "expected a number"),
     "text": (_good | {"trans": np.full((5, 3), "a")}, "`trans` holds <U1, not numbers"),
     "objects": (_good | {"poses": np.array([{}] * 5)}, "`poses` is a pickled object"),

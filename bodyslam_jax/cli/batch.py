@@ -94,7 +94,9 @@ def _line(outcome: Any) -> str:
 
 def _refused(error: InputError) -> int:
     """Prints a line for each mistake; returns the exit code."""
-    for line in str(error).splitlines():
+    from bodyslam_jax.io.error_line import error_line
+
+    for line in getattr(error, "lines", [error_line(error)]):
         print(f"bodyslam: {line}", file=sys.stderr)
     return 1
 

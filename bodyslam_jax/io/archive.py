@@ -53,7 +53,9 @@ class Archive:
         missing = [name for name in names if name not in self]
         if missing:
             found = ", ".join(name[:40] for name in self.names[:12])
-            raise InputError(f"{self.path}: no array {', '.join(missing)}; found {found}.")
+            raise InputError(
+                f"{self.path}: no array {', '.join(missing)}; found {found}."
+            )
 
     def header(self, name: str) -> tuple[tuple[int, ...], np.dtype]:
         """Shape and type of an array, which is not read."""

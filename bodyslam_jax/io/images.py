@@ -15,6 +15,8 @@ from bodyslam_jax.io.files import open_binary, read_bytes, reading
 _FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF", "WEBP", "GIF", "PPM", "JPEG2000")
 """Formats, by Pillow's names, of which both Pillow and OpenCV know the header."""
 
+_PNG = b"\x89PNG\r\n\x1a\n"
+
 
 def read_image(path: Path, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
     """The pixels of an image, BGR or as OpenCV's `flag` says.
@@ -62,6 +64,19 @@ def _check_header(path: Path, data: bytes) -> None:
     except Exception:
         raise InputError(f"{path}: not an image that OpenCV can read.") from None
     budget.check_pixels(path, *size)
+    if data.startswith(_PNG) and not _is_whole_png(data):
+        raise InputError(f"{path}: a PNG image that is cut short or damaged.")
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether the chunks of a PNG lie within it: OpenCV would allocate what one claims
+    to have, up to 2 GB."""
+    at = len(_PNG)
+    while at + 8 <= len(data):
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+        if data[at - 8 : at - 4] == b"IEND":
+            return True
+    return at <= len(data)
 
 
 def _header(file: Any) -> Any:

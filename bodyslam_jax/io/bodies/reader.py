@@ -207,11 +207,17 @@ def _gather(
     """Checks the rows and sorts them by person and frame."""
     if not len(rows.frame):
         raise InputError(f"{path}: no body in any frame.")
-    for name in ("person", "poses", "betas", "trans"):
-        array = getattr(rows, name)
-        if len(array) != len(rows.frame):
+    m = len(rows.frame)
+    for name, more in (
+        ("person", ()),
+        ("poses", (72,)),
+        ("betas", (10,)),
+        ("trans", (3,)),
+    ):
+        shape = getattr(rows, name).shape
+        if shape != (m, *more):
             raise InputError(
-                f"{path}: {len(rows.frame)} frames for {len(array)} of `{name}`."
+                f"{path}: {m} frames for `{name}` of {shape}, expected {(m, *more)}."
             )
     rows = _finite(path, rows, warn)
     low, high = int(rows.frame.min()), int(rows.frame.max())

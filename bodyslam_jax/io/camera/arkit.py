@@ -60,6 +60,7 @@ def read_arkit_poses(
     """
     if path.suffix == ".csv":
         table = _table(path)
+        _check_times(path, table[:, 0])
         return table[:, 0] - table[0, 0], _poses(path, table[:, 5:], table[:, 2:5])
     data = _metadata(path)
     rows = data.array("poses", (None, 7))
@@ -67,6 +68,7 @@ def read_arkit_poses(
         raise InputError(f"{path}: no pose in it, expected {_RECORD3D}.")
     if data.data.get("frameTimestamps"):
         times = data.array("frameTimestamps", (len(rows),), high=_MAX_TIME)
+        _check_times(path, times)
         times = times - times[0]
     else:
         times = np.arange(len(rows)) / data.number("fps", 0.1, 1000)
@@ -106,6 +108,11 @@ def _table(path: Path) -> Float[np.ndarray, "n 9"]:
             f"{', '.join(_COLUMNS)}."
         )
     return _numbers(path, [row[: len(_COLUMNS)] for row in rows])
+
+
+def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
+    if (np.diff(times) <= 0).any():
+        raise InputError(f"{path}: times of poses that do not increase.")
 
 
 def _numbers(path: Path, rows: list[list[str]]) -> Float[np.ndarray, "n m"]:
