@@ -19,8 +19,8 @@ _SUFFIX = re.compile(
 )
 
 
-_MAX_DIGITS = 30
-"""Digits of a number in a name: more than a date and a time in nanoseconds have."""
+_MAX_DIGITS = 255
+"""Digits of a number in a name: file systems allow no longer names."""
 
 
 class InvalidContent(ValueError):
