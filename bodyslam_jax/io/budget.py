@@ -24,6 +24,8 @@ MAX_PIXELS = 100_000_000
 """Pixels of one image: three times those of 8K video."""
 MAX_MEMBERS = 100_000
 """Files within an archive."""
+MAX_PEOPLE = 1000
+"""People in one frame: they are told apart in pairs."""
 SPARSEST = 100
 """Ratio of the last number to the count of observations above which numbers are no
 frame numbers, but times for example."""

@@ -35,6 +35,8 @@ _log = logging.getLogger(__name__)
 
 _MAX_DISTANCE = 200.0
 """Of a body from the camera, m; further away, `trans` is in another unit."""
+_MAX_BETA = 100.0
+"""Standard deviations of SMPL's shapes; those of people are within 5."""
 _MIN_FINITE = 0.5
 """Share of the bodies that must be finite."""
 
@@ -119,25 +121,21 @@ def _from_contract(data: dict, video: Video) -> Rows:
         ("betas", data["betas"], (n, 10)),
         ("trans", data["trans"], (n, 3)),
     ):
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
-            raise InvalidContent(f"`{name}` holds {array.dtype}, not numbers")
-        if array.shape != shape:
-            raise InvalidContent(f"`{name}` is {array.shape}, not {shape}")
+        array = numbers_of({name: value}, name, shape)
         whole = name in ("frame", "person")
-        arrays[name] = whole_of(array, name) if whole else array.astype(np.float64)
+        arrays[name] = whole_of(array, name) if whole else array
     return Rows(**arrays, shapes_regressed=regressed)
 
 
 def _as_smpl(data: dict) -> dict:
     """The data with SMPL's poses, if they are as wide as SMPL-H's or SMPL-X's."""
-    poses, betas = np.asarray(data["poses"]), np.asarray(data["betas"])
+    poses, betas = (numbers_of(data, name, None) for name in ("poses", "betas"))
     if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
         poses72 = poses
     else:
         poses72 = body_pose(poses)
         if is_smplx(data, poses.shape[1]):
-            trans = np.asarray(data["trans"]) + PELVIS_SMPLX - PELVIS_SMPL
+            trans = numbers_of(data, "trans", (-1, 3)) + PELVIS_SMPLX - PELVIS_SMPL
             return {
                 **data,
                 "poses": poses72,
@@ -238,6 +236,12 @@ def _gather(
     turn = float(np.linalg.norm(rows.poses.reshape(-1, 3), axis=-1).max())
     if turn > 20:
         raise InputError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
+    widest = float(np.abs(rows.betas).max(initial=0))
+    if widest > _MAX_BETA:
+        raise InputError(
+            f"{path}: a shape of {widest:.3g} standard deviations (`betas`), expected "
+            f"at most {_MAX_BETA:g}."
+        )
     people, index = np.unique(rows.person, return_inverse=True)
     size = (len(people), num_frames)
     check_bytes(path, 8 * 85 * len(people) * num_frames, "as a table ")

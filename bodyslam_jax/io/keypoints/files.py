@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import Archive, read_npz
+from bodyslam_jax.io.budget import last_frame_problem
 from bodyslam_jax.io.declared import as_array, as_whole
 from bodyslam_jax.io.declared_size import Size, size_in
 from bodyslam_jax.io.files import read_json, reading
@@ -248,6 +249,10 @@ def read_npz_keypoints(path: Path, num_frames: int | None) -> Listed:
             f"{path}: keypoints of {points.shape[1]} frames, but the video has "
             f"{num_frames}."
         )
+    if num_frames is None and (
+        problem := last_frame_problem(points.shape[1] - 1, points.shape[1], "keypoints")
+    ):
+        raise InputError(f"{path}: {problem}.")
     rows = [
         (str(k), points[h, k], int(h))
         for h, k in np.argwhere(~(points[..., 2] <= 0).all(axis=-1))

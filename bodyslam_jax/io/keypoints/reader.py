@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
@@ -93,6 +94,11 @@ def read_detections(
         listed.rows, arranged(path, listed, warn), strict=True
     ):
         by_frame[frames[name]].append((points, who))
+    busiest = max(map(len, by_frame), default=0)
+    if busiest > MAX_PEOPLE:
+        raise InputError(
+            f"{path}: {busiest} people in one frame, expected at most {MAX_PEOPLE}."
+        )
     points = [np.array([p for p, _ in f]).reshape(-1, 25, 3) for f in by_frame]
     person = [np.array([who for _, who in f], dtype=np.int64) for f in by_frame]
     person = _checked(person, warn)
