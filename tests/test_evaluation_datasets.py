@@ -369,7 +369,7 @@ def test_bad_motions_are_refused(tmp_path, world):
     np.savez(tmp_path / "shapeless.npz", **arrays)
     (tmp_path / "text.npz").write_text("text")
     for name, message in (
-        ("text", "text.npz: not a readable .npz"),
+        ("text", "text.npz: not a true body"),
         ("shapeless", "shapeless.npz: no array betas"),
     ):
         with pytest.raises(ValueError, match=message):

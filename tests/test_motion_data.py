@@ -177,7 +177,7 @@ def test_a_folder_without_motion(tmp_path):
     whole = (tmp_path / "broken.npz").read_bytes()
     for torn in (b"PK not really", b"", whole[: len(whole) // 2]):
         (tmp_path / "broken.npz").write_bytes(torn)
-        with pytest.raises(ValueError, match="broken.npz: not a readable"):
+        with pytest.raises(ValueError, match="broken.npz: not motion"):
             read_motion(tmp_path)
     flipped = bytearray(whole)
     flipped[1000] ^= 255  # within `poses`: the archive's checksum notices

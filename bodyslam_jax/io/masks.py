@@ -119,7 +119,9 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
             f"{path}: `{name}` {stack.dtype}{stack.shape}, expected numbers (frames, "
             "height, width) or (frames, people, height, width)."
         )
-    found = np.asarray(stack > (0 if stack.dtype.kind in "bu" else 0.5))
+    if stack.dtype.kind != "b":
+        stack = stack > (0 if stack.dtype.kind == "u" else 0.5)
+    found = np.asarray(stack)
     return np.asarray(found.any(axis=1)) if found.ndim == 4 else found
 
 

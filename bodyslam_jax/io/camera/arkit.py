@@ -63,9 +63,12 @@ def read_arkit_poses(
         _check_times(path, table[:, 0])
         return table[:, 0] - table[0, 0], _poses(path, table[:, 5:], table[:, 2:5])
     data = _metadata(path)
-    rows = data.array("poses", (None, 7))
-    if not len(rows):
-        raise InputError(f"{path}: no pose in it, expected {_RECORD3D}.")
+    rows = data.array("poses")
+    if rows.ndim != 2 or rows.shape[1] != 7 or not len(rows):
+        raise InputError(
+            f"{path}: poses of shape {rows.shape}, expected rows of "
+            "`qx qy qz qw x y z`."
+        )
     if data.data.get("frameTimestamps"):
         times = data.array("frameTimestamps", (len(rows),), high=_MAX_TIME)
         _check_times(path, times)
@@ -104,8 +107,8 @@ def _table(path: Path) -> Float[np.ndarray, "n 9"]:
     names = tuple(word.strip() for word in head)[: len(_COLUMNS)]
     if names != _COLUMNS or not rows:
         raise InputError(
-            f"{path}: columns {', '.join(names)[:80]} and {len(rows)} rows, expected "
-            f"{', '.join(_COLUMNS)}."
+            f"{path}: not Stray Scanner's odometry: columns {', '.join(names)[:80]} "
+            f"and {len(rows)} rows, expected {', '.join(_COLUMNS)}."
         )
     return _numbers(path, [row[: len(_COLUMNS)] for row in rows])
 

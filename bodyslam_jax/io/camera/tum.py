@@ -13,6 +13,8 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.files import read_lines
 
+_LONGEST = 1000
+"""Characters of a line that are read: eight numbers have some two hundred."""
 _MAX_NUMBER = 1e19
 """A time in nanoseconds since 1970 has 19 digits; positions are far smaller."""
 
@@ -25,7 +27,8 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     rows = []
     lines = read_lines(path, "a TUM trajectory")
     for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].replace(",", " ").split()
+        # No more than is needed to see that a line is too long.
+        words = line[:_LONGEST].partition("#")[0].replace(",", " ").split()
         if not words:
             continue
         try:
