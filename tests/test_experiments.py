@@ -60,7 +60,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     traced = jax.jit(
         jax.vmap(
             lambda f: solver.trace(
-                held, g.rescaled(bare, f), lambda y: y.scale, schedule=SHORT
+                *g.rescaled(held, bare, f), lambda y: y.scale, schedule=SHORT
             )
         )
     )
@@ -68,7 +68,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     assert seen.shape == (3, 9)
     np.testing.assert_array_equal(seen[:, 0], bare.scale)
     np.testing.assert_array_equal(seen[:, -1], states.scale)
-    single = solver.solve(held, g.rescaled(bare, 3.0), schedule=SHORT)
+    single = solver.solve(*g.rescaled(held, bare, 3.0), schedule=SHORT)
     # The same arithmetic in another order, eight steps long.
     np.testing.assert_allclose(states.scale[2], single.state.scale, rtol=1e-6)
     np.testing.assert_allclose(states.roots[2], single.state.roots, atol=1e-6)
