@@ -94,7 +94,11 @@ def rescaled(
         _check_units(each, state)
     by = jnp.asarray(factor, state.scale.dtype)
     arrays, static = eqx.partition((problem, state), eqx.is_array)
-    one = lambda f: eqx.filter(_in_unit(*eqx.combine(arrays, static), f), eqx.is_array)
+
+    def one(by):
+        problem, state = eqx.combine(arrays, static)
+        return eqx.filter(_in_unit(problem, state, by), eqx.is_array)
+
     for _ in range(by.ndim):
         one = jax.vmap(one)
     return eqx.combine(one(by), static)

@@ -2,9 +2,10 @@
 
 People are anchored in the camera, so residuals are linear in s, and how wrong a start's
 s is says nothing of the rest. The best s for the given people is found here in one step
-from anywhere, the best of several where a factor that sees s has a robust loss; were s and people moved together from an s that is off by ten times,
-people would be moved to suit it first, and solves from several starts would end apart
-by what the last step leaves, or in several minima.
+from anywhere, or, where a factor that sees s has a robust loss, as the best of several.
+Were s and people moved together from an s that is off by ten times, people would be
+moved to suit it first, and solves from several starts would end apart by what the last
+step leaves, or in several minima.
 """
 
 import dataclasses
@@ -82,7 +83,7 @@ def at_best_scale(problem: Problem, state: State) -> tuple[State, Float[Array, "
 
 
 def is_quadratic(problem: Problem) -> bool:
-    """Whether no robust loss is on a factor that sees s, so that there is one best s."""
+    """Whether no factor that sees s has a robust loss, so that there is one best s."""
     return all(isinstance(f.loss, Squared) for f in _factors_of_scale(problem))
 
 

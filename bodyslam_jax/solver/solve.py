@@ -162,10 +162,10 @@ def _run(problem, state, method):
         lifted, method, state, problem, max_steps=None, throw=False
     )
     solution, final = outcome(state, found.value, found.result, found.stats)
-    return with_better_scale(problem, solution, method), final
+    return _with_better_scale(problem, solution, method), final
 
 
-def with_better_scale(
+def _with_better_scale(
     problem: Problem, solution: Solution, method: StructuredLevenbergMarquardt
 ) -> Solution:
     """The solution with another s that is better, where a stage has moved s and robust
