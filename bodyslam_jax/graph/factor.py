@@ -9,7 +9,7 @@ all frames and the blocks of the Jacobian follow from that.
 
 import abc
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -103,7 +103,7 @@ class Factor(eqx.Module, _Declared):
     if not TYPE_CHECKING:
         loss: eqx.AbstractVar[Loss]
 
-    def rescaled(self, factor: Float[Array, ""]) -> Self:
+    def rescaled(self, factor: Float[Array, ""]) -> "Factor":
         """The same measurements in a map that is `factor` times as large: fields are
         multiplied by the powers of `factor` in `map_units`."""
         found = self
