@@ -12,6 +12,27 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```python([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
+OUTPUT = re.compile(r"^```output\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+
+
+def same(found: list[str], expected: list[str]) -> bool:
+    """Whether lines have the same words, and the same numbers to 2 %: machines round
+    differently."""
+    if [NUMBER.sub("#", line) for line in found] != [
+        NUMBER.sub("#", line) for line in expected
+    ]:
+        return False
+    values = lambda lines: [float(x) for line in lines for x in NUMBER.findall(line)]
+    return values(found) == pytest.approx(values(expected), rel=0.02)
+
+
+def test_output_of_the_documentation_is_compared():
+    assert same(["λ 51380: +0.0101 m"], ["λ 51383: +0.0100 m"])
+    assert not same(["λ 51383: +0.0110 m"], ["λ 51383: +0.0100 m"])
+    assert not same(["1.6e-06"], ["0.01 m"])
+
+
 def code_of(page: Path) -> str:
     """The blocks of a page that are not marked `no-run`, at their lines."""
     text = page.read_text()
@@ -30,12 +51,19 @@ def code_of(page: Path) -> str:
     "page", [p for p in PAGES if code_of(p).strip()], ids=lambda page: page.name
 )
 def test_code_in_the_documentation_runs(page, tmp_path):
+    if "SEQUENCE_FOLDER" in code_of(page):
+        simulate = ["simulate", "SEQUENCE_FOLDER", "--length", "60"]
+        program = [sys.executable, "-m", "bodyslam_jax", *simulate]
+        subprocess.run(program, check=True, capture_output=True, cwd=tmp_path)
     script = tmp_path / f"{page.stem}.py"
     script.write_text(code_of(page))
     done = subprocess.run(
         [sys.executable, script], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr[-2000:]
+    expected = "".join(OUTPUT.findall(page.read_text()))
+    last = done.stdout.splitlines()[-len(expected.splitlines()) :]
+    assert not expected or same(last, expected.splitlines()), done.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -280,11 +280,10 @@ def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
 @pytest.mark.parametrize("hold", [("cameras", "landmarks"), ()], ids=["held", "free"])
 def test_the_scale_is_the_same_in_both_families(name, family, frames, hold):
     case = bs.simulate_case(name, family=family, frames=frames)
-    factors = jnp.array(FACTORS)
-    starts = bs.rescaled(*bs.build(case, hold=hold), factors)
-    found = jax.vmap(bs.solve)(*starts)
-    np.testing.assert_array_equal(found.status, "converged")
-    answers = np.asarray(found.state.scale * factors)
+    built = bs.build(case, hold=hold)
+    found = [bs.solve(*bs.rescaled(*built, factor)) for factor in FACTORS]
+    assert {x.status for x in found} == {"converged"}
+    answers = [float(x.state.scale) * f for x, f in zip(found, FACTORS, strict=True)]
     np.testing.assert_allclose(answers, answers[3], rtol=1e-6)
 
 
@@ -293,10 +292,14 @@ def test_of_several_scales_the_best_is_taken_from_all_starts():
     said = SaidScale(jnp.where(jnp.arange(20) < 8, 1.0, 2.0))
     free = dataclasses.replace(state.zero_step(), scale=jnp.ones(()))
     problem = graph.make_problem([said], state, free=free)
+    answers = []
     for factor in FACTORS:
         found = bs.solve(*bs.rescaled(problem, state, factor))
         assert found.status == "converged"
-        np.testing.assert_allclose(found.state.scale * factor, 2.0, rtol=1e-3)
+        answers.append(float(found.state.scale) * factor)
+    np.testing.assert_allclose(answers, answers[0], rtol=1e-6)
+    # The eight others pull a little.
+    np.testing.assert_allclose(answers, 2.0, rtol=2e-3)
 
 
 def test_a_better_scale_that_is_known_is_said(solution):

@@ -93,7 +93,11 @@ def rescaled(
     for each in problem.factors:
         _check_units(each, state)
     by = jnp.asarray(factor, state.scale.dtype)
-    arrays, static = eqx.partition((problem, state), eqx.is_array)
+    whole = (problem, state)
+    if by.ndim:  # `jax.vmap` maps arrays only.
+        as_array = lambda x: jnp.asarray(x, by.dtype) if isinstance(x, float) else x
+        whole = jax.tree.map(as_array, whole)
+    arrays, static = eqx.partition(whole, eqx.is_array)
 
     def one(by):
         problem, state = eqx.combine(arrays, static)
