@@ -30,7 +30,7 @@ def of_person(
 
     `inferred` are the frames whose legs were mostly inferred.
     """
-    stretches = runs(present)
+    stretches = _runs(present)
     found: dict[str, Frames] = {}
     if not stretches:
         return found
@@ -56,7 +56,7 @@ def of_person(
         found["speed_across_gap"] = (a.stop - 1, b.start)
         shortest = min(stretches, key=lambda run: run.stop - run.start)
         found["seen_in_pieces"] = (shortest.start, shortest.stop - 1)
-    hidden = runs(inferred)
+    hidden = _runs(inferred)
     if hidden:
         longest = max(hidden, key=lambda run: run.stop - run.start)
         found["legs_inferred"] = (longest.start, longest.stop - 1)
@@ -88,6 +88,11 @@ def seen(present: Bool[np.ndarray, " t"]) -> Frames | None:
     """The first and the last frame of these; `None` if there is none."""
     where = np.flatnonzero(present)
     return (int(where[0]), int(where[-1])) if len(where) else None
+
+
+def _runs(where: Bool[np.ndarray, " t"]) -> list[slice]:
+    """Runs of frames, in Python's numbers, as JSON knows them."""
+    return [slice(int(run.start), int(run.stop)) for run in runs(where)]
 
 
 def _worst(stretches, figure, joints, length) -> Frames | None:
