@@ -87,7 +87,8 @@ def judge(
         if frames is not None:
             where = f" (frames {frames[0]} to {frames[1]})"
         if frames is not None and times is not None:
-            seconds = tuple(round(float(times[k] - times[0]), 2) for k in frames)
+            first, last = (float(times[k] - times[0]) for k in frames)
+            seconds = round(first, 2), round(last, 2)
             where = where[:-1] + f", {seconds[0]:.2f} to {seconds[1]:.2f} s)"
         found.append(
             Reason(

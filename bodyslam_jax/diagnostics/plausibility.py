@@ -63,7 +63,7 @@ def implausible(
         judge(checks, found, who, moments=where, times=result.timestamps)
     )
     for h, there in enumerate(present):
-        where: dict[str, moments.Frames | None] = {}
+        own: dict[str, moments.Frames] = {}
         ground = ground_heights(result, h, there)
         of_person = figures.person_figures(result.joints[h], there, fps, ground)
         walking |= "trunk_lean" in of_person
@@ -74,11 +74,11 @@ def implausible(
             of_person["keypoint_misfit"], misfit = misfits[h]
             of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
             of_person |= of_measurement[h]
-            where = moments.of_person(result.joints[h], there, inferred[h], fps)
+            own = moments.of_person(result.joints[h], there, inferred[h], fps)
             if misfit is not None:
-                where["keypoint_misfit"] = misfit
-            whole = moments.seen(there)
-            where = {name: where.get(name, whole) for name in of_person}
+                own["keypoint_misfit"] = misfit
+        whole = moments.seen(there)
+        where = {name: own.get(name, whole) for name in of_person}
         of_people.append(judged(PERSON_CHECKS, of_person, h, where))
     of_camera: dict[str, moments.Frames] = {}
     of_world = {"floors_apart": figures.floors_apart(result.joints, present, fps)}
@@ -93,7 +93,7 @@ def implausible(
         of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
         of_world["ground_under_feet"] = ground_factor
-    anybody = moments.seen(result.present.any(axis=0))
+    anybody = moments.seen(np.any(result.present, axis=0))
     where = {name: of_camera.get(name, anybody) for name in of_world}
     return Doubts(tuple(of_people), judged(WORLD_CHECKS, of_world, None, where))
 
