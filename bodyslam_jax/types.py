@@ -88,6 +88,18 @@ class Tracks:
 
 
 @dataclasses.dataclass(frozen=True)
+class PathClock:
+    """One reading of the times of a camera path."""
+
+    name: str
+    """What the times of the file are, for messages."""
+    times: Float[np.ndarray, " n"]
+    """Of the poses, s, increasing; on the video's clock up to an offset."""
+    is_videos: bool
+    """Whether the clock is the video's, so that the offset is 0."""
+
+
+@dataclasses.dataclass(frozen=True)
 class CameraPath:
     """Camera poses that were given with a video."""
 
@@ -97,6 +109,10 @@ class CameraPath:
     """Frames whose pose was given."""
     metric: bool
     """Whether translations are in metres; else their unit is arbitrary."""
+    poses: Float[np.ndarray, "n 4 4"] | None = None
+    """All poses of the file, as `T_WC`; `None` if their times are settled."""
+    clocks: tuple[PathClock, ...] = ()
+    """Readings of the times of `poses`, the likeliest first."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -62,6 +62,14 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
     tracks, share = sfm.without_burnt_in(tracks, sequence.intrinsics, num_frames)
     if share > 0 and sequence.tracks is not None:
         warnings = (*warnings, sfm.burnt_in_warning(share))
+    if sequence.camera_path is not None:
+        placed = sfm.place_in_time(
+            sequence.camera_path, tracks, sequence.intrinsics, sequence.timestamps
+        )
+        warnings = (*warnings, *placed.warnings)
+        sequence = dataclasses.replace(
+            sequence, camera_path=placed.path, intrinsics=placed.intrinsics
+        )
     if config.static_camera or sequence.camera_path is not None:
         found = reconstruct(sequence, tracks, sequence.intrinsics, config)
         model = sfm.CameraModel(sequence.intrinsics, None, tracks, found, ())

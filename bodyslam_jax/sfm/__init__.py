@@ -8,6 +8,7 @@ from bodyslam_jax.sfm.features import brisk_status as brisk_status
 from bodyslam_jax.sfm.moving_points import (
     second_motion_warning as second_motion_warning,
 )
+from bodyslam_jax.sfm.path_clock import place_in_time as place_in_time
 from bodyslam_jax.sfm.person_mask import SILHOUETTE_STEP as SILHOUETTE_STEP
 from bodyslam_jax.sfm.scene_tracks import track as track
 from bodyslam_jax.sfm.segments import Segments as Segments

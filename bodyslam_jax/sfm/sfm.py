@@ -18,6 +18,7 @@ from bodyslam_jax.sfm.camera_motion import (
     rotations_only,
     stillness,
 )
+from bodyslam_jax.sfm.given_path import MIN_TESTED, PathTest, what_would_fit
 from bodyslam_jax.sfm.incremental import MIN_SHARED, Builder, build_map
 from bodyslam_jax.sfm.missing_poses import fill_missing_poses
 from bodyslam_jax.sfm.partial_map import PartialMap, Refine
@@ -39,9 +40,9 @@ _LEAST_BASELINE = 0.08
 """Extent of the camera path below which the camera only rotates, of the median distance
 of landmarks: assumes that a wrong focal length lets a rotating camera seem to move by
 less than this."""
-_EXPLAINED, _TESTED = 0.3, 200
-"""Least share of inliers under a given camera path, and least number of observations
-for this test."""
+_MAPPED = 0.3
+"""Share of observations of triangulated points below which the images may show no
+parallax along a given path."""
 
 _CERTAIN_PARALLAX = 6.0
 """Residual of a pure rotation, in `TURNING_ERROR`, beyond which the camera
@@ -198,7 +199,7 @@ def _along(
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
     num_seen = len(problem.views.frame)
-    if not num_seen or (not grown.has_point.any() and num_seen < _TESTED):
+    if not num_seen or (not grown.has_point.any() and num_seen < MIN_TESTED):
         text = (
             f"camera path: {num_seen} observations of background points, of which no "
             "map can be made: the given path is used as it is and was not compared "
@@ -207,9 +208,42 @@ def _along(
         nothing = np.zeros(num_seen, dtype=bool)
         last = problem.num_frames - 1
         return _moving(problem, grown, nothing, (0, last), (text,))
-    share, tested = builder.share_explained(grown, np.flatnonzero(path.known))
-    if tested < _TESTED or share >= _EXPLAINED:
-        return _moving(problem, grown, grown.inlier, (0, problem.num_frames - 1), ())
+    test = PathTest(problem.tracks, problem.intrinsics, problem.num_frames)
+    fit = test.fit(path.T_WC, path.known)
+    mapped, tested = builder.share_explained(grown, np.flatnonzero(path.known))
+    if tested >= MIN_TESTED and mapped < _MAPPED and _only_turns(problem):
+        text = (
+            "the images show no parallax along the given path: the camera only turns."
+        )
+        every = np.ones(num_seen, bool)
+        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
+    if fit.fits:
+        warnings: tuple[str, ...] = ()
+        if fit.is_tested and fit.share < fit.doubtful:
+            warnings = (
+                f"camera path: {100 * fit.share:.0f} % of the points fit it within "
+                f"{fit.threshold:.1f} px, where a right path has "
+                f"{100 * fit.expected:.0f} %: less exact than poses usually are, or of "
+                "a slightly different focal length or clock.",
+            )
+        last = problem.num_frames - 1
+        return _moving(problem, grown, grown.inlier, (0, last), warnings)
+    reading = what_would_fit(test, path.T_WC, path.known)
+    why = (
+        f": {reading}."
+        if reading
+        else ": poses of another video, from world to camera, with other axes, on "
+        "another clock, or another focal length?"
+    )
+    raise InputError(
+        f"camera path: {100 * fit.share:.0f} % of the points in the images fit it "
+        f"within {fit.threshold:.1f} px, expected {100 * fit.required:.0f} % or more "
+        f"({100 * fit.expected:.0f} % under a right path with this noise){why}"
+    )
+
+
+def _only_turns(problem: _Problem) -> bool:
+    """Whether a rotation explains the images of all keyframes."""
     shot = problem.views
     motion = _KEYFRAME_MOTION * max(problem.intrinsics.width, problem.intrinsics.height)
     keyframes = choose_keyframes(
@@ -220,17 +254,7 @@ def _along(
         MIN_SHARED,
     )
     pairs = rotation_error(shot, keyframes, 1 / problem.focal)
-    if _turning_error(pairs) * problem.focal < TURNING_ERROR:
-        text = (
-            "the images show no parallax along the given path: the camera only turns."
-        )
-        every = np.ones(len(shot.frame), bool)
-        return _fixed(problem, every, "rotation", 1 / problem.focal, (text,))
-    raise InputError(
-        f"camera path: {100 * share:.0f} % of the points in the images fit it, "
-        f"expected {100 * _EXPLAINED:.0f} % or more: poses of another video, from "
-        "world to camera, with other axes, or another focal length?"
-    )
+    return _turning_error(pairs) * problem.focal < TURNING_ERROR
 
 
 def _longest_shot(

@@ -11,12 +11,31 @@ from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import read_poses
 from bodyslam_jax.io.camera.tum import read_tum
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
-from bodyslam_jax.types import CameraPath
+from bodyslam_jax.types import CameraPath, PathClock
 
 _FEWEST = 2
 """Frames with a pose, at least."""
-_LONGEST_GAP = 0.5
+MAX_GAP_S = 0.5
 """Time between poses across which frames are interpolated, s."""
+_SAME_TIME = 0.05
+"""Of a frame, by which the times of a pose and of its frame may differ: those of some
+files are whole milliseconds."""
+_UNITS = (
+    ("seconds", 1.0),
+    ("milliseconds", 1e-3),
+    ("microseconds", 1e-6),
+    ("nanoseconds", 1e-9),
+)
+"""Units of timestamps, and how many seconds each is."""
+_SHORTEST_STEP, _LONGEST_STEP = 1e-3, 2.0
+"""s, between poses: trackers give at most 1000 poses a second, and keyframes at least
+every other second."""
+_UNIX_TIME = 1e8
+"""s: times beyond it count from 1970."""
+_NUMBER_STEPS = 1, 100
+"""Steps of whole numbers that may be those of frames."""
+_EVERY = (1, 2, 3, 4, 5, 6, 8, 10, 15)
+"""Values of k for a pose of every k-th frame."""
 
 
 def read_camera_path(
@@ -32,7 +51,8 @@ def read_camera_path(
 
     A trajectory with as many poses as the video has frames is taken frame by frame, any
     other is interpolated at the frames' `timestamps` (s). Images are matched to frames
-    by the numbers in their names.
+    by the numbers in their names. Where the times may be on another clock than the
+    video's, their possible readings are kept for `sfm.place_in_time`.
 
     Args:
         metric: whether the poses are in metres.
@@ -49,59 +69,144 @@ def read_camera_path(
         path = next((p for p in inside if p.exists()), inside[0])
         if not path.exists():
             raise InputError(f"{path.parent}: no {', '.join(names)} in this folder.")
-    count = len(timestamps)
     if arkit.is_path(path):
         metric = True
         times, poses = arkit.read_arkit_poses(path)
-        T_WC, known = _at_times(times, poses, timestamps)
+        of_frames = False
     elif path.suffix in (".bin", ".json") or path.name == "images.txt":
         names, poses = read_poses(path)
         try:
             frames = frames_of_names(
                 names,
                 what="poses",
-                num_frames=count,
+                num_frames=len(timestamps),
                 images=images,
                 complete=False,
                 warn=warn,
             )
         except InvalidContent as error:
             raise InputError(f"{path}: {error}.") from None
-        T_WC, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
-        at = [frames[name] for name in names]
-        T_WC[at], known[at] = poses, True
+        at = np.array([frames[name] for name in names])
+        order = np.argsort(at)
+        times, poses, of_frames = timestamps[at[order]], poses[order], True
     else:
         times, poses = read_tum(path)
-        if len(times) < _FEWEST:
-            raise InputError(f"{path}: one pose, expected {_FEWEST} or more.")
-        T_WC, known = _at_times(times, poses, timestamps)
-    if known.sum() < _FEWEST:
+        of_frames = False
+    if len(times) < _FEWEST:
+        raise InputError(f"{path}: one pose, expected {_FEWEST} or more.")
+    clocks = _clocks(times, timestamps, of_frames)
+    if of_frames:
+        T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
+        known = np.isin(timestamps, times)
+        T_WC[known] = poses
+    else:
+        T_WC, known = at_times(clocks[0].times, poses, timestamps)
+    if clocks[0].is_videos and known.sum() < _FEWEST:
         raise InputError(
-            f"{path}: poses for {known.sum()} of the video's {count} frames, expected "
-            f"{_FEWEST} or more: of another video, or another clock?"
+            f"{path}: poses for {known.sum()} of the video's {len(timestamps)} frames, "
+            f"expected {_FEWEST} or more: of another video, or another clock?"
         )
-    if known.sum() < count:
-        warn(f"{path.name}: poses for {known.sum()} of {count} frames.")
-    return CameraPath(T_WC, known, metric)
+    if clocks[0].is_videos and not known.all():
+        warn(f"{path.name}: poses for {known.sum()} of {len(timestamps)} frames.")
+    return CameraPath(T_WC, known, metric, poses, clocks)
 
 
-def _at_times(
+def _clocks(
+    times: Float[np.ndarray, " n"],
+    timestamps: Float[np.ndarray, " t"],
+    of_frames: bool,
+) -> tuple[PathClock, ...]:
+    """Readings of a path's times, the likeliest first.
+
+    Args:
+        timestamps: of the video's frames, s.
+        of_frames: whether the times are those of frames that the file names.
+    """
+    count, num_frames = len(times), len(timestamps)
+    if of_frames:
+        return (PathClock("poses of frames by number", times, True),)
+    period = usual_step(timestamps)
+    end = timestamps[-1]
+    step = usual_step(times)
+    starts = times - times[0] + timestamps[0]
+    found = []
+    within = times[0] > timestamps[0] - period and times[-1] < end + period
+    # From 0 on but too short: as likely counted from its own first pose.
+    from_zero = abs(times[0]) < 1e-6 and times[-1] < end - 1.5 * period
+    if count == num_frames:
+        found.append(PathClock("a pose for each frame", timestamps.copy(), True))
+    elif within and step < _LONGEST_STEP and not from_zero:
+        found.append(PathClock("times in seconds", times, True))
+    whole = bool((times == np.round(times)).all())
+    if whole and _NUMBER_STEPS[0] <= step <= _NUMBER_STEPS[1]:
+        numbered = (times - times[0]) * period
+        if times[-1] < num_frames:
+            at = np.interp(times, np.arange(num_frames), timestamps)
+            name = "frame numbers"
+            if times[0] == 0 and times[-1] < num_frames - 1.5:
+                found.append(PathClock(f"{name} from 0", at, False))
+            else:
+                found.append(PathClock(name, at, True))
+        else:
+            name = "frame numbers of another count"
+            found.append(PathClock(name, numbered + timestamps[0], False))
+    overlapping = step < _LONGEST_STEP and times[0] < end and times[-1] > timestamps[0]
+    if overlapping and not from_zero and not (whole and step >= 1):
+        found.append(PathClock("times in seconds", times, True))
+    for name, unit in _UNITS:
+        if _SHORTEST_STEP <= step * unit < _LONGEST_STEP:
+            unix = times[0] * unit > _UNIX_TIME
+            what = f"Unix time in {name}" if unix else f"times in {name}"
+            what += " from 0" if times[0] == 0 else " on a clock of their own"
+            scaled = starts[0] + (starts - starts[0]) * unit
+            found.append(PathClock(what, scaled, False))
+    # Of a clock that assumed another frame rate: a pose for every k-th frame.
+    for k in _EVERY:
+        if step > 0 and (times[-1] - times[0]) / step * k <= 1.1 * num_frames:
+            scaled = starts[0] + (times - times[0]) / step * k * period
+            what = f"a pose every {k} frames" if k > 1 else "a pose for each frame"
+            found.append(PathClock(f"{what} from an unknown one on", scaled, False))
+    if not found:
+        found.append(PathClock("times in seconds", times, True))
+    return tuple(found)
+
+
+def at_times(
     times: Float[np.ndarray, " n"],
     poses: Float[np.ndarray, "n 4 4"],
     timestamps: Float[np.ndarray, " t"],
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
-    """Interpolated poses at the frames' times, and the frames that have one."""
-    if len(times) == len(timestamps):
-        return poses, np.ones(len(timestamps), bool)
-    if times[0] > timestamps[-1]:
-        times = times - times[0]  # of another clock, taken to start with the video
+    """Poses (camera to world) at the frames' `timestamps`, interpolated between those
+    at `times` (s, increasing), and the frames that have one.
+
+    A frame has none before the first pose, after the last, and where neighbouring poses
+    lie further apart than `MAX_GAP_S`, unless it is at one of them.
+    """
+    T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
     after = np.clip(np.searchsorted(times, timestamps), 1, len(times) - 1)
     gap = times[after] - times[after - 1]
-    inside = (timestamps >= times[0] - 1e-6) & (timestamps <= times[-1] + 1e-6)
-    known = inside & (gap <= _LONGEST_GAP)
-    at = np.clip(timestamps, times[0], times[-1])
-    T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
-    T_WC[:, :3, :3] = so3.interpolate_path(times, poses[:, :3, :3], at)
+    near = np.minimum(
+        np.abs(timestamps - times[after - 1]), np.abs(timestamps - times[after])
+    )
+    same = _SAME_TIME * usual_step(timestamps)
+    inside = (timestamps >= times[0] - same) & (timestamps <= times[-1] + same)
+    known = inside & ((gap <= MAX_GAP_S) | (near <= same))
+    if not known.any():
+        return T_WC, known
+    at = np.clip(timestamps[known], times[0], times[-1])
+    T_WC[known, :3, :3] = so3.interpolate_path(times, poses[:, :3, :3], at)
     for axis in range(3):
-        T_WC[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
+        T_WC[known, axis, 3] = np.interp(at, times, poses[:, axis, 3])
     return T_WC, known
+
+
+def usual_step(times: Float[np.ndarray, " n"]) -> float:
+    """The step of increasing times without their gaps, in their unit; 0 of one time.
+
+    It is the mean of the steps up to 1.5 times the median, because times may be
+    rounded.
+    """
+    steps = np.diff(times)
+    if not len(steps):
+        return 0.0
+    return float(steps[steps <= 1.5 * np.median(steps)].mean())

@@ -1,0 +1,493 @@
+"""The clock of a given camera path: the offset from the video's, found from tracks.
+
+Where the times of a path are not those of the video, the offset between the two is the
+one at which the tracks fit the path best (`given_path.PathTest`). Its standard
+deviation is that of the jackknife over blocks of time, because errors of neighbouring
+frames are correlated; an offset that fits as well as another is no result.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import binom
+
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.io.camera.path import at_times, usual_step
+from bodyslam_jax.sfm.given_path import MIN_TESTED, MIN_VIEWS, PathTest
+from bodyslam_jax.types import CameraPath, Intrinsics, PathClock, Tracks
+
+_MAX_OFFSETS = 1500
+"""Offsets of the coarse search; it is by frames, or by several in long videos."""
+_LEAST_OVERLAP = 0.5
+"""Share of the shorter of path and video that lies within the other."""
+_LOCAL_FRAMES = 15
+"""Frames before and after the given time within which a path on the video's own clock
+is compared with itself."""
+_SIGNIFICANT, _UNLIKELY = 3.0, 0.005
+"""Standard errors beyond which, and probability of chance below which, two offsets do
+not fit equally well."""
+_AS_EXPECTED = 0.95
+"""Share of the expected fit from which no other reading of the times is tried."""
+_WHOLE_RATE = 0.005
+"""Relative difference of rates up to which a path with a pose per frame was made from
+the frames of this video."""
+_NEAR_RATE = 0.05
+"""Relative difference of rates up to which a tracker may have assumed another frame
+rate than the video's without any part of the path showing it."""
+_PHASES = 4
+"""Offsets per frame in the refinement."""
+_PHASE_EFFECT = 0.02
+"""Share of the rise of the cost over a frame from which a cost that depends on the
+phase of poses and frames hides the minimum between them."""
+_SAME_PATH = 0.05, 0.02
+"""RMS difference of positions, of the path's extent, and of rotations (rad) up to which
+offsets that fit equally give the same path."""
+_LOST_PENALTY = 0.02
+"""Share of the cost by which a step of the offset must lower it."""
+_MAX_LOST = 60
+"""Frames lost at once, or in all, that are looked for."""
+_FOCAL_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
+"""Factors of a guessed focal length under which a path is tried: fields of view from 31
+to 70 degrees around the guess of 45 degrees."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Placed:
+    """A path whose poses have been put on the frames of the video."""
+
+    path: CameraPath
+    intrinsics: Intrinsics
+    """With the focal length under which the path fits, if it was a guess."""
+    warnings: tuple[str, ...]
+
+
+def place_in_time(
+    path: CameraPath,
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    timestamps: Float[np.ndarray, " t"],
+) -> Placed:
+    """Puts the poses of a path on the frames at which the tracks fit them.
+
+    A path on the video's own clock stays where it is, unless another time fits
+    significantly better. Of any other path the offset, and frames lost on the way, are
+    found from the tracks.
+
+    Args:
+        timestamps: of the frames, s.
+
+    **Raises:** `InputError` if the clock is not the video's and its offset cannot be
+    found.
+    """
+    if path.poses is None or not path.clocks or len(timestamps) < MIN_VIEWS:
+        return Placed(path, intrinsics, ())
+    test = PathTest(tracks, intrinsics, len(timestamps))
+    most = int(test.used.sum())
+    given = path.clocks[0]
+    if most < MIN_TESTED:
+        if given.is_videos:
+            return Placed(path, intrinsics, ())
+        raise InputError(
+            f"camera path: its clock is not the video's ({given.name}), and {most} "
+            f"observations of background points, expected {MIN_TESTED} or more, do not "
+            "tell the offset: give its times in seconds from the video's first frame."
+        )
+    warnings: list[str] = []
+    search = _Search(test, path.poses, timestamps)
+    if intrinsics.is_guess:
+        search, intrinsics, text = _with_best_focal(search, path, tracks, intrinsics)
+        warnings += text
+    found = _best_clock(search, path.clocks)
+    if found is None:
+        raise InputError(
+            f"camera path: its clock is not the video's ({given.name}), and no offset "
+            "leaves points to compare it with: give its times in seconds from the "
+            "video's first frame."
+        )
+    placed = search.path(found.times, path)
+    fit = search.test.fit(placed.T_WC, placed.known)
+    if not given.is_videos and not fit.fits:
+        raise InputError(
+            f"camera path: its clock is not the video's ({given.name}), and no offset "
+            f"explains the images: {100 * fit.share:.0f} % of the points fit at best, "
+            f"with its first pose at {found.times[0]:.2f} s, where a right path has "
+            f"{100 * fit.expected:.0f} %: poses of another video, from world to "
+            "camera, with other axes, or another focal length?"
+        )
+    if found.is_given:
+        return Placed(path, intrinsics, tuple(warnings))
+    range_, same = search.equally_good(found)
+    rate = 1 / search.period
+    if range_ is not None:
+        between = (
+            f"first poses between {range_[0]:.2f} and {range_[1]:.2f} s fit the images "
+            "equally well"
+        )
+        if not same and not given.is_videos:
+            raise InputError(
+                f"camera path: its clock is not the video's ({given.name}), and "
+                f"{between} but give different paths: give its times in seconds from "
+                "the video's first frame."
+            )
+        if not same or given.is_videos:
+            return Placed(path, intrinsics, tuple(warnings))
+        warnings.append(f"camera path: {between} and give the same path.")
+    first = found.times[0] - timestamps[0]
+    text = (
+        f"camera path: {found.clock.name}; the tracks put its first pose at "
+        f"{found.times[0]:.3f} ± {found.sigma:.3f} s (frame {first * rate:.1f}), where "
+        f"{100 * fit.share:.0f} % of the points fit ({100 * fit.expected:.0f} % are "
+        "expected)"
+    )
+    if given.is_videos:
+        before = search.test.fit(path.T_WC, path.known)
+        text += f" and not at {given.times[0]:.3f} s, where {100 * before.share:.0f} %"
+    warnings.append(text + ".")
+    if found.lost:
+        where = ", ".join(f"{k} before {s:.2f} s" for s, k in found.lost[:4])
+        warnings.append(f"camera path: frames without a pose were lost: {where}.")
+    if not placed.known.all():
+        count = f"{int(placed.known.sum())} of {len(timestamps)}"
+        warnings.append(f"camera path: poses for {count} frames.")
+    return Placed(placed, intrinsics, tuple(warnings))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """A clock with its offset."""
+
+    clock: PathClock
+    times: Float[np.ndarray, " n"]
+    """Of the poses on the video's clock, s."""
+    sigma: float
+    """Of the offset, s."""
+    is_given: bool = False
+    """Whether the times are those of the file."""
+    lost: tuple[tuple[float, int], ...] = ()
+    """Times (s) before which poses of frames are missing, and of how many frames."""
+
+
+class _Search:
+    """Offsets of one path, tested against one sample of tracks."""
+
+    def __init__(
+        self,
+        test: PathTest,
+        poses: Float[np.ndarray, "n 4 4"],
+        timestamps: Float[np.ndarray, " t"],
+    ):
+        self.test, self.poses, self.timestamps = test, poses, timestamps
+        self.period = usual_step(timestamps)
+
+    def path(self, times: Float[np.ndarray, " n"], path: CameraPath) -> CameraPath:
+        """The path with its poses at `times` of the video's clock."""
+        T_WC, known = at_times(times, self.poses, self.timestamps)
+        return dataclasses.replace(path, T_WC=T_WC, known=known, poses=None, clocks=())
+
+    def costs(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "b 2"]:
+        """As `PathTest.cost`, with the poses at `times`."""
+        return self.test.cost(
+            self.test.errors(*at_times(times, self.poses, self.timestamps))
+        )
+
+    def offsets(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+        """Offsets, s, at which path and video overlap enough, by whole frames."""
+        start, end = self.timestamps[0], self.timestamps[-1]
+        length = min(times[-1] - times[0], end - start)
+        shortest = max(_LEAST_OVERLAP * length, MIN_VIEWS * self.period)
+        low = start + shortest - times[-1]
+        high = end - shortest - times[0]
+        step = max(1, int((high - low) / self.period / _MAX_OFFSETS) + 1) * self.period
+        # Through the first frame and pose together.
+        first = np.ceil((low - (start - times[0])) / step)
+        last = np.floor((high - (start - times[0])) / step)
+        return start - times[0] + step * np.arange(first, last + 1)
+
+    def profile(
+        self, times: Float[np.ndarray, " n"], offsets: Float[np.ndarray, " d"]
+    ) -> Float[np.ndarray, "d b 2"]:
+        return np.stack([self.costs(times + offset) for offset in offsets])
+
+    def refined(
+        self, times: Float[np.ndarray, " n"], offset: float
+    ) -> tuple[float, float]:
+        """The offset of least cost near `offset`, and its sigma, both in s.
+
+        Interpolation between poses averages their noise, most in the middle between
+        two, so that the cost of a noisy path also depends on the phase of frames and
+        poses: first a parabola plus a constant for each phase is fitted, and without
+        such an effect a narrower one.
+        """
+        phases = np.arange(-2 * _PHASES, 2 * _PHASES + 1)
+        at = offset + phases * self.period / _PHASES
+        profile = self.profile(times, at)
+        offset, sigma, effect = _minimum(at, profile, phases % _PHASES)
+        if effect < _PHASE_EFFECT:
+            step = 0.15 * self.period
+            at = offset + step * np.arange(-4, 5)
+            one = np.zeros(len(at), int)
+            offset, sigma, _ = _minimum(at, self.profile(times, at), one)
+        # Below a hundredth of a frame exposures and read-out matter.
+        return offset, max(sigma, 0.01 * self.period)
+
+    def equally_good(self, found: _Found) -> tuple[tuple[float, float] | None, bool]:
+        """Times (s) of the first pose that fit as well as the one found, if they span
+        more than the sigma claims; and whether they all give the same path."""
+        times = found.times
+        step = self.period
+        offsets = self.offsets(times)
+        offsets = offsets[np.abs(offsets) > max(3 * found.sigma, 1.5 * step)]
+        here = self.costs(times)
+        alike = [d for d in offsets if not _worse(self.costs(times + d), here)]
+        if not alike:
+            return None, True
+        range_ = times[0] + min(0.0, *alike), times[0] + max(0.0, *alike)
+        same = all(self._same(times, times + d) for d in (alike[0], alike[-1]))
+        return range_, same
+
+    def _same(self, one: np.ndarray, other: np.ndarray) -> bool:
+        """Whether poses at two series of times give one path, up to a rigid motion."""
+        a, known_a = at_times(one, self.poses, self.timestamps)
+        b, known_b = at_times(other, self.poses, self.timestamps)
+        both = known_a & known_b
+        if both.sum() < MIN_VIEWS:
+            return False
+        a, b = a[both], b[both]
+        U, _, Vt = np.linalg.svd(
+            np.einsum("tij,tkj->ik", a[:, :3, :3], b[:, :3, :3]), full_matrices=False
+        )
+        R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        turned = so3.log(np.swapaxes(a[:, :3, :3], 1, 2) @ R @ b[:, :3, :3])
+        centres = a[:, :3, 3] - a[:, :3, 3].mean(0)
+        away = centres - (b[:, :3, 3] - b[:, :3, 3].mean(0)) @ R.T
+        rms = lambda v: float(np.sqrt((v**2).sum(-1).mean()))
+        extent = max(rms(centres), 1e-12)
+        return rms(away) < _SAME_PATH[0] * extent and rms(turned) < _SAME_PATH[1]
+
+
+def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None:
+    """The clock and offset that fit best; the given one if none fits better.
+
+    Other clocks than the first are tried only if that one does not fit as expected, or
+    if its rate is nearly, but not quite, that of the frames.
+    """
+    given, kept, found = clocks[0], None, []
+    if given.is_videos:
+        kept = _Found(given, given.times, 0.0, is_given=True)
+        offsets = np.arange(-_LOCAL_FRAMES, _LOCAL_FRAMES + 1) * search.period
+        near = _found_in(search, given, offsets)
+        found.append(kept)
+        if near is not None:
+            shift = abs(near.times[0] - given.times[0])
+            if shift > max(_SIGNIFICANT * near.sigma, search.period / 4):
+                found.append(near)
+    else:
+        found.append(_found_in(search, given, search.offsets(given.times)))
+    best = _best_of(search, found)
+    rate = abs(usual_step(given.times) / search.period - 1)
+    if (
+        best is None
+        or _WHOLE_RATE < rate < _NEAR_RATE
+        or not _fits_as_expected(search, best)
+    ):
+        others = clocks if given.is_videos else clocks[1:]
+        others = [c for c in others if len(search.offsets(c.times))]
+        found = [best, *(_found_in(search, c, search.offsets(c.times)) for c in others)]
+        best = _best_of(search, found)
+    if best is not None and not (best.is_given and _fits_as_expected(search, best)):
+        best = _best_of(search, [best, _with_lost_frames(search, best)])
+    if kept is not None and best is not None and not best.is_given:
+        # A path that says its time is believed, unless another time fits outright.
+        fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
+        return best if fit.fits else kept
+    return best
+
+
+def _best_of(search: _Search, found: list[_Found | None]) -> _Found | None:
+    """The first that none of the later ones is significantly better than."""
+    best, cost = None, np.zeros((0, 2))
+    for one in found:
+        if one is None:
+            continue
+        its = search.costs(one.times)
+        if best is None or _worse(cost, its):
+            best, cost = one, its
+    return best
+
+
+def _found_in(
+    search: _Search, clock: PathClock, offsets: Float[np.ndarray, " d"]
+) -> _Found | None:
+    """The best of the offsets (s) of a clock, refined."""
+    profile = search.profile(clock.times, offsets)
+    count = profile[..., 1].sum(1)
+    enough = count >= max(MIN_TESTED, 0.3 * count.max())
+    if not enough.any():
+        return None
+    mean = np.where(enough, profile[..., 0].sum(1) / np.maximum(count, 1), np.inf)
+    offset, sigma = search.refined(clock.times, float(offsets[int(np.argmin(mean))]))
+    if abs(usual_step(clock.times) / search.period - 1) < _WHOLE_RATE:
+        # Made from the frames of this video, so that poses are of whole frames.
+        first = (clock.times[0] + offset - search.timestamps[0]) / search.period
+        moved = (round(first) - first) * search.period
+        if abs(moved) < max(_SIGNIFICANT * sigma, 0.05 * search.period):
+            offset += moved
+    return _Found(clock, clock.times + offset, sigma)
+
+
+def _fits_as_expected(search: _Search, found: _Found) -> bool:
+    """Whether as many points fit as under a right path."""
+    fit = search.test.fit(*at_times(found.times, search.poses, search.timestamps))
+    return fit.is_tested and fit.share >= _AS_EXPECTED * fit.expected
+
+
+def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
+    """The offset with steps where poses of frames are missing that are not numbered.
+
+    Each block of time prefers an offset; the cheapest series of offsets that only grow
+    is found by dynamic programming, and then the frame of each step.
+
+    Returns: `None` if there is no such step.
+    """
+    times, period, start = found.times, search.period, search.timestamps[0]
+    missing = search.timestamps[-1] - start - (times[-1] - times[0])
+    most = min(int(round(missing / period)), _MAX_LOST)
+    if most < 1:
+        return None
+    steps = np.arange(-most, most + 1)
+    profile = search.profile(times, steps * period)
+    num = profile[..., 1].max(0)
+    mean = profile[..., 0] / np.maximum(profile[..., 1], 1)
+    unseen = profile[..., 1] < 0.5 * num
+    # Where the path has no pose, no offset is better than another.
+    seen = np.where(unseen, np.nan, mean)
+    usual = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in seen.T])
+    cost = np.where(unseen, usual, mean) * num
+    penalty = _LOST_PENALTY * np.median(cost, axis=0).sum() + 1e-9
+    total, back = cost[:, 0], []
+    for b in range(1, cost.shape[1]):
+        # From the best of the smaller offsets, with a penalty, or the same.
+        best = np.minimum.accumulate(total)
+        at = np.maximum.accumulate(np.where(total <= best, np.arange(len(total)), 0))
+        jumps = best + penalty < total
+        back.append(np.where(jumps, at, np.arange(len(total))))
+        total = np.where(jumps, best + penalty, total) + cost[:, b]
+    chosen = [int(np.argmin(total))]
+    for before in reversed(back):
+        chosen.append(int(before[chosen[-1]]))
+    offset = steps[np.array(chosen[::-1])]
+    ends = np.flatnonzero(np.diff(offset))
+    if not len(ends):
+        return None
+    moved, lost = times + offset[0] * period, []
+    width = search.test.block_frames * period
+    for b in ends:
+        count = int(offset[b + 1] - offset[b])
+        around = np.abs(moved - (start + (b + 1) * width)) < 2 * width + count * period
+        tries = np.flatnonzero(around)
+        if not len(tries):
+            continue
+        stepped = lambda n: moved + count * period * (np.arange(len(moved)) >= n)
+        costs = [_mean(search.costs(stepped(n))) for n in tries]
+        n = int(tries[int(np.argmin(costs))])
+        moved = stepped(n)
+        lost.append((float(moved[n]), count))
+    return dataclasses.replace(found, times=moved, is_given=False, lost=tuple(lost))
+
+
+def _with_best_focal(
+    search: _Search, path: CameraPath, tracks: Tracks, guess: Intrinsics
+) -> tuple[_Search, Intrinsics, list[str]]:
+    """The guessed focal length under which the path fits best at its best offset."""
+    assert path.poses is not None
+    clock = path.clocks[0]
+    tries: list[tuple[float, float, _Search, Intrinsics]] = []
+    for factor in _FOCAL_FACTORS:
+        params = guess.params.copy()
+        params[:2] *= factor
+        camera = dataclasses.replace(guess, params=params)
+        test = PathTest(tracks, camera, len(search.timestamps))
+        other = _Search(test, path.poses, search.timestamps)
+        offsets = np.zeros(1) if clock.is_videos else search.offsets(clock.times)
+        profile = other.profile(clock.times, offsets)
+        count = profile[..., 1].sum(1)
+        mean = profile[..., 0].sum(1) / np.maximum(count, 1)
+        mean[count < max(MIN_TESTED, 0.3 * count.max())] = np.inf
+        tries.append((float(mean.min()), abs(factor - 1), other, camera))
+    best = min(tries, key=lambda one: one[:2])
+    same = next(one for one in tries if one[1] == 0.0)
+    if best is same or best[0] > 0.9 * same[0]:
+        return search, guess, []
+    text = (
+        f"the camera path fits the images with a focal length of about "
+        f"{best[3].params[0]:.0f} px, not with the guess of {guess.params[0]:.0f} px."
+    )
+    return best[2], best[3], [text]
+
+
+def _mean(cost: Float[np.ndarray, "b 2"]) -> float:
+    """Mean cost of the tested observations; infinite if there are too few."""
+    count = cost[:, 1].sum()
+    return float(cost[:, 0].sum() / count) if count >= MIN_TESTED else float("inf")
+
+
+def _worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> bool:
+    """Whether the first of two costs is significantly larger: by the scatter of the
+    difference between blocks of time that both test, or by its sign in them."""
+    both = (one[:, 1] > 0) & (other[:, 1] > 0)
+    if both.sum() < 2:
+        return _mean(one) > _mean(other)
+    a, b = one[both], other[both]
+    weight = np.minimum(a[:, 1], b[:, 1])
+    difference = a[:, 0] / a[:, 1] - b[:, 0] / b[:, 1]
+    mean = (weight @ difference) / weight.sum()
+    scatter = weight @ (difference - mean) ** 2 / weight.sum()
+    num = int(both.sum())
+    error = np.sqrt(scatter / (num - 1)) + 1e-6
+    chance = float(binom.sf((difference > 0).sum() - 1, num, 0.5))
+    return bool(mean > 0 and (mean > _SIGNIFICANT * error or chance < _UNLIKELY))
+
+
+def _minimum(
+    at: Float[np.ndarray, " d"],
+    profile: Float[np.ndarray, "d b 2"],
+    phase: Int[np.ndarray, " d"],
+) -> tuple[float, float, float]:
+    """The offset of least cost, its sigma by the jackknife over blocks, and the range
+    of the phases' constants relative to the rise of the parabola over one period.
+
+    Args:
+        phase: number of the phase of each offset, which has a constant of its own.
+    """
+    parts = np.flatnonzero(profile[..., 1].min(0) > 0)
+    total = profile.sum(1)
+    left = total[:, None] - profile[:, parts]
+    left = left[:, left[..., 1].min(0) > 0].swapaxes(0, 1)
+    centre = at.mean()
+    half = (at[-1] - at[0]) / 2
+    x = (at - centre) / half
+    constants = phase[:, None] == np.unique(phase)
+    A = np.column_stack([x**2, x, constants])
+
+    def fitted(cost: Float[np.ndarray, "d 2"]) -> tuple[float, float]:
+        mean = cost[:, 0] / np.maximum(cost[:, 1], 1)
+        # Near the minimum, where it is a parabola.
+        weight = 1 / (1 + ((mean - mean.min()) / (np.ptp(mean) / 4 + 1e-12)) ** 2)
+        root = np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(A * root, mean * root[:, 0], rcond=None)[0]
+        rise = found[0] / (half / (at[1] - at[0])) ** 2 * _PHASES**2
+        spread = float(np.ptp(found[2:])) / max(rise, 1e-12)
+        if found[0] <= 0:
+            return float(at[int(np.argmin(mean))]), spread
+        low = -found[1] / (2 * found[0])
+        return float(centre + half * np.clip(low, -1, 1)), spread
+
+    best, effect = fitted(total)
+    if len(left) < 2:
+        return best, half, effect
+    each = np.array([fitted(one)[0] for one in left])
+    count = len(each)
+    spread = ((each - each.mean()) ** 2).sum()
+    return best, float(np.sqrt((count - 1) / count * spread)), effect
