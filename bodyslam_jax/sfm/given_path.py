@@ -76,7 +76,15 @@ class Fit:
 class PathTest:
     """A sample of tracks, against which paths and offsets are tested."""
 
-    def __init__(self, tracks: Tracks, intrinsics: Intrinsics, num_frames: int):
+    def __init__(
+        self,
+        tracks: Tracks,
+        intrinsics: Intrinsics,
+        num_frames: int,
+        span: int | None = None,
+    ):
+        """With a `span`, tracks are cut into pieces within intervals of so many frames,
+        each of which is a block."""
         K, distortion = as_opencv(intrinsics.params)
         self.focal = float(np.sqrt(K[0, 0] * K[1, 1]))
         views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
@@ -89,12 +97,15 @@ class PathTest:
         self.threshold = _THRESHOLD * self.noise
         self.expected = share * _within(_THRESHOLD)
         self.required = share * _within(_THRESHOLD / _NOISIEST)
+        if span is not None:
+            piece = views.landmark * (num_frames // span + 1) + views.frame // span
+            views = Views(views.frame, piece, views.xy)
         self.frame, self.xy, self.used = _sample(views, num_frames)
         self.num_frames = num_frames
         middle = np.where(self.used, self.frame, 0).sum(1) / np.maximum(
             self.used.sum(1), 1
         )
-        self.block_frames = max(num_frames / _MAX_BLOCKS, _BLOCK_FRAMES)
+        self.block_frames = span or max(num_frames / _MAX_BLOCKS, _BLOCK_FRAMES)
         self.block = (middle / self.block_frames).astype(int)
 
     def errors(

@@ -25,7 +25,9 @@ _LEAST_OVERLAP = 0.5
 _LOCAL_FRAMES = 15
 """Frames before and after the given time within which a path on the video's own clock
 is compared with itself."""
-_SIGNIFICANT, _UNLIKELY = 3.0, 0.005
+_SAME_COST = 0.02
+"""Difference of the mean cost of a block's observations that tells nothing."""
+_SIGNIFICANT, _UNLIKELY = 3.0, 0.01
 """Standard errors beyond which, and probability of chance below which, two offsets do
 not fit equally well."""
 _AS_EXPECTED = 0.95
@@ -46,8 +48,8 @@ _SAME_PATH = 0.05, 0.02
 offsets that fit equally give the same path."""
 _LOST_PENALTY = 0.02
 """Share of the cost by which a step of the offset must lower it."""
-_MAX_LOST = 60
-"""Frames lost at once, or in all, that are looked for."""
+_PIECE_FRAMES = 10
+"""Frames of the pieces of tracks between which steps of the offset are sought."""
 _FOCAL_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """Factors of a guessed focal length under which a path is tried: fields of view from 31
 to 70 degrees around the guess of 45 degrees."""
@@ -99,7 +101,8 @@ def place_in_time(
     if intrinsics.is_guess:
         search, intrinsics, text = _with_best_focal(search, path, tracks, intrinsics)
         warnings += text
-    found = _best_clock(search, path.clocks)
+    pieces = PathTest(tracks, intrinsics, len(timestamps), _PIECE_FRAMES)
+    found = _best_clock(search, path.clocks, pieces)
     if found is None:
         raise InputError(
             f"camera path: its clock is not the video's ({given.name}), and no offset "
@@ -267,7 +270,9 @@ class _Search:
         return rms(away) < _SAME_PATH[0] * extent and rms(turned) < _SAME_PATH[1]
 
 
-def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None:
+def _best_clock(
+    search: _Search, clocks: tuple[PathClock, ...], pieces: PathTest
+) -> _Found | None:
     """The clock and offset that fit best; the given one if none fits better.
 
     Other clocks than the first are tried only if that one does not fit as expected, or
@@ -297,7 +302,7 @@ def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None
         found = [best, *(_found_in(search, c, search.offsets(c.times)) for c in others)]
         best = _best_of(search, found)
     if best is not None and not (best.is_given and _fits_as_expected(search, best)):
-        best = _best_of(search, [best, _with_lost_frames(search, best)])
+        best = _best_of(search, [best, _with_lost_frames(search, best, pieces)])
     if kept is not None and best is not None and not best.is_given:
         # A path that says its time is believed, unless another time fits outright.
         fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
@@ -343,21 +348,28 @@ def _fits_as_expected(search: _Search, found: _Found) -> bool:
     return fit.is_tested and fit.share >= _AS_EXPECTED * fit.expected
 
 
-def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
+def _with_lost_frames(
+    search: _Search, found: _Found, pieces: PathTest
+) -> _Found | None:
     """The offset with steps where poses of frames are missing that are not numbered.
 
-    Each block of time prefers an offset; the cheapest series of offsets that only grow
-    is found by dynamic programming, and then the frame of each step.
+    Each block of time prefers an offset, told by `pieces` of tracks that lie within it,
+    as no offset explains a track across a step; the cheapest series of offsets that
+    only grow is found by dynamic programming, and then the frame of each step.
 
     Returns: `None` if there is no such step.
     """
-    times, period, start = found.times, search.period, search.timestamps[0]
-    missing = search.timestamps[-1] - start - (times[-1] - times[0])
-    most = min(int(round(missing / period)), _MAX_LOST)
+    period, start = search.period, search.timestamps[0]
+    # A path with lost frames was made from this video: it begins and ends within it.
+    first = np.floor((found.times[0] - start) / period + 1e-3)
+    times = found.times - first * period
+    missing = search.timestamps[-1] - times[-1]
+    most = min(int(round(missing / period)), _MAX_OFFSETS)
     if most < 1:
         return None
-    steps = np.arange(-most, most + 1)
-    profile = search.profile(times, steps * period)
+    steps = np.arange(most + 1)
+    short = _Search(pieces, search.poses, search.timestamps)
+    profile = short.profile(times, steps * period)
     num = profile[..., 1].max(0)
     mean = profile[..., 0] / np.maximum(profile[..., 1], 1)
     unseen = profile[..., 1] < 0.5 * num
@@ -381,20 +393,34 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
     ends = np.flatnonzero(np.diff(offset))
     if not len(ends):
         return None
-    moved, lost = times + offset[0] * period, []
-    width = search.test.block_frames * period
-    for b in ends:
-        count = int(offset[b + 1] - offset[b])
-        around = np.abs(moved - (start + (b + 1) * width)) < 2 * width + count * period
-        tries = np.flatnonzero(around)
-        if not len(tries):
-            continue
-        stepped = lambda n: moved + count * period * (np.arange(len(moved)) >= n)
-        costs = [_mean(search.costs(stepped(n))) for n in tries]
-        n = int(tries[int(np.argmin(costs))])
-        moved = stepped(n)
-        lost.append((float(moved[n]), count))
-    return dataclasses.replace(found, times=moved, is_given=False, lost=tuple(lost))
+    times = times + offset[0] * period
+    # Pose before which each step lies, and its frames: by whole tracks.
+    counts = offset[ends + 1] - offset[ends]
+    before = np.cumsum(counts) - counts
+    at = (ends + 1) * pieces.block_frames - offset[0] - before
+    at = np.clip(at, 1, len(times) - 1)
+
+    def stepped(at: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " n"]:
+        after = np.arange(len(times))[:, None] >= at
+        return times + period * (after * counts).sum(1)
+
+    def cost(at: np.ndarray, counts: np.ndarray) -> float:
+        return _mean(search.costs(stepped(at, counts)))
+
+    reach, change = 2 * pieces.block_frames, 0
+    for _ in range(3):
+        for k in range(len(at)):
+            one = np.arange(len(at)) == k
+            tries = [
+                (np.clip(at + move * one, 1, len(times) - 1), counts + more * one)
+                for more in range(-min(change, counts[k] - 1), change + 1)
+                for move in range(-reach, reach + 1)
+            ]
+            at, counts = min(tries, key=lambda pair: cost(*pair))
+        reach, change = 3, 2
+    moved = stepped(at, counts)
+    lost = tuple((float(moved[n]), int(c)) for n, c in zip(at, counts, strict=True))
+    return dataclasses.replace(found, times=moved, is_given=False, lost=lost)
 
 
 def _with_best_focal(
@@ -440,11 +466,15 @@ def _worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> bo
     if both.sum() < 2:
         return _mean(one) > _mean(other)
     a, b = one[both], other[both]
-    weight = np.minimum(a[:, 1], b[:, 1])
     difference = a[:, 0] / a[:, 1] - b[:, 0] / b[:, 1]
+    # Blocks that both explain alike tell nothing.
+    telling = np.abs(difference) > _SAME_COST
+    weight, difference = np.minimum(a[:, 1], b[:, 1])[telling], difference[telling]
+    num = len(difference)
+    if num < 2:
+        return False
     mean = (weight @ difference) / weight.sum()
     scatter = weight @ (difference - mean) ** 2 / weight.sum()
-    num = int(both.sum())
     error = np.sqrt(scatter / (num - 1)) + 1e-6
     chance = float(binom.sf((difference > 0).sum() - 1, num, 0.5))
     return bool(mean > 0 and (mean > _SIGNIFICANT * error or chance < _UNLIKELY))
