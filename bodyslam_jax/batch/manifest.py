@@ -16,7 +16,8 @@ from pathlib import Path
 from bodyslam_jax.batch.inputs import RESERVED, Input, safe_name
 from bodyslam_jax.config import Config, with_options
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.camera.calibration import read_camera
+from bodyslam_jax.io.camera.calibration import read_camera, split_camera_name
+from bodyslam_jax.io.camera.calibration_files import read_named_cameras
 from bodyslam_jax.io.files import read_text
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.io.video import VIDEO_SUFFIXES
@@ -121,12 +122,17 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
     name = row.get("name") or safe_name(video)
     wrong += _wrong_name(name)
     for column in ("keypoints", "bodies", "camera"):
-        found = _wrong_file(column, at(column), folder=column != "bodies")
+        file = at(column)
+        if column == "camera" and file is not None:
+            file, _ = split_camera_name(file)
+        found = _wrong_file(column, file, folder=column != "bodies")
         wrong += _told(column, found)
     camera = at("camera")
     if camera is not None and camera.suffix == ".json" and os.path.isfile(camera):
         try:
-            read_camera(camera, None)
+            # A calibration without an image size is checked with its video.
+            if read_named_cameras(camera) is None:
+                read_camera(camera, None)
         except ValueError as error:
             wrong.append(f"camera: {error}".rstrip("."))
     truth = at("groundtruth")

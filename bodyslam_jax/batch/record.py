@@ -16,6 +16,7 @@ from typing import Any
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.config import Config
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.camera.calibration import split_camera_name
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.pipeline.stage_cache import body_model_file, fingerprint
 
@@ -87,11 +88,14 @@ def stamp(source: Input, config: Config) -> str:
 def _files(source: Input, config: Config) -> list[Path]:
     """The files and folders that a job reads, but for models."""
     parts = find_parts(source.path)
+    camera = source.camera or parts.camera
+    if camera is not None:
+        camera, _ = split_camera_name(camera)
     found = [
         parts.footage,
         source.keypoints or parts.keypoints,
         source.bodies or parts.bodies,
-        source.camera or parts.camera,
+        camera,
         parts.tracks,
         parts.masks,
         source.groundtruth or parts.groundtruth,

@@ -38,8 +38,10 @@ def run(
         keypoints: OpenPose folder, COCO/AlphaPose JSON or .npz, if not in the input.
         bodies: Regressed bodies, the result file of a supported tool, if not in the
             input.
-        camera: camera.json, or a file of COLMAP, nerfstudio, Stray Scanner or Record3D,
-            if not in the input.
+        camera: Calibration, if not in the input: camera.json, `fx fy cx cy [k1 k2 p1
+            p2]` or a 3 x 3 matrix (text, .npy), OpenCV, ROS, ORB-SLAM, Pose2Sim,
+            Qualisys, COLMAP, nerfstudio, Stray Scanner, Record3D. FILE:NAME for one of
+            several cameras.
         tracks: Point tracks (tracks.npz), if not in the input.
         masks: Person masks, non-zero is a person: folder of .png, or .npz with `masks`
             (frames, height, width), if not in the input.

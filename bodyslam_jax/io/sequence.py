@@ -210,7 +210,8 @@ def _look_at_footage(
             footage = at_rate(footage, known.fps)
     if parts.camera:
         size = (footage.width, footage.height) if footage else None
-        intrinsics, fps = read_camera(parts.camera, size)
+        name = footage.path.stem if footage else parts.name
+        intrinsics, fps = read_camera(parts.camera, size, name)
     if fps and not known.fps and parts.footage and parts.footage.is_dir():
         footage = look_at(parts.footage, fps)
     fps = known.fps or fps

@@ -10,6 +10,11 @@ from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera import arkit
+from bodyslam_jax.io.camera.calibration_files import (
+    choose_camera,
+    read_named_cameras,
+    to_opencv_params,
+)
 from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
 from bodyslam_jax.io.files import read_json_fields
 from bodyslam_jax.io.images import exif_focal_35mm
@@ -25,36 +30,53 @@ MAX_SIDE = 1_000_000
 """Width or height of an image, px, at most: more than any format can hold."""
 _MAX_PARAMETER = 1e8
 """A focal length, in px, of a hundred times the widest image."""
+_IN_FOLDERS = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
+_IN_FOLDERS = (*_IN_FOLDERS, *arkit.CAMERA_FILES, "calib.txt")
+"""Names of cameras' files, by which they are found in a folder."""
 _NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
 """Models of `camera.json` and the number of their parameters."""
 
 
 def read_camera(
-    path: Path, size: tuple[int, int] | None = None
+    path: Path, size: tuple[int, int] | None = None, video: str = ""
 ) -> tuple[Intrinsics, float | None]:
     """Reads intrinsics, and the frame rate (1/s) if the file has one.
 
     The file is a `camera.json` (parameters in COLMAP's order, pixel centres at whole
     numbers), COLMAP's `cameras.txt` or `cameras.bin`, nerfstudio's `transforms.json`,
-    Stray Scanner's `camera_matrix.csv` or Record3D's `metadata.json`; or a folder with
-    one of these.
+    Stray Scanner's `camera_matrix.csv` or Record3D's `metadata.json`, or a calibration
+    of `calibration_files`; or a folder with one of these. `FILE:NAME` names one camera
+    of a file that holds several.
 
     Args:
-        size: of the video, px; it selects the camera of a file that holds several.
+        size: of the video, px; it selects the camera of a file that holds several, and
+            is that of a calibration without a size.
+        video: name of the video without its suffix, which may be that of a camera.
 
     **Raises:** `InputError`, naming the file, if something is missing or impossible.
     """
+    path, wanted = split_camera_name(path)
     if path.is_dir():
-        names = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
-        names = (*names, *arkit.CAMERA_FILES)
-        inside = [p for name in names if (p := path / name).exists()]
+        inside = [p for name in _IN_FOLDERS if (p := path / name).exists()]
         if not inside:
-            raise InputError(f"{path}: none of {', '.join(names)} in this folder.")
+            raise InputError(
+                f"{path}: none of {', '.join(_IN_FOLDERS)} in this folder."
+            )
         path = inside[0]
     if not path.exists():
         raise InputError(f"{path}: no such file, expected a camera's.")
     if arkit.is_camera(path):
         return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
+    named = read_named_cameras(path)
+    if named is not None:
+        chosen = choose_camera(path, named, wanted, size, video)
+        size = chosen.size or size
+        if size is None:
+            raise InputError(f"{path}: of what image size? It needs the video.")
+        params = to_opencv_params(path, chosen, size)
+        model = "PINHOLE" if len(params) == 4 else "OPENCV"
+        found = _intrinsics(path, model, np.array(params), *size)
+        return found, chosen.fps
     if path.suffix in (".txt", ".bin"):
         return _from_cameras(path, read_cameras(path), size), None
     data = read_json_fields(path, "a camera (JSON)")
@@ -74,6 +96,14 @@ def read_camera(
     intrinsics = _intrinsics(path, model, params, width, height)
     fps = data.number("fps", 0.1, 1000) if data.data.get("fps") is not None else None
     return intrinsics, fps
+
+
+def split_camera_name(path: Path) -> tuple[Path, str | None]:
+    """A file, and the name behind its last colon, if there is no file of that name."""
+    if path.exists() or ":" not in path.name:
+        return path, None
+    file, _, name = path.name.rpartition(":")
+    return path.with_name(file) if file else path, name or None
 
 
 def _from_cameras(
