@@ -71,6 +71,9 @@ class Bodies:
     shapes_regressed: bool = True
     """Whether β was regressed by a network, and so is biased towards the mean shape;
     false if it was measured or optimised."""
+    gender: str | None = None
+    """Gender of the body model that β belongs to, `female`, `male` or `neutral`; `None`
+    if the file does not tell, or if people have several."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,20 +1,55 @@
-"""Which body model a run takes where the settings name none."""
+"""Which body model a run takes: of the bodies' gender, and where none is named."""
 
 import dataclasses
+from pathlib import Path
 
 from bodyslam_jax import motion
-from bodyslam_jax.body import DEFAULT, load_body_model
+from bodyslam_jax.body import DEFAULT, load_body_model, search_paths
+from bodyslam_jax.body.files import candidates, named_gender
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline.stage_cache import body_model_file
 
 
-def with_compatible_body(config: Config) -> tuple[Config, tuple[str, ...]]:
+def with_compatible_body(
+    config: Config, gender: str | None = None
+) -> tuple[Config, tuple[str, ...]]:
     """The settings with a body that the motion model was trained on, and warnings.
+
+    Args:
+        gender: of the model that given bodies belong to, if they tell. The model of
+            that gender is taken from the folder in the settings, or from those that
+            are installed; a warning says so where there is none.
 
     A body model that was found on this machine, not named by the user, is replaced by
     the default body if the motion model belongs to that one; a warning says so. A body
     model that the user names is kept: the mismatch is refused later.
     """
+    config, warnings = _with_default_body(config)
+    if gender is None or not config.people:
+        return config, warnings
+    named = None if config.body_model is None else Path(config.body_model)
+    found = search_paths(gender) if named is None else candidates(named, gender)
+    found = [file for file in found if file.is_file() and file != DEFAULT]
+    fitting = [file for file in found if named_gender(file) in (gender, None)]
+    if named is None:
+        kind = motion.load_motion_model(config.motion_model).body
+        fitting = [file for file in fitting if load_body_model(file).kind == kind]
+    if fitting:
+        return dataclasses.replace(config, body_model=str(fitting[0])), warnings
+    if gender == "neutral" and (named is None or named == DEFAULT or named.is_dir()):
+        return config, warnings
+    used = "the default body" if named in (None, DEFAULT) else str(named)
+    text = (
+        f"the given bodies belong to the {gender} model, but {used} is used, in which "
+        "their β mean another shape: name a folder with the model of that gender "
+        "(--body-model)."
+    )
+    return config, (*warnings, text)
+
+
+def _with_default_body(config: Config) -> tuple[Config, tuple[str, ...]]:
+    """The settings with the default body in place of one that was found on this machine
+    but does not suit the motion model, and a warning."""
     file = body_model_file(config.body_model)
     if config.body_model is not None or file is None or not config.people:
         return config, ()

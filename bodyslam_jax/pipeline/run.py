@@ -39,7 +39,8 @@ def run(
     **Raises:** `InputError`, in one line, if the sequence holds nothing that cameras or
     people can be estimated from.
     """
-    config, warnings = with_compatible_body(config)
+    gender = sequence.bodies.gender if sequence.bodies else None
+    config, warnings = with_compatible_body(config, gender)
     return run_stages(with_warnings(sequence, warnings), config, cache)[0]
 
 

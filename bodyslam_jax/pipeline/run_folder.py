@@ -25,7 +25,8 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
     **Raises:** `ValueError` if `out` cannot be written, holds something else, or is
     being written by another process.
     """
-    config, warnings = with_compatible_body(config)
+    gender = sequence.bodies.gender if sequence.bodies else None
+    config, warnings = with_compatible_body(config, gender)
     sequence = with_warnings(sequence, warnings)
     cache = stage_cache_of(sequence, out)
     check_people(sequence, config)

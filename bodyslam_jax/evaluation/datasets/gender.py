@@ -8,7 +8,6 @@ import dataclasses
 import logging
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,12 +16,11 @@ from bodyslam_jax.body.files import VARIABLE, candidates, named_gender
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.readers import read_groundtruth
 from bodyslam_jax.io.archive import Archive, read_npz
+from bodyslam_jax.io.bodies.parts import gender_of
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
 
-_GENDERS = {"f": "female", "m": "male", "n": "neutral"}
-_GENDERS |= {gender: gender for gender in _GENDERS.values()}
 _NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 _NAMES["default"] = "the free body that ships with the package"
 _KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
@@ -33,13 +31,6 @@ _STEMS: dict[str, tuple[str, ...]] = {
     "smplx": ("smplx_",),
 }
 """Beginnings of the usual names of files."""
-
-
-def gender_of(value: Any) -> str | None:
-    """`female`, `male` or `neutral`, from text, bytes or arrays of them."""
-    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-    text = value.decode("latin1") if isinstance(value, bytes) else str(value)
-    return _GENDERS.get(text.strip().lower())
 
 
 def body_for(

@@ -4,6 +4,7 @@ Errors are `InvalidContent`, to which the caller adds the file's name.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +24,8 @@ PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
 _NOWHERE = Path("bodies")
+_GENDERS = {"f": "female", "m": "male", "n": "neutral"}
+_GENDERS |= {gender: gender for gender in _GENDERS.values()}
 _BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
 """Grid of the size of a body about its middle, in the plane of the image, m."""
 
@@ -249,3 +252,30 @@ def join(rows: list[Rows]) -> Rows:
         *(np.concatenate([getattr(r, name) for r in rows]) for name in names),
         shapes_regressed=any(r.shapes_regressed for r in rows),
     )
+
+
+def gender_of(value: Any) -> str | None:
+    """`female`, `male` or `neutral`, from text, bytes or an array of one of them."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    text = value.decode("latin1") if isinstance(value, bytes) else str(value)
+    return _GENDERS.get(text.strip().lower())
+
+
+def genders_in(value: Any) -> tuple[set[str], set[str]]:
+    """The genders in a file's entry, of one person or of each: those that are known,
+    and other words."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, np.ndarray):
+        value = np.unique(value).tolist() if value.dtype.kind in "SU" else []
+    known, other = set(), set()
+    for one in value if isinstance(value, list | tuple) else [value]:
+        if not isinstance(one, str | bytes):
+            continue
+        gender = gender_of(one)
+        word = one.decode("latin1") if isinstance(one, bytes) else one
+        if gender:
+            known.add(gender)
+        elif word.strip().lower() not in ("", "unknown", "none"):
+            other.add(word.strip()[:20])
+    return known, other

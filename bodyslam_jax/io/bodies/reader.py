@@ -20,6 +20,7 @@ from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
     PELVIS_SMPLX,
+    genders_in,
     join,
     numbers_of,
     whole_of,
@@ -71,10 +72,27 @@ def read_bodies(
         raise InputError(f"{path}: no such file.")
     video = Video(intrinsics, num_frames, fps, times, images, config, warn)
     if path.is_dir():
-        rows = _read_tram_folder(path, video)
+        rows, gender = _read_tram_folder(path, video), None
     else:
-        rows = _read(path, with_track_info(path, restricted_load(path)), video)
-    return _gather(path, rows, num_frames, warn)
+        data = restricted_load(path)
+        gender = _gender(data, warn)
+        rows = _read(path, with_track_info(path, data), video)
+    return dataclasses.replace(_gather(path, rows, num_frames, warn), gender=gender)
+
+
+def _gender(data: Any, warn: Warn) -> str | None:
+    """The gender of the model that all bodies of a file belong to, if it is one."""
+    found = data.get("gender") if isinstance(data, dict) else None
+    known, other = genders_in(found)
+    if other:
+        words = ", ".join(sorted(other)[:3])
+        warn(f"bodies: gender {words!r}, expected female, male or neutral: ignored.")
+    if len(known) > 1:
+        warn(
+            f"bodies of {' and '.join(sorted(known))} models: one model is used for "
+            "all, in which β of the others mean other shapes."
+        )
+    return known.pop() if len(known) == 1 else None
 
 
 def _read(path: Path, data: Any, video: Video) -> Rows:
