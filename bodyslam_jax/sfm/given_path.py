@@ -6,6 +6,7 @@ projects to them within a threshold is the path's *fit*. It is compared with wha
 right path reaches given the noise of the tracks and of such paths.
 """
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -76,17 +77,10 @@ class Fit:
 class PathTest:
     """A sample of tracks, against which paths and offsets are tested."""
 
-    def __init__(
-        self,
-        tracks: Tracks,
-        intrinsics: Intrinsics,
-        num_frames: int,
-        span: int | None = None,
-    ):
-        """With a `span`, tracks are cut into pieces within intervals of so many frames,
-        each of which is a block."""
+    def __init__(self, tracks: Tracks, intrinsics: Intrinsics, num_frames: int):
         K, distortion = as_opencv(intrinsics.params)
         self.focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        self.num_frames = num_frames
         views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
         longer = max(intrinsics.width, intrinsics.height)
         path_noise = _PATH_NOISE * longer
@@ -97,16 +91,31 @@ class PathTest:
         self.threshold = _THRESHOLD * self.noise
         self.expected = share * _within(_THRESHOLD)
         self.required = share * _within(_THRESHOLD / _NOISIEST)
-        if span is not None:
-            piece = views.landmark * (num_frames // span + 1) + views.frame // span
-            views = Views(views.frame, piece, views.xy)
-        self.frame, self.xy, self.used = _sample(views, num_frames)
-        self.num_frames = num_frames
-        middle = np.where(self.used, self.frame, 0).sum(1) / np.maximum(
-            self.used.sum(1), 1
-        )
-        self.block_frames = span or max(num_frames / _MAX_BLOCKS, _BLOCK_FRAMES)
-        self.block = (middle / self.block_frames).astype(int)
+        self.views = views
+        self._take(views, max(num_frames / _MAX_BLOCKS, float(_BLOCK_FRAMES)))
+
+    def _take(self, views: Views, block_frames: float) -> None:
+        """Takes a new sample of tracks from these views."""
+        self.frame, self.xy, self.used = _sample(views, self.num_frames)
+        count = np.maximum(self.used.sum(1), 1)
+        middle = np.where(self.used, self.frame, 0).sum(1) / count
+        self.block_frames = block_frames
+        self.block = (middle / block_frames).astype(int)
+
+    def in_pieces(self, span: int) -> "PathTest":
+        """The test with tracks cut into pieces within intervals of `span` frames, each
+        of which is a block."""
+        views, cut = self.views, copy.copy(self)
+        piece = views.landmark * (self.num_frames // span + 1) + views.frame // span
+        cut._take(Views(views.frame, piece, views.xy), float(span))
+        return cut
+
+    def around(self, first: float, last: float) -> "PathTest":
+        """The test with a sample of tracks within some frames only, which is denser."""
+        within = (self.views.frame >= first) & (self.views.frame <= last)
+        part = copy.copy(self)
+        part._take(self.views[np.flatnonzero(within)], self.block_frames)
+        return part
 
     def errors(
         self, T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]

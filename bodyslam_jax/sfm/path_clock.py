@@ -40,9 +40,9 @@ _NEAR_RATE = 0.05
 rate than the video's without any part of the path showing it."""
 _PHASES = 4
 """Offsets per frame in the refinement."""
-_PHASE_EFFECT = 0.02
-"""Share of the rise of the cost over a frame from which a cost that depends on the
-phase of poses and frames hides the minimum between them."""
+_NOISE_EFFECT = 0.02
+"""Share of the rise of the cost over a frame by which smoother poses lower it, from
+which the noise of the path makes the cost depend on the phase of poses and frames."""
 _SAME_PATH = 0.05, 0.02
 """RMS difference of positions, of the path's extent, and of rotations (rad) up to which
 offsets that fit equally give the same path."""
@@ -101,8 +101,7 @@ def place_in_time(
     if intrinsics.is_guess:
         search, intrinsics, text = _with_best_focal(search, path, tracks, intrinsics)
         warnings += text
-    pieces = PathTest(tracks, intrinsics, len(timestamps), _PIECE_FRAMES)
-    found = _best_clock(search, path.clocks, pieces)
+    found = _best_clock(search, path.clocks)
     if found is None:
         raise InputError(
             f"camera path: its clock is not the video's ({given.name}), and no offset "
@@ -121,7 +120,9 @@ def place_in_time(
         )
     if found.is_given:
         return Placed(path, intrinsics, tuple(warnings))
-    range_, same = search.equally_good(found)
+    found, range_, same = search.equally_good(found)
+    placed = search.path(found.times, path)
+    fit = search.test.fit(placed.T_WC, placed.known)
     rate = 1 / search.period
     if range_ is not None:
         between = (
@@ -189,11 +190,16 @@ class _Search:
         T_WC, known = at_times(times, self.poses, self.timestamps)
         return dataclasses.replace(path, T_WC=T_WC, known=known, poses=None, clocks=())
 
-    def costs(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "b 2"]:
-        """As `PathTest.cost`, with the poses at `times`."""
-        return self.test.cost(
-            self.test.errors(*at_times(times, self.poses, self.timestamps))
-        )
+    def costs(
+        self, times: Float[np.ndarray, " n"], *, bridged: bool = True
+    ) -> Float[np.ndarray, "b 2"]:
+        """As `PathTest.cost`, with the poses at `times`; if not `bridged`, without the
+        frames of which neighbouring poses are missing."""
+        T_WC, known = at_times(times, self.poses, self.timestamps)
+        if not bridged:
+            away = np.abs(self.timestamps[:, None] - times).min(1)
+            known = known & (away < 0.75 * self.period)
+        return self.test.cost(self.test.errors(T_WC, known))
 
     def offsets(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
         """Offsets, s, at which path and video overlap enough, by whole frames."""
@@ -220,43 +226,63 @@ class _Search:
 
         Interpolation between poses averages their noise, most in the middle between
         two, so that the cost of a noisy path also depends on the phase of frames and
-        poses: first a parabola plus a constant for each phase is fitted, and without
-        such an effect a narrower one.
+        poses: then a parabola plus a constant for each phase is fitted, else a narrow
+        parabola.
         """
         phases = np.arange(-2 * _PHASES, 2 * _PHASES + 1)
+        one = np.zeros(len(phases), int)
         at = offset + phases * self.period / _PHASES
         profile = self.profile(times, at)
-        offset, sigma, effect = _minimum(at, profile, phases % _PHASES)
-        if effect < _PHASE_EFFECT:
-            step = 0.15 * self.period
-            at = offset + step * np.arange(-4, 5)
-            one = np.zeros(len(at), int)
-            offset, sigma, _ = _minimum(at, self.profile(times, at), one)
+        if self._is_noisy(times + _minimum(at, profile, one)[0]):
+            offset, sigma = _minimum(at, profile, phases % _PHASES)
+        else:
+            offset, sigma = _minimum(at, profile, one)
+            for step in (0.25, 0.1):
+                at = offset + step * self.period * np.arange(-4, 5)
+                offset, sigma = _minimum(at, self.profile(times, at), one[:9])
         # Below a hundredth of a frame exposures and read-out matter.
         return offset, max(sigma, 0.01 * self.period)
 
-    def equally_good(self, found: _Found) -> tuple[tuple[float, float] | None, bool]:
-        """Times (s) of the first pose that fit as well as the one found, if they span
-        more than the sigma claims; and whether they all give the same path."""
-        times = found.times
-        step = self.period
-        offsets = self.offsets(times)
-        offsets = offsets[np.abs(offsets) > max(3 * found.sigma, 1.5 * step)]
-        here = self.costs(times)
-        alike = [d for d in offsets if not _worse(self.costs(times + d), here)]
-        if not alike:
-            return None, True
-        range_ = times[0] + min(0.0, *alike), times[0] + max(0.0, *alike)
-        same = all(self._same(times, times + d) for d in (alike[0], alike[-1]))
-        return range_, same
+    def _is_noisy(self, times: Float[np.ndarray, " n"]) -> bool:
+        """Whether the tracks fit better if each pose is averaged with its neighbours,
+        by more than a small part of what a frame's offset costs."""
+        T_WC = self.poses.copy()
+        T_WC[1:-1] = (self.poses[:-2] + 2 * self.poses[1:-1] + self.poses[2:]) / 4
+        U, _, Vt = np.linalg.svd(T_WC[:, :3, :3])
+        T_WC[:, :3, :3] = U @ Vt
+        smooth = _Search(self.test, T_WC, self.timestamps)
+        here = _mean(self.costs(times))
+        rise = _mean(self.costs(times + self.period)) - here
+        return here - _mean(smooth.costs(times)) > _NOISE_EFFECT * max(rise, 0.0)
 
-    def _same(self, one: np.ndarray, other: np.ndarray) -> bool:
-        """Whether poses at two series of times give one path, up to a rigid motion."""
+    def equally_good(
+        self, found: _Found
+    ) -> tuple[_Found, tuple[float, float] | None, bool]:
+        """Times (s) of the first pose that fit as well as the one found, if they span
+        more than the sigma claims; and whether they all give the same path. Of these
+        the one with poses for most points is returned."""
+        times = found.times
+        offsets = self.offsets(times)
+        offsets = offsets[np.abs(offsets) > max(3 * found.sigma, 1.5 * self.period)]
+        here = self.costs(times)
+        costs = {0.0: here} | {float(d): self.costs(times + d) for d in offsets}
+        alike = [d for d in costs if d == 0.0 or not _worse(costs[d], here)]
+        if len(alike) == 1:
+            return found, None, True
+        best = max(alike, key=lambda d: (costs[d][:, 1].sum(), d == 0.0))
+        range_ = times[0] + min(alike), times[0] + max(alike)
+        same = [self._same(times + best, times + d) for d in alike if d != best]
+        moved = dataclasses.replace(found, times=times + best)
+        return moved, range_, all(one is not False for one in same) and any(same)
+
+    def _same(self, one: np.ndarray, other: np.ndarray) -> bool | None:
+        """Whether poses at two series of times give one path, up to a rigid motion;
+        `None` if they have too few frames in common."""
         a, known_a = at_times(one, self.poses, self.timestamps)
         b, known_b = at_times(other, self.poses, self.timestamps)
         both = known_a & known_b
         if both.sum() < MIN_VIEWS:
-            return False
+            return None
         a, b = a[both], b[both]
         U, _, Vt = np.linalg.svd(
             np.einsum("tij,tkj->ik", a[:, :3, :3], b[:, :3, :3]), full_matrices=False
@@ -270,9 +296,7 @@ class _Search:
         return rms(away) < _SAME_PATH[0] * extent and rms(turned) < _SAME_PATH[1]
 
 
-def _best_clock(
-    search: _Search, clocks: tuple[PathClock, ...], pieces: PathTest
-) -> _Found | None:
+def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None:
     """The clock and offset that fit best; the given one if none fits better.
 
     Other clocks than the first are tried only if that one does not fit as expected, or
@@ -302,7 +326,7 @@ def _best_clock(
         found = [best, *(_found_in(search, c, search.offsets(c.times)) for c in others)]
         best = _best_of(search, found)
     if best is not None and not (best.is_given and _fits_as_expected(search, best)):
-        best = _best_of(search, [best, _with_lost_frames(search, best, pieces)])
+        best = _best_of(search, [best, _with_lost_frames(search, best)])
     if kept is not None and best is not None and not best.is_given:
         # A path that says its time is believed, unless another time fits outright.
         fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
@@ -348,12 +372,10 @@ def _fits_as_expected(search: _Search, found: _Found) -> bool:
     return fit.is_tested and fit.share >= _AS_EXPECTED * fit.expected
 
 
-def _with_lost_frames(
-    search: _Search, found: _Found, pieces: PathTest
-) -> _Found | None:
+def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
     """The offset with steps where poses of frames are missing that are not numbered.
 
-    Each block of time prefers an offset, told by `pieces` of tracks that lie within it,
+    Each block of time prefers an offset, told by pieces of tracks that lie within it,
     as no offset explains a track across a step; the cheapest series of offsets that
     only grow is found by dynamic programming, and then the frame of each step.
 
@@ -368,6 +390,7 @@ def _with_lost_frames(
     if most < 1:
         return None
     steps = np.arange(most + 1)
+    pieces = search.test.in_pieces(_PIECE_FRAMES)
     short = _Search(pieces, search.poses, search.timestamps)
     profile = short.profile(times, steps * period)
     num = profile[..., 1].max(0)
@@ -397,29 +420,33 @@ def _with_lost_frames(
     # Pose before which each step lies, and its frames: by whole tracks.
     counts = offset[ends + 1] - offset[ends]
     before = np.cumsum(counts) - counts
-    at = (ends + 1) * pieces.block_frames - offset[0] - before
+    at = (ends + 1) * _PIECE_FRAMES - offset[0] - before
     at = np.clip(at, 1, len(times) - 1)
 
     def stepped(at: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " n"]:
         after = np.arange(len(times))[:, None] >= at
         return times + period * (after * counts).sum(1)
 
-    def cost(at: np.ndarray, counts: np.ndarray) -> float:
-        return _mean(search.costs(stepped(at, counts)))
-
-    reach, change = 2 * pieces.block_frames, 0
-    for _ in range(3):
+    # First where, then also by how many; the last round by all views near the step.
+    rounds = ((2 * _PIECE_FRAMES, 0), (3, 2), (3, 1))
+    for turn, (reach, change) in enumerate(rounds):
         for k in range(len(at)):
+            near = search
+            if turn == len(rounds) - 1:
+                middle = (stepped(at, counts)[at[k]] - start) / period
+                away = _PIECE_FRAMES + counts[k]
+                test = search.test.around(middle - away, middle + _PIECE_FRAMES)
+                near = _Search(test, search.poses, search.timestamps)
             one = np.arange(len(at)) == k
             tries = [
                 (np.clip(at + move * one, 1, len(times) - 1), counts + more * one)
                 for more in range(-min(change, counts[k] - 1), change + 1)
                 for move in range(-reach, reach + 1)
             ]
-            at, counts = min(tries, key=lambda pair: cost(*pair))
-        reach, change = 3, 2
+            costs = [_mean(near.costs(stepped(*pair), bridged=False)) for pair in tries]
+            at, counts = tries[int(np.argmin(costs))]
     moved = stepped(at, counts)
-    lost = tuple((float(moved[n]), int(c)) for n, c in zip(at, counts, strict=True))
+    lost = tuple((float(moved[n]), int(counts[at == n].sum())) for n in np.unique(at))
     return dataclasses.replace(found, times=moved, is_given=False, lost=lost)
 
 
@@ -484,9 +511,9 @@ def _minimum(
     at: Float[np.ndarray, " d"],
     profile: Float[np.ndarray, "d b 2"],
     phase: Int[np.ndarray, " d"],
-) -> tuple[float, float, float]:
-    """The offset of least cost, its sigma by the jackknife over blocks, and the range
-    of the phases' constants relative to the rise of the parabola over one period.
+) -> tuple[float, float]:
+    """The offset of least cost by a parabola, and its sigma by the jackknife over
+    blocks.
 
     Args:
         phase: number of the phase of each offset, which has a constant of its own.
@@ -495,29 +522,25 @@ def _minimum(
     total = profile.sum(1)
     left = total[:, None] - profile[:, parts]
     left = left[:, left[..., 1].min(0) > 0].swapaxes(0, 1)
-    centre = at.mean()
-    half = (at[-1] - at[0]) / 2
+    centre, half = at.mean(), (at[-1] - at[0]) / 2
     x = (at - centre) / half
     constants = phase[:, None] == np.unique(phase)
     A = np.column_stack([x**2, x, constants])
 
-    def fitted(cost: Float[np.ndarray, "d 2"]) -> tuple[float, float]:
+    def fitted(cost: Float[np.ndarray, "d 2"]) -> float:
         mean = cost[:, 0] / np.maximum(cost[:, 1], 1)
         # Near the minimum, where it is a parabola.
         weight = 1 / (1 + ((mean - mean.min()) / (np.ptp(mean) / 4 + 1e-12)) ** 2)
         root = np.sqrt(weight)[:, None]
         found = np.linalg.lstsq(A * root, mean * root[:, 0], rcond=None)[0]
-        rise = found[0] / (half / (at[1] - at[0])) ** 2 * _PHASES**2
-        spread = float(np.ptp(found[2:])) / max(rise, 1e-12)
         if found[0] <= 0:
-            return float(at[int(np.argmin(mean))]), spread
-        low = -found[1] / (2 * found[0])
-        return float(centre + half * np.clip(low, -1, 1)), spread
+            return float(at[int(np.argmin(mean))])
+        return float(centre + half * np.clip(-found[1] / (2 * found[0]), -1, 1))
 
-    best, effect = fitted(total)
+    best = fitted(total)
     if len(left) < 2:
-        return best, half, effect
-    each = np.array([fitted(one)[0] for one in left])
+        return best, float(half)
+    each = np.array([fitted(one) for one in left])
     count = len(each)
     spread = ((each - each.mean()) ** 2).sum()
-    return best, float(np.sqrt((count - 1) / count * spread)), effect
+    return best, float(np.sqrt((count - 1) / count * spread))
