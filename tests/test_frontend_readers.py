@@ -903,6 +903,28 @@ def test_truncated_files_are_refused(tmp_path):
             restricted_load(tmp_path / "a.pkl")
 
 
+@pytest.mark.parametrize(
+    "gender, expected, told",
+    [
+        ("female", "female", ""),
+        (np.array(b"male"), "male", ""),
+        (np.array(["f", "f"]), "female", ""),
+        (np.array([b"neutral"]), "neutral", ""),
+        (np.array(["female", "male"]), None, "female and male models"),
+        ("person", None, "gender 'person'"),
+        ("unknown", None, ""),
+    ],
+)
+def test_the_gender_of_bodies_is_read(tmp_path, gender, expected, told):
+    np.savez(tmp_path / "bodies.npz", **bodies(), gender=gender)
+    lines: list[str] = []
+    found = read_bodies(
+        tmp_path / "bodies.npz", num_frames=NUM, intrinsics=CAMERA, warn=lines.append
+    )
+    assert found.gender == expected
+    assert told in " ".join(lines) and bool(told) == bool(lines)
+
+
 # The whole sequence
 
 

@@ -143,3 +143,23 @@ def test_a_body_that_was_found_does_not_stop_who_did_not_ask_for_it(
         assert with_compatible_body(asked) == (asked, ())
     monkeypatch.setenv("BODYSLAM_BODY_MODEL", str(DEFAULT))
     assert with_compatible_body(Config()) == (Config(), ())
+
+
+def test_the_body_is_of_the_gender_of_given_bodies(tmp_path, no_body_models):
+    for gender in ("NEUTRAL", "FEMALE"):
+        write_npz(load_body_model(DEFAULT), tmp_path / f"SMPL_{gender}.npz")
+    folder = Config(body_model=str(tmp_path))
+    config, warnings = with_compatible_body(folder, "female")
+    assert config.body_model == str(tmp_path / "SMPL_FEMALE.npz") and not warnings
+    # Without a model of that gender, or with another named, one line says so.
+    for asked, gender in (
+        (folder, "male"),
+        (Config(), "female"),
+        (Config(body_model=str(tmp_path / "SMPL_FEMALE.npz")), "male"),
+        (Config(body_model=str(tmp_path / "SMPL_FEMALE.npz")), "neutral"),
+    ):
+        config, (line,) = with_compatible_body(asked, gender)
+        assert config == asked and f"belong to the {gender} model" in line
+    for asked, gender in ((Config(), None), (Config(), "neutral"), (folder, None)):
+        assert with_compatible_body(asked, gender) == (asked, ())
+    assert with_compatible_body(Config(people=False), "male")[1] == ()

@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import binom
 
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Views
@@ -42,6 +43,11 @@ _BEHIND = 10.0
 """Error, at depth 1, of a point that would lie behind the camera."""
 _ITERATIONS = 6
 """Of Gauss--Newton for a point; two more change shares by less than 0.1 %."""
+_SAME_COST = 0.02
+"""Difference of the mean cost of a block's observations that tells nothing."""
+_SIGNIFICANT, _UNLIKELY = 3.0, 0.01
+"""Standard errors beyond which, and probability of chance below which, two offsets do
+not fit equally well."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +159,33 @@ class PathTest:
         num = int(self.block.max()) + 1 if len(self.block) else 1
         sums = [np.bincount(self.block, a.sum(1), num) for a in (cost, tested)]
         return np.stack(sums, axis=1)
+
+
+def mean_cost(cost: Float[np.ndarray, "b 2"]) -> float:
+    """Mean cost of the tested observations; infinite if there are too few."""
+    count = cost[:, 1].sum()
+    return float(cost[:, 0].sum() / count) if count >= MIN_TESTED else float("inf")
+
+
+def is_worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> bool:
+    """Whether the first of two costs is significantly larger: by the scatter of the
+    difference between blocks of time that both test, or by its sign in them."""
+    both = (one[:, 1] > 0) & (other[:, 1] > 0)
+    if both.sum() < 2:
+        return mean_cost(one) > mean_cost(other)
+    a, b = one[both], other[both]
+    difference = a[:, 0] / a[:, 1] - b[:, 0] / b[:, 1]
+    # Blocks that both explain alike tell nothing.
+    telling = np.abs(difference) > _SAME_COST
+    weight, difference = np.minimum(a[:, 1], b[:, 1])[telling], difference[telling]
+    num = len(difference)
+    if num < 2:
+        return False
+    mean = (weight @ difference) / weight.sum()
+    scatter = weight @ (difference - mean) ** 2 / weight.sum()
+    error = np.sqrt(scatter / (num - 1)) + 1e-6
+    chance = float(binom.sf((difference > 0).sum() - 1, num, 0.5))
+    return bool(mean > 0 and (mean > _SIGNIFICANT * error or chance < _UNLIKELY))
 
 
 def what_would_fit(

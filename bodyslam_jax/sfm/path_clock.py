@@ -10,12 +10,17 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import binom
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.path import at_times, usual_step
-from bodyslam_jax.sfm.given_path import MIN_TESTED, MIN_VIEWS, PathTest
+from bodyslam_jax.sfm.given_path import (
+    MIN_TESTED,
+    MIN_VIEWS,
+    PathTest,
+    is_worse,
+    mean_cost,
+)
 from bodyslam_jax.types import CameraPath, Intrinsics, PathClock, Tracks
 
 _MAX_OFFSETS = 1500
@@ -25,11 +30,8 @@ _LEAST_OVERLAP = 0.5
 _LOCAL_FRAMES = 15
 """Frames before and after the given time within which a path on the video's own clock
 is compared with itself."""
-_SAME_COST = 0.02
-"""Difference of the mean cost of a block's observations that tells nothing."""
-_SIGNIFICANT, _UNLIKELY = 3.0, 0.01
-"""Standard errors beyond which, and probability of chance below which, two offsets do
-not fit equally well."""
+_SIGNIFICANT = 3.0
+"""Standard errors beyond which an offset differs from another."""
 _AS_EXPECTED = 0.95
 """Share of the expected fit from which no other reading of the times is tried."""
 _WHOLE_RATE = 0.005
@@ -251,9 +253,9 @@ class _Search:
         U, _, Vt = np.linalg.svd(T_WC[:, :3, :3])
         T_WC[:, :3, :3] = U @ Vt
         smooth = _Search(self.test, T_WC, self.timestamps)
-        here = _mean(self.costs(times))
-        rise = _mean(self.costs(times + self.period)) - here
-        return here - _mean(smooth.costs(times)) > _NOISE_EFFECT * max(rise, 0.0)
+        here = mean_cost(self.costs(times))
+        rise = mean_cost(self.costs(times + self.period)) - here
+        return here - mean_cost(smooth.costs(times)) > _NOISE_EFFECT * max(rise, 0.0)
 
     def equally_good(
         self, found: _Found
@@ -266,7 +268,7 @@ class _Search:
         offsets = offsets[np.abs(offsets) > max(3 * found.sigma, 1.5 * self.period)]
         here = self.costs(times)
         costs = {0.0: here} | {float(d): self.costs(times + d) for d in offsets}
-        alike = [d for d in costs if d == 0.0 or not _worse(costs[d], here)]
+        alike = [d for d in costs if d == 0.0 or not is_worse(costs[d], here)]
         if len(alike) == 1:
             return found, None, True
         best = max(alike, key=lambda d: (costs[d][:, 1].sum(), d == 0.0))
@@ -341,7 +343,7 @@ def _best_of(search: _Search, found: list[_Found | None]) -> _Found | None:
         if one is None:
             continue
         its = search.costs(one.times)
-        if best is None or _worse(cost, its):
+        if best is None or is_worse(cost, its):
             best, cost = one, its
     return best
 
@@ -443,7 +445,9 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
                 for more in range(-min(change, counts[k] - 1), change + 1)
                 for move in range(-reach, reach + 1)
             ]
-            costs = [_mean(near.costs(stepped(*pair), bridged=False)) for pair in tries]
+            costs = [
+                mean_cost(near.costs(stepped(*pair), bridged=False)) for pair in tries
+            ]
             at, counts = tries[int(np.argmin(costs))]
     moved = stepped(at, counts)
     lost = tuple((float(moved[n]), int(counts[at == n].sum())) for n in np.unique(at))
@@ -478,33 +482,6 @@ def _with_best_focal(
         f"{best[3].params[0]:.0f} px, not with the guess of {guess.params[0]:.0f} px."
     )
     return best[2], best[3], [text]
-
-
-def _mean(cost: Float[np.ndarray, "b 2"]) -> float:
-    """Mean cost of the tested observations; infinite if there are too few."""
-    count = cost[:, 1].sum()
-    return float(cost[:, 0].sum() / count) if count >= MIN_TESTED else float("inf")
-
-
-def _worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> bool:
-    """Whether the first of two costs is significantly larger: by the scatter of the
-    difference between blocks of time that both test, or by its sign in them."""
-    both = (one[:, 1] > 0) & (other[:, 1] > 0)
-    if both.sum() < 2:
-        return _mean(one) > _mean(other)
-    a, b = one[both], other[both]
-    difference = a[:, 0] / a[:, 1] - b[:, 0] / b[:, 1]
-    # Blocks that both explain alike tell nothing.
-    telling = np.abs(difference) > _SAME_COST
-    weight, difference = np.minimum(a[:, 1], b[:, 1])[telling], difference[telling]
-    num = len(difference)
-    if num < 2:
-        return False
-    mean = (weight @ difference) / weight.sum()
-    scatter = weight @ (difference - mean) ** 2 / weight.sum()
-    error = np.sqrt(scatter / (num - 1)) + 1e-6
-    chance = float(binom.sf((difference > 0).sum() - 1, num, 0.5))
-    return bool(mean > 0 and (mean > _SIGNIFICANT * error or chance < _UNLIKELY))
 
 
 def _minimum(
