@@ -62,7 +62,8 @@ class Known:
     camera_path: str | None = None
     """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `images.bin`,
     nerfstudio `transforms.json`, Stray Scanner or Record3D (these in metres). Structure
-    from motion then only makes the map."""
+    from motion then only makes the map. If its clock is not the video's, the offset is
+    found from the images."""
     camera_path_metric: bool = False
     """Whether that path is in metres, as a visual-inertial tracker's is."""
     static_camera: bool = False
