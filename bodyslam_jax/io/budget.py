@@ -20,6 +20,8 @@ million bytes of `.npz`, but as JSON a tree of gigabytes in memory."""
 MAX_YAML_BYTES = 200_000
 """Size of a YAML file: settings and calibrations have some thousand bytes, and the
 parser, which is written in Python, reads some 50,000 a second."""
+MAX_MARKUP_BYTES = 1_000_000
+"""Size of a TOML or XML file: calibrations of a hundred cameras have 100,000 bytes."""
 MAX_PIXELS = 100_000_000
 """Pixels of one image: three times those of 8K video."""
 MAX_MEMBERS = 100_000

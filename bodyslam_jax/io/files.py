@@ -13,10 +13,12 @@ import json
 import os
 import re
 import stat
+import tomllib
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import budget
@@ -225,6 +227,40 @@ def read_yaml(path: Path, what: str = "a YAML file") -> Any:
     except Exception as error:
         problem = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not YAML ({problem}), expected {what}.") from None
+
+
+def read_toml(path: Path, what: str = "a TOML file") -> dict[str, Any]:
+    """The content of a TOML file.
+
+    **Raises:** as `read_text`, or if it is not TOML or too large.
+    """
+    text = _short_text(path, what)
+    with reading(path, what):
+        return tomllib.loads(text)
+
+
+def read_xml(path: Path, what: str = "an XML file") -> ElementTree.Element:
+    """The root of an XML file that declares no entities, which could expand.
+
+    **Raises:** as `read_text`, or if it is not XML, declares a document type or
+    entities, or is too large.
+    """
+    text = _short_text(path, what)
+    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise InputError(f"{path}: declares entities (DOCTYPE), expected plain XML.")
+    with reading(path, what):
+        # The text is decoded already, whatever encoding it declares.
+        return ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]*\?>", "", text))
+
+
+def _short_text(path: Path, what: str) -> str:
+    text = read_text(path, what)
+    if len(text) > budget.MAX_MARKUP_BYTES:
+        raise InputError(
+            f"{path}: {len(text)} characters, expected at most "
+            f"{budget.MAX_MARKUP_BYTES} of {what}."
+        )
+    return text
 
 
 class Members:

@@ -154,7 +154,8 @@ def place_in_time(
     if found.lost:
         where = ", ".join(f"{k} before {s:.2f} s" for s, k in found.lost[:4])
         warnings.append(f"camera path: frames without a pose were lost: {where}.")
-    if not placed.known.all():
+    said = given.is_videos and placed.known.sum() == path.known.sum()
+    if not placed.known.all() and not said:
         count = f"{int(placed.known.sum())} of {len(timestamps)}"
         warnings.append(f"camera path: poses for {count} frames.")
     return Placed(placed, intrinsics, tuple(warnings))
