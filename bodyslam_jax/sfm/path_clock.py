@@ -35,8 +35,8 @@ _SIGNIFICANT = 3.0
 _AS_EXPECTED = 0.95
 """Share of the expected fit from which no other reading of the times is tried."""
 _WHOLE_RATE = 0.005
-"""Relative difference of rates up to which a path with a pose per frame was made from
-the frames of this video."""
+"""Relative difference up to which the step of a path is of whole frames, so that it was
+made from the frames of this video."""
 _NEAR_RATE = 0.05
 """Relative difference of rates up to which a tracker may have assumed another frame
 rate than the video's without any part of the path showing it."""
@@ -360,7 +360,8 @@ def _found_in(
         return None
     mean = np.where(enough, profile[..., 0].sum(1) / np.maximum(count, 1), np.inf)
     offset, sigma = search.refined(clock.times, float(offsets[int(np.argmin(mean))]))
-    if abs(usual_step(clock.times) / search.period - 1) < _WHOLE_RATE:
+    rate = usual_step(clock.times) / search.period
+    if abs(rate / max(round(rate), 1) - 1) < _WHOLE_RATE:
         # Made from the frames of this video, so that poses are of whole frames.
         first = (clock.times[0] + offset - search.timestamps[0]) / search.period
         moved = (round(first) - first) * search.period
