@@ -34,6 +34,9 @@ _UNIX_TIME = 1e8
 """s: times beyond it count from 1970."""
 _NUMBER_STEPS = 1, 100
 """Steps of whole numbers that may be those of frames."""
+_LARGEST_STEP = 4
+"""Step from which whole numbers that span more than the video are milliseconds: 4 ms
+are 250 poses a second."""
 _EVERY = (1, 2, 3, 4, 5, 6, 8, 10, 15)
 """Values of k for a pose of every k-th frame."""
 
@@ -147,7 +150,7 @@ def _clocks(
                 found.append(PathClock(f"{name} from 0", at, False))
             else:
                 found.append(PathClock(name, at, True))
-        else:
+        elif step < _LARGEST_STEP or times[-1] - times[0] < 1.1 * num_frames:
             name = "frame numbers of another count"
             found.append(PathClock(name, numbered + timestamps[0], False))
     overlapping = step < _LONGEST_STEP and times[0] < end and times[-1] > timestamps[0]
