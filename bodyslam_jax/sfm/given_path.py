@@ -72,6 +72,12 @@ class Fit:
         return (self.expected + self.required) / 2
 
     @property
+    def convinces(self) -> bool:
+        """Whether it fits well enough for a path whose offset was chosen to fit: that
+        alone lets a third of the points fit a path that is none."""
+        return not self.is_tested or self.share >= self.doubtful
+
+    @property
     def is_tested(self) -> bool:
         return self.tested >= MIN_TESTED
 

@@ -112,12 +112,12 @@ def place_in_time(
         )
     placed = search.path(found.times, path)
     fit = search.test.fit(placed.T_WC, placed.known)
-    if not given.is_videos and not fit.fits:
+    if not given.is_videos and not fit.convinces:
         raise InputError(
             f"camera path: its clock is not the video's ({given.name}), and no offset "
             f"explains the images: {100 * fit.share:.0f} % of the points fit at best, "
-            f"with its first pose at {found.times[0]:.2f} s, where a right path has "
-            f"{100 * fit.expected:.0f} %: poses of another video, from world to "
+            f"with its first pose at {found.times[0]:.2f} s, expected "
+            f"{100 * fit.doubtful:.0f} % or more: poses of another video, from world to "
             "camera, with other axes, or another focal length?"
         )
     if found.is_given:
@@ -333,7 +333,7 @@ def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None
     if kept is not None and best is not None and not best.is_given:
         # A path that says its time is believed, unless another time fits outright.
         fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
-        return best if fit.fits else kept
+        return best if fit.convinces else kept
     return best
 
 
