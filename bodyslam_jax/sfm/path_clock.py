@@ -117,8 +117,8 @@ def place_in_time(
             f"camera path: its clock is not the video's ({given.name}), and no offset "
             f"explains the images: {100 * fit.share:.0f} % of the points fit at best, "
             f"with its first pose at {found.times[0]:.2f} s, expected "
-            f"{100 * fit.doubtful:.0f} % or more: poses of another video, from world to "
-            "camera, with other axes, or another focal length?"
+            f"{100 * fit.doubtful:.0f} % or more: poses of another video, from world "
+            "to camera, with other axes, or another focal length?"
         )
     if found.is_given:
         return Placed(path, intrinsics, tuple(warnings))
