@@ -315,6 +315,10 @@ class JointEstimate:
     on_floor: Bool[np.ndarray, " h"] | None = None
     """People whom the estimate holds on one plane before a camera that does not move;
     `None` where there is no such plane."""
+    statures: Float[np.ndarray, "h 4"] | None = None
+    """Stature that was given, its standard deviation, the stature had it not been
+    given, and the standard deviation of that, m; NaN for people of whom none was given.
+    `None` where none was, or uncertainty was not computed."""
 
 
 @dataclasses.dataclass(frozen=True)
