@@ -217,6 +217,12 @@ class SfmResult:
     zoom: Float[np.ndarray, " t"] | None = None
     """Logarithm of each frame's focal length relative to that of `intrinsics`, which
     describe the images with the zoom undone; `None` if the camera does not zoom."""
+    from_tracks: Float[np.ndarray, "3 2"] | None = None
+    """fx, cx and cy of a camera whose focal length was given, as the tracks alone have
+    them, and their standard deviations, px; `None` if that was not computed."""
+    wander: float = float("nan")
+    """How far points of the background move, px, where the camera is said to stand
+    still; NaN elsewhere."""
 
     @property
     def focal(self) -> float:

@@ -6,9 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import Known
 from bodyslam_jax.diagnostics import measurability
 from bodyslam_jax.diagnostics.checks import Reason, Status, status_of
 from bodyslam_jax.diagnostics.completeness import incomplete, scale_undetermined
+from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
 from bodyslam_jax.diagnostics.gait import Gait, gait
 from bodyslam_jax.diagnostics.ground_scale import ground_scale
 from bodyslam_jax.diagnostics.measured import measured
@@ -30,6 +32,7 @@ from bodyslam_jax.diagnostics.statistics import (
     camera_statistics,
 )
 from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.people.stature import SIZE_STEP, stature_range
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 _GROUND_WARNING = 1.15
@@ -59,6 +62,8 @@ class Verdict:
     """As of `measured.Measured`."""
     up: Upright
     """How the vertical was found."""
+    given: tuple[Fact, ...] = ()
+    """What was given, and the estimates without it."""
 
 
 def assess(
@@ -68,10 +73,12 @@ def assess(
     joint: JointEstimate,
     result: Result,
     up: Upright,
+    known: Known = Known(),
 ) -> Verdict:
     """Judges a result.
 
     Args:
+        known: what the user gave.
         joint: the optimum of which `result` is the metric, upright version.
         up: how the vertical of the result was found.
     """
@@ -107,7 +114,15 @@ def assess(
     warnings += warnings_of_people(people)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
-    reasons = (*whole, *reasons_of_people(people), *of_world)
+    of_given = tuple(
+        given_facts(
+            known, sequence, cameras, joint, up, gaits, scale_sigma / result.scale
+        )
+    )
+    lines, contradicted = contradictions(of_given)
+    warnings += lines
+    reasons = (*whole, *reasons_of_people(people), *of_world, *contradicted)
+    reasons += tuple(_resized(body, joint))
     return Verdict(
         status=status_of(list(reasons)),
         reasons=reasons,
@@ -119,7 +134,35 @@ def assess(
         per_frame=per_frame(sequence, body, cameras, joint),
         joint_sigma=found.joint_sigma,
         up=up,
+        given=of_given,
     )
+
+
+def _resized(body: BodyModel, joint: JointEstimate) -> list[Reason]:
+    """A reason for each person of a stature that no shape of the body model has."""
+    if not body.sized or joint.statures is None:
+        return []
+    low, high = stature_range(body)
+    return [
+        Reason(
+            name="stature_beyond_body_model",
+            message=f"person {h}: the body model's shapes reach statures of {low:.2f} "
+            f"to {high:.2f} m (3 standard deviations), not the {height:.2f} m given: "
+            f"the person is a model's body resized by {1 + SIZE_STEP * shape[-1]:.2f}, "
+            "with an adult's proportions, where a child's legs are shorter.",
+            expected=f"{low:.2f} to {high:.2f} m",
+            advice="the stature is right if it was given right, lengths of limbs and "
+            "the camera's path are off by as much as the proportions; for children "
+            "give a body model of children (--body-model)",
+            figure=float(height),
+            unit="m",
+            person=h,
+        )
+        for h, (shape, (height, *_)) in enumerate(
+            zip(joint.shapes, joint.statures, strict=True)
+        )
+        if np.isfinite(height) and not low <= height <= high
+    ]
 
 
 def _warnings(

@@ -48,6 +48,8 @@ def summarise(
             "ground_factor": verdict.ground_factor,
         },
         "up": _up(verdict.up),
+        # What the user gave, and the estimates without it.
+        "given": [fact.to_dict() for fact in verdict.given],
         "people": [_person(person) for person in verdict.people],
         # The first and the last.
         "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),

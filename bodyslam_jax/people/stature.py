@@ -58,9 +58,11 @@ def statures_of(
 
 
 def stature_range(body: BodyModel) -> tuple[float, float]:
-    """Statures, m, of shapes within `REACH` standard deviations of the mean shape."""
+    """Statures, m, of shapes of the body's file within `REACH` standard deviations of
+    the mean shape."""
     linear = linear_stature(body)
-    way = REACH * float(np.linalg.norm(linear.slope))
+    slope = linear.slope[: 9 if body.sized else 10]
+    way = REACH * float(np.linalg.norm(slope))
     return linear.template - way, linear.template + way
 
 

@@ -161,7 +161,7 @@ def assemble(
     edges in the images, for gravity.
     """
     result, up = to_metric(sequence, config, body, cameras, joint, edges)
-    verdict = diagnostics.assess(sequence, body, cameras, joint, result, up)
+    verdict = diagnostics.assess(sequence, body, cameras, joint, result, up, config)
     summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
     return dataclasses.replace(result, summary=summary, joint_sigma=verdict.joint_sigma)
 
