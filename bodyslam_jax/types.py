@@ -160,6 +160,9 @@ class Sequence:
     """All people in the images, who are kept out of the map."""
     warnings: tuple[str, ...] = ()
     """What was guessed or left out while reading, for the report."""
+    contradictions: tuple[str, ...] = ()
+    """Parts of the input that contradict each other, a line each, which make the result
+    doubtful."""
 
     @property
     def num_frames(self) -> int:
