@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import Known
+from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import measurability
+from bodyslam_jax.diagnostics.accuracy import Accuracy, accuracy, guess_warning
 from bodyslam_jax.diagnostics.checks import Reason, Status, status_of
 from bodyslam_jax.diagnostics.completeness import incomplete, scale_undetermined
 from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
@@ -62,6 +63,8 @@ class Verdict:
     """As of `measured.Measured`."""
     up: Upright
     """How the vertical was found."""
+    accuracy: Accuracy
+    """How well each kind of length is known."""
     given: tuple[Fact, ...] = ()
     """What was given, and the estimates without it."""
 
@@ -73,12 +76,12 @@ def assess(
     joint: JointEstimate,
     result: Result,
     up: Upright,
-    known: Known = Known(),
+    config: Config = Config(),
 ) -> Verdict:
     """Judges a result.
 
     Args:
-        known: what the user gave.
+        config: has what the user gave.
         joint: the optimum of which `result` is the metric, upright version.
         up: how the vertical of the result was found.
     """
@@ -110,19 +113,36 @@ def assess(
         )
         people = with_doubts(people, doubts)
         of_world = doubts.of_whole
+    sizes = [
+        scale_sigma / abs(result.scale)
+        if cameras.kind == "moving"
+        else (person.stature_sigma or np.nan) / (person.stature or np.nan)
+        for person in people
+    ]
+    lengths = accuracy(sequence, cameras, result, up, sizes, config.structure)
     warnings = _warnings(sequence, cameras, joint, ground_factor)
+    warnings += guess_warning(sequence, cameras, lengths)
     warnings += warnings_of_people(people)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
     of_given = tuple(
         given_facts(
-            known, sequence, cameras, joint, up, gaits, scale_sigma / result.scale
+            config, sequence, cameras, joint, up, gaits, scale_sigma / result.scale
         )
     )
     lines, contradicted = contradictions(of_given)
     warnings += lines
     reasons = (*whole, *reasons_of_people(people), *of_world, *contradicted)
     reasons += tuple(_resized(body, joint))
+    reasons += tuple(
+        Reason(
+            name="input_contradicts_itself",
+            message=text,
+            expected="files that agree",
+            advice="mend the file that is wrong, or leave it out",
+        )
+        for text in sequence.contradictions
+    )
     return Verdict(
         status=status_of(list(reasons)),
         reasons=reasons,
@@ -134,6 +154,7 @@ def assess(
         per_frame=per_frame(sequence, body, cameras, joint),
         joint_sigma=found.joint_sigma,
         up=up,
+        accuracy=lengths,
         given=of_given,
     )
 

@@ -82,20 +82,44 @@ def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
     if share >= 1:
         return ["sizes are not known", "distances and statures may be off many times"]
     notes = [_one_metre(share)]
+    far = along_view(summary)
+    if far is not None and far > 1.5 * share:
+        return [f"sizes are known to {_percent(share)}", _from_focal(far), *notes[1:]]
     if scale.get("sigma_of_covariance", sigma) < sigma:
         notes.append("people's steps and the ground tell different sizes")
     return [f"sizes are known to {_percent(share)}", *notes]
 
 
 def _sizes_of_stature(result: Result, summary: Mapping[str, Any]) -> list[str]:
-    """Where the camera's path gives no size, bodies give all of it."""
+    """Where the camera's path gives no size, bodies give all of it, but for what
+    follows from the focal length."""
     known = [stature_sigma(summary, h) for h in range(len(result.present))]
     statures = [(s, p.get("stature_m")) for s, p in zip(known, _people(summary))]
     shares = [s / m for s, m in statures if s and m]
     note = "all of them come from how tall people look"
     if not shares:
         return ["in metres", note]
-    return [f"sizes are known to {_percent(min(shares))}", note]
+    far = along_view(summary)
+    if far is None or far < 1.5 * min(shares):
+        return [f"sizes are known to {_percent(min(shares))}", note]
+    return [
+        f"sizes across the view are known to {_percent(min(shares))}",
+        _from_focal(far),
+        note,
+    ]
+
+
+def along_view(summary: Mapping[str, Any]) -> float | None:
+    """Relative standard deviation of distances from the camera, as reported."""
+    far = (summary.get("lengths") or {}).get("along_view_sigma")
+    return None if far is None or not np.isfinite(far) else float(far)
+
+
+def _from_focal(far: float) -> str:
+    return (
+        "distances from the camera and motion along the view are known to "
+        f"{_percent(far)}, by the focal length: give it (--focal)"
+    )
 
 
 def _people(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:

@@ -17,7 +17,7 @@ from bodyslam_jax.diagnostics.statistics import (
     person_statistics,
 )
 from bodyslam_jax.export import figures
-from bodyslam_jax.export.answers import answers
+from bodyslam_jax.export.answers import along_view, answers
 from bodyslam_jax.export.expert_figures import focal_length, lengths, people_table
 from bodyslam_jax.export.folder import plain
 from bodyslam_jax.export.plain_words import in_plain_words
@@ -58,7 +58,7 @@ def write_report(
         _PAGE.format(
             title=html.escape(str(name or "run")),
             style=style,
-            status=_status(str(summary.get("status", "ok"))),
+            status=_status(str(summary.get("status", "ok")), along_view(summary)),
             subtitle=html.escape(_subtitle(result, source)),
             body="\n".join(section for section in sections if section),
         ),
@@ -66,6 +66,8 @@ def write_report(
     )
 
 
+_HARDLY_KNOWN = 0.1
+"""Relative standard deviation of distances that is named beside the status."""
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -90,10 +92,13 @@ _PAGE = """<!doctype html>
 """
 
 
-def _status(status: str) -> str:
-    """The badge beside the title."""
+def _status(status: str, along: float | None) -> str:
+    """The badge beside the title; `along` is the relative standard deviation of
+    distances from the camera."""
     good = status == "ok"
     text = "plausible" if good else html.escape(status)
+    if good and along is not None and along > _HARDLY_KNOWN:
+        text += f", distances ± {100 * along:.0f} %"
     return f'<span class="badge {"good" if good else "bad"}">{text}</span>'
 
 
