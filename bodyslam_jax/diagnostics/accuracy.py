@@ -100,9 +100,7 @@ def focal_uncertainty(
     return structure.focal_sigma
 
 
-def guess_warning(
-    sequence: Sequence, cameras: SfmResult, found: Accuracy
-) -> list[str]:
+def guess_warning(sequence: Sequence, cameras: SfmResult, found: Accuracy) -> list[str]:
     """A line on what a focal length that is a guess makes uncertain, if anybody is
     there to be at a distance."""
     if not found.people or not found.focal > _TOLD_APART:

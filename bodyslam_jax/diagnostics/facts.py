@@ -61,6 +61,9 @@ class Fact:
     advice: str
     digits: int = 0
     person: int | None = None
+    words: str = ""
+    """What was given and found, where "given as ..., without it ..." does not say
+    it."""
 
     @property
     def sigmas(self) -> float:
@@ -75,10 +78,12 @@ class Fact:
         figure = lambda x, s: f"{x:.{self.digits}f} ± {s:.{self.digits}f}"
         unit = self.unit and f" {self.unit}"
         whose = "" if self.person is None else f"person {self.person}: "
+        words = self.words or (
+            f"{self.what} was given as {figure(self.given, self.given_sigma)}{unit}; "
+            f"without it {figure(self.found, self.found_sigma)}{unit} would be found"
+        )
         return (
-            f"{whose}{self.what} was given as {figure(self.given, self.given_sigma)}"
-            f"{unit}; without it {figure(self.found, self.found_sigma)}{unit} would be "
-            f"found, {self.sigmas:.1f} standard deviations away: {self.why}."
+            f"{whose}{words}, {self.sigmas:.1f} standard deviations away: {self.why}."
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,7 +202,11 @@ def _calibration(sequence: Sequence, cameras: SfmResult) -> list[Fact]:
         )
         for name, what, value, error, (found, found_error) in zip(
             names,
-            ("the focal length fx", "the principal point's x", "the principal point's y"),
+            (
+                "the focal length fx",
+                "the principal point's x",
+                "the principal point's y",
+            ),
             given,
             sigma,
             by_tracks,
@@ -213,19 +222,22 @@ def _gravity(known: Known, up: Upright, gaits: Many[Gait | None]) -> list[Fact]:
     walking = any(steps is not None for steps in gaits)
     if not known.gravity or not (walking or np.isfinite(up.edges)):
         return []
+    away, sigma = np.degrees(up.unaided), np.degrees(up.unaided_sigma)
     return [
         Fact(
             name="given_gravity",
-            what="the angle of gravity to itself",
+            what="gravity",
             unit="degrees",
             given=0.0,
             given_sigma=float(np.degrees(GRAVITY_SIGMA)),
-            found=float(np.degrees(up.unaided)),
-            found_sigma=float(np.degrees(up.unaided_sigma)),
-            why="gravity is in other axes than the first frame's camera (x right, y "
+            found=float(away),
+            found_sigma=float(sigma),
+            words=f"gravity was given (± {np.degrees(GRAVITY_SIGMA):.1f} degrees) at "
+            f"{away:.1f} degrees from where people, ground and edges have it "
+            f"(± {sigma:.1f} degrees)",
+            why="it is in other axes than the first frame's camera (x right, y "
             "down, z forward), of another moment, or points up",
             advice="check --gravity: 0 1 0 for a level camera",
-            digits=1,
         )
     ]
 
@@ -240,15 +252,17 @@ def _standing_camera(
     return [
         Fact(
             name="given_static",
-            what="motion of the background (--static-camera)",
+            what="motion of the background",
             unit="px",
             given=0.0,
             given_sigma=0.0,
             found=cameras.wander,
             found_sigma=sigma,
+            words="the camera was said to stand still, but points of the background "
+            f"move by {cameras.wander:.1f} px, where errors of tracking make up to "
+            f"{sigma:.1f} px",
             why="the camera moves, turns or zooms, or the points are of moving things",
             advice="leave --static-camera out, or give masks of what moves",
-            digits=1,
         )
     ]
 
@@ -269,8 +283,8 @@ def _path(joint: JointEstimate) -> list[Fact]:
             found_sigma=others.standard_error / start.path,
             why="the path is not in metres or of another scale, or people's sizes are "
             "off (children)",
-            advice="leave --camera-path-metric out if the path's unit is not the metre, "
-            "or give people's statures (--height)",
+            advice="leave --camera-path-metric out if the path's unit is not the "
+            "metre, or give people's statures (--height)",
             digits=2,
         )
     ]
@@ -284,7 +298,9 @@ def _frame_rate(
 ) -> list[Fact]:
     if known.fps is None:
         return []
-    error = np.hypot(WALK_RATIO_SPREAD, np.nan_to_num(length_error) / 2)
+    error = float(np.hypot(WALK_RATIO_SPREAD, np.nan_to_num(length_error) / 2))
+    # In logarithms, in which the walk ratio is normal, the distance is log(k) / error.
+    slope = lambda k: 1.0 if abs(k - 1) < 1e-6 else (k - 1) / float(np.log(k))
     return [
         Fact(
             name="given_fps",
@@ -292,12 +308,8 @@ def _frame_rate(
             unit="1/s",
             given=sequence.fps,
             given_sigma=0.0,
-            # In logarithms the distance is `log(slowness) / error` either way.
             found=sequence.fps * steps.slowness,
-            found_sigma=sequence.fps
-            * abs(steps.slowness - 1)
-            / max(abs(float(np.log(steps.slowness))), 1e-9)
-            * float(error),
+            found_sigma=sequence.fps * slope(steps.slowness) * error,
             why="it is not the rate at which the video was taken (slow motion, or "
             "frames left out), or the person is no usual walker",
             advice="check --fps: speeds are off in proportion",

@@ -21,6 +21,7 @@ from bodyslam_jax.diagnostics.person_verdict import (
     reasons_of_people,
     warnings_of_people,
     with_doubts,
+    with_more_doubts,
 )
 from bodyslam_jax.diagnostics.plausibility import implausible
 from bodyslam_jax.diagnostics.reprojection import per_frame
@@ -132,8 +133,10 @@ def assess(
     )
     lines, contradicted = contradictions(of_given)
     warnings += lines
+    people, contradicted = with_more_doubts(
+        people, [*contradicted, *_resized(body, joint)]
+    )
     reasons = (*whole, *reasons_of_people(people), *of_world, *contradicted)
-    reasons += tuple(_resized(body, joint))
     reasons += tuple(
         Reason(
             name="input_contradicts_itself",

@@ -283,6 +283,7 @@ def _details(
     scale = summary.get("scale") or {}
     contents = {
         "People": people_table(result, summary, people, body),
+        "What was given, and what is found without it": _given(summary),
         "Scale": lengths(result, scale) + _scale_table(result, scale),
         "Camera intrinsics (px)": focal_length(summary.get("intrinsics") or {})
         + table(["parameter", "value"], lens),
@@ -296,6 +297,22 @@ def _details(
     parts = [folded(title, text) for title, text in contents.items() if text]
     errors = error_tables(summary.get("errors") or {})
     return f"{errors}<section><h2>For experts</h2>{''.join(parts)}</section>"
+
+
+def _given(summary: Mapping[str, Any]) -> str:
+    """Facts that were given, each with the estimate that was made without it."""
+    rows = [
+        [
+            str(fact.get("name", "")).removeprefix("given_").replace("_", " ")
+            + ("" if fact.get("person") is None else f" of person {fact['person']}"),
+            *(fact.get(key) for key in ("unit", "given", "given_sigma")),
+            *(fact.get(key) for key in ("without", "without_sigma")),
+            fact.get("standard_deviations_apart"),
+        ]
+        for fact in summary.get("given") or []
+    ]
+    columns = ["fact", "unit", "given", "±", "without it", "±", "apart, in sigmas"]
+    return table(columns, rows) if rows else ""
 
 
 def _scale_table(result: Result, scale: Mapping[str, Any]) -> str:

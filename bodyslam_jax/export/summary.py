@@ -127,7 +127,8 @@ def _headline(
         sure = verdict.accuracy.people[h]
         lines.append(f"person {h}: {_in_a_line(person, sure)}")
     if lens["guessed"]:
-        text = f"focal length: guess {lens['guess_px']:.0f} px"
+        origin = "guess" if sequence.intrinsics.is_guess else "given"
+        text = f"focal length: {origin} {lens['guess_px']:.0f} px"
         if (sigma := lens["focal_sigma_px"]) is not None:
             text += f", from the camera's path {lens['focal_px']:.0f} ± {sigma:.0f} px"
         elif sequence.intrinsics.is_guess:

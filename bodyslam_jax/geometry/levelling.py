@@ -57,9 +57,7 @@ def level(
     )
     if gravity:
         rest = (standing, edges, on_floor)
-        _, unaided = level(
-            T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest
-        )
+        _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
         cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
         found = dataclasses.replace(
             found, unaided=float(np.arccos(cosine)), unaided_sigma=unaided.sigma

@@ -15,8 +15,8 @@ from bodyslam_jax.people.person_state import PersonState
 _UP = 1
 REACH = 3.0
 """Standard deviations of β within which a model has bodies of people: 99.7 % of those
-it was made from. Beyond, proportions are extrapolated: the default body's legs are 0.48 of
-a stature of 1.70 m and 0.40 of one of 1.08 m."""
+it was made from. Beyond, proportions are extrapolated: the default body's legs are 0.48
+of a stature of 1.70 m and 0.40 of one of 1.08 m."""
 SIZE_STEP = 0.01
 """Relative size of a body for one unit of a size axis. The prior on β (sigma 0.4) then
 holds the size of people of unknown stature to 0.4 %."""
