@@ -15,6 +15,8 @@ from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
+_ADULT = 1.7
+"""Stature, m, of the people whose cadence the limit of quick steps is from."""
 _LEAST_CONFIDENCE = 0.3
 """Of keypoints that are compared with the body."""
 
@@ -68,6 +70,11 @@ def implausible(
             of_person["keypoint_misfit"] = misfits[h]
             of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
             of_person |= of_measurement[h]
+            if joint.statures is not None and np.isfinite(joint.statures[h, 0]):
+                # Of a child of known stature, the cadence of an adult who walks alike:
+                # times of steps are as the root of legs' lengths.
+                pace = min(float(np.sqrt(joint.statures[h, 0] / _ADULT)), 1.0)
+                of_person["quick_steps"] = pace * of_person.get("quick_steps", np.nan)
         of_people.append(tuple(judge(PERSON_CHECKS, of_person, h)))
     of_world = {"floors_apart": figures.floors_apart(result.joints, present, fps)}
     if walking:
