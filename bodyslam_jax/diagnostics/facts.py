@@ -75,7 +75,8 @@ class Fact:
     @property
     def message(self) -> str:
         """The line with both figures and the likely reason."""
-        figure = lambda x, s: f"{x:.{self.digits}f} ± {s:.{self.digits}f}"
+        places = f".{self.digits}f"
+        figure = lambda x, s: f"{x:{places}} ± {s:{places}}" if s else f"{x:{places}}"
         unit = self.unit and f" {self.unit}"
         whose = "" if self.person is None else f"person {self.person}: "
         words = self.words or (

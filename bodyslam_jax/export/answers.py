@@ -14,6 +14,8 @@ from bodyslam_jax.types import Result
 
 _MOST_ROWS = 5
 """People whom a card names; the table of people has all."""
+_VAGUE = 0.1
+"""Relative standard deviation of a way or a speed that is named beside it."""
 _STILL = {"static": "stood still", "rotation": "turned on the spot"}
 
 
@@ -32,8 +34,9 @@ def answers(
     if shown:
         known = [h for h in shown if reported_status(summary, h).measurable]
         if_known = lambda h, text: text if h in known else "not measurable"
-        far = rows(lambda h: if_known(h, f"{people[h].distance:.1f} m"))
-        fast = rows(lambda h: if_known(h, f"{people[h].mean_speed:.1f} m/s"))
+        give = lambda h, x: f"{x:.1f}{_vague(summary, h, x)}"
+        far = rows(lambda h: if_known(h, f"{give(h, people[h].distance)} m"))
+        fast = rows(lambda h: if_known(h, f"{give(h, people[h].mean_speed)} m/s"))
         walk = [f"{name(h)}: {3.6 * people[h].mean_speed:.1f} km/h" for h in known[:1]]
         tall = rows(lambda h: if_known(h, _stature(result, summary, body, h)))
         moved = kind or f"{camera.distance:.1f} m"
@@ -66,6 +69,14 @@ def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
     """Standard deviation of a person's stature, m, as reported."""
     reported = (summary.get("people") or [])[h : h + 1]
     return reported[0].get("stature_sigma_m") if reported else None
+
+
+def _vague(summary: Mapping[str, Any], h: int, value: float) -> str:
+    """The standard deviation of a person's way or speed, where it is much."""
+    person = (_people(summary)[h : h + 1] or [{}])[0]
+    sigma, speed = person.get("speed_sigma_m_s"), person.get("speed_m_s")
+    share = sigma / speed if sigma and speed else 0.0
+    return f" ± {share * value:.1f}" if share > _VAGUE else ""
 
 
 def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
