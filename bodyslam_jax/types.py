@@ -179,6 +179,9 @@ class Sequence:
     """All people in the images, who are kept out of the map."""
     warnings: tuple[str, ...] = ()
     """What was guessed or left out while reading, for the report."""
+    contradictions: tuple[str, ...] = ()
+    """Parts of the input that contradict each other, a line each, which make the result
+    doubtful."""
 
     @property
     def num_frames(self) -> int:
@@ -236,6 +239,12 @@ class SfmResult:
     zoom: Float[np.ndarray, " t"] | None = None
     """Logarithm of each frame's focal length relative to that of `intrinsics`, which
     describe the images with the zoom undone; `None` if the camera does not zoom."""
+    from_tracks: Float[np.ndarray, "3 2"] | None = None
+    """fx, cx and cy of a camera whose focal length was given, as the tracks alone have
+    them, and their standard deviations, px; `None` if that was not computed."""
+    wander: float = float("nan")
+    """How far points of the background move, px, where the camera is said to stand
+    still; NaN elsewhere."""
 
     @property
     def focal(self) -> float:
@@ -334,6 +343,10 @@ class JointEstimate:
     on_floor: Bool[np.ndarray, " h"] | None = None
     """People whom the estimate holds on one plane before a camera that does not move;
     `None` where there is no such plane."""
+    statures: Float[np.ndarray, "h 4"] | None = None
+    """Stature that was given, its standard deviation, the stature had it not been
+    given, and the standard deviation of that, m; NaN for people of whom none was given.
+    `None` where none was, or uncertainty was not computed."""
 
 
 @dataclasses.dataclass(frozen=True)

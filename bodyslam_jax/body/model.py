@@ -40,6 +40,9 @@ class BodyModel(eqx.Module):
     """Of the file, without suffix."""
     kind: str = eqx.field(static=True)
     """Kind of the file: `default`, `smpl`, `smplh` or `smplx`."""
+    sized: bool = eqx.field(static=True, default=False)
+    """Whether the last component of β is the size of the whole body, not one of the
+    file's (`people.with_size_axis`)."""
 
     @property
     def num_vertices(self) -> int:

@@ -8,6 +8,7 @@ from bodyslam_jax.config.front_end import Association as Association
 from bodyslam_jax.config.front_end import Detect as Detect
 from bodyslam_jax.config.front_end import Structure as Structure
 from bodyslam_jax.config.front_end import Tracking as Tracking
+from bodyslam_jax.config.known import FOCAL_SIGMA as FOCAL_SIGMA
 from bodyslam_jax.config.known import GRAVITY_SIGMA as GRAVITY_SIGMA
 from bodyslam_jax.config.known import PATH_SIGMA as PATH_SIGMA
 from bodyslam_jax.config.known import Known as Known

@@ -53,7 +53,8 @@ class Known:
 
     height: tuple[str, ...] = ()
     """Stature, m, of the only person or of each by number: `1.78`, `1.78±0.01`, `0=1.78
-    1=1.65`. Default standard deviation: 2 cm."""
+    1=1.65`. Default standard deviation: 2 cm. The body is resized where no shape of the
+    body model is as tall (children)."""
     focal: str | None = None
     """Focal length, px of the video: `1250`, `1250±20`. Default standard deviation: 2
     %. Without it or `--fov`, it is estimated from an initial guess."""

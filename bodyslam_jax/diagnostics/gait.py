@@ -23,6 +23,9 @@ _LEGS = ([1, 4, 7], [2, 5, 8])
 _WALK_RATIO = 1.7
 """Dimensionless walk ratio, the median of 85 walks and runs of the CMU archive, of
 which nine of ten have 1.4 to 2.2."""
+WALK_RATIO_SPREAD = 0.14
+"""Standard deviation of the logarithm of the walk ratio: half of log(2.2 / 1.4), which
+nine of ten are within, over 1.645."""
 _SLOW = 1.6
 """Factor on the walk ratio from which it is slow motion: of those 85 two exceed it,
 with strides that are exaggerated on purpose."""
@@ -73,18 +76,23 @@ class Gait:
     def is_slow_motion(self, unsure: float = 0.0) -> bool:
         """Whether the walk is implausibly slow, even if lengths are too large by the
         relative error `unsure`."""
-        return self.step > _STEP and self.slowness > _SLOW * (1 + unsure)
+        return self.strides and self.slowness > _SLOW * (1 + unsure)
+
+    @property
+    def strides(self) -> bool:
+        """Whether steps are long enough that the frame rate can be judged by them."""
+        return self.step > _STEP
 
     def has_low_cadence(self) -> bool:
         """Whether steps are taken more rarely than in nearly all walks, whatever the
         scale."""
-        return self.step > _STEP and self.frequency < _SELDOM
+        return self.strides and self.frequency < _SELDOM
 
     def is_fast_motion(self, unsure: float = 0.0) -> bool:
         """Whether the walk is implausibly quick, even if lengths are too small by the
         relative error `unsure`."""
         quick = self.slowness * _SLOW * (1 + unsure) < 1
-        return self.step > _STEP and quick and self.frequency > _OFTEN
+        return self.strides and quick and self.frequency > _OFTEN
 
 
 def gait(result: Result, person: int) -> Gait | None:

@@ -110,6 +110,22 @@ def with_doubts(people: list[PersonVerdict], doubts: Doubts) -> list[PersonVerdi
     ]
 
 
+def with_more_doubts(
+    people: list[PersonVerdict], reasons: list[Reason]
+) -> tuple[list[PersonVerdict], list[Reason]]:
+    """The people, doubtful where a reason is about somebody who can be measured, and
+    the reasons that are about nobody of them."""
+    found, rest = list(people), []
+    for reason in reasons:
+        h = reason.person
+        if h is None or found[h].status not in ("ok", "doubtful"):
+            rest.append(reason)
+            continue
+        more = (*found[h].reasons, reason)
+        found[h] = dataclasses.replace(found[h], status="doubtful", reasons=more)
+    return found, rest
+
+
 def reasons_of_people(people: list[PersonVerdict]) -> list[Reason]:
     """Reasons to doubt the whole result: those about people who can be measured, or,
     where nobody can, why not."""

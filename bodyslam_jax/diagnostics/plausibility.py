@@ -15,6 +15,8 @@ from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
+_ADULT = 1.7
+"""Stature, m, of the people whose cadence the limit of quick steps is from."""
 _LEAST_CONFIDENCE = 0.3
 """Of keypoints that are compared with the body."""
 
@@ -77,6 +79,11 @@ def implausible(
             own = moments.of_person(result.joints[h], there, inferred[h], fps)
             if misfit is not None:
                 own["keypoint_misfit"] = misfit
+            if joint.statures is not None and np.isfinite(joint.statures[h, 0]):
+                # Of a child of known stature, the cadence of an adult who walks alike:
+                # times of steps are as the root of legs' lengths.
+                pace = min(float(np.sqrt(joint.statures[h, 0] / _ADULT)), 1.0)
+                of_person["quick_steps"] = pace * of_person.get("quick_steps", np.nan)
         whole = moments.seen(there)
         where = {name: own.get(name, whole) for name in of_person}
         of_people.append(judged(PERSON_CHECKS, of_person, h, where))

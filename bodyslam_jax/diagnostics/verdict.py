@@ -6,9 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import measurability
+from bodyslam_jax.diagnostics.accuracy import Accuracy, accuracy, guess_warning
 from bodyslam_jax.diagnostics.checks import Reason, Status, status_of
 from bodyslam_jax.diagnostics.completeness import incomplete, scale_undetermined
+from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
 from bodyslam_jax.diagnostics.gait import Gait, gait
 from bodyslam_jax.diagnostics.ground_scale import ground_scale
 from bodyslam_jax.diagnostics.measured import measured
@@ -18,6 +21,7 @@ from bodyslam_jax.diagnostics.person_verdict import (
     reasons_of_people,
     warnings_of_people,
     with_doubts,
+    with_more_doubts,
 )
 from bodyslam_jax.diagnostics.plausibility import implausible
 from bodyslam_jax.diagnostics.reprojection import per_frame
@@ -30,6 +34,7 @@ from bodyslam_jax.diagnostics.statistics import (
     camera_statistics,
 )
 from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.people.stature import SIZE_STEP, stature_range
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 _GROUND_WARNING = 1.15
@@ -59,6 +64,10 @@ class Verdict:
     """As of `measured.Measured`."""
     up: Upright
     """How the vertical was found."""
+    accuracy: Accuracy
+    """How well each kind of length is known."""
+    given: tuple[Fact, ...] = ()
+    """What was given, and the estimates without it."""
 
 
 def assess(
@@ -68,10 +77,12 @@ def assess(
     joint: JointEstimate,
     result: Result,
     up: Upright,
+    config: Config = Config(),
 ) -> Verdict:
     """Judges a result.
 
     Args:
+        config: has what the user gave.
         joint: the optimum of which `result` is the metric, upright version.
         up: how the vertical of the result was found.
     """
@@ -110,11 +121,38 @@ def assess(
         )
         people = with_doubts(people, doubts)
         of_world = doubts.of_whole
+    sizes = [
+        scale_sigma / abs(result.scale)
+        if cameras.kind == "moving"
+        else (person.stature_sigma or np.nan) / (person.stature or np.nan)
+        for person in people
+    ]
+    lengths = accuracy(sequence, cameras, result, up, sizes, config.structure)
     warnings = _warnings(sequence, cameras, joint, ground_factor)
+    warnings += guess_warning(sequence, cameras, lengths)
     warnings += warnings_of_people(people)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
-    reasons = (*whole, *reasons_of_people(people), *of_world)
+    of_given = tuple(
+        given_facts(
+            config, sequence, cameras, joint, up, gaits, scale_sigma / result.scale
+        )
+    )
+    lines, contradicted = contradictions(of_given)
+    warnings += lines
+    people, contradicted = with_more_doubts(
+        people, [*contradicted, *_resized(body, joint)]
+    )
+    reasons = (*whole, *reasons_of_people(people), *of_world, *contradicted)
+    reasons += tuple(
+        Reason(
+            name="input_contradicts_itself",
+            message=text,
+            expected="files that agree",
+            advice="mend the file that is wrong, or leave it out",
+        )
+        for text in sequence.contradictions
+    )
     return Verdict(
         status=status_of(list(reasons)),
         reasons=reasons,
@@ -126,7 +164,36 @@ def assess(
         per_frame=per_frame(sequence, body, cameras, joint),
         joint_sigma=found.joint_sigma,
         up=up,
+        accuracy=lengths,
+        given=of_given,
     )
+
+
+def _resized(body: BodyModel, joint: JointEstimate) -> list[Reason]:
+    """A reason for each person of a stature that no shape of the body model has."""
+    if not body.sized or joint.statures is None:
+        return []
+    low, high = stature_range(body)
+    return [
+        Reason(
+            name="stature_beyond_body_model",
+            message=f"person {h}: the body model's shapes reach statures of {low:.2f} "
+            f"to {high:.2f} m (3 standard deviations), not the {height:.2f} m given: "
+            f"the person is a model's body resized by {1 + SIZE_STEP * shape[-1]:.2f}, "
+            "with an adult's proportions, where a child's legs are shorter.",
+            expected=f"{low:.2f} to {high:.2f} m",
+            advice="the stature is right if it was given right, lengths of limbs and "
+            "the camera's path are off by as much as the proportions; for children "
+            "give a body model of children (--body-model)",
+            figure=float(height),
+            unit="m",
+            person=h,
+        )
+        for h, (shape, (height, *_)) in enumerate(
+            zip(joint.shapes, joint.statures, strict=True)
+        )
+        if np.isfinite(height) and not low <= height <= high
+    ]
 
 
 def _warnings(

@@ -14,6 +14,8 @@ from bodyslam_jax.types import Result
 
 _MOST_ROWS = 5
 """People whom a card names; the table of people has all."""
+_VAGUE = 0.1
+"""Relative standard deviation of a way or a speed that is named beside it."""
 _STILL = {"static": "stood still", "rotation": "turned on the spot"}
 
 
@@ -32,8 +34,9 @@ def answers(
     if shown:
         known = [h for h in shown if reported_status(summary, h).measurable]
         if_known = lambda h, text: text if h in known else "not measurable"
-        far = rows(lambda h: if_known(h, f"{people[h].distance:.1f} m"))
-        fast = rows(lambda h: if_known(h, f"{people[h].mean_speed:.1f} m/s"))
+        give = lambda h, x: f"{x:.1f}{_vague(summary, h, x)}"
+        far = rows(lambda h: if_known(h, f"{give(h, people[h].distance)} m"))
+        fast = rows(lambda h: if_known(h, f"{give(h, people[h].mean_speed)} m/s"))
         walk = [f"{name(h)}: {3.6 * people[h].mean_speed:.1f} km/h" for h in known[:1]]
         tall = rows(lambda h: if_known(h, _stature(result, summary, body, h)))
         moved = kind or f"{camera.distance:.1f} m"
@@ -68,6 +71,14 @@ def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
     return reported[0].get("stature_sigma_m") if reported else None
 
 
+def _vague(summary: Mapping[str, Any], h: int, value: float) -> str:
+    """The standard deviation of a person's way or speed, where it is much."""
+    person = (_people(summary)[h : h + 1] or [{}])[0]
+    sigma, speed = person.get("speed_sigma_m_s"), person.get("speed_m_s")
+    share = sigma / speed if sigma and speed else 0.0
+    return f" ± {share * value:.1f}" if share > _VAGUE else ""
+
+
 def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
     """How well lengths are known, in a few words, and notes on it."""
     if not result.present.any():
@@ -82,20 +93,44 @@ def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
     if share >= 1:
         return ["sizes are not known", "distances and statures may be off many times"]
     notes = [_one_metre(share)]
+    far = along_view(summary)
+    if far is not None and far > 1.5 * share:
+        return [f"sizes are known to {_percent(share)}", _from_focal(far), *notes[1:]]
     if scale.get("sigma_of_covariance", sigma) < sigma:
         notes.append("people's steps and the ground tell different sizes")
     return [f"sizes are known to {_percent(share)}", *notes]
 
 
 def _sizes_of_stature(result: Result, summary: Mapping[str, Any]) -> list[str]:
-    """Where the camera's path gives no size, bodies give all of it."""
+    """Where the camera's path gives no size, bodies give all of it, but for what
+    follows from the focal length."""
     known = [stature_sigma(summary, h) for h in range(len(result.present))]
     statures = [(s, p.get("stature_m")) for s, p in zip(known, _people(summary))]
     shares = [s / m for s, m in statures if s and m]
     note = "all of them come from how tall people look"
     if not shares:
         return ["in metres", note]
-    return [f"sizes are known to {_percent(min(shares))}", note]
+    far = along_view(summary)
+    if far is None or far < 1.5 * min(shares):
+        return [f"sizes are known to {_percent(min(shares))}", note]
+    return [
+        f"sizes across the view are known to {_percent(min(shares))}",
+        _from_focal(far),
+        note,
+    ]
+
+
+def along_view(summary: Mapping[str, Any]) -> float | None:
+    """Relative standard deviation of distances from the camera, as reported."""
+    far = (summary.get("lengths") or {}).get("along_view_sigma")
+    return None if far is None or not np.isfinite(far) else float(far)
+
+
+def _from_focal(far: float) -> str:
+    return (
+        "distances from the camera and motion along the view are known to "
+        f"{_percent(far)}, by the focal length: give it (--focal)"
+    )
 
 
 def _people(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:

@@ -110,8 +110,8 @@ def focal_length(lens: Mapping[str, Any]) -> str:
     guess, sigma = lens["guess_px"], lens.get("focal_sigma_px")
     if sigma is None:
         text = (
-            f"Focal length: {guess:.0f} px, guessed from the image's size; depths are "
-            "wrong in proportion."
+            f"Focal length: {guess:.0f} px, guessed from the image's size; distances "
+            "from the camera and motion along the view are wrong in proportion."
         )
     else:
         text = (

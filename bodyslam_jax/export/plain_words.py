@@ -40,6 +40,15 @@ _PERSON = {
     "speed_across_gap": (
         "{Who} is gone for a moment and back too far away to be the same person."
     ),
+    "given_stature": "{Who} looks taller or shorter than the stature that was given.",
+    "given_fps": (
+        "{Who} takes steps more slowly or quickly than people do at the frame rate "
+        "that was given."
+    ),
+    "stature_beyond_body_model": (
+        "{Who} is smaller or taller than the body model can be, and has an adult's "
+        "proportions."
+    ),
     "leg_in_image": "{Who} is too small in the video to be measured.",
     "speed_error": "{Who} is too far away, for too short a time, to be measured.",
 }
@@ -51,6 +60,12 @@ _WHOLE = {
     "camera_speed": "The camera moves faster than somebody can carry it.",
     "camera_acceleration": "The camera's way jerks more than a hand can.",
     "camera_turning": "The camera turns faster than a hand can turn it.",
+    "given_focal": "The images contradict the focal length that was given.",
+    "given_centre": "The images contradict the camera's centre that was given.",
+    "given_gravity": "People and ground contradict the gravity that was given.",
+    "given_static": "The camera was said to stand still, but the background moves.",
+    "given_path": "People's sizes contradict the camera's path that was given.",
+    "input_contradicts_itself": "The files that were given contradict each other.",
     "scale_sigma": "All sizes and distances are hardly known.",
     "scale_cues_apart": (
         "People's steps and the ground they stand on disagree about the size of the "

@@ -17,7 +17,7 @@ from bodyslam_jax.diagnostics.statistics import (
     person_statistics,
 )
 from bodyslam_jax.export import figures
-from bodyslam_jax.export.answers import answers
+from bodyslam_jax.export.answers import along_view, answers
 from bodyslam_jax.export.expert_figures import focal_length, lengths, people_table
 from bodyslam_jax.export.folder import plain
 from bodyslam_jax.export.plain_words import in_plain_words
@@ -58,7 +58,7 @@ def write_report(
         _PAGE.format(
             title=html.escape(str(name or "run")),
             style=style,
-            status=_status(str(summary.get("status", "ok"))),
+            status=_status(str(summary.get("status", "ok")), along_view(summary)),
             subtitle=html.escape(_subtitle(result, source)),
             body="\n".join(section for section in sections if section),
         ),
@@ -66,6 +66,8 @@ def write_report(
     )
 
 
+_HARDLY_KNOWN = 0.1
+"""Relative standard deviation of distances that is named beside the status."""
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -90,10 +92,13 @@ _PAGE = """<!doctype html>
 """
 
 
-def _status(status: str) -> str:
-    """The badge beside the title."""
+def _status(status: str, along: float | None) -> str:
+    """The badge beside the title; `along` is the relative standard deviation of
+    distances from the camera."""
     good = status == "ok"
     text = "plausible" if good else html.escape(status)
+    if good and along is not None and along > _HARDLY_KNOWN:
+        text += f", distances ± {100 * along:.0f} %"
     return f'<span class="badge {"good" if good else "bad"}">{text}</span>'
 
 
@@ -300,6 +305,7 @@ def _details(
     scale = summary.get("scale") or {}
     contents = {
         "People": people_table(result, summary, people, body),
+        "What was given, and what is found without it": _given(summary),
         "Scale": lengths(result, scale) + _scale_table(result, scale),
         "Camera intrinsics (px)": focal_length(summary.get("intrinsics") or {})
         + table(["parameter", "value"], lens),
@@ -313,6 +319,22 @@ def _details(
     parts = [folded(title, text) for title, text in contents.items() if text]
     errors = error_tables(summary.get("errors") or {})
     return f"{errors}<section><h2>For experts</h2>{''.join(parts)}</section>"
+
+
+def _given(summary: Mapping[str, Any]) -> str:
+    """Facts that were given, each with the estimate that was made without it."""
+    rows = [
+        [
+            str(fact.get("name", "")).removeprefix("given_").replace("_", " ")
+            + ("" if fact.get("person") is None else f" of person {fact['person']}"),
+            *(fact.get(key) for key in ("unit", "given", "given_sigma")),
+            *(fact.get(key) for key in ("without", "without_sigma")),
+            fact.get("standard_deviations_apart"),
+        ]
+        for fact in summary.get("given") or []
+    ]
+    columns = ["fact", "unit", "given", "±", "without it", "±", "apart, in sigmas"]
+    return table(columns, rows) if rows else ""
 
 
 def _scale_table(result: Result, scale: Mapping[str, Any]) -> str:

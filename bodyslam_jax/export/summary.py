@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.config import Config
+from bodyslam_jax.diagnostics.accuracy import Accuracy, PersonAccuracy
 from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
 from bodyslam_jax.diagnostics.verdict import Verdict
 from bodyslam_jax.geometry.gravity import Upright
@@ -47,8 +48,16 @@ def summarise(
             **_cues(joint.start),
             "ground_factor": verdict.ground_factor,
         },
-        "up": _up(verdict.up),
-        "people": [_person(person) for person in verdict.people],
+        "up": _up(verdict.up, verdict.accuracy),
+        "lengths": _lengths(verdict.accuracy),
+        # What the user gave, and the estimates without it.
+        "given": [fact.to_dict() for fact in verdict.given],
+        "people": [
+            _person(person, known)
+            for person, known in zip(
+                verdict.people, verdict.accuracy.people, strict=True
+            )
+        ],
         # The first and the last.
         "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),
         "counts": {
@@ -115,16 +124,20 @@ def _headline(
     for h, person in enumerate(verdict.people):
         if person.stature is None or person.stature_sigma is None:
             continue
-        lines.append(f"person {h}: {_in_a_line(person)}")
+        sure = verdict.accuracy.people[h]
+        lines.append(f"person {h}: {_in_a_line(person, sure)}")
     if lens["guessed"]:
-        text = f"focal length: guess {lens['guess_px']:.0f} px"
+        origin = "guess" if sequence.intrinsics.is_guess else "given"
+        text = f"focal length: {origin} {lens['guess_px']:.0f} px"
         if (sigma := lens["focal_sigma_px"]) is not None:
             text += f", from the camera's path {lens['focal_px']:.0f} ± {sigma:.0f} px"
+        elif sequence.intrinsics.is_guess:
+            text += f" ± {100 * verdict.accuracy.focal:.0f} %"
         lines.append(text)
     return lines
 
 
-def _in_a_line(person: PersonVerdict) -> str:
+def _in_a_line(person: PersonVerdict, sure: PersonAccuracy) -> str:
     """Way, speed and stature, and whether they can be trusted."""
     if person.status == "not_measurable":
         return (
@@ -134,10 +147,11 @@ def _in_a_line(person: PersonVerdict) -> str:
     sigma = person.stature_sigma
     plus_minus = "" if sigma is None or np.isnan(sigma) else f" ± {100 * sigma:.0f}"
     tall = f"{100 * (person.stature or 0.0):.0f}{plus_minus}"
-    return (
-        f"{person.path.distance:.2f} m at {person.path.mean_speed:.2f} m/s, "
-        f"{tall} cm tall ({person.status})"
-    )
+    way = f"{person.path.distance:.2f} m at {person.path.mean_speed:.2f} m/s"
+    # Of a way whose size is that of all lengths it has been said.
+    if sure.speed > 1.5 * sure.across:
+        way += f" ± {100 * sure.speed:.0f} %"
+    return f"{way}, {tall} cm tall ({person.status})"
 
 
 def _length_error(relative: float, cameras: SfmResult) -> str:
@@ -149,10 +163,20 @@ def _length_error(relative: float, cameras: SfmResult) -> str:
     return f" ± {max(1, 100 * relative):.0f} %"
 
 
-def _up(up: Upright) -> dict[str, float | None]:
+def _lengths(found: Accuracy) -> dict[str, float | None]:
+    """Relative standard deviations of lengths by what they depend on."""
+    known = lambda x: float(x) if np.isfinite(x) else None
+    return {
+        "across_view_sigma": known(found.across),
+        "along_view_sigma": known(found.along),
+        "focal_sigma": known(found.focal),
+    }
+
+
+def _up(up: Upright, found: Accuracy) -> dict[str, float | None]:
     """How sure the vertical is, its angle to trunks and edges, the ground's slope."""
     angles = {
-        "sigma_degrees": up.sigma,
+        "sigma_degrees": found.up,
         "from_trunks_degrees": up.trunks,
         "from_edges_degrees": up.edges,
         "slope_of_ground_degrees": up.ground,
@@ -161,7 +185,7 @@ def _up(up: Upright) -> dict[str, float | None]:
     return {name: degrees(angle) for name, angle in angles.items()}
 
 
-def _person(person: PersonVerdict) -> dict[str, Any]:
+def _person(person: PersonVerdict, sure: PersonAccuracy) -> dict[str, Any]:
     known = lambda x: None if np.isnan(x) else float(x)
     return {
         "status": person.status,
@@ -169,6 +193,9 @@ def _person(person: PersonVerdict) -> dict[str, Any]:
         "frames": person.frames,
         "path_m": person.path.distance,
         "speed_m_s": person.path.mean_speed,
+        "speed_sigma_m_s": known(sure.speed * person.path.mean_speed),
+        "across_view_sigma": known(sure.across),
+        "along_view_sigma": known(sure.along),
         "steps_per_s": person.steps_per_s,
         "stature_m": person.stature,
         "stature_sigma_m": person.stature_sigma,

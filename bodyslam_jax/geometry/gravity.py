@@ -85,6 +85,11 @@ class Upright:
     """Estimated slope of the ground, rad; NaN if no ground plane was found."""
     edges: float = np.nan
     """Angle between `up` and the vertical of edges, rad; NaN without such edges."""
+    unaided: float = np.nan
+    """Angle between gravity that was given and up without it, rad; NaN where none
+    was."""
+    unaided_sigma: float = np.inf
+    """Standard deviation of up without the gravity that was given, as `sigma`."""
 
 
 def find_upright(

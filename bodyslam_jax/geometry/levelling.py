@@ -27,7 +27,8 @@ def level(
     Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
     opposite to `gravity` (in the first camera's axes) if that is measured, else the
     mean direction of people's trunks, or, without people, the first camera's -y.
-    `up` and `normal` of the cues are in the world that is given.
+    `up` and `normal` of the cues are in the world that is given. Where gravity is
+    measured, up is found once more without it, to be compared.
     """
     up = -T_WC[0, :3, 1]
     if gravity:
@@ -51,9 +52,17 @@ def level(
         on_floor,
     )
     whole = upright(rough @ T_WC, found.up) @ rough
-    return whole, dataclasses.replace(
+    found = dataclasses.replace(
         found, up=turn.T @ found.up, normal=turn.T @ found.normal
     )
+    if gravity:
+        rest = (standing, edges, on_floor)
+        _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
+        cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
+        found = dataclasses.replace(
+            found, unaided=float(np.arccos(cosine)), unaided_sigma=unaided.sigma
+        )
+    return whole, found
 
 
 def upright(

@@ -72,13 +72,11 @@ def people_factors(
     weights: GraphWeights,
     body: BodyModel,
     *,
-    shape: Float[np.ndarray, "h 10"] | None = None,
     predicted: Bool[Array, "h t"] | None = None,
 ) -> list[graph.Factor]:
     """Factors of keypoints, poses, shapes, roots and smoothness of `h` people.
 
     Args:
-        shape: measured β, where those in `roots` are informed by a known stature too.
         predicted: frames with a valid prediction of the motion model. Body poses have a
             prior in these only, if it is the prediction (`weights.posture_predicted`).
     """
@@ -128,8 +126,7 @@ def people_factors(
             jnp.asarray(placed), weights.root_correlation**per_frame
         )
         factors.append(_position_factor(roots, placed, rho, weights))
-    measured = roots.shape if shape is None else shape
-    factors.append(_shape_factor(roots.present, measured, weights))
+    factors.append(_shape_factor(roots.present, roots.shape, weights))
     if weights.root_sigma is not None:
         factors.append(
             graph.RootOrientation(

@@ -13,6 +13,7 @@ from bodyslam_jax.io.aspect import aspect_warnings, at_size_of
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import guess_camera, read_camera, with_focal
 from bodyslam_jax.io.camera.path import read_camera_path
+from bodyslam_jax.io.camera.recognise import recognised
 from bodyslam_jax.io.detected import detected_people
 from bodyslam_jax.io.frame_index import Warn, gap_among
 from bodyslam_jax.io.keypoints.associate import associate
@@ -241,6 +242,7 @@ def _intrinsics(
             _check_size(parts, intrinsics, footage)
             if not known.fps:
                 _check_rate(fps, footage, warn)
+        intrinsics = recognised(str(parts.camera), intrinsics, warn)
     elif footage:
         first = footage.path / images[0] if images else None
         size = (footage.width, footage.height)
@@ -253,14 +255,18 @@ def _intrinsics(
     if calibrated is None and known.focal is None and known.fov is None:
         warn(f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px.")
     focal = known.focal_length(intrinsics.width)
-    return intrinsics if focal is None else with_focal(intrinsics, *focal)
+    if focal is None:
+        return intrinsics
+    # Of the principal point the file was asked already, and a guess is in the middle.
+    return recognised("focal", with_focal(intrinsics, *focal), lambda text: None)
 
 
 def _check_size(parts: Parts, intrinsics: Intrinsics, footage: Footage) -> None:
     if (intrinsics.width, intrinsics.height) != (footage.width, footage.height):
         raise InputError(
             f"{parts.camera}: for {intrinsics.width}x{intrinsics.height} px, but "
-            f"{footage.path.name} has {footage.width}x{footage.height} px."
+            f"{footage.path.name} has {footage.width}x{footage.height} px; expected a "
+            "calibration of images of that size, as they are shown."
         )
 
 

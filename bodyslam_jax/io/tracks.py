@@ -12,6 +12,8 @@ from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.types import Tracks
 
 _log = logging.getLogger(__name__)
+_MOST_OUTSIDE = 0.1
+"""Largest share of the points that may be outside the image."""
 _MIN_FINITE = 0.5
 """Share of the observations that must be finite."""
 
@@ -54,8 +56,16 @@ def read_tracks(
             f"{path}: tracks up to frame {frame.max():.0f}, but the video has "
             f"{num_frames} frames."
         )
-    outside = ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
-    if outside > 0.1:
+    beyond = lambda size: ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
+    outside = beyond(size)
+    if outside > _MOST_OUTSIDE and beyond(size[::-1]) < outside / 10:
+        raise InputError(
+            f"the camera file is of {size[0]}x{size[1]} px, but "
+            f"{100 * outside:.0f} % of the points of {path} are outside such an image, "
+            f"and within {size[1]}x{size[0]} px: are its width and height exchanged, "
+            "or the tracks of the image before it was turned?"
+        )
+    if outside > _MOST_OUTSIDE:
         raise InputError(
             f"{path}: {100 * outside:.0f} % of the points outside the image of "
             f"{size[0]}x{size[1]} px: of another video?"

@@ -19,6 +19,11 @@ from bodyslam_jax.people.person_state import PersonState as PersonState
 from bodyslam_jax.people.person_state import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people.person_state import roots_from_bodies as roots_from_bodies
 from bodyslam_jax.people.sides import correct_left_right as correct_left_right
+from bodyslam_jax.people.stature import beyond_reach as beyond_reach
+from bodyslam_jax.people.stature import in_model as in_model
 from bodyslam_jax.people.stature import linear_stature as linear_stature
+from bodyslam_jax.people.stature import stature_range as stature_range
+from bodyslam_jax.people.stature import stature_without as stature_without
 from bodyslam_jax.people.stature import statures_of as statures_of
+from bodyslam_jax.people.stature import with_size_axis as with_size_axis
 from bodyslam_jax.people.stature import with_statures as with_statures

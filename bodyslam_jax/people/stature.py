@@ -13,6 +13,15 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.person_state import PersonState
 
 _UP = 1
+REACH = 3.0
+"""Standard deviations of β within which a model has bodies of people: 99.7 % of those
+it was made from. Beyond, proportions are extrapolated: the default body's legs are 0.48
+of a stature of 1.70 m and 0.40 of one of 1.08 m."""
+SIZE_STEP = 0.01
+"""Relative size of a body for one unit of a size axis. The prior on β (sigma 0.4) then
+holds the size of people of unknown stature to 0.4 %."""
+JOINT_SIGMA = 0.02
+"""m; error of joints at rest that counts as much as one standard deviation of β."""
 
 
 class LinearStature(NamedTuple):
@@ -48,6 +57,37 @@ def statures_of(
     return {h: height for h, height in enumerate(found) if height is not None}
 
 
+def stature_range(body: BodyModel) -> tuple[float, float]:
+    """Statures, m, of shapes of the body's file within `REACH` standard deviations of
+    the mean shape."""
+    linear = linear_stature(body)
+    slope = linear.slope[: 9 if body.sized else 10]
+    way = REACH * float(np.linalg.norm(slope))
+    return linear.template - way, linear.template + way
+
+
+def beyond_reach(body: BodyModel, height: float) -> bool:
+    """Whether no shape of the model within its reach is `height` tall, m."""
+    low, high = stature_range(body)
+    return not low <= height <= high
+
+
+def with_size_axis(body: BodyModel) -> BodyModel:
+    """The model with its last shape component replaced by its size.
+
+    One unit of β₉ is `SIZE_STEP` of the mean shape's size, about the origin of the
+    model, so that a body of any stature keeps the proportions of one within the
+    model's reach: `s (T + S β)` has the shape `(s β₀, ..., s β₈, (s - 1) / SIZE_STEP)`.
+    """
+    sized = lambda dirs, mean: dirs.at[..., -1].set(SIZE_STEP * mean)
+    return dataclasses.replace(
+        body,
+        shape_dirs=sized(body.shape_dirs, body.template),
+        joint_shape_dirs=sized(body.joint_shape_dirs, body.joint_template),
+        sized=True,
+    )
+
+
 def with_statures(
     roots: PersonState,
     statures: Mapping[int, Measured],
@@ -57,16 +97,104 @@ def with_statures(
     """The most probable shapes given the statures, people as large in the image.
 
     β has the standard deviation `shape_sigma` about its estimate in every component, so
-    that β moves along the slope g of the stature by `σ_β² (h̃ - h) / (σ_β² |g|² + σ²)`.
-    Distances from the camera change in the ratio of the statures.
+    that β moves along the slope g of the stature by `V (h̃ - h) / (V + σ²)` in m, with
+    the variance V = σ_β² |g|², or the difference squared where that is more: a fact
+    that contradicts the estimate shows that the estimate is off, not by how much.
+    Under a model with a size axis the body is resized instead where no shape within
+    the model's reach has the stature. Distances from the camera change in the ratio of
+    the statures.
     """
     linear = linear_stature(body)
     shape, T_CH = roots.shape.copy(), roots.T_CH.copy()
+    slope = linear.slope.copy()
+    if body.sized:
+        shape[:, -1] = slope[-1] = 0.0
     for h, measured in statures.items():
-        variance = shape_sigma[h] ** 2
-        before = linear.template + linear.slope @ shape[h]
-        gain = variance / (variance * linear.slope @ linear.slope + measured.sigma**2)
-        shape[h] += gain * (measured.value - before) * linear.slope
-        after = linear.template + linear.slope @ shape[h]
+        before = linear.template + slope @ shape[h]
+        apart = measured.value - before
+        variance = max(shape_sigma[h] ** 2 * float(slope @ slope), apart**2)
+        after = before + variance / (variance + measured.sigma**2) * apart
+        if body.sized and beyond_reach(body, measured.value):
+            shape[h] *= after / before
+            shape[h, -1] = (after / before - 1) / SIZE_STEP
+        else:
+            shape[h] += (after - before) / (slope @ slope) * slope
         T_CH[h, roots.present[h], :3, 3] *= after / before
     return dataclasses.replace(roots, shape=shape, T_CH=T_CH)
+
+
+@dataclasses.dataclass(frozen=True)
+class WithoutStature:
+    """What a person's stature would be had it not been given."""
+
+    value: float
+    """m"""
+    sigma: float
+    """m"""
+
+
+def stature_without(
+    body: BodyModel,
+    given: Measured,
+    shape: Float[np.ndarray, " 10"],
+    covariance: Float[np.ndarray, "10 10"],
+    prior: tuple[Float[np.ndarray, " 10"], float],
+    before: Float[np.ndarray, " 10"],
+    before_sigma: float,
+) -> WithoutStature:
+    """The stature without the one that was given, from the estimate with it.
+
+    The factor of the stature and the move of the shape prior to it are taken out of the
+    posterior of β in information form, which is exact for Gaussian factors and costs no
+    further solve. A size axis is held at 0 then: without a stature nobody is resized.
+
+    Args:
+        shape: β at the optimum, with its marginal `covariance`.
+        prior: mean and standard deviation of the prior on β in the estimate.
+        before: mean of the prior had no stature been given.
+        before_sigma: standard deviation of the stature of `before`, m; where it is more
+            than that of the prior, it is what is reported.
+    """
+    linear, (mean, sigma) = linear_stature(body), prior
+    g = linear.slope
+    weight = sigma**-2.0
+    information = np.linalg.inv(covariance)
+    moment = information @ shape - weight * (mean - before)
+    moment -= g * (given.value - linear.template) / given.sigma**2
+    information -= np.outer(g, g) / given.sigma**2
+    own = slice(0, len(g) - 1) if body.sized else slice(None)
+    g = g[own]
+    free = np.linalg.inv(information[own, own])
+    variance = float(g @ free @ g)
+    # Of an error of `before` along g the estimate keeps the share of the prior in it.
+    more = max(before_sigma**2 - float(g @ g) / weight, 0.0)
+    kept = variance * weight / float(g @ g)
+    return WithoutStature(
+        linear.template + float(g @ free @ moment[own]),
+        float(np.sqrt(variance + more * kept**2)),
+    )
+
+
+def in_model(
+    sized: BodyModel, body: BodyModel, shape: Float[np.ndarray, " 10"]
+) -> Float[np.ndarray, " 10"]:
+    """The shape of `body` that is as tall as `shape` of the model with a size axis, and
+    nearest to its joints at rest.
+
+    Bones' ends are fitted in the least-squares sense, with the stature as a constraint
+    and a standard normal prior on β at an error of `JOINT_SIGMA`.
+    """
+    wanted = np.asarray(sized.joint_template, float) + (
+        np.asarray(sized.joint_shape_dirs, float) @ shape
+    )
+    template = np.asarray(body.joint_template, float)
+    dirs = np.asarray(body.joint_shape_dirs, float)
+    # Relative to the pelvis, which `trans` places.
+    A = (dirs - dirs[:1]).reshape(-1, 10) / JOINT_SIGMA
+    b = ((wanted - wanted[:1]) - (template - template[:1])).ravel() / JOINT_SIGMA
+    of_sized, of_body = linear_stature(sized), linear_stature(body)
+    tall = of_sized.template + of_sized.slope @ shape - of_body.template
+    system = np.zeros((11, 11))
+    system[:10, :10] = A.T @ A + np.eye(10)
+    system[:10, 10] = system[10, :10] = of_body.slope
+    return np.linalg.solve(system, np.append(A.T @ b, tall))[:10]

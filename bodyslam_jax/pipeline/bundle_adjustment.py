@@ -28,6 +28,9 @@ _SAME_FOCAL = 0.005
 triangulated with the former one, are dropped."""
 _ASPECT_SIGMA = 1e-4
 """Sigma of the difference of fx and fy, relative to the focal length."""
+_WIDE_FOCAL, _WIDE_CENTRE = 0.5, 0.2
+"""Standard deviations, relative to the focal length, of priors that only keep a
+self-calibration from diverging."""
 _OUTLIER = 10.0
 """Residuals beyond this many sigmas are outliers."""
 
@@ -42,21 +45,10 @@ def adjust(
         guess: the intrinsics that the focal length's prior is centred on; `None` holds
             all intrinsics constant.
     """
-    nobody = initialisation.no_people(len(cameras.T_WC))
-    state = initialisation.first_state(
-        cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
-    )
-    # A noise that is set for the joint graph is not that of the observations.
-    weights = dataclasses.replace(config.weights, pixel_sigma=None)
-    factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
-    prior = initialisation.revisit_factor(
-        cameras.prior_mean, cameras.prior_information, sigma
-    )
-    if guess is not None and config.structure.focal_sigma > HELD_SIGMA:
-        # Prior means were triangulated with the focal length that is now a variable.
-        prior = dataclasses.replace(prior, whitening=0 * prior.whitening)
-    path = initialisation.path_factors(cameras.path, cameras.path_known)
-    problem = _problem([factor, prior, *path], state, config.structure, guess)
+    state = _first_state(cameras)
+    free = guess is not None and config.structure.focal_sigma > HELD_SIGMA
+    factors = _factors(cameras, sigma, config, free)
+    problem = _problem(factors, state, config.structure, guess)
     solution = solver.solve(problem, state)
     before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
@@ -84,6 +76,65 @@ def adjust(
         pixel_sigma=noise,
         costs=(before, float(solution.cost)),
     )
+
+
+def self_calibrated(
+    cameras: SfmResult, config: Config
+) -> Float[np.ndarray, "3 2"] | None:
+    """fx, cx and cy by the tracks alone, each with its standard deviation, px.
+
+    They are variables about the intrinsics of `cameras`, with a wide prior whose
+    information is taken out of the answer again. `None` where there are no tracks or
+    they determine nothing.
+    """
+    if not cameras.keep.any():
+        return None
+    state, sigma = _first_state(cameras), cameras.pixel_sigma
+    intrinsics = np.asarray(cameras.intrinsics, float)
+    focal, runs = float(intrinsics[0]), config.structure.focal_runs
+    prior = np.full(len(intrinsics), HELD_SIGMA * focal)
+    prior[:2] = _WIDE_FOCAL * focal / np.sqrt(runs)
+    prior[2:4] = _WIDE_CENTRE * focal / np.sqrt(runs)
+    problem = _with_free_intrinsics(
+        _factors(cameras, sigma, config, free=True), state, intrinsics, prior
+    )
+    solution = solver.solve(problem, state)
+    at = [0, 2, 3]
+    covariance = runs * np.asarray(solver.marginals(problem, solution.state).intrinsics)
+    information = np.linalg.inv(covariance[np.ix_(at, at)])
+    moved = np.asarray(solution.state.intrinsics)[at] - intrinsics[at]
+    moment = information @ moved
+    # The prior on fy is another one on fx, to which it is tied.
+    information -= np.diag(np.array([2.0, 1.0, 1.0]) * prior[at] ** -2.0) / runs
+    strength = np.linalg.eigvalsh(information)
+    if not np.isfinite(moment).all() or strength[0] <= 1e-6 * strength[-1]:
+        return None
+    own = np.linalg.inv(information)
+    return np.stack([intrinsics[at] + own @ moment, np.sqrt(np.diag(own))], axis=1)
+
+
+def _first_state(cameras: SfmResult) -> graph.State:
+    nobody = initialisation.no_people(len(cameras.T_WC))
+    return initialisation.first_state(
+        cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
+    )
+
+
+def _factors(
+    cameras: SfmResult, sigma: float, config: Config, free: bool
+) -> list[graph.Factor]:
+    """Factors of cameras and map; `free` if intrinsics are variables."""
+    # A noise that is set for the joint graph is not that of the observations.
+    weights = dataclasses.replace(config.weights, pixel_sigma=None)
+    factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
+    prior = initialisation.revisit_factor(
+        cameras.prior_mean, cameras.prior_information, sigma
+    )
+    if free:
+        # Prior means were triangulated with the focal length that is now a variable.
+        prior = dataclasses.replace(prior, whitening=0 * prior.whitening)
+    path = initialisation.path_factors(cameras.path, cameras.path_known)
+    return [factor, prior, *path]
 
 
 def clipped_sigma(sigma: float) -> float:
@@ -118,6 +169,18 @@ def _problem(
     sigma[:2] = min(error, structure.focal_sigma * focal) / np.sqrt(
         structure.focal_runs
     )
+    return _with_free_intrinsics(factors, state, params, sigma)
+
+
+def _with_free_intrinsics(
+    factors: list[graph.Factor],
+    state: graph.State,
+    params: Float[np.ndarray, " i"],
+    sigma: Float[np.ndarray, " i"],
+) -> graph.Problem:
+    """The problem with intrinsics as variables near `params`, and their aspect ratio
+    held."""
+    focal = float(params[0])
     factors = [
         *factors,
         graph.IntrinsicsPrior(jnp.asarray(params)[None], jnp.asarray(sigma)[None]),

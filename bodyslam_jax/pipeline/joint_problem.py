@@ -35,6 +35,10 @@ log = logging.getLogger(__name__)
 _TRIPODS = ("static", "rotation")
 """Kinds of camera motion that show no map, so that people alone show the floor."""
 
+_REGRESSED_STATURE = 0.07
+"""m: spread of the statures of adults of one sex (NCD-RisC, eLife 2016), which those of
+regressors hardly follow."""
+
 Passengers = dict[int, tuple[float, float]]
 """People whose steps are no measurement of scale, as something carries them: their
 number -> speeds over the ground as `initialisation.carried` returns them, m/s."""
@@ -56,16 +60,21 @@ class Prepared:
     """Lines for the report."""
     passengers: tuple[int, ...] = ()
     """People (rows) whom something carries."""
+    crowd: "StartingPeople | None" = None
+    """The people as they start."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _StartingPeople:
+class StartingPeople:
     """`h` people before the joint problem."""
 
     roots: PersonState
-    """Start values, with known statures applied."""
-    shape: Float[np.ndarray, "h 10"]
-    """SMPL β that the shape prior is centred on."""
+    """Start values, with known statures applied; the shape prior is centred on their
+    β."""
+    unaided: Float[np.ndarray, "h 10"]
+    """SMPL β as fitted or regressed, without known statures."""
+    unaided_sigma: Float[np.ndarray, " h"]
+    """Standard deviation of the statures of these, m."""
     fitted: Bool[np.ndarray, " h"]
     """Whether the bodies were fitted to keypoints, not regressed from images."""
     statures: dict[int, Measured]
@@ -182,7 +191,15 @@ def prepare(
         problem = dataclasses.replace(problem, motion=None)
     warnings = initialisation.lines_of_carried(passengers)
     return Prepared(
-        problem, state, start, roots, moving, stages, warnings, tuple(passengers)
+        problem,
+        state,
+        start,
+        roots,
+        moving,
+        stages,
+        warnings,
+        tuple(passengers),
+        crowd,
     )
 
 
@@ -215,20 +232,30 @@ def _starting_people(
     bodies: Bodies,
     body: BodyModel,
     config: Config,
-) -> _StartingPeople:
+) -> StartingPeople:
     bodies = dataclasses.replace(bodies, present=bodies.present & cameras.within)
     roots = people.roots_from_bodies(bodies, body)
     fitted = people.without_bodies(sequence)
     numbers = config.person or range(len(roots.present))
     statures = people.statures_of(config.heights(), list(dict.fromkeys(numbers)))
-    shape = roots.shape
-    if statures:
-        unsure = np.where(fitted, 1.0, config.weights.shape_sigma)
-        roots = people.with_statures(roots, statures, body, unsure)
-        # The prior of a fitted shape has a sigma that is smaller than its uncertainty
-        # (`diagnostics.scale_uncertainty`), so it must not pull away from the stature.
-        shape = np.where(fitted[:, None], roots.shape, shape)
-    return _StartingPeople(roots, shape, fitted, statures)
+    unaided = roots.shape.copy()
+    if body.sized:
+        unaided[:, -1] = 0.0
+    regressed = sequence.bodies is not None and sequence.bodies.shapes_regressed
+    per_unit = float(np.linalg.norm(people.linear_stature(body).slope))
+    # The prior of a fitted shape has a sigma that is smaller than its uncertainty
+    # (`diagnostics.scale_uncertainty`), and that of a regressed one is of its noise,
+    # not of its bias.
+    unsure = np.where(
+        fitted,
+        1.0,
+        np.maximum(
+            config.weights.shape_sigma,
+            _REGRESSED_STATURE / per_unit if regressed else 0.0,
+        ),
+    )
+    roots = people.with_statures(roots, statures, body, unsure)
+    return StartingPeople(roots, unaided, unsure * per_unit, fitted, statures)
 
 
 def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
@@ -249,7 +276,7 @@ def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
 def _people_factors(
     sequence: Sequence,
     cameras: SfmResult,
-    crowd: _StartingPeople,
+    crowd: StartingPeople,
     state: graph.State,
     prediction: motion.Prediction,
     body: BodyModel,
@@ -260,7 +287,7 @@ def _people_factors(
     weights, roots = config.weights, crowd.roots
     predicted = prediction.valid if weights.posture_predicted else None
     factors = initialisation.people_factors(
-        sequence, roots, weights, body, shape=crowd.shape, predicted=predicted
+        sequence, roots, weights, body, predicted=predicted
     )
     if crowd.statures:
         factors.append(
@@ -310,7 +337,7 @@ def _motion_factors(
 def _start_of_scale(
     sequence: Sequence,
     cameras: SfmResult,
-    crowd: _StartingPeople,
+    crowd: StartingPeople,
     state: graph.State,
     prediction: motion.Prediction,
     contact: graph.GroundContact | None,

@@ -34,6 +34,8 @@ class Uncertainty:
     shape_covariance: Float[np.ndarray, "h 10 10"]
     unobserved: tuple[str, ...] = ()
     """Quantities that the measurements do not determine, a line each."""
+    statures: Float[np.ndarray, "h 4"] | None = None
+    """As in `JointEstimate`."""
 
 
 def estimate(
@@ -97,6 +99,7 @@ def of_state(
         start=prepared.scale,
         scale_sigma=uncertainty.scale_sigma,
         shape_covariance=uncertainty.shape_covariance,
+        statures=uncertainty.statures,
         unobserved=(
             *prepared.warnings,
             *(f"not well determined: {line}" for line in uncertainty.unobserved),
@@ -131,6 +134,7 @@ def estimate_uncertainty(
     marginals = solver.marginals(prepared.problem, best)
     unobserved = solver.observability(prepared.problem, best, marginals)
     variance, shapes = marginals.scale, marginals.shapes
+    statures = _statures(prepared, best, np.asarray(shapes), body, config)
     fitted = people.without_bodies(sequence)
     anywhere = np.any(prepared.roots.present, axis=1)
     if len(anywhere) and (fitted & anywhere).any():
@@ -142,7 +146,39 @@ def estimate_uncertainty(
     scale_sigma = covariance_sigma(
         float(variance), moving=prepared.moving, metric=bool(metric)
     )
-    return Uncertainty(scale_sigma, np.asarray(shapes), tuple(unobserved))
+    return Uncertainty(scale_sigma, np.asarray(shapes), tuple(unobserved), statures)
+
+
+def _statures(
+    prepared: Prepared,
+    best: graph.State,
+    covariance: Float[np.ndarray, "h 10 10"],
+    body: BodyModel,
+    config: Config,
+) -> Float[np.ndarray, "h 4"] | None:
+    """Given statures and those without them, with their sigma; NaN for people whose
+    stature was not given."""
+    crowd = prepared.crowd
+    if crowd is None or not crowd.statures:
+        return None
+    found = np.full((len(covariance), 4), np.nan)
+    for h, given in crowd.statures.items():
+        present = crowd.roots.present[h]
+        if not present.any():
+            continue
+        times = present.sum() if config.weights.shape_each_frame else 1
+        sigma = config.weights.shape_sigma / float(times) ** 0.5
+        without = people.stature_without(
+            body,
+            given,
+            np.asarray(best.shapes[h], float),
+            np.asarray(covariance[h], float),
+            (crowd.roots.shape[h], sigma),
+            crowd.unaided[h],
+            float(crowd.unaided_sigma[h]),
+        )
+        found[h] = *given, without.value, without.sigma
+    return found
 
 
 def empty_estimate(cameras: SfmResult) -> JointEstimate:

@@ -5,8 +5,10 @@ Each stage's result is kept in a `Cache` under a fingerprint of all that it depe
 
 import dataclasses
 
+import numpy as np
+
 from bodyslam_jax import diagnostics, motion, people, sfm
-from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax.body import BodyModel, load_body_model, rest_joints
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
@@ -65,6 +67,7 @@ def run_stages(
     everybody = sequence
     sequence = people.select_people(sequence, config.person)
     refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+    files_body, body = body, _body_that_reaches(body, config)
     edges = None
     if cameras.kind != "moving":  # They show how the floor lies.
         with watch("edges"):
@@ -80,7 +83,28 @@ def run_stages(
         with watch("edges"):
             edges = find_edges(everybody, cameras, joint, cache)
     result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
-    return result, cameras, refined
+    return _with_shapes_of(files_body, body, result), cameras, refined
+
+
+def _body_that_reaches(body: BodyModel, config: Config) -> BodyModel:
+    """The body model, with a size axis where a given stature is beyond its shapes."""
+    heights = (height.value for height in config.heights().values())
+    beyond = any(people.beyond_reach(body, height) for height in heights)
+    return people.with_size_axis(body) if beyond else body
+
+
+def _with_shapes_of(body: BodyModel, used: BodyModel, result: Result) -> Result:
+    """The result with the shapes of the body model itself, which other programs have,
+    where the estimate used a size axis; joints are those of the estimate."""
+    if not used.sized:
+        return result
+    betas = [people.in_model(used, body, shape) for shape in result.betas]
+    betas = np.stack(betas) if betas else result.betas
+    pelvis = [np.asarray(rest_joints(used, shape))[0] for shape in result.betas]
+    of_body = [np.asarray(rest_joints(body, shape))[0] for shape in betas]
+    move = np.reshape(pelvis, (-1, 3)) - np.reshape(of_body, (-1, 3))
+    trans = result.trans + move[:, None]
+    return dataclasses.replace(result, betas=betas, trans=trans)
 
 
 def before_joint(
@@ -138,7 +162,7 @@ def assemble(
     edges in the images, for gravity.
     """
     result, up = to_metric(sequence, config, body, cameras, joint, edges)
-    verdict = diagnostics.assess(sequence, body, cameras, joint, result, up)
+    verdict = diagnostics.assess(sequence, body, cameras, joint, result, up, config)
     summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
     return dataclasses.replace(result, summary=summary, joint_sigma=verdict.joint_sigma)
 

@@ -17,6 +17,7 @@ from bodyslam_jax.pipeline.bundle_adjustment import (
     HELD_SIGMA,
     adjust,
     clipped_sigma,
+    self_calibrated,
 )
 from bodyslam_jax.types import Intrinsics, Sequence, SfmResult, Tracks
 
@@ -83,6 +84,9 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
     moved = sfm.second_motion_warning(model.tracks, model.found, model.intrinsics)
     if moved is not None:
         warnings = (*warnings, moved)
+    if config.static_camera:
+        wander = sfm.background_motion(model.tracks, model.intrinsics)
+        cameras = dataclasses.replace(cameras, wander=wander)
     return dataclasses.replace(cameras, warnings=warnings, zoom=model.zoom)
 
 
@@ -98,6 +102,9 @@ def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> Sfm
         cameras = adjust(cameras, 1.0, config, None)
     if cameras.kind != "moving":
         return cameras
+    if not guess.is_guess:
+        found_by_tracks = self_calibrated(cameras, config)
+        cameras = dataclasses.replace(cameras, from_tracks=found_by_tracks)
     # Only now, because whole tracks determine path and focal length better.
     return _split_tracks(cameras, config.structure.landmark_span)
 

@@ -4,6 +4,7 @@ from bodyslam_jax.sfm.burnt_in import burnt_in_warning as burnt_in_warning
 from bodyslam_jax.sfm.burnt_in import without_burnt_in as without_burnt_in
 from bodyslam_jax.sfm.camera_model import CameraModel as CameraModel
 from bodyslam_jax.sfm.camera_model import find_camera_model as find_camera_model
+from bodyslam_jax.sfm.camera_motion import background_motion as background_motion
 from bodyslam_jax.sfm.features import brisk_status as brisk_status
 from bodyslam_jax.sfm.moving_points import (
     second_motion_warning as second_motion_warning,

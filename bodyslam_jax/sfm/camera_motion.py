@@ -4,8 +4,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry.triangulation import unit_rays
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Views
 from bodyslam_jax.sfm.multiview import fit_rotation
+from bodyslam_jax.types import Intrinsics, Tracks
 
 _FOLLOWED = 0.05
 """Share of the points that remain tracked over a frame of quick motion."""
@@ -99,6 +101,16 @@ def stillness(views: Views, window: int = 10) -> float:
         medians = np.array([np.median(part, axis=0) for part in parts])
         wander.append(np.linalg.norm(medians - medians[0], axis=-1).max())
     return float(np.median(wander)) if wander else np.inf
+
+
+def background_motion(tracks: Tracks, intrinsics: Intrinsics) -> float:
+    """How far the points of the tracks move, px (`stillness`); NaN without any."""
+    if not len(tracks.frame):
+        return float("nan")
+    K, distortion = as_opencv(intrinsics.params)
+    xy = rays(tracks.uv, K, distortion)
+    still = stillness(Views(tracks.frame, tracks.landmark, xy))
+    return float(still * np.sqrt(K[0, 0] * K[1, 1]))
 
 
 def rotation_error(

@@ -1,5 +1,6 @@
 """The consequence of an accepted explanation: undone, a warning, or a refusal."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +18,9 @@ from bodyslam_jax.types import Sequence
 
 _TOO_FAR = 1.6
 """Largest factor by which a regressor may misjudge all depths."""
+_OFF_CENTRE = 0.1
+"""Distance of a principal point from the middle, of the image's longer side, that no
+camera has whose images were not cropped."""
 _ASIDE = 0.2
 """Largest common shift by a regressor, in sizes of a person."""
 
@@ -95,7 +99,17 @@ def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence
             f"of the image, not ({cx:.0f}, {cy:.0f}): moved accordingly ({figures})."
         )
         move = lambda p: p + p[:, 2:] * np.array([*(to_middle / [fx, fy]), 0.0])
-        return with_bodies_moved(sequence, body, move)
+        moved = with_bodies_moved(sequence, body, move)
+        if np.linalg.norm(to_middle) < _OFF_CENTRE * max(camera.width, camera.height):
+            return moved
+        text = (
+            f"the camera file has its principal point at ({cx:.0f}, {cy:.0f}) px, "
+            f"{np.linalg.norm(to_middle):.0f} px from the middle of the image; bodies "
+            "and keypoints together say that it is the middle. Unless the video was "
+            "cropped and the bodies' tool did not know, the file is wrong."
+        )
+        contradictions = (*sequence.contradictions, text)
+        return dataclasses.replace(moved, contradictions=contradictions)
     if found.kind == "crop" and np.linalg.norm(shift) < _ASIDE * size:
         warn(
             f"keypoints lie ({shift[0]:.0f}, {shift[1]:.0f}) px from the bodies in all "

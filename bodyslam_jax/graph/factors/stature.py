@@ -4,7 +4,8 @@
 
 In m. The height of the mesh at rest, between the vertices that are highest and lowest
 in the mean shape, is linear in β (`people/stature.py`). `h̃` and `σ` are what the user
-states (`--height`). Ours.
+states (`--height`). The shape prior is centred on a shape of that stature
+(`people.with_statures`): far from the mean it would pull away from the fact. Ours.
 """
 
 import jax.numpy as jnp

@@ -1,0 +1,142 @@
+"""How well each kind of length is known, by what it depends on.
+
+The size of people gives the size of everything (`sizes`). Lengths across the view at
+their distance follow from it alone; their distance from the camera, and motion along
+the view, are proportional to the focal length too. A slope in depth is seen through the
+focal length as well: up, where the camera looks down by the angle θ, is off by
+δf / f · sin θ cos θ.
+"""
+
+import dataclasses
+from collections.abc import Sequence as Many
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.config import Structure
+from bodyslam_jax.diagnostics.statistics import smoothed
+from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.types import Result, Sequence, SfmResult
+
+_TOLD_APART = 0.05
+"""Relative standard deviation of the focal length from which it is named: below, it is
+no more than that of the size of people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonAccuracy:
+    """Relative standard deviations of a person's lengths; NaN where unknown."""
+
+    across: float
+    """Of stature and motion across the view."""
+    along: float
+    """Of the distance from the camera and of motion along the view."""
+    speed: float
+    """Of way and speed over the ground, by their direction."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Accuracy:
+    """What the lengths of a result depend on, and how well each is known."""
+
+    focal: float
+    """Relative standard deviation of the focal length; 0 of a calibration."""
+    up: float
+    """Standard deviation of up, rad."""
+    people: tuple[PersonAccuracy, ...]
+
+    @property
+    def across(self) -> float:
+        """Of lengths across the view, by the person who is known best."""
+        return min((p.across for p in self.people if p.across > 0), default=np.nan)
+
+    @property
+    def along(self) -> float:
+        """Of distances from the camera, by the person who is known best."""
+        return min((p.along for p in self.people if p.along > 0), default=np.nan)
+
+
+def accuracy(
+    sequence: Sequence,
+    cameras: SfmResult,
+    result: Result,
+    up: Upright,
+    sizes: Many[float],
+    structure: Structure,
+) -> Accuracy:
+    """How well the lengths of a result are known.
+
+    Args:
+        sizes: relative standard deviation of the size of each person.
+    """
+    focal = focal_uncertainty(sequence, cameras, structure)
+    people, downwards = [], [0.0]
+    for h, size in enumerate(sizes):
+        share, down = _view(result, h)
+        downwards.append(abs(np.sin(down) * np.cos(down)))
+        along = float(np.hypot(size, focal))
+        speed = float(np.hypot(size, share * focal))
+        people.append(PersonAccuracy(float(size), along, speed))
+    return Accuracy(
+        focal=focal,
+        up=float(np.hypot(up.sigma, focal * max(downwards))),
+        people=tuple(people),
+    )
+
+
+def focal_uncertainty(
+    sequence: Sequence, cameras: SfmResult, structure: Structure
+) -> float:
+    """Relative standard deviation of the focal length that the result has; 0 of a
+    calibration."""
+    lens = sequence.intrinsics
+    if not lens.is_refined:
+        return 0.0
+    if np.isfinite(cameras.focal_sigma):
+        return cameras.focal_sigma / cameras.focal
+    if lens.focal_sigma is not None:
+        return float(lens.focal_sigma / lens.params[0])
+    return structure.focal_sigma
+
+
+def guess_warning(sequence: Sequence, cameras: SfmResult, found: Accuracy) -> list[str]:
+    """A line on what a focal length that is a guess makes uncertain, if anybody is
+    there to be at a distance."""
+    if not found.people or not found.focal > _TOLD_APART:
+        return []
+    lens = sequence.intrinsics
+    origin = "as given" if not lens.is_guess else "guessed"
+    if np.isfinite(cameras.focal_sigma):
+        origin = "estimated from the camera's path"
+    across = _percent(found.across)
+    return [
+        f"the focal length is {origin}, {cameras.focal:.0f} px "
+        f"± {_percent(found.focal)}: distances from the camera and motion along the "
+        f"view (± {_percent(found.along)}) and up (± {np.degrees(found.up):.1f} "
+        f"degrees) follow from it; lengths across the view do not (± {across}). Give "
+        "--focal, --fov or --camera."
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "unknown"
+
+
+def _view(result: Result, person: int) -> tuple[float, float]:
+    """Share of a person's squared motion over the ground that is along the view, and
+    the angle by which the camera looks down at the person, rad."""
+    share = total = 0.0
+    gaze: list[Float[np.ndarray, "n 3"]] = []
+    for run in runs(result.present[person]):
+        to = result.joints[person, run, 0] - result.T_WC[run, :3, 3]
+        to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
+        gaze.append(to)
+        steps = np.diff(smoothed(result.joints[person, run, 0], result.fps), axis=0)
+        steps[:, 1] = 0.0
+        share += float(((steps * to[1:]).sum(axis=1) ** 2).sum())
+        total += float((steps**2).sum())
+    if not gaze:
+        return 0.0, 0.0
+    down = float(-np.arcsin(np.clip(np.concatenate(gaze)[:, 1].mean(), -1, 1)))
+    return share / total if total > 0 else 0.0, down
