@@ -39,14 +39,14 @@ def estimate(job) -> dict:
 
     seconds, _, word = job.source.path.read_text().partition(" ")
     with export.locked(job.out):
-        _note(job.out.parent / "log", f"begun {job.name} {os.getpid()}")
+        _note(job.batch / "log", f"begun {job.name} {os.getpid()}")
         time.sleep(float(seconds))
         if word == "kill" and not (job.out / "tried").exists():
             (job.out / "tried").touch()
             os.kill(os.getpid(), signal.SIGKILL)
         summary = {"status": "ok", "reasons": [], "filling": "x" * 20_000}
         atomic.write_text(job.out / "summary.json", json.dumps(summary))
-        _note(job.out.parent / "log", f"done {job.name} {os.getpid()}")
+        _note(job.batch / "log", f"done {job.name} {os.getpid()}")
     return summary
 
 

@@ -47,7 +47,7 @@ def estimate(job) -> dict:
         raise ValueError(f"{job.source.path}: no frames in it.")
     if content == "slow":
         time.sleep(0.5)
-    _append(job.out.parent / "log", job.name)
+    _append(job.batch / "log", job.name)
     summary = {"status": "doubtful" if content == "doubtful" else "ok", "reasons": []}
     if content == "doubtful":
         summary["reasons"] = [{"message": "feet slide."}]

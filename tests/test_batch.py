@@ -1,7 +1,9 @@
 """A batch: what is run, what is left out, what is said of failures."""
 
 import csv
+import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -69,7 +71,7 @@ def test_a_batch_runs_every_clip_and_lists_failures(clips, tmp_path):
     (line,) = failures.read(out)
     assert line["name"] == "b" and line["message"].endswith("b.mp4: no frames in it.")
     assert "Traceback" in (out / line["log"]).read_text()
-    assert not (out / "b").exists()
+    assert not (out / "runs" / "b").exists()
 
 
 def test_only_what_changed_is_run_again(clips, tmp_path):
@@ -91,10 +93,166 @@ def test_only_what_changed_is_run_again(clips, tmp_path):
     found, ran = run(clips, out, Config(fps=25.0))
     assert ran == ["a", "b", "c", "d"] and not found["a"].was_finished
     # A run that is not as the batch left it.
-    (out / "a" / "summary.json").write_text("{}")
+    (out / "runs" / "a" / "summary.json").write_text("{}")
     assert run(clips, out, Config(fps=25.0))[1] == ["a"]
     # Another version of the package.
     assert run(clips, out, Config(fps=25.0))[1] == []
+
+
+BATCH_FILES = ("failed.jsonl", "batch.json", "table.csv", "table.md", "index.html")
+BATCH_FILES += ("plots.png", "logs", "thumbnails", "runs", "table.tex", "a.mp4")
+
+
+def test_clips_may_have_the_names_of_the_files_of_a_batch(clips, tmp_path, command):
+    out = tmp_path / "out"
+    lines = [f"{name},{clips / 'a.mp4'}" for name in BATCH_FILES]
+    (tmp_path / "clips.csv").write_text("\n".join(["name,video", *lines]))
+    found, _ = run(tmp_path / "clips.csv", out)
+    assert {one.status for one in found.values()} == {"ok"}
+    assert run(tmp_path / "clips.csv", out)[1] == []
+    code, text = command("collect", out)
+    assert code == 0, text
+    with (out / "table.csv").open() as file:
+        assert {row["clip"] for row in csv.DictReader(file)} == set(BATCH_FILES)
+    assert (out / "runs" / "table.csv" / "summary.json").is_file()
+    assert run(tmp_path / "clips.csv", out)[1] == []
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "", ".x", "a\n", "x" * 200])
+def test_names_that_lead_out_of_the_batch_are_refused(clips, tmp_path, name):
+    one = batch.Input(name, clips / "a.mp4")
+    with pytest.raises(ValueError, match="name: "):
+        run([one], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_batch_of_before_is_continued(clips, tmp_path):
+    """Its run folders were beside its own files."""
+    out = tmp_path / "out"
+    run(clips, out)
+    for name in ("a", "c", "d"):
+        (out / "runs" / name).rename(out / name)
+    (out / "runs").rmdir()
+    batch.collect(out)
+    with (out / "table.csv").open() as file:
+        rows = {row["clip"]: row["status"] for row in csv.DictReader(file)}
+    assert rows == {"a": "ok", "b": "error", "c": "doubtful", "d": "ok"}
+    assert run(clips, out)[1] == ["b"]
+    assert (out / "runs" / "a").is_dir() and not (out / "a").exists()
+
+
+DAMAGE = {
+    "empty": b"",
+    "not JSON": b"{",
+    "not text": b"\xff\xfe\xfd",
+    "deep": b"[" * 100_000,
+    "long number": b'{"status": ' + b"9" * 5000 + b"}",
+    "list": b"[1, 2]",
+    "number": b"3",
+    "wrong types": b'{"status": {}, "message": [], "source": 1, "settings": [[]]}',
+    "people of no kind": b'{"status": "ok", "people": [3]}',
+    "frames of no kind": b'{"status": "ok", "input": {"frames": [], "fps": {}}}',
+    "huge": b'{"status": "ok", "input": {"frames": 1e308, "fps": 1e-308}}',
+    "reasons of no kind": b'{"status": "ok", "reasons": {"a": 1}}',
+    "durations of no kind": b'{"status": "ok", "durations_s": {"a": "b"}}',
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_record_stops_no_other_clip(clips, tmp_path, damage, caplog, command):
+    out = tmp_path / "out"
+    run(clips, out)
+    content, record = DAMAGE[damage], out / "runs" / "a" / ".job.json"
+    record.write_bytes(content)
+    assert run(clips, out)[1] == ["a", "b"]
+    # A record that fits its summary, and is none otherwise.
+    summary = out / "runs" / "a" / "summary.json"
+    mark = hashlib.sha256(summary.read_bytes()).hexdigest()[:16]
+    record.write_text(json.dumps({"summary": mark, "status": ["ok"]}))
+    assert run(clips, out)[1] == ["a", "b"]
+    summary.write_bytes(content)
+    (out / "failed.jsonl").write_bytes(content + b"\n")
+    (out / "batch.json").write_bytes(content)
+    caplog.clear()
+    code, text = command("collect", out)
+    assert code == 0, text
+    with (out / "table.csv").open() as file:
+        rows = {row["clip"]: row["status"] for row in csv.DictReader(file)}
+    assert rows == {"c": "doubtful", "d": "ok"}
+    assert any(str(summary) in line for line in caplog.messages), caplog.messages
+    assert all("\n" not in line for line in caplog.messages)
+    assert run(clips, out)[1] == ["a", "b"]
+
+
+def test_what_is_no_file_is_no_record(clips, tmp_path):
+    out = tmp_path / "out"
+    run(clips, out)
+    (out / "runs" / "p").mkdir()
+    os.mkfifo(out / "runs" / "p" / "summary.json")
+    (out / "runs" / "q" / "summary.json").mkdir(parents=True)
+    (out / "runs" / "d" / "overlay.webm").write_bytes(b"no film")
+    assert len(batch.collect(out)) == 5
+    (out / "runs" / "a" / "summary.json").unlink()
+    os.mkfifo(out / "runs" / "a" / "summary.json")
+    assert run(clips, out)[1] == ["a", "b"]
+
+
+NAMES = ("=1+1", "@SUM(1+1)*cmd", "-2+3+cmd|' -C calc'!A0", "+1+2", "\t=1", "\r=1")
+NAMES += ("<img src=x onerror=alert(1)>", "a|b", "x\ny", "[a](https://x.example)")
+NAMES += ("`a`", "<!--ROWS-->", "\uff1d1+1", " =1", "$x$", "[5mm]", "https://x.example")
+
+
+def test_text_of_others_is_text_in_every_table(tmp_path):
+    for name in NAMES:
+        folder = tmp_path / name.replace("/", "_")
+        folder.mkdir()
+        summary = _summary("=1+1", name) | {"camera_motion": name}
+        summary["reasons"] = [{"message": name}]
+        (folder / "summary.json").write_text(json.dumps(summary))
+    batch.collect(tmp_path)
+    with (tmp_path / "table.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    assert len(rows) == len(NAMES) + 1 and {len(row) for row in rows} == {len(rows[0])}
+    cells = [cell for row in rows for cell in row]
+    assert not [c for c in cells if c.strip()[:1] in "=+-@\uff1d" and c.strip()]
+    assert "'=1+1" in cells and "2.0" in cells
+    markdown = (tmp_path / "table.md").read_text()
+    assert len(markdown.splitlines()) == len(NAMES) + 3  # head, rule, median
+    plain = markdown.replace("\\\\", "").replace("\\|", "").replace("\\`", "")
+    plain = plain.replace("\\[", "").replace("\\]", "")
+    assert len({line.count("|") for line in plain.splitlines()}) == 1
+    assert not set("<`[]") & set(plain) and "https://" not in plain
+    page = (tmp_path / "index.html").read_text()
+    assert "<img src=x" not in page and page.count("<tbody") == 1
+    latex = (tmp_path / "table.tex").read_text()
+    rows = latex.split("\\midrule\n")[1].splitlines()
+    assert len(rows) == len(NAMES) and not [r for r in rows if r.startswith(("[", "*"))]
+
+
+def test_a_run_folder_of_the_name_of_a_table_is_named(finished, command):
+    (finished / "table.csv").mkdir()
+    code, text = command("collect", finished)
+    assert code == 1 and "table.csv: a folder of the name" in text
+
+
+def test_rows_of_a_sweep_that_are_none_are_solved_again(clips, tmp_path):
+    out, inputs = tmp_path / "sweep", [clips / "a.mp4"]
+    axes = grid.parse_axes(["weights.human_motion=10,100", "scale=1,2"])
+    given = inputs, axes, Config(), out
+    batch.sweep(*given, Rows(), batch_stubs.nothing)
+    (kept,) = (out / "rows").iterdir()
+    rows = json.loads(kept.read_text())
+    harm = [b"[" * 10_000, b"{}", b"[]", json.dumps(rows[:1]).encode(), b""]
+    harm += [json.dumps([rows[0] | {"cost": {}}, *rows[1:]]).encode()]
+    harm += [json.dumps([rows[0] | {"name": "x"}, *rows[1:]]).encode()]
+    for content in harm:
+        kept.write_bytes(content)
+        engine = Rows()
+        batch.sweep(*given, engine, batch_stubs.nothing)
+        assert len(engine.labels) == 1 and json.loads(kept.read_text()) == rows
+    engine = Rows()
+    batch.sweep(*given, engine, batch_stubs.nothing)
+    assert not engine.labels
 
 
 def test_another_version_of_the_package_runs_all_again(clips, tmp_path, monkeypatch):

@@ -110,7 +110,6 @@ MISTAKES = {
         "2: name: 'x/y', expected letters, digits",
     ),
     "hidden name": (".x,a.mp4,,,,,,", "2: name: '.x', expected letters, digits"),
-    "reserved name": ("logs,a.mp4,,,,,,", "2: name: 'logs' is the name of another"),
     "long name": (f"{'x' * 300},a.mp4,,,,,,", "2: name: 300 letters, expected at most"),
     "name twice": ("A,a.mp4,,,,,,\na,b.MOV,,,,,,", "3: name: 'a' is that of line 2."),
     "quote that stays open": (',"a.mp4,,,,,,', ":2: not CSV (unexpected end of data)"),

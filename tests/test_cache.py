@@ -1,6 +1,11 @@
 import dataclasses
+import os
+import shutil
+import tracemalloc
+import zipfile
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -46,6 +51,132 @@ def test_a_damaged_stage_is_computed_again(tmp_path, caplog):
     (tmp_path / "tracks-a.npz").write_bytes(b"PK\x03\x04 cut short")
     found = cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
     assert found.uv.shape == (2, 2) and "computed again" in caplog.text
+
+
+def _rewrite(path: Path, **arrays) -> None:
+    """Replaces members of a stage file, as a tool that knows archives would."""
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files}
+    np.savez(path, **(kept | arrays))
+
+
+HARM = {
+    "not finite": {".uv": np.full((2, 2), np.nan)},
+    "another shape": {".uv": np.zeros((2, 3))},
+    "another length": {".frame": np.zeros(3, np.int64)},
+    "another type": {".frame": np.array(["a", "b"])},
+    "another value": {".uv": np.ones((2, 2))},
+    "more": {"more": np.zeros(3)},
+    "no header": {"__header__": np.zeros(4, np.uint8)},
+    "deep header": {"__header__": np.frombuffer(b"[" * 100_000, np.uint8)},
+    "header of a list": {"__header__": np.frombuffer(b"[1]", np.uint8)},
+    "no hash": {"__sha256__": np.zeros(0, np.uint8)},
+}
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_a_stage_that_is_not_as_written_is_computed_again(tmp_path, caplog, harm):
+    cache, path = Cache(tmp_path), tmp_path / "tracks-a.npz"
+    cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    _rewrite(path, **HARM[harm])
+    found = cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    np.testing.assert_array_equal(found.uv, _sequence().tracks.uv)
+    (line,) = caplog.messages
+    assert str(path) in line and "computed again" in line and "\n" not in line
+    assert load(path, Tracks, sealed=True).uv.shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"uv": np.full((2, 2), np.inf)},
+        {"uv": np.zeros((2, 3))},
+        {"uv": np.zeros((2, 2), complex)},
+        {"frame": np.zeros(2)},
+        {"frame": np.zeros(1, int)},
+        {"landmark": None},
+        {"landmark": "text"},
+        {"warnings": (1,)},
+        {"warnings": "text"},
+    ],
+)
+def test_a_stage_of_values_that_a_field_cannot_have_is_no_stage(tmp_path, change):
+    """Also if the file is sealed."""
+    kept = vars(_sequence().tracks) | change
+    save(tmp_path / "x.npz", dataclasses.make_dataclass("Tracks", kept)(**kept))
+    # Under the tests' type checker the constructor may be the one that complains.
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError)):
+        load(tmp_path / "x.npz", Tracks)
+
+
+def _bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("__header__.npy", bytes(1 << 24))
+
+
+def _huge(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 99), }"
+        text = header.encode().ljust(118) + b"\n"
+        archive.writestr(".uv.npy", b"\x93NUMPY\x01\x00\x77\x00" + text)
+
+
+def _unfinished_header(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(".uv.npy", b"\x93NUMPY\x01\x00\x05\x00{'a((")
+
+
+FILES = {
+    "a folder": lambda path: (path / "x").mkdir(parents=True),
+    "a pipe": lambda path: os.mkfifo(path),
+    "empty": lambda path: path.write_bytes(b""),
+    "compressed": _bomb,
+    "larger than its file": _huge,
+    "half a header": _unfinished_header,
+    "an .npy": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00v\x00{"),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_what_is_no_stage_is_computed_again_at_no_cost(tmp_path, caplog, kind):
+    path = tmp_path / "tracks-a.npz"
+    FILES[kind](path)
+    tracemalloc.start()
+    try:
+        found = Cache(tmp_path).stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+    assert found.uv.shape == (2, 2) and "computed again" in caplog.text
+    assert load(path, Tracks).uv.shape == (2, 2)
+
+
+@pytest.mark.parametrize("error", [RecursionError, MemoryError, NotImplementedError])
+def test_no_error_in_reading_a_stage_ends_a_run(tmp_path, monkeypatch, error):
+    def fail(*args, **more):
+        raise error
+
+    cache = Cache(tmp_path)
+    cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    monkeypatch.setattr(stage_cache, "load", fail)
+    found = cache.stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+    assert found.uv.shape == (2, 2)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "[]", "\udcff", "1" * 5000, ""])
+def test_a_damaged_description_of_the_input_is_none(tmp_path, content):
+    (tmp_path / "source.json").write_bytes(content.encode(errors="surrogateescape"))
+    assert Cache(tmp_path).owner() in (None, {})
+
+
+def test_stages_that_escaped_before_are_computed_again(tmp_path):
+    files = Path(__file__).parents[2] / "shared" / "cases" / "files"
+    if not files.is_dir():
+        pytest.skip("needs shared files")
+    for file in files.glob("stage_cache_escape_*.npz"):
+        shutil.copy(file, tmp_path / "tracks-a.npz")
+        found = Cache(tmp_path).stage("tracks", "a", Tracks, lambda: _sequence().tracks)
+        assert found.uv.shape == (2, 2)
 
 
 @pytest.mark.parametrize("names", ["frame", "frame landmark uv more"])

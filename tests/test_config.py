@@ -1,6 +1,7 @@
 """Settings that mean nothing are refused where they are made."""
 
 import dataclasses
+import pickle
 
 import jax.numpy as jnp
 import pytest
@@ -15,6 +16,7 @@ from bodyslam_jax.config import (
     Structure,
     Tracking,
 )
+from bodyslam_jax.config.errors import InputError
 
 NAN, INF = float("nan"), float("inf")
 
@@ -92,3 +94,13 @@ def test_a_file_of_settings_is_named_with_what_is_wrong_in_it(tmp_path, text, ex
         read_settings(path, Config())
     assert str(refused.value).startswith(f"{path}: {expected}")
     assert str(refused.value).count(str(path)) == 1
+
+
+def test_a_message_about_an_input_is_a_line_that_a_terminal_can_show():
+    error = InputError("a.json: found 'x\ny\x1b[2J\u2028\udcff\0'.")
+    assert str(error) == r"a.json: found 'x\ny\x1b[2J\u2028\udcff\x00'."
+    assert len(str(InputError("a" * 10**6))) < 2000
+    several = InputError("first.", "sec\nond.")
+    assert several.lines == ["first.", r"sec\nond."]
+    assert str(several) == r"first. sec\nond."
+    assert str(pickle.loads(pickle.dumps(several))) == str(several)

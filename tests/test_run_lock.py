@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -84,22 +85,77 @@ def test_the_lock_of_a_killed_process_is_taken_over(tmp_path, holder):
     assert not (tmp_path / "run" / ".lock").exists()
 
 
-def test_another_machine_holds_as_long_as_it_says_so(tmp_path):
-    """Where the file system does not pass locks on."""
+@pytest.mark.parametrize("shift", [-3600, 0, 3600 * 24 * 365])
+def test_another_machine_holds_as_long_as_its_file_changes(
+    tmp_path, monkeypatch, shift
+):
+    """Where the file system does not pass locks on; whatever its clock says."""
+    monkeypatch.setattr(lock, "STALE", 0.3)
     file = tmp_path / ".lock"
     file.write_text(json.dumps({"host": "node17", "pid": 4}))
-    message = "process 4 on node17 is writing this run.*try again in 60 s"
-    with pytest.raises(ValueError, match=message), export.locked(tmp_path):
-        pass
-    old = time.time() - 2 * lock.STALE
-    os.utime(file, (old, old))
-    with export.locked(tmp_path):
+    date = time.time() + shift
+    os.utime(file, (date, date))
+    done = threading.Event()
+
+    def touch():
+        for k in range(1000):
+            if done.wait(0.05):
+                return
+            os.utime(file, (date + k, date + k))
+
+    holder = threading.Thread(target=touch)
+    holder.start()
+    try:
+        message = "process 4 on node17 is writing this run"
+        with pytest.raises(ValueError, match=message), export.locked(tmp_path):
+            pass
+    finally:
+        done.set()
+        holder.join()
+    os.utime(file, (date, date))
+    with export.locked(tmp_path):  # it is no more
         assert json.loads(file.read_text())["pid"] == os.getpid()
-        assert time.time() - file.stat().st_mtime < lock.STALE
-    file.write_text("half")  # of a process that was killed as it wrote
-    with export.locked(tmp_path):
-        pass
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "half",  # of a process that was killed as it wrote
+        "[" * 4000,
+        '{"host": ["a"], "pid": {}}',
+        '{"host": "line\\nline\\u001b[2J", "pid": 1e400}',
+        '{"pid": 9999999999999999999999}',
+        "\x00" * 10000,
+        "[]",
+    ],
+)
+def test_a_lock_that_names_nobody_holds_nothing(tmp_path, monkeypatch, content, caplog):
+    monkeypatch.setattr(lock, "STALE", 0.05)
+    (tmp_path / ".lock").write_text(content)
+    with caplog.at_level("INFO"), export.locked(tmp_path):
+        pass
+    assert all(len(one.message.splitlines()) == 1 for one in caplog.records)
+    assert "\x1b" not in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_leads_elsewhere_is_not_followed(tmp_path):
+    run, other = tmp_path / "run", tmp_path / "precious"
+    run.mkdir()
+    other.write_text("kept")
+    (run / ".lock").symlink_to(other)
+    with pytest.raises(ValueError, match="lock: not a file"), export.locked(run):
+        pass
+    (run / ".lock").unlink()
+    (run / ".lock").mkdir()
+    with pytest.raises(ValueError, match="lock: not a file"), export.locked(run):
+        pass
+    (run / ".lock").rmdir()
+    os.mkfifo(run / ".lock")
+    with pytest.raises(ValueError, match="lock: not a file"), export.locked(run):
+        pass
+    assert other.read_text() == "kept"
 
 
 def test_a_lock_is_renewed(tmp_path, monkeypatch):
@@ -162,7 +218,7 @@ def test_nobody_and_no_way_to_find_anybody_is_said_at_once(
     assert code == 1 and "neither keypoints nor bodies" in err.splitlines()[-1]
     assert not (tmp_path / "out").exists()
     code, err = command("run", sequence, "--out", tmp_path / "out", "--no-people")
-    assert code == 3 and "computed" in err
+    assert code == 70 and "computed" in err
 
 
 @pytest.mark.parametrize("inside", [".", "run", "keypoints/run"])

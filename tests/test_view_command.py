@@ -2,8 +2,12 @@
 
 import dataclasses
 import json
+import os
 import re
+import socket
+import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from http.server import ThreadingHTTPServer
@@ -21,7 +25,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.pipeline.stage_cache import save
 from bodyslam_jax.pipeline.start_of_joint import start_of_joint
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, SfmResult, Tracks
-from bodyslam_jax.view.serve import address_of, page_server
+from bodyslam_jax.view.serve import MAX_THREADS, address_of, page_server
 
 SCALE = 2.5
 """m per map unit."""
@@ -154,6 +158,103 @@ def test_a_run_is_served_with_its_start_and_another_run(
     assert start["label"] == "before the joint estimate" and start["hidden"]
 
 
+@pytest.fixture
+def opened_files():
+    """The files that are opened from here on."""
+    found, state = [], {"on": True}
+
+    def note(event, args):
+        if state["on"] and event == "open":
+            found.append(str(args[0]))
+
+    sys.addaudithook(note)
+    yield found
+    state["on"] = False
+
+
+def _foreign(run, result, name, **input):
+    """The run folder of somebody else, whose summary names files."""
+    summary = result.summary | {"settings": {"body_model": name, "motion_model": name}}
+    summary["input"] = {**summary.get("input", {}), "path": name, "name": "../x"}
+    export.write_run(run, dataclasses.replace(result, summary=summary))
+
+
+def test_no_file_is_opened_because_a_run_folder_names_it(
+    tmp_path, result, body, monkeypatch, opened_files, command
+):
+    run, named = tmp_path / "foreign", tmp_path / "named.pkl"
+    named.write_bytes(b"a body, or a trap")
+    _foreign(run, result, str(named))
+    opened_files.clear()
+    assert len(_pages(run, monkeypatch)) == 1
+    code, text = command("export", run, "--to", "glb", "tum", "colmap")
+    assert code == 0, text
+    code, text = command("evaluate", run, run)
+    assert code == 0, text
+    assert str(named) not in opened_files and str(run / "result.npz") in opened_files
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["foreign", "named.pkl"]
+    code, text = command("export", run, "--body-model", named)
+    assert code == 1 and "named.pkl" in text
+    assert str(named) in opened_files
+
+
+def test_a_run_of_another_body_asks_for_it_in_a_line(
+    tmp_path, result, body, monkeypatch, command, caplog
+):
+    run = tmp_path / "run"
+    other = dataclasses.replace(result, joints=result.joints + [0.1, 0, 0])
+    _foreign(run, other, "my/body.npz\nsecond line")
+    for argv in (("export", run), ("view", run)):
+        code, text = command(*argv)
+        line = text.strip().splitlines()[-1]
+        assert code == 1 and "my/body.npz" in line and "--body-model" in line
+    view.write_scene(run / "scene.html", result, body)
+    assert len(_pages(run, monkeypatch)) == 1
+    assert "--body-model" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "summary",
+    [
+        {"settings": [1]},
+        {"people": 3},
+        {"people": [3]},
+        {"scale": "a"},
+        {"input": {"width": 1e400}},
+        {"frames_used": ["a", "b"]},
+        {"status": {"a": 1}},
+    ],
+)
+def test_a_summary_of_other_types_is_named(run, summary, command):
+    file = run / "summary.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | summary))
+    for argv in (("export", run, "--to", "tum"), ("view", run)):
+        code, text = command(*argv)
+        line = text.strip().splitlines()[-1]
+        assert code == 1 and str(file) in line and next(iter(summary)) in line
+
+
+@pytest.mark.parametrize("page", ["", "[" * 100_000, "[1]", "{}", '{"name": NaN'])
+def test_a_page_that_is_none_is_named(run, page):
+    text = f'<script type="application/json" class="run">{page}</script>'
+    (run / "scene.html").write_text(text)
+    with pytest.raises(ValueError, match="scene.html[:,] "):
+        view.read_runs(run / "scene.html")
+
+
+def test_names_are_text_in_the_page(run, result, body):
+    names = ("</script><script>alert(1)</script>", "{script}", "{runs}", "<!--\u2028")
+    for name in names:
+        summary = result.summary | {"input": {"name": name}, "status": name}
+        page = view.scene_page(
+            [view.scene_data(dataclasses.replace(result, summary=summary), body)]
+        )
+        assert page.count("<script") == 2 and "alert(1)</script>" not in page
+        assert "\u2028" not in page.partition("class=")[2]
+        (run / "scene.html").write_text(page)
+        assert view.read_runs(run / "scene.html")[0]["name"] == name
+
+
 def test_only_the_pictures_of_a_run_are_served(run):
     (run / "overlay.webm").write_bytes(bytes(range(100)))
     with page_server("<html>page</html>", run) as server:
@@ -172,6 +273,114 @@ def test_only_the_pictures_of_a_run_are_served(run):
                 get(name)
         with pytest.raises(ValueError, match=r"--port \d+: .*; expected a free port"):
             page_server("", run, server.server_address[1])
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def served(run):
+    """The raw answer to a request of the server of a run."""
+    (run / "overlay.webm").write_bytes(bytes(range(100)))
+    with page_server("<html>page</html>", run) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        port = server.server_address[1]
+
+        def ask(request: str, host: str | None = "127.0.0.1:{port}") -> bytes:
+            lines = [request, "Connection: close"]
+            lines += [] if host is None else [f"Host: {host.format(port=port)}"]
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as link:
+                link.sendall("\r\n".join([*lines, "", ""]).encode())
+                return b"".join(iter(lambda: link.recv(1 << 16), b""))
+
+        yield ask
+        server.shutdown()
+        thread.join()
+
+
+def test_only_requests_to_its_own_name_are_answered(served):
+    """A page elsewhere whose name is made to lead here sends its own name."""
+    own = ("127.0.0.1:{port}", "localhost:{port}", "LOCALHOST:{port}")
+    assert all(served("GET / HTTP/1.1", host)[9:12] == b"200" for host in own)
+    others = ("evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "", None, "[::1]")
+    for host in others:
+        answer = served("GET / HTTP/1.1", host)
+        assert answer[9:12] in (b"421", b"400") and b"page" not in answer, host
+    assert b"page" not in served("GET / HTTP/1.1\r\nHost: evil", "127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "X"])
+def test_nothing_but_reading_is_served(served, method):
+    answer = served(f"{method} / HTTP/1.1")
+    assert answer[9:12] == b"501" and b"page" not in answer
+    head = served("HEAD /overlay.webm HTTP/1.1")
+    assert head[9:12] == b"200" and head.endswith(b"\r\n\r\n")
+    assert b"Content-Length: 100" in head and b"nosniff" in head
+    assert b"Content-Security-Policy: default-src 'self'" in head
+
+
+def test_links_and_paths_do_not_lead_out_of_the_folder(served, run):
+    (run.parent / "secret.html").write_text("secret")
+    (run / "report.html").symlink_to(run.parent / "secret.html")
+    (run / "scene.html").mkdir()
+    os.mkfifo(run / "overlay.mp4")
+    names = ("report.html", "scene.html", "overlay.mp4", "scene.html/", ".", "..")
+    names += ("../secret.html", "%2e%2e/secret.html", "/etc/passwd", "//report.html")
+    for name in names:
+        answer = served(f"GET /{name} HTTP/1.1")
+        assert answer[9:12] == b"404" and b"secret\n" not in answer, name
+    (run / "report.html").unlink()
+    (run / "inside.html").write_text("inside")
+    (run / "report.html").symlink_to("inside.html")
+    assert served("GET /report.html HTTP/1.1").endswith(b"inside")
+
+
+@pytest.mark.parametrize(
+    "wanted, expected",
+    [
+        ("bytes=10-19", bytes(range(10, 20))),
+        ("bytes=90-", bytes(range(90, 100))),
+        ("bytes=-5", bytes(range(95, 100))),
+        ("bytes=-500", bytes(range(100))),
+        ("bytes=90-999999999999", bytes(range(90, 100))),
+        ("bytes=100-", 416),
+        ("bytes=20-10", 416),
+        ("bytes=-0", 416),
+        ("bytes=0-1,3-4" + ",0-99" * 1000, bytes(range(100))),
+        ("bytes=" + "9" * 5000 + "-", bytes(range(100))),
+        ("bytes=--5", bytes(range(100))),
+        ("bytes=-", bytes(range(100))),
+        ("lines=1-2", bytes(range(100))),
+    ],
+)
+def test_ranges_are_answered_within_the_file(served, wanted, expected):
+    answer = served(f"GET /overlay.webm HTTP/1.1\r\nRange: {wanted}")
+    head, _, body = answer.partition(b"\r\n\r\n")
+    if expected == 416:
+        assert head[9:12] == b"416" and b"Content-Range: bytes */100" in head
+    else:
+        assert head[9:12] in (b"200", b"206") and body == expected
+
+
+def test_connections_are_bounded(run):
+    with page_server("page", run) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        place = server.server_address[:2]
+        silent = [socket.create_connection(place) for _ in range(MAX_THREADS)]
+        with socket.create_connection(place, timeout=10) as one:
+            assert one.recv(100).startswith(b"HTTP/1.1 503")
+        assert threading.active_count() < MAX_THREADS + 20
+        for link in silent:
+            link.close()
+        for _ in range(500):
+            try:
+                assert urllib.request.urlopen(address_of(server)).read() == b"page"
+                break
+            except (urllib.error.HTTPError, ConnectionError):
+                time.sleep(0.01)
+        else:
+            raise AssertionError("threads are not given back")
         server.shutdown()
         thread.join()
 

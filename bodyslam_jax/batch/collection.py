@@ -1,10 +1,17 @@
 """`collect`: one table, plots and a page for all run folders in a folder."""
 
+import logging
 from pathlib import Path
 
 from bodyslam_jax.batch import plots, rows, table
 from bodyslam_jax.batch.index_page import write_index
+from bodyslam_jax.batch.inputs import RUNS
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.error_line import error_line
+
+log = logging.getLogger(__name__)
+_FILES = ("table.csv", "table.md", "table.tex", "plots.png", "index.html")
 
 
 def collect(folder: str | Path) -> list[Path]:
@@ -13,9 +20,18 @@ def collect(folder: str | Path) -> list[Path]:
 
     Clips that failed or have not been run are in the table, with the reason.
 
-    **Raises:** `ValueError` if there are no run folders in it.
+    A record that cannot be read is left out, with a warning that names it.
+
+    **Raises:** `InputError` if there are no run folders in it, or a folder has the name
+    of a file that is written.
     """
     folder = Path(folder)
+    for name in _FILES:
+        if (folder / name).is_dir():
+            raise InputError(
+                f"{folder / name}: a folder of the name of a file that is written; "
+                f"move run folders into {folder / RUNS}."
+            )
     found = rows.read_rows(folder)
     columns = table.present(rows.columns(), found)
     written = write_tables(folder, columns, found)
@@ -45,10 +61,13 @@ def _thumbnails(folder: Path, found: list[table.Row]) -> dict[str, str]:
     made = {}
     for row in found:
         name = str(row["name"])
-        film = folder / name / "overlay.webm"
-        if not film.exists():
+        film = folder / str(row["folder"]) / "overlay.webm"
+        if not film.is_file():
             continue
-        (folder / "thumbnails").mkdir(exist_ok=True)
-        if write_thumbnail(film, folder / "thumbnails" / f"{name}.jpg"):
-            made[name] = f"thumbnails/{name}.jpg"
+        try:
+            (folder / "thumbnails").mkdir(exist_ok=True)
+            if write_thumbnail(film, folder / "thumbnails" / f"{name}.jpg"):
+                made[name] = f"thumbnails/{name}.jpg"
+        except Exception as error:  # a page without this picture is still one
+            log.warning("%s: no picture of it (%s).", film, error_line(error))
     return made

@@ -8,9 +8,16 @@ import logging
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from bodyslam_jax.batch import failures
+from bodyslam_jax.batch import failures, record
 from bodyslam_jax.batch.engine import Engine, Failure, Setup, make_engine
-from bodyslam_jax.batch.inputs import MARK, Input, find_inputs, shard
+from bodyslam_jax.batch.inputs import (
+    MARK,
+    RUNS,
+    Input,
+    find_inputs,
+    shard,
+    wrong_name,
+)
 from bodyslam_jax.batch.job import (
     Estimate,
     Job,
@@ -81,14 +88,17 @@ def plan(
     chosen = found if part is None else shard(found, part)
     jobs, mistakes = [], []
     for one in chosen:
+        if wrong := wrong_name(one.name):
+            mistakes.append(f"name: {wrong}")
+            continue
         try:
             settings = one.settings(config)
         except ValueError as error:
             mistakes.append(f"{one.name}: {error}")
             continue
-        jobs.append(Job(_absolute(one), settings, out / one.name))
+        jobs.append(Job(_absolute(one), settings, out / RUNS / one.name))
     if mistakes:
-        raise InputError("\n".join(mistakes))
+        raise InputError(*mistakes)
     _mark(out, found)
     return jobs
 
@@ -101,15 +111,15 @@ def run_jobs(
 ) -> Iterator[Outcome]:
     """Outcomes of jobs: those that are finished first, the others as they finish."""
     missing = []
-    folder = jobs[0].out.parent if jobs else None
-    listed = {line.get("name") for line in failures.read(folder)} if folder else set()
+    folder = jobs[0].batch if jobs else None
+    listed = {line["name"] for line in failures.read(folder)} if folder else set()
     for job in jobs:
         outcome = finished(job)
         if outcome is None:
             missing.append(job)
             continue
         if outcome.is_failure and job.name not in listed:
-            failures.add(job.out.parent, outcome)
+            failures.add(job.batch, outcome)
         yield outcome
     if folder is None or not missing:
         return
@@ -156,7 +166,22 @@ def _mark(out: Path, inputs: Sequence[Input]) -> None:
     clips = {one.name: str(one.path) for one in inputs}
     text = json.dumps({"clips": clips}, indent=0)
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
+        if (out / MARK).is_file():
+            _move_runs(out, clips)
         atomic.write_text(out / MARK, text)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
+
+
+def _move_runs(out: Path, names: Iterable[str]) -> None:
+    """Moves run folders to where they belong: earlier versions had them beside the
+    files of the batch."""
+    for name in names:
+        old, new = out / name, out / RUNS / name
+        if name == RUNS:  # stays where it is, and is run again
+            continue
+        if record.is_begun(old) and not new.exists():
+            with contextlib.suppress(FileNotFoundError):  # another driver has
+                old.rename(new)
+                log.info("%s: moved to %s", old, new)

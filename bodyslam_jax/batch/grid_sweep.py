@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from bodyslam_jax.batch import record, sweep_plots
 from bodyslam_jax.batch.collection import write_tables
@@ -17,7 +18,7 @@ from bodyslam_jax.batch.sweep_job import ERRORS, SweepJob, run_sweep
 from bodyslam_jax.batch.table import Column, Row, present
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io import atomic
+from bodyslam_jax.io import atomic, files
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +44,8 @@ def sweep(
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
     jobs = list(_jobs(find_inputs(inputs, config), axes, config, out.resolve()))
-    files = {job.label: _file(out, job) for job in jobs}
-    found = {job.label: _kept(files[job.label]) for job in jobs}
+    places = {job.label: _file(out, job) for job in jobs}
+    found = {job.label: _kept(places[job.label], job) for job in jobs}
     missing = [job for job in jobs if found[job.label] is None]
     log.info("%d problems, %d of them solved", len(jobs), len(jobs) - len(missing))
     failed = []
@@ -54,7 +55,7 @@ def sweep(
                 failed.append(f"{job.label}: {value.message}")
                 log.warning("%s", failed[-1])
                 continue
-            atomic.write_text(files[job.label], json.dumps(value))
+            atomic.write_text(places[job.label], json.dumps(value))
             found[job.label] = value
             log.info("%s: %d points", job.label, len(value))
     rows = [row for job in jobs for row in found[job.label] or []]
@@ -90,11 +91,32 @@ def _file(out: Path, job: SweepJob) -> Path:
     return out / "rows" / f"{job.source.name}-{mark}.json"
 
 
-def _kept(file: Path) -> list[Row] | None:
-    try:
-        return json.loads(file.read_text())
-    except (OSError, ValueError):
+def _kept(file: Path, job: SweepJob) -> list[Row] | None:
+    if not file.exists():
         return None
+    try:
+        found = files.read_json(file, "rows of a sweep")
+    except InputError as error:
+        log.warning("%s Solved again.", error)
+        return None
+    if not _are_rows(found, job):
+        log.warning("%s: not the rows of its problem; solved again.", file)
+        return None
+    return found
+
+
+def _are_rows(found: Any, job: SweepJob) -> bool:
+    """Whether they are those of a job: a row of plain values for each of its points."""
+    if not isinstance(found, list) or len(found) != len(job.points):
+        return False
+    plain = (str, int, float, bool, type(None))
+    return all(
+        isinstance(row, dict)
+        and row.get("name") == job.source.name
+        and row.items() >= {**job.setting, **point}.items()
+        and all(isinstance(value, plain) for value in row.values())
+        for row, point in zip(found, job.points, strict=True)
+    )
 
 
 def _columns(axes: Sequence[Axis]) -> list[Column]:

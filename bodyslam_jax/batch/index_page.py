@@ -5,6 +5,7 @@ the browser loads when they come into view or are pointed at.
 """
 
 import html
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -39,9 +40,10 @@ def write_index(
         "HEADS": heads,
         "ROWS": body,
     }
-    for name, text in parts.items():
-        template = template.replace(f"<!--{name}-->", text)
-    atomic.write_text(folder / "index.html", template)
+    # In one pass: a name may be that of another part.
+    place = re.compile(f"<!--({'|'.join(parts)})-->")
+    page = place.sub(lambda found: parts[found[1]], template)
+    atomic.write_text(folder / "index.html", page)
 
 
 def _head(column: Column) -> str:
@@ -56,11 +58,12 @@ def _row(
     thumbnails: Mapping[str, str],
 ) -> str:
     name = str(row["name"])
-    cells = [f"<td>{_preview(folder, name, thumbnails)}</td>"]
-    report = folder / name / "report.html"
+    cells = [f"<td>{_preview(row, thumbnails)}</td>"]
+    run = str(row["folder"])
+    report = folder / run / "report.html"
     label = html.escape(name)
     if report.exists():
-        label = f'<a href="{quote(f"{name}/report.html")}">{label}</a>'
+        label = f'<a href="{quote(f"{run}/report.html")}">{label}</a>'
     elif (folder / "logs" / f"{name}.txt").exists():
         label += f' <a href="{quote(f"logs/{name}.txt")}">log</a>'
     cells.append(f'<th scope="row" data-v="{html.escape(name)}">{label}</th>')
@@ -78,13 +81,14 @@ def _row(
     return f"<tr>{''.join(cells)}</tr>"
 
 
-def _preview(folder: Path, name: str, thumbnails: Mapping[str, str]) -> str:
+def _preview(row: Row, thumbnails: Mapping[str, str]) -> str:
     """A still image; where there is an overlay, it plays while pointed at."""
+    name = str(row["name"])
     image = thumbnails.get(name)
     if image is None:
         return ""
     alt = html.escape(f"overlay of {name}")
-    film = quote(f"{name}/overlay.webm")
+    film = quote(f"{row['folder']}/overlay.webm")
     return (
         f'<div class="preview" data-film="{film}">'
         f'<img src="{quote(image)}" alt="{alt}" loading="lazy" width="160"></div>'

@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,8 +14,11 @@ from bodyslam_jax.io.video import VIDEO_SUFFIXES
 
 MARK = "batch.json"
 """File by which the folder of a batch is recognised."""
-RESERVED = ("logs", "thumbnails")
-"""Folders of a batch that are no run folders."""
+RUNS = "runs"
+"""Folder of a batch's run folders, apart from the batch's own files, so that clips may
+have any name."""
+_MAX_NAME_LETTERS = 120
+"""File systems allow 255 bytes with all suffixes."""
 _RUN = "summary.json"
 
 
@@ -85,7 +89,30 @@ def safe_name(path: Path) -> str:
     """The name of a run folder for this input."""
     name = path.resolve().name if path.is_dir() else path.stem
     name = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "clip"
-    return f"{name}-clip" if name in RESERVED else name
+    return name[:_MAX_NAME_LETTERS]
+
+
+def wrong_name(name: str) -> str | None:
+    """What is wrong with the name of a run folder; `None` if nothing is."""
+    if not re.fullmatch(r"[\w.+ -]+", name) or name.startswith("."):
+        return f"{name!r}, expected letters, digits, _ - + . and spaces"
+    if len(name) > _MAX_NAME_LETTERS:
+        return f"{len(name)} letters, expected at most {_MAX_NAME_LETTERS}"
+    return None
+
+
+def is_file_name(name: str) -> bool:
+    """Whether a name that a file tells can be that of a folder; it is not looked for
+    elsewhere."""
+    size = len(name.encode(errors="replace"))
+    signs = "/\\" if os.name == "nt" else "/"
+    plain = name.isprintable() or not any(sign in name for sign in "\0\n\r")
+    return (
+        0 < size <= 240
+        and plain
+        and name not in (".", "..")
+        and not (set(signs) & set(name))
+    )
 
 
 def _matching(source: str | Path) -> list[Path]:

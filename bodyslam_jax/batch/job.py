@@ -31,11 +31,16 @@ class Job:
     config: Config
     """With the options of this clip."""
     out: Path
-    """Run folder."""
+    """Run folder, in the folder `RUNS` of the batch."""
 
     @property
     def name(self) -> str:
         return self.source.name
+
+    @property
+    def batch(self) -> Path:
+        """Folder of the batch."""
+        return self.out.parents[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,16 +97,16 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
     """Runs a job unless its input and settings are those of the run in its folder.
 
     Errors become the outcome's message, their traceback is in the log of the job,
-    `logs/NAME.txt` beside the run folder. If another process is running the job, waits
-    for it.
+    `logs/NAME.txt` in the folder of the batch. If another process is running the job,
+    waits for it.
     """
     start, before = time.monotonic(), _compilations().count
     try:
-        home = job.out.parent
-        if not home.is_dir():
+        home = job.batch
+        if not job.out.parent.is_dir():
             raise InputError(
-                f"{home}: no such folder on {socket.gethostname()}; expected one that "
-                "all machines share."
+                f"{job.out.parent}: no such folder on {socket.gethostname()}; expected "
+                "one that all machines share."
             )
         with _logged(home / "logs" / f"{job.name}.txt"):
             try:

@@ -9,11 +9,10 @@ import csv
 import difflib
 import io
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from bodyslam_jax.batch.inputs import RESERVED, Input, safe_name
+from bodyslam_jax.batch.inputs import Input, safe_name, wrong_name
 from bodyslam_jax.config import Config, with_options
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera.calibration import read_camera, split_camera_name
@@ -26,20 +25,10 @@ COLUMNS = (
     *("name", "video", "keypoints", "bodies", "camera"),
     *("height", "groundtruth", "options"),
 )
-_LONGEST = 120
-"""Letters of a name; file systems allow 255 bytes with all suffixes."""
 _TRUTH = ("camera.txt", "camera.tum", "body.npz", "body_*.npz", "result.npz")
 _WITHIN = ("", "groundtruth/")
 
 Row = dict[str, str]
-
-
-class Mistakes(InputError):
-    """All that is wrong with a manifest, which the command line shows line by line."""
-
-    def __init__(self, lines: list[str]) -> None:
-        self.lines = [" ".join(line.split()) for line in lines]
-        super().__init__(" ".join(self.lines))
 
 
 def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
@@ -51,7 +40,7 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     header, lines = _table(path)
     mistakes = [f"{path}:1: {text}" for text in _wrong_header(header)]
     if mistakes:
-        raise Mistakes(mistakes)
+        raise InputError(*mistakes)
     found: list[Input] = []
     first: dict[str, int] = {}
     for number, cells in lines:
@@ -69,7 +58,7 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     if not lines:
         mistakes.append(f"{path}: no lines below the header.")
     if mistakes:
-        raise Mistakes(mistakes)
+        raise InputError(*mistakes)
     return found
 
 
@@ -120,7 +109,8 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
     else:
         wrong += _told("video", _wrong_video(video))
     name = row.get("name") or safe_name(video)
-    wrong += _wrong_name(name)
+    if mistake := wrong_name(name):
+        wrong.append(f"name: {mistake}")
     for column in ("keypoints", "bodies", "camera"):
         file = at(column)
         if column == "camera" and file is not None:
@@ -172,15 +162,6 @@ def _wrong_video(path: Path) -> Iterator[str]:
         yield f"video: {path}: {path.suffix or 'no suffix'}, expected that of a video"
     else:
         yield from _wrong_file("video", path)
-
-
-def _wrong_name(name: str) -> Iterator[str]:
-    if not re.fullmatch(r"[\w.+ -]+", name) or name.startswith("."):
-        yield f"name: {name!r}, expected letters, digits, _ - + . and spaces"
-    elif len(name) > _LONGEST:
-        yield f"name: {len(name)} letters, expected at most {_LONGEST}"
-    elif name in RESERVED:
-        yield f"name: {name!r} is the name of another folder of a batch"
 
 
 def _wrong_file(column: str, path: Path | None, folder: bool = False) -> Iterator[str]:

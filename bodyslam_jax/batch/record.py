@@ -9,19 +9,26 @@ import contextlib
 import functools
 import hashlib
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.config import Config
-from bodyslam_jax.io import atomic
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import atomic, files
 from bodyslam_jax.io.camera.calibration import split_camera_name
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.pipeline.stage_cache import body_model_file, fingerprint
 
+log = logging.getLogger(__name__)
 _RECORD = ".job.json"
 _SUMMARY = "summary.json"
+_TEXTS = ("source", "settings", "stamp", "status", "message", "summary")
+"""Fields of the record of a finished run, all of them text."""
+STATUSES = ("ok", "doubtful", "failed")
+"""Of a run that left a result."""
 
 
 def read(out: Path) -> dict[str, Any] | None:
@@ -31,7 +38,18 @@ def read(out: Path) -> dict[str, Any] | None:
         is_kept = record.get("summary") == _hash_of(out / _SUMMARY)
     except OSError:
         return None
-    return record if is_kept else None
+    if not is_kept:
+        return None
+    texts = all(isinstance(record.get(name), str) for name in _TEXTS)
+    if not texts or record["status"] not in STATUSES:
+        log.warning("%s: not the record of a run; the clip is run again", out / _RECORD)
+        return None
+    return record
+
+
+def is_begun(out: Path) -> bool:
+    """Whether a folder is that of a job."""
+    return (out / _RECORD).is_file()
 
 
 def finish(out: Path, record: dict[str, Any]) -> None:
@@ -59,7 +77,8 @@ def begun(out: Path, source: str) -> Iterator[None]:
 
 def begun_for(out: Path) -> str | None:
     """The hash of the input that the run in `out` is of; `None` if there is none."""
-    return _load(out).get("source")
+    source = _load(out).get("source")
+    return source if isinstance(source, str) else None
 
 
 def source_hash(source: Input, config: Config) -> str:
@@ -106,12 +125,18 @@ def _files(source: Input, config: Config) -> list[Path]:
 
 
 def _load(out: Path) -> dict[str, Any]:
+    if not (out / _RECORD).exists():
+        return {}
     try:
-        found = json.loads((out / _RECORD).read_text())
-    except (OSError, ValueError):
+        found = files.read_json(out / _RECORD, "the record of a run")
+    except InputError as error:
+        log.warning("%s The clip is run again.", error)
         return {}
     return found if isinstance(found, dict) else {}
 
 
 def _hash_of(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    if not file.is_file():  # a pipe would be waited for
+        raise FileNotFoundError(file)
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()[:16]

@@ -1,17 +1,18 @@
 """A row of figures for each run folder, from its `summary.json`."""
 
-import json
 import logging
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax import evaluation
 from bodyslam_jax.batch import failures
-from bodyslam_jax.batch.inputs import MARK
+from bodyslam_jax.batch.inputs import MARK, RUNS, is_file_name
 from bodyslam_jax.batch.table import Column, Row
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import ROWS
 from bodyslam_jax.evaluation.before_after import JOINT
+from bodyslam_jax.io import files
 
 log = logging.getLogger(__name__)
 _ERRORS = (
@@ -68,11 +69,13 @@ def read_rows(folder: Path) -> list[Row]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder.")
-    found = {}
-    for summary in sorted(folder.glob("*/summary.json")):
-        row = _row(summary)
-        if row is not None:
-            found[row["name"]] = row
+    found: dict[str, Row] = {}
+    # Run folders of a batch are in one of its own, apart from the batch's files.
+    for home in (folder, folder / RUNS):
+        for summary in sorted(home.glob("*/summary.json")):
+            row = _row(folder, summary)
+            if row is not None:
+                found[row["name"]] = row
     for line in failures.read(folder):
         row = {
             "name": line["name"],
@@ -84,39 +87,44 @@ def read_rows(folder: Path) -> list[Row]:
     for name in _planned(folder):
         found.setdefault(name, {"name": name, "status": MISSING})
     if not found:
-        raise InputError(f"{folder}: no run folders in it (no */summary.json).")
+        raise InputError(
+            f"{folder}: no run folders in it (no */summary.json that can be read)."
+        )
+    for name, row in found.items():
+        row.setdefault("folder", str(Path(RUNS, name)))
     return [found[name] for name in sorted(found)]
 
 
-def _row(file: Path) -> Row | None:
+def _row(folder: Path, file: Path) -> Row | None:
+    """The row of a run, with its place from the folder that is collected."""
     try:
-        summary = json.loads(file.read_text())
-        return _figures(file.parent.name, summary)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        log.warning("%s: not a summary of a run (%s); left out", file, error)
+        row = _figures(file.parent.name, evaluation.read_summary(file))
+    except InputError as error:
+        log.warning("%s It is left out.", error)
         return None
+    return row | {"folder": str(file.parent.relative_to(folder))}
 
 
 def _figures(name: str, summary: dict[str, Any]) -> Row:
     source = summary.get("input") or {}
+    source = source if isinstance(source, dict) else {}
     frames, fps = source.get("frames"), source.get("fps")
     scale = summary.get("scale") or {}
+    durations = (summary.get("durations_s") or {}).values()
     row: Row = {
         "name": name,
-        "status": summary["status"],
+        "status": summary.get("status") or "unknown",
         "frames": frames,
         "duration": frames / fps if frames and fps else None,
         "camera_motion": summary.get("camera_motion"),
         "camera_path": summary.get("camera_path_m"),
         "scale": scale.get("value"),
-        "seconds": sum((summary.get("durations_s") or {}).values()) or None,
-        "reasons": " ".join(
-            str(reason.get("message")) for reason in summary.get("reasons") or []
-        ),
+        "seconds": sum(x for x in durations if x is not None) or None,
+        "reasons": " ".join(map(_reason, summary.get("reasons") or [])),
     }
     if scale.get("sigma") and scale.get("value"):
         row["scale_error"] = scale["sigma"] / scale["value"]
-    people = summary.get("people") or []
+    people = [person or {} for person in summary.get("people") or []]
     row["people"] = len(people)
     if people and people[0].get("status") != "not_measurable":
         row |= {
@@ -130,9 +138,21 @@ def _figures(name: str, summary: dict[str, Any]) -> Row:
     return row | {_error_key(k): v for k, v in numbers.items() if k in _ERRORS}
 
 
+def _reason(reason: Any) -> str:
+    return str(reason.get("message") if isinstance(reason, dict) else reason)
+
+
 def _planned(folder: Path) -> list[str]:
     """The names of a batch's clips."""
-    try:
-        return list(json.loads((folder / MARK).read_text())["clips"])
-    except (OSError, ValueError, LookupError, TypeError):
+    if not (folder / MARK).exists():
         return []
+    try:
+        found = files.read_json(folder / MARK, "the clips of a batch")
+    except InputError as error:
+        log.warning("%s Clips that have not been run are left out.", error)
+        return []
+    clips = found.get("clips") if isinstance(found, dict) else None
+    if not isinstance(clips, (dict, list)):
+        log.warning("%s: no clips in it; those not run are left out.", folder / MARK)
+        return []
+    return [name for name in clips if isinstance(name, str) and is_file_name(name)]

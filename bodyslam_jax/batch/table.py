@@ -1,11 +1,11 @@
 """Rows of figures as CSV, Markdown and LaTeX."""
 
-import csv
 import dataclasses
-import io
 import math
 from collections.abc import Sequence
 from typing import Any, TypeGuard
+
+from bodyslam_jax.io.markup import csv_table, latex_text, markdown_table
 
 Row = dict[str, Any]
 
@@ -48,31 +48,26 @@ def present(columns: Sequence[Column], rows: Sequence[Row]) -> list[Column]:
 
 def to_csv(columns: Sequence[Column], rows: Sequence[Row]) -> str:
     """All digits; columns have their keys as names, and the unit of the title."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([column.title for column in columns])
-    for row in rows:
-        cells = (column.value(row) for column in columns)
-        writer.writerow(["" if cell is None else cell for cell in cells])
-    return out.getvalue()
+    titles = [column.title for column in columns]
+    cells = ([column.value(row) for column in columns] for row in rows)
+    return csv_table([titles, *cells])
 
 
 def to_markdown(columns: Sequence[Column], rows: Sequence[Row]) -> str:
     """A table with numbers to the right, and the median of each below."""
-    lines = [[column.title for column in columns]]
-    lines.append(["---:" if c.digits is not None else "---" for c in columns])
-    lines += [[column.text(row) for column in columns] for row in rows]
-    if len(rows) > 2:
-        lines.append(["**median**", *_medians(columns[1:], rows)])
-    escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-    return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
+    cells = ([column.text(row) for column in columns] for row in rows)
+    return markdown_table(
+        [[column.title for column in columns], *cells],
+        right=[column.digits is not None for column in columns],
+        last=["median", *_medians(columns[1:], rows)] if len(rows) > 2 else (),
+    )
 
 
 def to_latex(columns: Sequence[Column], rows: Sequence[Row]) -> str:
     """A `tabular` with rules of the package booktabs."""
     columns = [column for column in columns if not column.is_wide]
     form = "".join("r" if column.digits is not None else "l" for column in columns)
-    line = lambda cells: " & ".join(map(_escaped, cells)) + r" \\"
+    line = lambda cells: " & ".join(map(latex_text, cells)) + r" \\"
     body = [line([column.text(row) for column in columns]) for row in rows]
     if len(rows) > 2:
         body += [r"\midrule", line(["median", *_medians(columns[1:], rows)])]
@@ -107,14 +102,3 @@ def _medians(columns: Sequence[Column], rows: Sequence[Row]) -> list[str]:
 
 def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and math.isfinite(value)
-
-
-_LATEX = {
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    **{"±": r"$\pm$", "²": r"$^2$", "–": "--", "\\": r"\textbackslash{}"},
-    **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-}
-
-
-def _escaped(text: str) -> str:
-    return "".join(_LATEX.get(letter, letter) for letter in text)

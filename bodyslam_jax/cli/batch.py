@@ -94,9 +94,7 @@ def _line(outcome: Any) -> str:
 
 def _refused(error: InputError) -> int:
     """Prints a line for each mistake; returns the exit code."""
-    from bodyslam_jax.io.error_line import error_line
-
-    for line in getattr(error, "lines", [error_line(error)]):
+    for line in error.lines:
         print(f"bodyslam: {line}", file=sys.stderr)
     return 1
 

@@ -45,7 +45,8 @@ def export(
         person: Numbers of the people to write; without it everybody.
         video: Video or folder of images of the run, whose frames colmap and nerfstudio
             then write beside their files.
-        body_model: The body model of the run, if it is not where it was.
+        body_model: The body model of the run; without it the one that `bodyslam doctor`
+            shows. What a run folder names is not opened.
     """
     import bodyslam_jax as bs
     from bodyslam_jax import evaluation

@@ -29,7 +29,8 @@ def view(
         compare: Second run folder, drawn fainter in the same scene.
         port: Port to serve on; 0 takes a free one.
         open: Open the page in the default browser.
-        body_model: The body model of the runs, if it is not where it was.
+        body_model: The body model of the runs; without it the one that `bodyslam
+            doctor` shows. What a run folder names is not opened.
     """
     from bodyslam_jax.view import scene_page
     from bodyslam_jax.view.serve import address_of, page_server
@@ -55,9 +56,20 @@ def _runs(run: Path, body_model: Path | None) -> list[dict[str, Any]]:
     from bodyslam_jax.pipeline.start_of_joint import start_of_joint
 
     result = evaluation.read_result(run)
-    named = body_model or result.summary.get("settings", {}).get("body_model")
-    body = bs.load_body_model(named)
-    if (run / "scene.html").exists():
+    has_page = (run / "scene.html").exists()
+    try:
+        if body_model is None:
+            body = evaluation.body_of_run(result)
+        else:
+            body = bs.load_body_model(body_model)
+            evaluation.check_body(result, body)
+    except ValueError as error:
+        if body_model is not None or not has_page:
+            raise
+        # The page has all that it shows, but for what the joint estimate started from.
+        log.warning("what the run started from is left out: %s", error)
+        return view.read_runs(run / "scene.html")[:1]
+    if has_page:
         runs = view.read_runs(run / "scene.html")[:1]
     else:
         runs = [view.scene_data(result, body)]

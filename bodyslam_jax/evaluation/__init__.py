@@ -49,3 +49,6 @@ from bodyslam_jax.evaluation.report import gaps as gaps
 from bodyslam_jax.evaluation.report import to_json as to_json
 from bodyslam_jax.evaluation.report import to_rows as to_rows
 from bodyslam_jax.evaluation.report import to_table as to_table
+from bodyslam_jax.evaluation.run_body import body_of_run as body_of_run
+from bodyslam_jax.evaluation.run_body import check_body as check_body
+from bodyslam_jax.evaluation.run_summary import read_summary as read_summary

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from bodyslam_jax.body import BodyModel, joints
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.resampling import bracket, interpolate_poses
+from bodyslam_jax.evaluation.run_summary import read_summary
 from bodyslam_jax.io import read_tum as read_tum
 from bodyslam_jax.io.archive import read_npy, read_npz
 from bodyslam_jax.io.declared import as_array, as_number
-from bodyslam_jax.io.files import read_json_fields
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
@@ -48,6 +48,12 @@ def read_result(path: Path) -> Result:
     }
     if fields["timestamps"].size == 0 or (np.diff(fields["timestamps"]) <= 0).any():
         raise InputError(f"{file}: `timestamps` do not increase, or there is none.")
+    if len(fields["intrinsics"]) not in (4, 8) or (fields["intrinsics"][:2] <= 0).any():
+        raise InputError(
+            f"{file}: `intrinsics` are {fields['intrinsics'][:8].tolist()}, expected "
+            "fx, fy, cx, cy and for some k1, k2, p1, p2."
+        )
+    _check_rigid(file, fields["T_WC"])
     fields["scale"] = float(fields["scale"])
     fields["present"] = archive.array("present", ("h", "t"), kind="boolean")
     if "joint_sigma" in archive:
@@ -58,12 +64,20 @@ def read_result(path: Path) -> Result:
     return Result(**fields, summary=summary)
 
 
-def read_summary(file: Path) -> dict[str, Any]:
-    """The content of a run's `summary.json`.
+_ROTATION_TOLERANCE = 0.01
+"""Distance of `RᵀR` from the identity: rounding to float16 is below 0.002."""
 
-    **Raises:** `InputError`, naming the file, if it is no JSON object.
-    """
-    return read_json_fields(file, "a run's summary.json").data
+
+def _check_rigid(file: Path, T_WC: Float[np.ndarray, "t 4 4"]) -> None:
+    """**Raises:** `InputError` for a pose whose 3x3 block is no rotation."""
+    R = np.clip(T_WC[:, :3, :3], -10, 10)
+    away = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    wrong = (away > _ROTATION_TOLERANCE) | (np.linalg.det(R) < 0)
+    if wrong.any():
+        raise InputError(
+            f"{file}: `T_WC` of frame {wrong.argmax()} has no rotation, expected "
+            "poses of the camera."
+        )
 
 
 def read_groundtruth(path: Path, body: BodyModel) -> Result:

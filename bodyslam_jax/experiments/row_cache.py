@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bodyslam_jax.io import atomic
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import atomic, files
 from bodyslam_jax.pipeline.stage_cache import fingerprint
 
 log = logging.getLogger(__name__)
@@ -32,9 +33,12 @@ class Journal:
         self, name: str, label: str, key: Sequence[Any], form: Any = dict
     ) -> Row | None:
         """The row of this `key` if it is on disk and of that `form`, see `fits`."""
+        path = self.path(name, label, *key)
+        if not path.exists():
+            return None
         try:
-            found = json.loads(self.path(name, label, *key).read_text())
-        except (FileNotFoundError, ValueError):
+            found = files.read_json(path, "a row of an experiment")
+        except InputError:
             return None
         return found if fits(found, form) else None
 

@@ -1,14 +1,13 @@
 """Writes rows as Markdown and CSV tables, below a description of the data."""
 
-import csv
 import dataclasses
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.experiments.paper import OTHER_DATA
 from bodyslam_jax.io.atomic import write_text
+from bodyslam_jax.io.markup import csv_table, markdown_table
 
 Row = dict[str, Any]
 MM = 1e3
@@ -44,7 +43,7 @@ def markdown(
     columns: Sequence[Column], rows: Sequence[dict[str, Any]], *, mean: bool = False
 ) -> str:
     """A Markdown table, with the mean over rows at its end if it is wanted."""
-    lines = [[column.title for column in columns], ["---"] * len(columns)]
+    lines, total = [[column.title for column in columns]], []
     lines += [[c.text(c.value(row)) for c in columns] for row in rows]
     if mean and rows:
         last: list[str] = []
@@ -54,9 +53,8 @@ def markdown(
             averaged = column.average and len(numbers) == len(rows)
             last.append(column.text(sum(numbers) / len(rows)) if averaged else "")
         if any(last):
-            lines.append(["**mean**", *last[1:]])
-    escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-    return "".join("| " + " | ".join(line) + " |\n" for line in escaped)
+            total = ["mean", *last[1:]]
+    return markdown_table(lines, last=total)
 
 
 def to_csv(
@@ -66,14 +64,10 @@ def to_csv(
 
     If `about`, a description of the data, is given, it fills a last column `data`.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     last = [about] if about else []
-    writer.writerow([column.title for column in columns] + ["data"] * len(last))
-    for row in rows:
-        cells = [column.value(row) for column in columns]
-        writer.writerow([*("" if c is None else c for c in cells), *last])
-    return out.getvalue()
+    titles = [column.title for column in columns] + ["data"] * len(last)
+    cells = ([*(column.value(row) for column in columns), *last] for row in rows)
+    return csv_table([titles, *cells])
 
 
 def intro(title: str, about: str, *lines: str) -> str:

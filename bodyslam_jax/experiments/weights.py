@@ -23,6 +23,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.problems import without_map
 from bodyslam_jax.experiments.scoring import errors
+from bodyslam_jax.io.error_line import error_line
 from bodyslam_jax.pipeline import stage_cache
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.joint_problem import Prepared
@@ -251,8 +252,9 @@ def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
         return None
     try:
         kept = stage_cache.load(progress, Progress)
-    except stage_cache.UNREADABLE as error:
-        log.warning("%s: not readable (%s); learnt from the start", progress, error)
+    except Exception as error:  # whatever is in it, weights can be learnt again
+        reason = error_line(error)
+        log.warning("%s: not readable (%s); learnt from the start", progress, reason)
         return None
     if kept.names != names:
         raise InputError(f"{progress}: weights {kept.names}, expected {names}.")

@@ -22,7 +22,7 @@ import yaml
 from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io import atomic, write_body, write_tum
+from bodyslam_jax.io import atomic, files, write_body, write_tum
 from bodyslam_jax.types import Result
 
 _LAST = "summary.json"
@@ -66,9 +66,10 @@ def check_folder(
 def _finished_for(folder: Path) -> dict[str, Any] | None:
     """The input of the finished run in a folder, `None` if there is none."""
     try:
-        return dict(json.loads((folder / _LAST).read_text())["input"])
-    except (OSError, ValueError, KeyError, TypeError):
+        found = files.read_json(folder / _LAST)["input"]
+    except (InputError, LookupError, TypeError):
         return None
+    return found if isinstance(found, dict) else None
 
 
 @contextlib.contextmanager

@@ -3,15 +3,19 @@
 The lock is a file, `.lock`, that names the process which holds it. On one machine the
 operating system's lock on that file decides, so that a killed process holds nothing.
 On a file system shared by several machines such locks may be invisible to the others:
-there the existence of the file decides. Its holder renews its modification time; a file
-that is older than `STALE` is abandoned.
+there the holder touches the file every `RENEWED` seconds, and a file that does not
+change while another process watches it for `STALE` seconds is abandoned. Its date is
+not compared with any clock: clocks of machines and file servers differ, and a date can
+be in the future.
 """
 
 import contextlib
 import errno
 import json
+import logging
 import os
 import socket
+import stat
 import threading
 import time
 from collections.abc import Iterator
@@ -22,14 +26,19 @@ from bodyslam_jax.config.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # Windows: the file's content and age decide
+except ImportError:  # Windows: the file's content and its changes decide
     fcntl = None
 
+log = logging.getLogger(__name__)
 _NAME = ".lock"
 RENEWED = 10.0
-"""Period after which the holder renews the file's modification time, s."""
-STALE = 60.0
-"""Age from which a file that is not renewed is abandoned, s."""
+"""Period after which the holder touches the file, s."""
+STALE = 3 * RENEWED
+"""Time for which a file of another machine must not change to be abandoned, s."""
+_PAUSE = 0.5
+"""Between two looks at a file that may be abandoned, s."""
+_MAX_OWNER_BYTES = 4096
+"""Size of what is read of a lock file; a host name has at most 255 bytes."""
 _UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL}
 
 
@@ -42,8 +51,10 @@ def locked(folder: Path) -> Iterator[None]:
     """Holds the run folder for this process. A folder that was created for it and stays
     empty is removed afterwards.
 
+    A lock of a process on another machine is watched for `STALE` seconds first.
+
     **Raises:** `FolderInUse`, one line that names folder, process and machine, if
-    another process holds it.
+    another process holds it; `InputError` if `.lock` is no file.
     """
     existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
@@ -67,16 +78,20 @@ def locked(folder: Path) -> Iterator[None]:
 def _acquire(path: Path) -> int:
     """The open lock file, with this process as its owner."""
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = _open(path, os.O_RDWR | os.O_CREAT)
         try:
-            if not _lock(file):
+            if (is_granted := _lock(file)) is False:
                 raise _held(path, _owner(file))
             if not _is_still(path, file):
                 os.close(file)  # its holder has just released and removed it
                 continue
             owner = _owner(file)
-            if owner is not None and _holds(owner, os.fstat(file).st_mtime, path):
-                raise _held(path, owner)
+            if owner is not None and _may_hold(owner, is_granted):
+                if _changes(path, file, owner):
+                    raise _held(path, owner)
+                if not _is_still(path, file):
+                    os.close(file)
+                    continue
             text = json.dumps({"host": socket.gethostname(), "pid": os.getpid()})
             os.ftruncate(file, 0)
             os.pwrite(file, text.encode(), 0)
@@ -88,14 +103,33 @@ def _acquire(path: Path) -> int:
             raise
 
 
-def _lock(file: int) -> bool:
-    """Whether the system grants the lock, or does not support locks here."""
+def _open(path: Path, flags: int) -> int:
+    """Opens a lock file; never what a link of this name points to."""
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        file = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise _no_file(path) from None
+        raise
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise _no_file(path)
+    return file
+
+
+def _no_file(path: Path) -> InputError:
+    return InputError(f"{path}: not a file, expected the lock of a run; delete it.")
+
+
+def _lock(file: int) -> bool | None:
+    """Whether the system grants the lock; `None` if it does not support locks here."""
     if fcntl is None:
-        return True
+        return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return error.errno in _UNSUPPORTED
+        return None if error.errno in _UNSUPPORTED else False
     return True
 
 
@@ -108,26 +142,43 @@ def _is_still(path: Path, file: int) -> bool:
     return (on_disk.st_ino, on_disk.st_dev) == (held.st_ino, held.st_dev)
 
 
-def _holds(owner: dict[str, Any], renewed: float, path: Path) -> bool:
-    """Whether the process that a file names may still hold it, although the system
-    reports no lock."""
-    if owner.get("host") == socket.gethostname():
-        # A lock of the system, if supported, would have been found before.
-        return fcntl is None and _is_alive(owner.get("pid")) and _is_new(renewed, path)
-    return _is_new(renewed, path)
+def _may_hold(owner: dict[str, Any], is_granted: bool | None) -> bool:
+    """Whether the process that a file names may hold it although the system reports no
+    lock."""
+    if owner.get("host") != socket.gethostname():
+        return True
+    return is_granted is None and _is_alive(owner.get("pid"))
 
 
-def _is_new(renewed: float, path: Path) -> bool:
-    """Whether a file is not yet abandoned, by the clock of the shared file system."""
-    probe = path.with_name(f"{path.name}-{os.getpid()}")
+def _changes(path: Path, file: int, owner: dict[str, Any]) -> bool:
+    """Whether a lock file changes, or goes, within `STALE` seconds."""
+    log.info(
+        "%s: %s held this run; waiting up to %.0f s to see whether it still does",
+        *(path.parent, _named(owner), STALE),
+    )
+    first = _state(path)
+    until = time.monotonic() + STALE
+    while time.monotonic() < until:
+        time.sleep(min(_PAUSE, STALE / 4))
+        if not _is_still(path, file):
+            return False  # released: the caller opens its successor
+        if _state(path) != first:
+            return True
+    return False
+
+
+def _state(path: Path) -> tuple[Any, ...] | None:
+    """What changes when a holder touches the file. It is opened anew, which makes
+    network file systems ask their server."""
     try:
-        probe.touch()
-        now = probe.stat().st_mtime
+        file = _open(path, os.O_RDONLY)
     except OSError:
-        now = time.time()
+        return None
+    try:
+        found = os.fstat(file)
+        return found.st_mtime_ns, found.st_size, os.pread(file, _MAX_OWNER_BYTES, 0)
     finally:
-        probe.unlink(missing_ok=True)
-    return now - renewed < STALE
+        os.close(file)
 
 
 def _is_alive(pid: Any) -> bool:
@@ -135,7 +186,7 @@ def _is_alive(pid: Any) -> bool:
         return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except OSError:
         return True
@@ -143,21 +194,26 @@ def _is_alive(pid: Any) -> bool:
 
 
 def _owner(file: int) -> dict[str, Any] | None:
+    """The process that a lock file names; `None` if it names none."""
     try:
-        found = json.loads(os.pread(file, 4096, 0))
-    except (OSError, ValueError):
+        found = json.loads(os.pread(file, _MAX_OWNER_BYTES, 0))
+    except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
 
 def _held(path: Path, owner: dict[str, Any] | None) -> FolderInUse:
-    who = "another process"
-    if owner is not None:
-        who = f"process {owner.get('pid')} on {owner.get('host')}"
-    advice = "wait for it or give another folder"
-    if owner is not None and owner.get("host") != socket.gethostname():
-        advice += f"; if it is no more, try again in {STALE:.0f} s"
-    return FolderInUse(f"{path.parent}: {who} is writing this run; {advice}.")
+    who = "another process" if owner is None else _named(owner)
+    return FolderInUse(
+        f"{path.parent}: {who} is writing this run; wait for it or give another folder."
+    )
+
+
+def _named(owner: dict[str, Any]) -> str:
+    """A process in words; a file may name anything as one."""
+    pid, host = (str(owner.get(key))[:80] for key in ("pid", "host"))
+    text = f"process {pid} on {host}"
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _renew(path: Path, done: threading.Event) -> None:

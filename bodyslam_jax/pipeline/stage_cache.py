@@ -10,18 +10,21 @@ import functools
 import hashlib
 import json
 import logging
+import shutil
+import types
 import typing
-import zipfile
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import AbstractArray, jaxtyped
 
 from bodyslam_jax.body import search_paths
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io import atomic
+from bodyslam_jax.io import atomic, files
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.error_line import error_line
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -29,9 +32,10 @@ _EDGE = 1 << 20
 _SOURCE = "source.json"
 _CACHE = ".cache"
 """Name of the folder of stage results inside a run folder."""
-UNREADABLE = (ValueError, LookupError, TypeError, OSError, EOFError)
-UNREADABLE += (zipfile.BadZipFile, zlib.error)
-"""Errors that `load` raises for a file that is damaged or of another version."""
+_HEADER, _DIGEST = "__header__", "__sha256__"
+"""Members of a stage file beside its arrays: the structure, and the hash of all."""
+_MAY_BE_NAN = ("shape_covariance",)
+"""Fields whose arrays are NaN where nothing was computed; all others are finite."""
 _FILES = ("body_model", "motion_model", "motion")
 """Settings that name a file: their fingerprint is that of its content."""
 
@@ -129,9 +133,11 @@ class Cache:
         path = self.folder / f"{name}-{key}.npz"
         if path.exists():
             try:
-                found = load(path, kind)
-            except UNREADABLE as error:
-                log.warning("%s: not readable (%s); computed again", path, error)
+                found = load(path, kind, sealed=True)
+            except Exception as error:
+                # Whatever is in the file, the stage can be computed.
+                reason = error_line(error).removeprefix(f"{path}: ").rstrip(".")
+                log.warning("%s: not readable (%s); computed again", path, reason)
             else:
                 log.info("%s: taken from an earlier run", name)
                 return found
@@ -140,7 +146,10 @@ class Cache:
         if self.source is not None:
             (self.folder / _SOURCE).write_text(json.dumps(self.source))
         for old in self.folder.glob(f"{name}-*.npz"):
-            old.unlink(missing_ok=True)  # another process may have
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.unlink(missing_ok=True)  # another process may have
         save(path, result)
         return result
 
@@ -152,27 +161,47 @@ class Cache:
         if self.folder is None:
             return None
         try:
-            return dict(json.loads((self.folder / _SOURCE).read_text()))
-        except (OSError, ValueError, TypeError):
+            found = files.read_json(self.folder / _SOURCE)
+        except InputError:
             return None
+        return found if isinstance(found, dict) else None
 
 
 def save(path: Path, value: Any) -> None:
-    """Writes a dataclass of arrays and plain values; atomic."""
+    """Writes a dataclass of arrays and plain values with a hash of them; atomic."""
     arrays: dict[str, np.ndarray] = {}
     header = _encode(value, "", arrays)
-    blob = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    atomic.write_npz(path, {"__header__": blob, **arrays}, compressed=False)
+    arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    digest = np.frombuffer(_digest(arrays), np.uint8)
+    atomic.write_npz(path, {**arrays, _DIGEST: digest}, compressed=False)
 
 
-def load(path: Path, kind: type[T]) -> T:
-    """Reads what `save` wrote.
+def load(path: Path, kind: type[T], *, sealed: bool = False) -> T:
+    """Reads what `save` wrote, and checks types, shapes and finiteness of every field.
 
-    **Raises:** `InputError` if `kind` has other fields now than when it was saved.
+    Args:
+        sealed: whether a file without a hash of its content is refused; earlier
+            versions wrote none.
+
+    **Raises:** `InputError` if the file is not what was saved or if `kind` has other
+    fields now than then; other exceptions for what only a forger writes.
     """
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        header = json.loads(archive["__header__"].tobytes())
-        return _decode(header, kind, archive)
+    archive = read_npz(path, "a stage of a run")
+    arrays = {name: archive.raw(name) for name in archive.names}
+    sealed = sealed or _DIGEST in arrays
+    if sealed and arrays.pop(_DIGEST).tobytes() != _digest(arrays):
+        raise InputError(f"{path}: its content is not what was written.")
+    header = json.loads(arrays[_HEADER].tobytes())
+    return _decode(header, kind, arrays)
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """A hash of the arrays, their names, types and shapes, in any order."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        _update(digest, arrays[name])
+    return digest.digest()
 
 
 def _encode(value: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -210,10 +239,43 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
         if not is_class or fields.keys() != {f.name for f in dataclasses.fields(kind)}:
             raise InputError(f"fields {', '.join(fields)} of another version")
         kinds = typing.get_type_hints(kind)
-        return kind(
-            **{n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}
-        )
+        found = {n: _decode(h, _class(kinds[n]), archive) for n, h in fields.items()}
+        with jaxtyped("context"):  # axes of one name have one length
+            for name, value in found.items():
+                _check_field(name, value, kinds[name])
+        return kind(**found)
     return header["value"]
+
+
+def _check_field(name: str, value: Any, annotation: Any) -> None:
+    """**Raises:** `InputError` for a value that the field cannot have."""
+    if not _fits(value, annotation):
+        shape = f" {value.shape}" if isinstance(value, np.ndarray) else ""
+        raise InputError(f"{name} is a {type(value).__name__}{shape}")
+    is_real = isinstance(value, np.ndarray) and value.dtype.kind in "fc"
+    if is_real and name not in _MAY_BE_NAN and not np.isfinite(value).all():
+        raise InputError(f"{name} is not finite")
+
+
+def _fits(value: Any, annotation: Any) -> bool:
+    """Whether a value is of the annotated type; shapes are bound by `jaxtyped`."""
+    options = typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    if annotation is Any:
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, option) for option in options)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if options[-1] is Ellipsis:
+            return all(_fits(item, options[0]) for item in value)
+        return len(value) == len(options) and all(map(_fits, value, options))
+    if annotation is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(annotation, type) and issubclass(annotation, AbstractArray):
+        return isinstance(value, annotation)
+    return isinstance(value, origin or annotation)
 
 
 def _class(annotation: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyslam_jax.body import BodyModel, joints, rest_joints
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.pipeline.stage_cache import UNREADABLE, load
+from bodyslam_jax.pipeline.stage_cache import load
 from bodyslam_jax.types import Bodies, JointEstimate, Result, SfmResult
 
 T = TypeVar("T")
@@ -72,5 +72,5 @@ def _stage(run: Path, name: str, kind: type[T]) -> T | None:
         return None
     try:
         return load(found[0], kind)
-    except UNREADABLE:
+    except Exception:  # the page is shown without what cannot be read
         return None

@@ -3,7 +3,8 @@
 import html
 from pathlib import Path
 
-from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax import evaluation
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.scene_data import scene_data
 from bodyslam_jax.view.scene_page import read_runs, scene_page
@@ -37,10 +38,11 @@ def notebook_scene(
 
     Args:
         height: Of the page in the notebook, px.
-        body: The body model of the result; without it the one of its settings.
+        body: The body model of the result; without it the one that this machine has;
+            a file that the result names is not opened.
     """
     if run is not None and (run / "scene.html").exists():
         return NotebookScene(scene_page(read_runs(run / "scene.html")[:1]), height)
     if body is None:
-        body = load_body_model(result.summary.get("settings", {}).get("body_model"))
+        body = evaluation.body_of_run(result)
     return NotebookScene(scene_page([scene_data(result, body)]), height)

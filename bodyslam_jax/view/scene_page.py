@@ -1,7 +1,6 @@
 """`scene.html`: one file with everything in it, which opens without a network."""
 
 import html
-import json
 import re
 from collections.abc import Sequence
 from importlib import resources
@@ -10,7 +9,8 @@ from typing import Any
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io import atomic
+from bodyslam_jax.io import atomic, files
+from bodyslam_jax.io.markup import json_in_html
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.scene_data import scene_data
 from bodyslam_jax.view.video_samples import VideoSamples
@@ -35,27 +35,27 @@ def write_scene(
 
 def scene_page(runs: Sequence[dict[str, Any]]) -> str:
     """The page of one or more runs (`scene_data`), whose first sets the timeline."""
-    # "</script>" in a name must not end the element; "<\\/" is "</" in JSON.
-    parts = [json.dumps(run, separators=(",", ":")) for run in runs]
-    elements = [_RUN.format(part.replace("</", "<\\/")) for part in parts]
-    return (
-        _asset("scene.html")
-        .replace("{title}", html.escape(str(runs[0]["name"])))
-        .replace("{style}", _asset("scene.css"))
-        .replace("{script}", "\n".join(map(_asset, _SCRIPTS)))
-        .replace("{runs}", "\n".join(elements))
-    )
+    parts = {
+        "{title}": html.escape(str(runs[0]["name"])),
+        "{style}": _asset("scene.css"),
+        "{script}": "\n".join(map(_asset, _SCRIPTS)),
+        "{runs}": "\n".join(_RUN.format(json_in_html(run)) for run in runs),
+    }
+    # In one pass: a name may be that of another part.
+    place = re.compile("|".join(map(re.escape, parts)))
+    return place.sub(lambda found: parts[found[0]], _asset("scene.html"))
 
 
 def read_runs(path: Path) -> list[dict[str, Any]]:
     """The runs in a page that `write_scene` wrote.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` if the file is no such page.
+    **Raises:** `InputError` if the file is no such page.
     """
-    found = _RUNS.findall(path.read_text(encoding="utf-8"))
-    if not found:
+    text = files.read_text(path, "a scene.html of a run")
+    found = [files.parse_json(run, path) for run in _RUNS.findall(text)]
+    if not found or not all(isinstance(run, dict) and "name" in run for run in found):
         raise InputError(f"{path}: no runs in it, expected a scene.html of a run.")
-    return [json.loads(run) for run in found]
+    return found
 
 
 def _asset(name: str) -> str:

@@ -95,10 +95,13 @@ def whole(file: Path, name: str, value: Any) -> int:
 
 
 def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarray:
-    """World-to-camera matrices, which can be inverted."""
+    """World-to-camera matrices: rigid motions."""
     found = array(file, name, values, (num, 4, 4))
-    if np.any(abs(np.linalg.det(found)) < 1e-6):
-        raise InputError(f"{file}: {name}: matrices without an inverse, not poses.")
+    R = np.clip(found[:, :3, :3], -10, 10)
+    away = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(initial=0)
+    rows = np.abs(found[:, 3] - [0, 0, 0, 1]).max(initial=0)
+    if max(away, rows) > 0.01 or (np.linalg.det(R) < 0).any():
+        raise InputError(f"{file}: {name}: matrices that are no rigid motions.")
     return found
 
 

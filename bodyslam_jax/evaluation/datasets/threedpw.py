@@ -1,5 +1,6 @@
 """3DPW: one or two people, a moving camera, joints in the file."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ def convert_3dpw(source: Path, out: Path) -> Path:
     if not source.is_file():
         raise checks.not_there(source, "3DPW")
     data = checks.dictionary(source, _NEEDED)
-    name = str(data["sequence"])
-    if Path(name).name != name:  # it names files, and must not lead elsewhere
-        raise InputError(f"{source}: sequence: {name!r}, not the name of a folder.")
+    name = data["sequence"]
+    # It names files, and must not lead elsewhere.
+    if not isinstance(name, str) or not re.fullmatch(r"\w[\w.+ -]{0,119}", name):
+        found = f"{str(name)[:80]!r}"
+        raise InputError(f"{source}: sequence: {found}, not the name of a folder.")
     T_CW = checks.extrinsics(source, "cam_poses", data["cam_poses"], None)
     K = checks.array(source, "cam_intrinsics", data["cam_intrinsics"], (3, 3))
     people = _people(source, data, len(T_CW))

@@ -9,7 +9,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from bodyslam_jax.body import BodyModel, load_body_model
+from bodyslam_jax import evaluation
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.registry import FORMATS, Format
@@ -43,7 +44,8 @@ def export(
         to: Names of `FORMATS`; without it what the suffix of `path` says.
         up: Axis of the world that points up.
         person: Number of the only person to write, or of several; without it everybody.
-        body: The body model of the result; without it the one of its settings.
+        body: The body model of the result; without it the one that this machine has;
+            a file that the result names is not opened.
         observations: Of landmarks, for COLMAP; see `read_observations`.
         video: Video or folder of images, whose frames are written beside COLMAP's and
             nerfstudio's files.
@@ -62,7 +64,7 @@ def export(
             f"{path}: a file, expected a folder for {len(formats)} formats."
         )
     if body is None:
-        body = load_body_model(result.summary.get("settings", {}).get("body_model"))
+        body = evaluation.body_of_run(result)
     scene = make_scene(result, body, up, person, observations, video)
     plain = scene if up == "y" else make_scene(result, body, "y", person, observations)
     inside = several or (path.is_dir() and bool(formats[0].suffix))

@@ -11,6 +11,8 @@ from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.types import Result
 
 _ZOOM = ".zoom"
+_MAX_ZOOM = 10.0
+"""Logarithm of a factor on the focal length that no lens has."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +48,9 @@ def read_observations(run: Path, result: Result) -> Observations | None:
         landmark = archive.array(".tracks.landmark", ("m",), high=l - 1, **index)
         uv = archive.array(".tracks.uv", ("m", 2))
         keep = archive.array(".keep", ("m",), kind="boolean")
-        zoom = archive.array(_ZOOM, (t,)) if _ZOOM in archive else None
+        zoom = None
+        if _ZOOM in archive:
+            zoom = archive.array(_ZOOM, (t,), low=-_MAX_ZOOM, high=_MAX_ZOOM)
     except InputError:
         return None
     frame, landmark, uv = frame[keep], landmark[keep], uv[keep]

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bodyslam_jax.body import PARENTS, BodyModel, joints, rest_joints
+from bodyslam_jax import evaluation
+from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.geometry import so3_numpy as so3
@@ -20,9 +21,6 @@ Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from the run's world (y up) to one whose z axis is up: z becomes -y."""
 COLORS = ((232, 110, 36), (40, 170, 115), (150, 90, 200), (200, 160, 20))
 """Of people, sRGB, as in report and overlay."""
-_OTHER_BODY = 0.01
-"""Distance between a result's joints and those of the body model, m, from which the
-model cannot be the one that the result was estimated with."""
 _LARGE = 100.0
 """Length of the ground, m, up to which its grid has a line each metre."""
 _UNEVEN = 0.25
@@ -153,7 +151,7 @@ def make_scene(
         )
     fields = ("poses", "trans", "betas", "joints", "present")
     few = dataclasses.replace(result, **{n: getattr(result, n)[chosen] for n in fields})
-    _check_body(few, body)
+    evaluation.check_body(few, body)
     if up == "z":
         few = turned(few, body, Y_TO_Z)
     source = _input(result)
@@ -245,19 +243,3 @@ def _input(result: Result) -> dict[str, Any]:
     """What the summary says of the video; empty where there is no summary."""
     found = result.summary.get("input")
     return found if isinstance(found, dict) else {}
-
-
-def _check_body(result: Result, body: BodyModel) -> None:
-    """Compares joints of a few frames."""
-    for h, there in enumerate(result.present):
-        k = np.flatnonzero(there)[[0, -1]]
-        cast = lambda x: jnp.asarray(x, body.dtype)
-        posed = joints(
-            body, *map(cast, (result.poses[h, k], result.betas[h], result.trans[h, k]))
-        )
-        away = np.linalg.norm(np.asarray(posed) - result.joints[h, k], axis=-1).max()
-        if not away < _OTHER_BODY:
-            raise InputError(
-                f"body model {body.name}: its joints are {100 * away:.0f} cm off the "
-                "run's, expected the body model of the run; give it by --body-model."
-            )

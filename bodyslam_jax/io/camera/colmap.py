@@ -145,7 +145,7 @@ def _binary_cameras(path: Path) -> Iterator[FoundCamera]:
     for _ in range(reader.take("Q")[0]):
         _, model, width, height = reader.take("iiQQ")
         if not 0 <= model < len(_MODELS):
-            raise ValueError(f"camera model number {model}")
+            raise InputError(f"{path}: camera model number {model}.")
         name, count = _MODELS[model]
         yield FoundCamera(name, width, height, list(reader.take(f"{count}d")))
 

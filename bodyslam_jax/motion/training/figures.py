@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import PARENTS, BodyModel, local_joints
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.markup import markdown_table
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import place
 from bodyslam_jax.motion.continuation import Rollout
@@ -90,7 +91,7 @@ def compare(
 def write_table(rows: Sequence[Mapping[str, str | float]]) -> str:
     """Rows of `compare` as a Markdown table."""
     head = ["model", "drift °", "class", *COLUMNS]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = [head]
     for row in rows:
         cells = [str(row["model"]), f"{row['drift']:g}", str(row["class"])]
         for column in COLUMNS:
@@ -98,8 +99,8 @@ def write_table(rows: Sequence[Mapping[str, str | float]]) -> str:
             digits = 1 if column.endswith(("_mm", "_deg")) else 3
             is_number = isinstance(value, float) and np.isfinite(value)
             cells.append(f"{value:.{digits}f}" if is_number else "")
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append(cells)
+    return markdown_table(lines)
 
 
 def draw_errors(
