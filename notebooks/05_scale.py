@@ -80,6 +80,23 @@ for axis in axes:
 # s is linear in the only term that sees it, and people are anchored in the camera: a
 # wrong s has nothing to hide behind, so one step brings it close from anywhere.
 #
+# ## With the map
+# The whole problem has terms in units of the map, too: the ground under people's feet,
+# what is known of landmarks. `bs.rescaled` changes them with cameras and landmarks (here
+# held), so that the question is the same in each unit, and so is the answer.
+
+# %%
+whole, first = bs.build(case, hold=("cameras", "landmarks"))
+print("factor  s         s x factor over the true scale")
+answers = []
+for factor in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0):
+    solution = bs.solve(*bs.rescaled(whole, first, factor))
+    scale = float(solution.state.scale)
+    answers.append(scale * factor / case.map_scale)
+    print(f"{factor:6g}  {scale:8.4f}  {answers[-1]:.9f}  {solution.status}")
+print(f"answers lie {np.ptp(answers):.1e} apart")
+
+# %% [markdown]
 # ## What remains
 # The deviation that all six share is no matter of convergence. It is what the motion
 # model makes of these postures on this sequence: how far a step goes is read off legs

@@ -249,7 +249,7 @@ INPUTS = {
     ),
     "broken JSON": (
         lambda f: next((f / "keypoints").iterdir()).write_text('{"people": ['),
-        "_keypoints.json: not a JSON file",
+        "_keypoints.json, line 1: not JSON",
     ),
     "JSON of something else": (
         lambda f: next((f / "keypoints").iterdir()).write_text('{"a": 1}'),
@@ -261,7 +261,7 @@ INPUTS = {
     ),
     "an unknown camera model": (
         lambda f: rewrite(f / "camera.json", model="FISHEYE"),
-        "camera.json: model 'FISHEYE', not one of",
+        "camera.json: `model` is 'FISHEYE', expected PINHOLE or",
     ),
     "a negative focal length": (
         lambda f: rewrite(f / "camera.json", params=[-80.0, 80.0, 31.5, 23.5]),
@@ -273,7 +273,7 @@ INPUTS = {
     ),
     "broken camera.json": (
         lambda f: (f / "camera.json").write_text("{"),
-        "camera.json: not a JSON file",
+        "camera.json, line 1: not JSON",
     ),
     "NaN in bodies": (nan_bodies, "bodies.npz: .*poses"),
     "bodies between frames": (
@@ -301,7 +301,7 @@ INPUTS = {
     ),
     "tracks without uv": (
         lambda f: np.savez(f / "tracks.npz", frame=np.arange(3)),
-        "tracks.npz: no landmark, uv",
+        "tracks.npz: no array landmark, uv",
     ),
     "tracks, but no video and no camera": (
         lambda f: (
@@ -341,7 +341,7 @@ OPTIONS = {
     "no such bodies": (["--bodies", "none.pkl"], "none.pkl: no such file"),
     "no such tracks": (["--tracks", "none.npz"], "none.npz: no such file"),
     "no such camera": (["--camera", "none.json"], "none.json: "),
-    "no such settings": (["--settings", "none.yaml"], "none.yaml: No such file"),
+    "no such settings": (["--settings", "none.yaml"], "none.yaml: no such file"),
     "no such body model": (["--body-model", "none.pkl"], "tried none.pkl"),
     "no such motion model": (["--motion-model", "none.npz"], "none.npz: "),
 }
@@ -448,8 +448,10 @@ def test_something_unforeseen_is_one_line_too(folder, command, tmp_path):
     """The solver that must not be reached is, with an input in which all is well."""
     code, err = command("run", folder, "--out", tmp_path / "run")
     line = err.strip().splitlines()[-1]
-    assert code == 3 and "computed from an input that is wrong" in line
-    assert "Traceback" not in err
+    assert code == 70 and "computed from an input that is wrong" in line
+    assert "please report it" in line and "Traceback" not in err
+    details = Path(line.split()[-1])
+    assert "Traceback" in details.read_text() and "bodyslam-jax" in details.read_text()
     assert not (tmp_path / "run" / "summary.json").exists()
 
 

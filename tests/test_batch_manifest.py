@@ -137,8 +137,8 @@ def test_a_mistake_in_a_line_is_named_with_its_line(home, kind):
         ("video,camera,video\na.mp4,,\n", "1: column video appears 2 times."),
         ("name;video\nx;a.mp4\n", "1: columns separated by ;, expected commas."),
         ("", "empty, expected a header"),
-        ("video\n\xe4.mp4\n".encode("latin-1"), "not UTF-8 text"),
-        ("video\na\0.mp4\n", "not a text table"),
+        ("video\n\xe4.mp4\n".encode("latin-1"), "is no text"),
+        ("video\na\0.mp4\n", "is a zero"),
     ],
 )
 def test_a_mistake_in_the_header_or_the_file_is_named(home, content, expected):

@@ -104,7 +104,7 @@ def test_what_is_wrong_is_one_line_and_writes_nothing(tmp_path, bodies, command)
         (("emdb", listed), "_data.pkl: smpl is a list, not a dictionary"),
         (("emdb", good), "_data.pkl: its joints need SMPL, female, not the free body"),
         (("3dpw", file), "walk_00.pkl: trans: 1 entries, not of 2 people"),
-        (("tum-amass", trajectory, motion), "walk_poses.npz: not a readable .npz"),
+        (("tum-amass", trajectory, motion), "walk_poses.npz: not a true body"),
     ):
         code, _, err = command("convert-dataset", *argv, out)
         assert code == 1 and message in err

@@ -12,6 +12,38 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```python([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
+OUTPUT = re.compile(r"^```output\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+
+
+def same(found: list[str], expected: list[str]) -> bool:
+    """Whether lines have the same words, and the same numbers to 1 % or one of the last
+    digit: machines round differently."""
+    if [NUMBER.sub("#", line) for line in found] != [
+        NUMBER.sub("#", line) for line in expected
+    ]:
+        return False
+    numbers = lambda lines: [x for line in lines for x in NUMBER.findall(line)]
+    return all(
+        float(a) == pytest.approx(float(b), rel=0.01, abs=1.01 * last_digit(b))
+        for a, b in zip(numbers(found), numbers(expected), strict=True)
+    )
+
+
+def last_digit(number: str) -> float:
+    """What the last digit of a printed number counts."""
+    digits, _, power = number.partition("e")
+    return 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
+
+
+def test_output_of_the_documentation_is_compared():
+    assert same(["λ 51380: +0.0101 m"], ["λ 51383: +0.0100 m"])
+    assert same(["-1.6e-06"], ["-1.7e-06"])
+    assert not same(["λ 51383: +0.0102 m"], ["λ 51383: +0.0100 m"])
+    assert not same(["λ 100: +0.0100 m"], ["λ 51383: +0.0100 m"])
+    assert not same(["1.6e-06"], ["0.01 m"])
+
+
 def code_of(page: Path) -> str:
     """The blocks of a page that are not marked `no-run`, at their lines."""
     text = page.read_text()
@@ -30,12 +62,19 @@ def code_of(page: Path) -> str:
     "page", [p for p in PAGES if code_of(p).strip()], ids=lambda page: page.name
 )
 def test_code_in_the_documentation_runs(page, tmp_path):
+    if "SEQUENCE_FOLDER" in code_of(page):
+        simulate = ["simulate", "SEQUENCE_FOLDER", "--length", "60"]
+        program = [sys.executable, "-m", "bodyslam_jax", *simulate]
+        subprocess.run(program, check=True, capture_output=True, cwd=tmp_path)
     script = tmp_path / f"{page.stem}.py"
     script.write_text(code_of(page))
     done = subprocess.run(
         [sys.executable, script], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr[-2000:]
+    expected = "".join(OUTPUT.findall(page.read_text()))
+    last = done.stdout.splitlines()[-len(expected.splitlines()) :]
+    assert not expected or same(last, expected.splitlines()), done.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

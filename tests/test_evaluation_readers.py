@@ -8,6 +8,7 @@ import pytest
 
 from bodyslam_jax import evaluation, export
 from bodyslam_jax.body import joints, load_body_model
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import read_groundtruth, read_result, read_tum
 
 WALK = Path(__file__).parents[2] / "shared" / "sequences" / "walk"
@@ -120,13 +121,22 @@ _good = _person(5) | {"mocap_framerate": 30.0}
 BAD_BODIES = {
     "no poses": (_without("poses"), "no array poses"),
     "no rate": (_person(5), "no array mocap_framerate"),
-    "zero rate": (_good | {"mocap_framerate": 0.0}, "not a frame rate"),
-    "lengths": (_good | {"trans": np.zeros((4, 3))}, r"trans \(4, 3\)"),
-    "nan": (_good | {"trans": np.full((5, 3), np.nan)}, "trans holds values"),
-    "joints": (_good | {"joints": np.zeros((5, 22, 3))}, r"joints \(5, 22, 3\)"),
-    "two rates": (_good | {"mocap_framerate": [30.0, 60.0]}, "not one number"),
-    "text": (_good | {"trans": np.full((5, 3), "a")}, "trans is of type"),
-    "objects": (_good | {"poses": np.array([{}] * 5)}, "not a readable"),
+    "zero rate": (_good | {"mocap_framerate": 0.0}, "is 0.0, expected 1 to 1000"),
+    "lengths": (
+        _good | {"trans": np.zeros((4, 3))},
+        r"`trans` of shape \(4, 3\), expected \(5, 3\)",
+    ),
+    "nan": (
+        _good | {"trans": np.full((5, 3), np.nan)},
+        "15 of 15 numbers of `trans` not finite",
+    ),
+    "joints": (
+        _good | {"joints": np.zeros((5, 22, 3))},
+        r"`joints` of shape \(5, 22, 3\)",
+    ),
+    "two rates": (_good | {"mocap_framerate": [30.0, 60.0]}, "expected a number"),
+    "text": (_good | {"trans": np.full((5, 3), "a")}, "`trans` holds <U1, not numbers"),
+    "objects": (_good | {"poses": np.array([{}] * 5)}, "`poses` is a pickled object"),
 }
 
 
@@ -138,14 +148,14 @@ def test_bad_bodies_are_refused(tmp_path, body, arrays, message):
 
 
 def test_what_is_not_there_is_said(tmp_path, body):
-    with pytest.raises(FileNotFoundError, match="no such ground truth"):
+    with pytest.raises(InputError, match="no such ground truth"):
         read_groundtruth(tmp_path / "nowhere", body)
     with pytest.raises(ValueError, match="neither camera.txt nor body.npz"):
         read_groundtruth(tmp_path, body)
-    with pytest.raises(FileNotFoundError, match="result.npz"):
+    with pytest.raises(InputError, match="result.npz"):
         read_result(tmp_path)
     (tmp_path / "result.npz").write_text("text")
-    with pytest.raises(ValueError, match="not a readable .npz"):
+    with pytest.raises(ValueError, match="not a run's result.npz, or damaged"):
         read_result(tmp_path)
     np.savez(tmp_path / "result.npz", T_WC=np.eye(4))
     with pytest.raises(ValueError, match="no array timestamps"):
@@ -157,7 +167,7 @@ def test_damaged_files_are_named(tmp_path, body):
     bytes_ = bytearray((tmp_path / "body.npz").read_bytes())
     bytes_[80:140] = b"\x55" * 60
     (tmp_path / "body.npz").write_bytes(bytes_)
-    with pytest.raises(ValueError, match="body.npz: not a readable"):
+    with pytest.raises(ValueError, match="body.npz: not a true body .* or damaged"):
         read_groundtruth(tmp_path, body)
     np.savez(tmp_path / "body.npz", **_good)
     for array in (np.zeros(7), np.array([{}])):

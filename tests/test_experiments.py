@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 import bodyslam_jax.graph as g
 from bodyslam_jax import cli, experiments, motion, simulation, solver
 from bodyslam_jax.config import Config, Experiment
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments import (
     ablation,
     figures,
@@ -59,7 +60,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     traced = jax.jit(
         jax.vmap(
             lambda f: solver.trace(
-                held, g.rescaled(bare, f), lambda y: y.scale, schedule=SHORT
+                *g.rescaled(held, bare, f), lambda y: y.scale, schedule=SHORT
             )
         )
     )
@@ -67,7 +68,7 @@ def test_mapped_perturbations_are_single_solves(scene):
     assert seen.shape == (3, 9)
     np.testing.assert_array_equal(seen[:, 0], bare.scale)
     np.testing.assert_array_equal(seen[:, -1], states.scale)
-    single = solver.solve(held, g.rescaled(bare, 3.0), schedule=SHORT)
+    single = solver.solve(*g.rescaled(held, bare, 3.0), schedule=SHORT)
     # The same arithmetic in another order, eight steps long.
     np.testing.assert_allclose(states.scale[2], single.state.scale, rtol=1e-6)
     np.testing.assert_allclose(states.roots[2], single.state.roots, atol=1e-6)
@@ -337,7 +338,7 @@ def test_missing_files_are_told_before_anything_is_computed(tmp_path):
         (Experiment(motion=gone), Config()),
         (Experiment(), Config(motion_model=gone)),
     ):
-        with pytest.raises(FileNotFoundError, match="gone.npz: no such"):
+        with pytest.raises(InputError, match="gone.npz: no such"):
             experiments.run_experiment("ablation", tmp_path / "out", on, config)
     (tmp_path / "bad.npz").write_bytes(b"")
     bad = Experiment(motion_models=(str(tmp_path / "bad.npz"),))

@@ -570,3 +570,13 @@ def test_command(tmp_path, result):
         check=False,
     )
     assert done.returncode == 1 and done.stderr.count("\n") == 1
+
+
+def test_files_name_themselves_and_no_temporary_file(tmp_path, result, body):
+    names = tuple(n for n, f in formats.FORMATS.items() if f.extra is None)
+    export.export(result, tmp_path, names, body=body)
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not [path for path in files if b".partial" in path.read_bytes()]
+    for path in tmp_path.glob("*.trc"):
+        first = path.read_text().splitlines()[0]
+        assert first.split("\t")[-1] == path.name

@@ -326,3 +326,17 @@ def test_as_many_people_as_are_estimated_have_colours_of_their_own():
     names = {person_variable(h) for h in range(8)}
     assert len(names) == len(set(PEOPLE)) == 8
     assert all(style.count(f"--{name}:") == 2 for name in names)
+
+
+def test_reasons_lead_to_their_frames_in_the_overlay(tmp_path, body):
+    reason = SUMMARY["reasons"][0] | {"frames": [31, 43], "seconds": [1.03, 1.43]}
+    summary = SUMMARY | {"reasons": [reason]}
+    result = dataclasses.replace(_walk(), summary=summary)
+    export.write_report(tmp_path / "report.html", result, body)
+    text = (tmp_path / "report.html").read_text()
+    assert "Look at frames 31 to 43. " in text and "#t=" not in text
+    (tmp_path / "overlay.webm").touch()
+    export.write_report(tmp_path / "report.html", result, body)
+    text = (tmp_path / "report.html").read_text()
+    assert '<a href="overlay.webm#t=1.03,1.53">Look at frames 31 to 43' in text
+    assert "x grows to the left" in text

@@ -209,7 +209,7 @@ def _nan():
 BAD_KEYPOINTS = {
     "missing": (lambda folder: folder / "nothing", "no such file"),
     "empty folder": (lambda folder: folder, "no \\*_keypoints.json"),
-    "text": (_text("a.json", "hello"), "not a JSON file"),
+    "text": (_text("a.json", "hello"), "line 1: not JSON"),
     "unknown json": (_text("a.json", '{"a": 1}'), "neither AlphaPose"),
     "nobody": (_other([[]] * NUM), "no person"),
     "all missing": (_other([[person() * [1, 1, 0]]] * NUM), "all confidences are zero"),
@@ -224,7 +224,7 @@ BAD_KEYPOINTS = {
     "wrong length": (_npz(keypoints=np.ones((3, 25, 3))), "of 3 frames"),
     "wrong array": (_npz(stuff=np.ones(3)), "no array `keypoints`"),
     "not an archive": (_text("a.npz", "hello"), "not a NumPy archive"),
-    "objects": (_npz(keypoints=np.array([None])), "cannot read array"),
+    "objects": (_npz(keypoints=np.array([None])), "`keypoints` is a pickled object"),
 }
 
 
@@ -310,17 +310,17 @@ GOOD_CAMERA = {
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"model": "FISHEYE"}, "model 'FISHEYE'"),
+        ({"model": "FISHEYE"}, "`model` is 'FISHEYE', expected"),
         ({"params": [80, 80, 30]}, "3 params for PINHOLE, not 4"),
-        ({"params": [[80, 80, 30, 25]]}, "params in no plain list for PINHOLE, not 4"),
-        ({"width": 64.5}, "width 64.5 is no whole number of pixels"),
-        ({"height": float("inf")}, "height inf is no whole number of pixels"),
-        ({"height": True}, "height True is no whole number of pixels"),
+        ({"params": [[80, 80, 30, 25]]}, r"`params` of shape \(1, 4\), expected"),
+        ({"width": 64.5}, "`width` is 64.5, expected a whole number"),
+        ({"height": float("inf")}, "`height` is inf, expected 1 to"),
+        ({"height": True}, "`height` is True, expected a number"),
         ({"params": [80, -80, 30, 25]}, "not those of a camera"),
-        ({"params": [80, "x", 30, 25]}, "numbers expected"),
-        ({"params": [80, float("nan"), 30, 25]}, "not those of a camera"),
+        ({"params": [80, "x", 30, 25]}, "`params` holds 'x', expected numbers"),
+        ({"params": [80, float("nan"), 30, 25]}, "`params` not finite"),
         ({"params": [80, 80, 3000, 25]}, "far outside"),
-        ({"width": 0}, "not that of an image"),
+        ({"width": 0}, "`width` is 0, expected 1 to"),
         ({"fps": -1}, "fps"),
     ],
 )

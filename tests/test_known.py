@@ -211,7 +211,7 @@ def test_recorders_of_arkit_are_read_and_are_metric(tmp_path, footage, kind):
         ("odometry.csv", b"timestamp, frame\n0, word\n", "not Stray Scanner's"),
         ("metadata.json", b'{"poses": [[0, 0, 0, 1]], "fps": 30}', "qx qy qz qw"),
         ("metadata.json", b'{"poses": [[2, 0, 0, 0, 0, 0, 0]], "fps": 3}', "no rot"),
-        ("a.r3d", b"PK", "not Record3D's metadata"),
+        ("a.r3d", b"PK", "not Record3D's archive"),
     ],
 )
 def test_a_recording_that_is_none_is_named(tmp_path, footage, name, content, text):
@@ -229,7 +229,7 @@ def test_a_recording_that_is_none_is_named(tmp_path, footage, name, content, tex
         ("cameras.bin", b"\x01\0\0", "not COLMAP's cameras"),
         ("cameras.txt", b"# nothing\n", "no camera in it"),
         ("cameras.txt", b"1 FOV 640 480 500 500 320 240 0.9\n", "undistort"),
-        ("transforms.json", b'{"frames": []}', "no fl_x"),
+        ("transforms.json", b'{"frames": []}', "no `fl_x`"),
     ],
 )
 def test_a_camera_file_that_is_none_is_named(tmp_path, footage, name, content, text):

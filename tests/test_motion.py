@@ -15,6 +15,7 @@ from test_motion_data import make_clip
 from bodyslam_jax import cli, io, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion import (
     MotionModel,
@@ -250,7 +251,7 @@ def test_the_papers_network_ships_and_is_what_its_preset_uses(body):
 
 
 def test_weights_of_something_else_are_refused(tmp_path, model, body):
-    with pytest.raises(FileNotFoundError, match="no such motion model"):
+    with pytest.raises(InputError, match="no such motion model"):
         load_motion_model(tmp_path / "none.npz")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="not a motion model"):

@@ -148,12 +148,15 @@ def test_root_and_body_of_other_lengths_are_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"poses": np.full((50, 156), "a")}, "`poses` is of type <U1; expected real"),
-        ({"poses": np.ones((50, 156), complex)}, "`poses` is of type complex128"),
-        ({"trans": np.full((50, 3), "a")}, "`trans` is of type <U1"),
-        ({"mocap_framerate": np.array("fast")}, "`mocap_framerate` is of type <U4"),
-        ({"mocap_framerate": np.array(np.inf)}, "frame rate inf; expected one"),
-        ({"mocap_framerate": np.array([30, 60])}, r"frame rate \[30, 60\]"),
+        ({"poses": np.full((50, 156), "a")}, "array `poses` holds <U1, not numbers"),
+        ({"poses": np.ones((50, 156), complex)}, "array `poses` holds complex128"),
+        ({"trans": np.full((50, 3), "a")}, "array `trans` holds <U1"),
+        ({"mocap_framerate": np.array("fast")}, "array `mocap_framerate` holds <U4"),
+        (
+            {"mocap_framerate": np.array(np.inf)},
+            "1 of 1 numbers of `mocap_framerate` not",
+        ),
+        ({"mocap_framerate": np.array([30, 60])}, r"frame rate \[30.0, 60.0\]"),
         ({"poses": np.array(1.0)}, r"poses \(\); expected \(t, 66 or more\)"),
         ({"poses": np.zeros(50)}, r"poses \(50,\); expected \(t, 66 or more\)"),
     ],

@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import evaluation, export, pipeline, simulation, view
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
@@ -45,6 +47,7 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     assert float(found["scale_error"]) < 0.1
     assert float(found["h_ate_se3"]) < 0.15
     assert result.summary["status"] == "ok"
+    assert result.T_WC[0, 0, 0] < -0.95  # x points left of the first camera
 
     with np.load(out / "result.npz", allow_pickle=False) as archive:
         for name, shape in CONTRACT.items():
@@ -111,6 +114,18 @@ def test_upright_turns_a_direction_up_and_keeps_distances():
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn[:3, :3]), 1)
     np.testing.assert_allclose((turn @ T_WC[0])[:3, 3], 0, atol=1e-12)
+
+
+def test_x_points_left_of_the_first_camera_as_the_conventions_say():
+    page = (Path(__file__).parent.parent / "docs" / "conventions.md").read_text()
+    assert "x **left** of, y up, z ahead of the first camera" in page
+    T_WC = np.tile(np.eye(4), (3, 1, 1))
+    T_WC[:, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    T_WC[:, :3, 3] = np.random.default_rng(0).normal(size=(3, 3))
+    first = (upright(T_WC, -T_WC[0, :3, 1]) @ T_WC)[0, :3, :3]
+    # The camera's right, down and forward in the world.
+    np.testing.assert_allclose(first, np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(first), 1)
 
 
 def test_a_body_that_was_found_does_not_stop_who_did_not_ask_for_it(

@@ -6,13 +6,17 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.diagnostics import figures, standing_height
+from bodyslam_jax.diagnostics import figures, moments, standing_height
 from bodyslam_jax.diagnostics.checks import (
     Reason,
     judge,
     status_of,
 )
-from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
+from bodyslam_jax.diagnostics.thresholds import (
+    MEASURABLE_CHECKS,
+    PERSON_CHECKS,
+    WORLD_CHECKS,
+)
 from bodyslam_jax.types import Result
 
 FPS = 30.0
@@ -269,6 +273,44 @@ def test_keypoints_that_are_another_persons_are_doubted():
     assert len(doubted(error)) == 1
     error[:] = np.nan
     assert np.isnan(figures.keypoint_misfit(error, size, FPS))
+
+
+def test_a_reason_says_where_to_look(truth):
+    joints, present = truth.joints[0].copy(), truth.present[0]
+    joints[60:] = joints[60:] + np.array([1.5, 0.0, 0.0])
+    hidden = np.zeros(len(joints), bool)
+    hidden[20:30] = True
+    found = moments.of_person(joints, present, hidden, FPS)
+    first, last = found["velocity_jump"]
+    assert first < 60 <= last and last - first <= 12
+    assert found["legs_inferred"] == (20, 29)
+    T_WC = truth.T_WC.copy()
+    T_WC[80:, :3, 3] += [3.0, 0.0, 0.0]
+    within = np.ones(len(T_WC), bool)
+    within[:5] = False
+    for first, last in moments.of_camera(T_WC, within, FPS).values():
+        assert 5 <= first < last < len(T_WC)
+    first, last = moments.of_camera(T_WC, within, FPS)["camera_speed"]
+    assert first < 80 <= last
+    (reason,) = judge(
+        PERSON_CHECKS,
+        {"velocity_jump": 9.0},
+        0,
+        moments=found,
+        times=truth.timestamps + 7.0,
+    )
+    where = f"frames {found['velocity_jump'][0]} to {found['velocity_jump'][1]}, 1."
+    assert where in reason.message
+    assert reason.to_dict()["frames"] == found["velocity_jump"]
+    assert reason.to_dict()["seconds"][0] == pytest.approx(
+        found["velocity_jump"][0] / FPS, abs=0.01
+    )
+
+
+def test_advice_never_drops_everybody():
+    for check in (*PERSON_CHECKS, *MEASURABLE_CHECKS, *WORLD_CHECKS):
+        assert "--no-people" not in check.advice
+        assert "look at both" not in check.advice
 
 
 def test_a_reason_says_what_is_expected_and_what_to_do():

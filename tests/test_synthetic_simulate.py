@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import body, simulation
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.simulation import Simulation
 
 FRAMES = 200
@@ -239,7 +240,7 @@ def test_without_feet_and_face_there_are_fourteen_points():
 
 def test_motion_of_ones_own_and_bad_motion(tmp_path):
     own = dataclasses.replace(Simulation(length=20), motion=str(tmp_path / "none"))
-    with pytest.raises(FileNotFoundError, match="none"):
+    with pytest.raises(InputError, match="none"):
         simulation.simulate(own)
     still = tmp_path / "stand.npz"
     upright = np.zeros((90, 156))

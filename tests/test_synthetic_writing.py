@@ -12,6 +12,7 @@ import pytest
 
 from bodyslam_jax import simulation
 from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import read_groundtruth
 from bodyslam_jax.io import read_sequence
 from bodyslam_jax.io.bodies.reader import read_bodies
@@ -159,7 +160,7 @@ def test_interrupted_writing_is_no_sequence_and_is_finished(
     with pytest.raises((KeyboardInterrupt, ValueError)):
         simulation.write_sequence(out, simulated)
     monkeypatch.undo()
-    with pytest.raises((ValueError, FileNotFoundError)):
+    with pytest.raises(InputError):
         read_sequence(out)
     assert "unfinished" in json.loads((out / "simulation.json").read_text())
     assert not list(out.glob(".*"))

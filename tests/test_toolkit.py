@@ -8,9 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import scenes
 from jaxtyping import Array, Float
 
 import bodyslam_jax as bs
+from bodyslam_jax import graph
+from bodyslam_jax.graph import Cauchy, Loss
 
 FRAMES = 40
 
@@ -161,15 +164,147 @@ def test_the_cost_by_term_is_a_differentiable_sum(built):
     np.testing.assert_allclose(jax.grad(cost_of)(2.0), expected, rtol=1e-9)
 
 
-def test_rescaled_states_have_the_factors_as_leading_axis(built):
+FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+class PathInMap(bs.FrameFactor):
+    """A camera path in units of the map, which does not say so."""
+
+    position: Float[Array, "t 3"]
+    keys = (("camera", 0),)
+
+    def frame_residual(self, data, window, shared):
+        return (window[0].camera[:3, 3] - data[0]) / 0.01
+
+
+class DeclaredPath(PathInMap):
+    """The same with errors that are a share of the path's size, and saying so."""
+
+    map_units = {"position": 1}
+
+    def frame_residual(self, data, window, shared):
+        length = jnp.linalg.norm(self.position.max(axis=0) - self.position.min(axis=0))
+        return (window[0].camera[:3, 3] - data[0]) / (0.01 * length)
+
+
+class BodySize(bs.FrameFactor):
+    """A factor that sees no map at all."""
+
+    size: Float[Array, " h"]
+    keys = (("shape", 0),)
+
+    def frame_residual(self, data, window, shared):
+        return shared.shape[:1] - data[0]
+
+
+class SaidScale(bs.FrameFactor):
+    """Sayings of metres per unit of the map, some of them wrong."""
+
+    metres: Float[Array, " t"]
+    loss: Loss = Cauchy(jnp.array(3.0))
+    keys = (("scale", 0),)
+    map_units = {"metres": -1}
+
+    def frame_residual(self, data, window, shared):
+        return (shared.scale / data[0] - 1)[None] / 0.01
+
+
+def in_another_unit(problem, state, factor):
+    """With so many metres per unit of the map that nothing else changes."""
+    problem, state = bs.rescaled(problem, state, factor)
+    return problem, dataclasses.replace(state, scale=state.scale / factor)
+
+
+def test_the_cost_does_not_depend_on_the_unit_of_the_map(built):
     problem, state = built
-    factors = jnp.array([0.5, 2.0])
-    several = bs.rescaled(state, factors)
-    assert several.landmarks.shape == (2, *state.landmarks.shape)
-    one = bs.rescaled(state, 2.0)
-    np.testing.assert_allclose(several.cameras[1], one.cameras)
+    expected = problem.cost_by_term(state)
+    terms = lambda p, s: p.cost_by_term(s)
+    costs_of = jax.jit(lambda f: terms(*in_another_unit(problem, state, f)))
+    for factor in FACTORS:
+        found = costs_of(factor)
+        for term, cost in expected.items():
+            np.testing.assert_allclose(found[term], cost, rtol=1e-9, err_msg=term)
+    assert {"GroundContact", "LandmarkPrior"} <= set(expected)
+    larger, start = bs.rescaled(problem, state, 2.0)
+    assert larger.cost(start) > problem.cost(state) + 1
+
+
+def test_a_batch_of_factors_is_a_batch_of_problems(built):
+    problem, state = built
+    problems, states = bs.rescaled(problem, state, jnp.array([0.5, 2.0]))
+    assert states.landmarks.shape == (2, *state.landmarks.shape)
+    one_problem, one = bs.rescaled(problem, state, 2.0)
+    np.testing.assert_allclose(states.cameras[1], one.cameras)
     np.testing.assert_allclose(one.cameras[:, :3, 3], 2 * state.cameras[:, :3, 3])
     np.testing.assert_array_equal(one.roots, state.roots)
+    assert one.scale == state.scale
+    costs = jax.vmap(lambda p, s: p.cost(s))(problems, states)
+    np.testing.assert_allclose(costs[1], one_problem.cost(one), rtol=1e-9)
+
+
+def test_a_state_alone_cannot_be_rescaled(built):
+    with pytest.raises(ValueError, match=r"expected `rescaled\(problem, state, fac"):
+        bs.rescaled(built[1], 2.0)
+    for factor in (0.0, -1.0, np.nan, np.inf, np.array([1.0, 0.0])):
+        with pytest.raises(ValueError, match="factor: found .*, expected a number ab"):
+            bs.rescaled(*built, factor)
+
+
+def test_factors_of_ones_own_are_rescaled_if_they_say_how(built):
+    problem, state = built
+    path = state.cameras[:, :3, 3]
+    silent = problem.with_factors(PathInMap(path))
+    with pytest.raises(ValueError, match="PathInMap changes with .* declare the power"):
+        bs.rescaled(silent, state, 2.0)
+    with pytest.raises(ValueError, match="PathInMap is traced.*map_units"):
+        jax.jit(lambda p: bs.rescaled(p, state, 2.0)[1].scale)(silent)
+    for more in ([DeclaredPath(path + 0.1)], [positions(state), BodySize(jnp.ones(1))]):
+        own = problem.with_factors(*more)
+        other, start = in_another_unit(own, state, 5.0)
+        np.testing.assert_allclose(other.cost(start), own.cost(state), rtol=1e-9)
+        assert own.cost(state) > problem.cost(state) + 0.1
+
+
+def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
+    """Section 4.2 of the paper, with the ground and the landmarks in the cost."""
+    for factor in FACTORS:
+        found = bs.solve(*bs.rescaled(*built, factor))
+        assert found.status == "converged"
+        answer = found.state.scale * factor
+        np.testing.assert_allclose(answer, solution.state.scale, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, family", [("E1", "follow"), ("M2", "room")])
+@pytest.mark.parametrize("frames", [40, 60, 300])
+@pytest.mark.parametrize("hold", [("cameras", "landmarks"), ()], ids=["held", "free"])
+def test_the_scale_is_the_same_in_both_families(name, family, frames, hold):
+    case = bs.simulate_case(name, family=family, frames=frames)
+    built = bs.build(case, hold=hold)
+    found = [bs.solve(*bs.rescaled(*built, factor)) for factor in FACTORS]
+    assert {x.status for x in found} == {"converged"}
+    answers = [float(x.state.scale) * f for x, f in zip(found, FACTORS, strict=True)]
+    np.testing.assert_allclose(answers, answers[3], rtol=1e-6)
+
+
+def test_of_several_scales_the_best_is_taken_from_all_starts():
+    state = scenes.truth(np.random.default_rng(0), frames=20, people=1, landmarks=0)
+    said = SaidScale(jnp.where(jnp.arange(20) < 8, 1.0, 2.0))
+    free = dataclasses.replace(state.zero_step(), scale=jnp.ones(()))
+    problem = graph.make_problem([said], state, free=free)
+    answers = []
+    for factor in FACTORS:
+        found = bs.solve(*bs.rescaled(problem, state, factor))
+        assert found.status == "converged"
+        answers.append(float(found.state.scale) * factor)
+    np.testing.assert_allclose(answers, answers[0], rtol=1e-6)
+    # The eight others pull a little.
+    np.testing.assert_allclose(answers, 2.0, rtol=2e-3)
+
+
+def test_a_better_scale_that_is_known_is_said(solution):
+    better = dataclasses.replace(solution, better_scale=jnp.array(1.25))
+    assert better.status == "converged, but a better scale is known: 1.25"
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from bodyslam_jax.batch.inputs import RESERVED, Input, safe_name
 from bodyslam_jax.config import Config, with_options
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera.calibration import read_camera
+from bodyslam_jax.io.files import read_text
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.io.video import VIDEO_SUFFIXES
 
@@ -32,6 +33,14 @@ _WITHIN = ("", "groundtruth/")
 Row = dict[str, str]
 
 
+class Mistakes(InputError):
+    """All that is wrong with a manifest, which the command line shows line by line."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self.lines = [" ".join(line.split()) for line in lines]
+        super().__init__(" ".join(self.lines))
+
+
 def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     """The inputs that a manifest lists.
 
@@ -41,7 +50,7 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     header, lines = _table(path)
     mistakes = [f"{path}:1: {text}" for text in _wrong_header(header)]
     if mistakes:
-        raise InputError("\n".join(mistakes))
+        raise Mistakes(mistakes)
     found: list[Input] = []
     first: dict[str, int] = {}
     for number, cells in lines:
@@ -59,18 +68,13 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
     if not lines:
         mistakes.append(f"{path}: no lines below the header.")
     if mistakes:
-        raise InputError("\n".join(mistakes))
+        raise Mistakes(mistakes)
     return found
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and the other lines with their numbers; empty ones left out."""
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start}).") from None
-    if "\0" in text:
-        raise InputError(f"{path}: not a text table (it has zero bytes).")
+    text = read_text(path, "a manifest (CSV)")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[tuple[int, list[str]]] = []
     try:
@@ -113,19 +117,20 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
         wrong.append("video: empty")
         video = home
     else:
-        wrong += _wrong_video(video)
+        wrong += _told("video", _wrong_video(video))
     name = row.get("name") or safe_name(video)
     wrong += _wrong_name(name)
     for column in ("keypoints", "bodies", "camera"):
-        wrong += _wrong_file(column, at(column), folder=column != "bodies")
+        found = _wrong_file(column, at(column), folder=column != "bodies")
+        wrong += _told(column, found)
     camera = at("camera")
-    if camera is not None and camera.is_file() and camera.suffix == ".json":
+    if camera is not None and camera.suffix == ".json" and os.path.isfile(camera):
         try:
             read_camera(camera, None)
         except ValueError as error:
             wrong.append(f"camera: {error}".rstrip("."))
     truth = at("groundtruth")
-    wrong += _wrong_truth(truth)
+    wrong += _told("groundtruth", _wrong_truth(truth))
     options = row.get("options", "")
     if row.get("height"):
         options = f"--height {row['height']} {options}".strip()
@@ -136,6 +141,14 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
         wrong.append(f"{column}: {str(error).removeprefix(f'{column}: ').rstrip('.')}")
     one = Input(name, video, at("keypoints"), at("bodies"), camera, truth, options)
     return one, wrong
+
+
+def _told(column: str, wrong: Iterator[str]) -> list[str]:
+    """What is wrong with a path; also that the system knows none of such a name."""
+    try:
+        return list(wrong)
+    except (OSError, ValueError) as error:
+        return [f"{column}: {getattr(error, 'strerror', None) or error}"]
 
 
 def _wrong_video(path: Path) -> Iterator[str]:

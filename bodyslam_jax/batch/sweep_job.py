@@ -70,9 +70,9 @@ def run_sweep(job: SweepJob) -> list[Row]:
         one = jax.tree.map(lambda x: x[k], found)
         status = str(np.asarray(found.status)[k])
         weighted = {term: weight[k] for term, weight in weights.items()}
-        same = dataclasses.replace(
-            prepared, problem=graph.with_weights(prepared.problem, **weighted)
-        )
+        problem = graph.with_weights(prepared.problem, **weighted)
+        problem, _ = graph.rescaled(problem, prepared.state, scales[k])
+        same = dataclasses.replace(prepared, problem=problem)
         standing = hold_standing_feet(same, one.state, clip, cameras, body, job.config)
         result = _result(
             job.config, clip, cameras, body, prepared, standing.state, status
@@ -93,8 +93,8 @@ def run_sweep(job: SweepJob) -> list[Row]:
 
 def _solve_one(problem, state, schedule, weights, scale):
     weighted = graph.with_weights(problem, **weights)
-    start = graph.rescaled(state, scale)
-    return solver.solve(weighted, start, schedule=schedule)
+    start = graph.rescaled(weighted, state, scale)
+    return solver.solve(*start, schedule=schedule)
 
 
 _solve_all = solver.vmap_over_devices(_solve_one, (None, None, None, 0, 0))

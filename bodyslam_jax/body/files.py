@@ -9,7 +9,6 @@ those of the wrist or head, and the body has SMPL's 72 pose parameters.
 import json
 import os
 import re
-import zipfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -27,6 +26,8 @@ from bodyslam_jax.body.smpl_pickle import read_pickle
 from bodyslam_jax.body.validate import checked
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.files import is_zip
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
 VARIABLE = "BODYSLAM_BODY_MODEL"
@@ -152,24 +153,12 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
     """The arrays of a `.npz` or a pickle, recognised by content; not yet checked."""
-    if zipfile.is_zipfile(file):
-        arrays = {}
-        try:
-            with open(file, "rb") as opened, np.load(opened) as archive:
-                for name in archive.files:
-                    try:
-                        arrays[name] = archive[name]
-                    except ValueError as error:
-                        # SMPL-X has objects beside its arrays, which are not needed.
-                        if "Object arrays" not in str(error):
-                            raise
-        except Exception as error:
-            found = " ".join(str(error).split())[:120]
-            raise InputError(f"{file}: a damaged .npz file ({found}).") from None
-        return arrays
-    if file.suffix == ".npz":
-        raise InputError(f"{file}: not a .npz file, or cut short (no zip archive).")
-    return read_pickle(file)
+    if file.suffix != ".npz" and not is_zip(file):
+        return read_pickle(file)
+    archive = read_npz(file, "a body model (.npz)")
+    # SMPL-X has objects beside its arrays, which are not needed.
+    plain = [n for n in archive.names if archive.header(n)[1].kind in "biufSU"]
+    return {name: archive.raw(name) for name in plain}
 
 
 def _locations() -> list[Path]:

@@ -1,12 +1,13 @@
 """Checks of a body model's arrays: shapes, types and values that later code assumes."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from bodyslam_jax.body.skeleton import PARENTS, SURFACE_POINTS
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.declared import as_array, fields
+from bodyslam_jax.io.files import parse_json
 
 _NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 
@@ -80,13 +81,7 @@ def _numbers(file, name, array) -> np.ndarray:
         raise InputError(f"{file}: {name} is of type {found}, expected real numbers.")
     if array.ndim == 0:
         raise InputError(f"{file}: {name} is a single number, expected an array.")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        count = int((~np.isfinite(array)).sum())
-        raise InputError(
-            f"{file}: {name} has {count} entries that are NaN or infinite."
-        )
-    return array
+    return as_array(file, name, array)
 
 
 def _integers(file, name, array) -> np.ndarray:
@@ -133,13 +128,6 @@ def _parents(file, table, num_joints) -> list[int]:
 
 def _picks(file, header, num_vertices) -> np.ndarray:
     """Vertices of the surface points, named in the header of our own files."""
-    try:
-        named = json.loads(str(header))["keypoints"]
-        picks = np.array([named[name] for name in SURFACE_POINTS], np.int64)
-    except (ValueError, KeyError, TypeError, OverflowError):
-        raise InputError(f"{file}: its header does not name the keypoints.") from None
-    if picks.min() < 0 or picks.max() >= num_vertices:
-        raise InputError(
-            f"{file}: its header names vertex {picks.max()} of {num_vertices}."
-        )
-    return picks
+    named = fields(file, parse_json(str(header), file, "a header (JSON)"), "header")
+    named = named.fields("keypoints")
+    return np.array([named.whole(n, 0, num_vertices - 1) for n in SURFACE_POINTS])

@@ -12,6 +12,7 @@ import tyro
 from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.cli.types import Flat, Input, Preset
 from bodyslam_jax.config import Config, Distribution
+from bodyslam_jax.config.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ def batch(
         for number, outcome in enumerate(outcomes, 1):
             counts[outcome.status] += 1
             print(f"{number}/{total} {_line(outcome)}", flush=True)
-    except ValueError as error:
+    except InputError as error:
         return _refused(error)
     listed = ", ".join(f"{count} {status}" for status, count in counts.items())
     print(f"{total} clips: {listed or 'none'}")
@@ -91,9 +92,11 @@ def _line(outcome: Any) -> str:
     return text
 
 
-def _refused(error: ValueError) -> int:
+def _refused(error: InputError) -> int:
     """Prints a line for each mistake; returns the exit code."""
-    for line in str(error).splitlines():
+    from bodyslam_jax.io.error_line import error_line
+
+    for line in getattr(error, "lines", [error_line(error)]):
         print(f"bodyslam: {line}", file=sys.stderr)
     return 1
 
@@ -132,7 +135,7 @@ def sweep(
         engine = batch_.make_engine(on, out.resolve(), config.device != "cpu")
         setup = prepared(functools.partial(jax_setup.prepare, config.device), True)
         paths, failed = batch_.sweep(inputs, axes, config, out, engine, setup)
-    except ValueError as error:
+    except InputError as error:
         return _refused(error)
     for path in paths:
         print(path)

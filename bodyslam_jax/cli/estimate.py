@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from bodyslam_jax.cli import jax_setup
+from bodyslam_jax.cli import jax_setup, unexpected
 from bodyslam_jax.cli.types import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
@@ -64,7 +64,8 @@ def run(
     )
     out = out or default_folder(sequence)
     _announce(f"run: {input}, {sequence.num_frames} frames", out)
-    return finish(pipeline.run_to_folder(sequence, out, config), out, open)
+    with unexpected.noted_in(out):
+        return finish(pipeline.run_to_folder(sequence, out, config), out, open)
 
 
 def demo(
@@ -91,7 +92,8 @@ def demo(
     from bodyslam_jax import pipeline
 
     _announce("demo: a rendered walker", out)
-    return finish(pipeline.demo(out, config, from_pixels=from_pixels), out, open)
+    with unexpected.noted_in(out):
+        return finish(pipeline.demo(out, config, from_pixels=from_pixels), out, open)
 
 
 def finish(result: Any, out: Path, is_opened: bool = False) -> int:

@@ -1,6 +1,7 @@
 """Runs one command and turns its outcome into an exit code.
 
-0: done; 1: bad input, one line; 2: wrong usage; 3: the estimate failed or is doubtful;
+0: done; 1: bad input, one line; 2: wrong usage; 3: the estimate failed or is doubtful,
+as `summary.json` says; 70: an error that nobody expected, with its details in a file;
 130: interrupted.
 """
 
@@ -13,7 +14,7 @@ from typing import NoReturn
 import tyro
 
 import bodyslam_jax
-from bodyslam_jax.cli import interrupts, progress
+from bodyslam_jax.cli import interrupts, progress, unexpected
 from bodyslam_jax.cli.commands import COMMANDS, GROUPS
 from bodyslam_jax.cli.options import GENERAL, options, suggestions
 from bodyslam_jax.cli.reference import command_help, overview
@@ -55,15 +56,11 @@ def main() -> NoReturn:
             _leave_interrupted()
         if os.environ.get("BODYSLAM_DEBUG"):
             raise
-        if isinstance(error, (OSError, ValueError)):
+        if unexpected.is_input(error):
             sys.exit(f"bodyslam: {error_line(error)}")
         # Memory, the linear algebra library, a bug: no fault of the input.
-        print(
-            f"bodyslam: failed: {error_line(error)}; run it with BODYSLAM_DEBUG=1 for "
-            "the traceback",
-            file=sys.stderr,
-        )
-        sys.exit(3)
+        print(f"bodyslam: {unexpected.line(error)}", file=sys.stderr)
+        sys.exit(unexpected.EXIT_CODE)
     sys.exit(code or 0)
 
 

@@ -73,8 +73,9 @@ def reference() -> str:
         ABOUT.replace("\n", " ") + " " + START,
         "`python -m bodyslam_jax` is the same as `bodyslam`. Exit codes: 0 done; 1 bad "
         "input, one line on standard error; 2 wrong usage; 3 the estimate failed or is "
-        "doubtful, `status` in `summary.json` says why; 130 interrupted, the same "
-        "command continues. Settings with a dot are those of one stage, in "
+        "doubtful, `status` in `summary.json` says why; 70 an error that nobody "
+        "expected, please report it with the file that is named; 130 interrupted, the "
+        "same command continues. Settings with a dot are those of one stage, in "
         "`config.yaml` under its name. `--[no-]x` is `--x` or `--no-x`.",
         "Options of every command:",
         "\n".join(f"- `{flag}`: {about}" for flag, about in GENERAL.items()),

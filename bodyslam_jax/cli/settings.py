@@ -13,6 +13,9 @@ from typing import Any
 from bodyslam_jax.cli import jax_setup
 from bodyslam_jax.config import Config, MotionTraining
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import budget
+from bodyslam_jax.io.declared import as_number, shown
+from bodyslam_jax.io.files import read_yaml
 
 
 def base_config(argv: list[str]) -> Config:
@@ -46,18 +49,12 @@ def read_settings(path: Path, base: Config) -> Config:
 
     **Raises:** `InputError`, naming file and key, if it is not one.
     """
-    import yaml
-
-    try:
-        found = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({error}).") from error
-    return _merged(found, base, str(path))
+    return _merged(read_yaml(path, "settings (config.yaml)"), base, str(path))
 
 
 def _merged(found: Any, base: Any, where: str) -> Any:
     if not isinstance(found, dict):
-        raise InputError(f"{where}: found {found!r}, expected settings by name.")
+        raise InputError(f"{where}: found {shown(found)}, expected settings by name.")
     known = {field.name for field in dataclasses.fields(base)}
     hints = typing.get_type_hints(type(base))
     changes = {}
@@ -66,20 +63,21 @@ def _merged(found: Any, base: Any, where: str) -> Any:
             close = difflib.get_close_matches(str(name), known, n=1)
             hint = f"did you mean `{close[0]}`?" if close else ""
             raise InputError(
-                f"{where}: no setting `{name}`; "
+                f"{where}: no setting `{str(name)[:60]}`; "
                 f"{hint or f'expected one of {sorted(known)}.'}"
             )
         old = getattr(base, name)
         kind = hints[name]
         if type(value) is int and float in (kind, *typing.get_args(kind)):
-            value = float(value)
+            value = as_number(Path(where), name, value)
         if dataclasses.is_dataclass(old):
             value = _merged(value, old, f"{where}: {name}")
         elif isinstance(old, tuple) and isinstance(value, list):
             value = tuple(value)
         elif old is not None and value is not None and type(value) is not type(old):
             raise InputError(
-                f"{where}: {name}: found {value!r}, expected {type(old).__name__} as "
+                f"{where}: {name}: found {shown(value)}, expected "
+                f"{type(old).__name__} as "
                 f"in {old!r}."
             )
         changes[name] = value
@@ -113,10 +111,11 @@ def prepared(
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
-        device = getattr(kwargs.get("config"), "device", None)
+        config = kwargs.get("config")
         elsewhere = in_workers or kwargs.get("engine") is not None
-        jax_setup.prepare("cpu" if elsewhere else device)
-        return command(*args, **kwargs)
+        jax_setup.prepare("cpu" if elsewhere else getattr(config, "device", None))
+        with budget.granted(getattr(config, "limits", budget.current())):
+            return command(*args, **kwargs)
 
     # `inspect` reads it; typeshed does not declare it.
     run.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]

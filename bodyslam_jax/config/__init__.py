@@ -12,6 +12,7 @@ from bodyslam_jax.config.known import GRAVITY_SIGMA as GRAVITY_SIGMA
 from bodyslam_jax.config.known import PATH_SIGMA as PATH_SIGMA
 from bodyslam_jax.config.known import Known as Known
 from bodyslam_jax.config.known import Measured as Measured
+from bodyslam_jax.config.limits import Limits as Limits
 from bodyslam_jax.config.motion import ContactTraining as ContactTraining
 from bodyslam_jax.config.motion import MotionTraining as MotionTraining
 from bodyslam_jax.config.options import field_names as field_names

@@ -6,6 +6,7 @@ from typing import Literal
 from bodyslam_jax.config.check import check
 from bodyslam_jax.config.front_end import Association, Detect, Structure, Tracking
 from bodyslam_jax.config.known import RANGES, Known
+from bodyslam_jax.config.limits import Limits
 from bodyslam_jax.config.people import PeopleFit
 from bodyslam_jax.config.weights import GraphWeights
 
@@ -55,6 +56,7 @@ class Config(Known):
     smoothing_hz: float | None = 6.0
     """Cut-off frequency above which people's motion in the result is smoothed as noise,
     Hz. Without it, nothing is smoothed."""
+    limits: Limits = Limits()
 
     def __post_init__(self):
         check(self, RANGES)

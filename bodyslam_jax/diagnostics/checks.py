@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 Status = Literal["ok", "doubtful", "failed"]
 
@@ -45,6 +46,10 @@ class Reason:
     figure: float | None = None
     unit: str = ""
     person: int | None = None
+    frames: tuple[int, int] | None = None
+    """The first and the last frame to look at."""
+    seconds: tuple[float, float] | None = None
+    """The same, s from the first frame."""
     fatal: bool = False
     """Whether the result as a whole is unusable."""
 
@@ -59,10 +64,14 @@ def judge(
     checks: tuple[Check, ...],
     figures: Mapping[str, float],
     person: int | None = None,
+    *,
+    moments: Mapping[str, tuple[int, int] | None] | None = None,
+    times: Float[np.ndarray, " t"] | None = None,
 ) -> list[Reason]:
     """A reason for each figure beyond its limit.
 
-    Figures that are missing or NaN are not judged; `person` is named in the messages.
+    Figures that are missing or NaN are not judged; `person` is named in the messages,
+    and so are the first and last frame of `moments` and their `times`, s.
     """
     found = []
     for check in checks:
@@ -73,16 +82,26 @@ def judge(
         bound = "at least" if check.below else "at most"
         expected = f"{bound} {check.limit:g}{unit}"
         whose = "" if person is None else f"person {person}: "
+        frames = (moments or {}).get(check.name)
+        seconds, where = None, ""
+        if frames is not None:
+            where = f" (frames {frames[0]} to {frames[1]})"
+        if frames is not None and times is not None:
+            first, last = (float(times[k] - times[0]) for k in frames)
+            seconds = round(first, 2), round(last, 2)
+            where = where[:-1] + f", {seconds[0]:.2f} to {seconds[1]:.2f} s)"
         found.append(
             Reason(
                 name=check.name,
-                message=f"{whose}{check.what} is {figure:.3g}{unit}, expected "
+                message=f"{whose}{check.what} is {figure:.3g}{unit}{where}, expected "
                 f"{expected}.",
                 expected=expected,
                 advice=check.advice,
                 figure=figure,
                 unit=check.unit,
                 person=person,
+                frames=frames,
+                seconds=seconds,
             )
         )
     return found

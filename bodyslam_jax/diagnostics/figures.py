@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import posture
 from bodyslam_jax.diagnostics.gait import Gait, gait_of_joints
+from bodyslam_jax.diagnostics.moments import MOMENT
 from bodyslam_jax.diagnostics.standing_height import standing_height_figures
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.runs import runs as runs_of
@@ -15,8 +16,6 @@ _WALKING = (0.7, posture.RUNNING)
 """Range of median speeds over the ground in walking, m/s."""
 _STEP = 0.35
 """Step length, in leg lengths, from which regular steps are a walk at any speed."""
-_MOMENT = 0.2
-"""Interval, s, in which nobody turns round or reverses a run."""
 _FEWEST = 15
 """Least length of a stretch that is judged, frames."""
 
@@ -58,11 +57,11 @@ def person_figures(
     found = {
         "speed": float(np.percentile(speed, 95)),
         "joint_acceleration": float(np.median(joined(posture.joint_acceleration, fps))),
-        "turn": float(joined(posture.turning_rate, fps, _MOMENT).max()),
-        "velocity_jump": float(joined(posture.speed_change, fps, _MOMENT).max()),
+        "turn": float(joined(posture.turning_rate, fps, MOMENT).max()),
+        "velocity_jump": float(joined(posture.speed_change, fps, MOMENT).max()),
     }
     if speed.mean() > _GETS_ON:
-        slower = joined(posture.slower_foot_speed, fps, _MOMENT / 2)
+        slower = joined(posture.slower_foot_speed, fps, MOMENT / 2)
         found["gliding"] = float(100 * np.percentile(slower, 25) / speed.mean())
     steps = gait_of_joints(max(runs, key=len), fps)
     found |= _strides(steps)
@@ -136,8 +135,15 @@ def floors_apart(
 def keypoint_misfit(
     error: Float[np.ndarray, "t k"], size: Float[np.ndarray, " t"], fps: float
 ) -> float:
+    """As `worst_misfit`, without the frames."""
+    return worst_misfit(error, size, fps)[0]
+
+
+def worst_misfit(
+    error: Float[np.ndarray, "t k"], size: Float[np.ndarray, " t"], fps: float
+) -> tuple[float, tuple[int, int] | None]:
     """Largest distance of keypoints from the body over a third of a second, % of the
-    person's size in the image.
+    person's size in the image, and the first and last frame of that third of a second.
 
     `error` is NaN where nothing is measured; of a frame the median counts, of the third
     of a second too, so that outliers do not. NaN where it is nowhere `_STANDS_OUT`
@@ -147,11 +153,14 @@ def keypoint_misfit(
     frames = np.flatnonzero(measured)
     n = max(3, round(fps / 3))
     if len(frames) < n:
-        return np.nan
+        return np.nan, None
     share = 100 * np.nanmedian(error[frames], axis=1) / np.maximum(size[frames], 1e-6)
     lasting = np.median(np.lib.stride_tricks.sliding_window_view(share, n), axis=-1)
-    worst = float(lasting.max())
-    return worst if worst > _STANDS_OUT * np.median(share) else np.nan
+    k = int(lasting.argmax())
+    worst = float(lasting[k])
+    if worst <= _STANDS_OUT * np.median(share):
+        return np.nan, None
+    return worst, (int(frames[k]), int(frames[k + n - 1]))
 
 
 def _strides(steps: Gait | None) -> dict[str, float]:

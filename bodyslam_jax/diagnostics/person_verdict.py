@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics import measurability
+from bodyslam_jax.diagnostics import measurability, moments
 from bodyslam_jax.diagnostics.checks import Reason, judge
 from bodyslam_jax.diagnostics.gait import Gait
 from bodyslam_jax.diagnostics.measured import Measured
@@ -76,7 +76,13 @@ def assess_person(
         if not found.body[person].any():
             error = measurability.relative_speed_error(speed_noise, path.mean_speed)
             figures = {"leg_in_image": leg_px, "speed_error": error}
-            reasons = judge(MEASURABLE_CHECKS, figures, person)
+            reasons = judge(
+                MEASURABLE_CHECKS,
+                figures,
+                person,
+                moments=dict.fromkeys(figures, moments.seen(present)),
+                times=result.timestamps,
+            )
     inferred = runs(measurability.inferred_legs(found, person, present))
     known = "ok" if present.any() else "absent"
     return PersonVerdict(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.diagnostics import figures
+from bodyslam_jax.diagnostics import figures, moments
 from bodyslam_jax.diagnostics.checks import Reason, judge
 from bodyslam_jax.diagnostics.reprojection import projected_keypoints
 from bodyslam_jax.diagnostics.scale_uncertainty import cue_discrepancy
@@ -42,6 +42,7 @@ def implausible(
     statures: list[float | None],
     of_measurement: list[dict[str, float]],
     measurable: Bool[np.ndarray, " h"],
+    inferred: Bool[np.ndarray, "h t"],
 ) -> Doubts:
     """Reasons where people, camera or ground are beyond what there is.
 
@@ -52,12 +53,17 @@ def implausible(
         statures: of each person, m; `None` if unknown.
         of_measurement: figures of `measurability.measurement_figures` of each person.
         measurable: people who are judged, and who count as people in the world.
+        inferred: frames in which a person's legs were mostly inferred.
     """
     fps, of_people = sequence.fps, []
     walking = False
     misfits = _misfits(sequence, body, joint)
     present = result.present & measurable[:, None]
+    judged = lambda checks, found, who, where: tuple(
+        judge(checks, found, who, moments=where, times=result.timestamps)
+    )
     for h, there in enumerate(present):
+        own: dict[str, moments.Frames] = {}
         ground = ground_heights(result, h, there)
         of_person = figures.person_figures(result.joints[h], there, fps, ground)
         walking |= "trunk_lean" in of_person
@@ -65,10 +71,16 @@ def implausible(
             stature = statures[h]
             if stature is not None:
                 of_person["stature"] = of_person["short_stature"] = stature
-            of_person["keypoint_misfit"] = misfits[h]
+            of_person["keypoint_misfit"], misfit = misfits[h]
             of_person["turned_from_body"] = _turned_from_body(sequence, joint, h)
             of_person |= of_measurement[h]
-        of_people.append(tuple(judge(PERSON_CHECKS, of_person, h)))
+            own = moments.of_person(result.joints[h], there, inferred[h], fps)
+            if misfit is not None:
+                own["keypoint_misfit"] = misfit
+        whole = moments.seen(there)
+        where = {name: own.get(name, whole) for name in of_person}
+        of_people.append(judged(PERSON_CHECKS, of_person, h, where))
+    of_camera: dict[str, moments.Frames] = {}
     of_world = {"floors_apart": figures.floors_apart(result.joints, present, fps)}
     if walking:
         of_world["up_against_trunks"] = np.degrees(up.trunks)
@@ -77,10 +89,13 @@ def implausible(
         of_world["up_in_image"] = figures.up_in_image(result.T_WC[cameras.within])
     if cameras.kind == "moving" and result.present.any():
         of_world |= figures.camera_figures(result.T_WC[cameras.within], fps)
+        of_camera = moments.of_camera(result.T_WC, cameras.within, fps)
         of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
         of_world["ground_under_feet"] = ground_factor
-    return Doubts(tuple(of_people), tuple(judge(WORLD_CHECKS, of_world)))
+    anybody = moments.seen(np.any(result.present, axis=0))
+    where = {name: of_camera.get(name, anybody) for name in of_world}
+    return Doubts(tuple(of_people), judged(WORLD_CHECKS, of_world, None, where))
 
 
 def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> float:
@@ -93,17 +108,19 @@ def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> 
     return figures.turned_from_body(np.asarray(turn), np.asarray(given, float))
 
 
-def _misfits(sequence: Sequence, body: BodyModel, joint: JointEstimate) -> list[float]:
+def _misfits(
+    sequence: Sequence, body: BodyModel, joint: JointEstimate
+) -> list[tuple[float, moments.Frames | None]]:
     """Greatest distance of each person's keypoints from the body, % of the person's
-    size in the image; NaN without keypoints."""
+    size in the image, and where; NaN without keypoints."""
     if sequence.keypoints is None or not joint.present.any():
-        return [np.nan] * len(joint.present)
+        return [(np.nan, None)] * len(joint.present)
     uv = projected_keypoints(body, joint)
     error = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
     valid = sequence.keypoints.confidence > _LEAST_CONFIDENCE
     error = np.where(valid & joint.present[..., None], error, np.nan)
     size = np.linalg.norm(np.ptp(uv, axis=2), axis=-1)
     return [
-        figures.keypoint_misfit(*one, sequence.fps)
+        figures.worst_misfit(*one, sequence.fps)
         for one in zip(error, size, strict=True)
     ]

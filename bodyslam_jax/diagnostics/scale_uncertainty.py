@@ -103,6 +103,8 @@ def discrepancy_warning(start: ScaleStart) -> list[str]:
     ratio = start.motion / start.ground
     return [
         f"people's motion makes the map {ratio:.2f} times as large as the ground under "
-        "their feet does: postures, focal length or ground are off; look at both. "
+        "their feet does: postures, focal length or ground are off. See in the overlay "
+        "whether bodies fit the people, and in the scene whether soles are on the "
+        "floor; --focal or --bodies mend the first. "
         f"Sizes are therefore known to no better than {50 * discrepancy:.0f} %."
     ]

@@ -8,25 +8,29 @@ them.
 
 from bodyslam_jax.diagnostics.checks import Check
 
-_FIT = "look at the overlay: keypoints, focal length or scale are off"
+_FIT = (
+    "look at the overlay there: if keypoints are not on the person, give better ones; "
+    "if they are and the body is not, give the focal length (--focal)"
+)
 _MOCAP = "motion capture"
 _GROUND = (
-    "if the ground is not like that, give the focal length (camera.json), or look at "
-    "the overlay: sizes and depths are off"
+    "if the ground is not like that, sizes and depths are off: give the focal length "
+    "(--focal), or better keypoints where feet are beside the person's in the overlay"
 )
 _IDENTITY = (
     "look at the overlay there: keypoints may jump from one person to another, or "
     "front and back be confused; give keypoints with track ids, or cut the video there"
 )
 _CAMERA = (
-    "if no vehicle carries the camera, look at the scene: tracks follow moving things, "
-    "or scale is off; give person masks or a video with more texture"
+    "if no vehicle carries the camera, look at the scene there: tracks follow moving "
+    "things, or scale is off; give person masks, cut the video there (--start, --end), "
+    "or take one with more texture"
 )
 _CARRIED = (
     "on wheels, on skates, on a moving walkway or carried, a person's motion tells no "
-    "size: leave the person out (--no-people) where the camera's path has metres, or "
-    "take lengths as unknown. If nothing carries the person, scale, focal length or "
-    "frame rate are off"
+    "size: name the people whose steps do (--person, which leaves the others out), or "
+    "take lengths as unknown where there is nobody else. If nothing carries the "
+    "person, scale, focal length or frame rate are off"
 )
 PERSON_CHECKS: tuple[Check, ...] = (
     Check(
@@ -245,7 +249,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "%",
         50.0,
         "two people may have been exchanged there, or one detected twice: look at the "
-        "overlay; give keypoints with track ids, or leave the person out (--person)",
+        "overlay; give keypoints with track ids, or name only the others (--person)",
         "twenty rendered sequences: 95 where two people were exchanged, 89 where one "
         "was detected twice, else nobody appears so",
     ),
@@ -265,7 +269,7 @@ MEASURABLE_CHECKS: tuple[Check, ...] = (
         "px",
         30.0,
         "people so small cannot be measured: a video of higher resolution, or from "
-        "nearer by, or leave the person out (--person)",
+        "nearer by, or name only the others (--person)",
         "detectors err by a pixel at least, which at this size is as much as their "
         "error on the body, 28 mm; rendered people of 15 to 27 px have twice the error "
         "of large ones",
@@ -277,7 +281,7 @@ MEASURABLE_CHECKS: tuple[Check, ...] = (
         "% of a walker's",
         20.0,
         "people so far away, seen so briefly, have no speed that could be measured: a "
-        "longer clip, from nearer by, or leave the person out (--person)",
+        "longer clip, from nearer by, or name only the others (--person)",
         "that of all lengths (`scale_sigma`)",
     ),
 )
@@ -360,7 +364,10 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "factor between the sizes that people's motion and the ground tell",
         "",
         1.25,
-        "postures, focal length, frame rate or ground are off: look at both",
+        "look at the overlay: if bodies are larger than the people in the images, or "
+        "their knees bent too much, give the focal length (--focal) or bodies "
+        "(--bodies); if soles are not on the floor that the scene shows, people stand "
+        "on something else than the map's ground; else check the frame rate (--fps)",
         "estimates of 13 simulated sequences with bodies, 80 to 240 frames: at most "
         "1.09; of 40 frames, or without bodies, up to 1.42, within their errors",
     ),

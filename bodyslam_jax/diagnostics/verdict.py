@@ -100,6 +100,13 @@ def assess(
             statures=[person.stature for person in people],
             of_measurement=measurability.measurement_figures(sequence, found, result),
             measurable=np.array([p.status == "ok" for p in people], bool),
+            inferred=np.array(
+                [
+                    measurability.inferred_legs(found, h, present)
+                    for h, present in enumerate(result.present)
+                ],
+                bool,
+            ).reshape(result.present.shape),
         )
         people = with_doubts(people, doubts)
         of_world = doubts.of_whole

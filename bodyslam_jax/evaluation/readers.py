@@ -1,9 +1,6 @@
 """Run folders and ground truths, read into one `Result` each."""
 
-import json
 import logging
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +13,9 @@ from bodyslam_jax.body import BodyModel, joints
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.resampling import bracket, interpolate_poses
 from bodyslam_jax.io import read_tum as read_tum
+from bodyslam_jax.io.archive import read_npy, read_npz
+from bodyslam_jax.io.declared import as_array, as_number
+from bodyslam_jax.io.files import read_json_fields
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
@@ -37,43 +37,33 @@ _RUN_FIELDS = {
 def read_result(path: Path) -> Result:
     """Reads `result.npz` (or the run folder around it) and its `summary.json`.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    **Raises:** `InputError`, naming the file, what was found and
     what was expected.
     """
     file = path / "result.npz" if path.is_dir() else path
-    arrays = load_npz(file)
-    missing = [name for name in _RUN_FIELDS if name not in arrays]
-    if missing:
-        raise InputError(f"{file}: no array {', '.join(missing)}; not a result.npz.")
-    sizes: dict[str, int] = {}
-    for name, axes in _RUN_FIELDS.items():
-        shape = arrays[name].shape
-        fits = len(shape) == len(axes) and all(
-            n == (axis if isinstance(axis, int) else sizes.setdefault(axis, n))
-            for n, axis in zip(shape, axes, strict=True)
-        )
-        if not fits:
-            raise InputError(f"{file}: {name} has shape {shape}, not {axes} ({sizes}).")
-        _check_finite(file, name, arrays[name])
+    archive = read_npz(file, "a run's result.npz")
+    archive.require(*_RUN_FIELDS)
+    fields: dict[str, Any] = {
+        name: archive.array(name, shape) for name, shape in _RUN_FIELDS.items()
+    }
+    if fields["timestamps"].size == 0 or (np.diff(fields["timestamps"]) <= 0).any():
+        raise InputError(f"{file}: `timestamps` do not increase, or there is none.")
+    fields["scale"] = float(fields["scale"])
+    fields["present"] = archive.array("present", ("h", "t"), kind="boolean")
+    if "joint_sigma" in archive:
+        shape = ("h", "t", 24)
+        fields["joint_sigma"] = archive.array("joint_sigma", shape, low=0)
     summary_file = file.with_name("summary.json")
-    summary = _read_summary(summary_file) if summary_file.exists() else {}
-    fields: dict[str, Any] = {name: _float(arrays[name]) for name in _RUN_FIELDS}
-    fields["scale"] = float(arrays["scale"])
-    fields["present"] = arrays["present"].astype(bool)
-    sigma = arrays.get("joint_sigma")
-    if sigma is not None and sigma.shape == fields["joints"].shape[:3]:
-        fields["joint_sigma"] = _float(sigma)
+    summary = read_summary(summary_file) if summary_file.exists() else {}
     return Result(**fields, summary=summary)
 
 
-def _read_summary(file: Path) -> dict[str, Any]:
-    try:
-        summary = json.loads(file.read_text())
-    except ValueError as error:
-        raise InputError(f"{file}: not readable as JSON ({error}).") from None
-    if not isinstance(summary, dict):
-        raise InputError(f"{file}: {type(summary).__name__}, expected an object.")
-    return summary
+def read_summary(file: Path) -> dict[str, Any]:
+    """The content of a run's `summary.json`.
+
+    **Raises:** `InputError`, naming the file, if it is no JSON object.
+    """
+    return read_json_fields(file, "a run's summary.json").data
 
 
 def read_groundtruth(path: Path, body: BodyModel) -> Result:
@@ -85,11 +75,11 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
     first timestamp. Bodies without joints are posed with `body`. Without a camera
     `summary["has_camera"]` is false; without bodies there are no people.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` naming the file, what was found and
+    **Raises:** `InputError`, naming the file, what was found and
     what was expected.
     """
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such ground truth.")
+        raise InputError(f"{path}: no such ground truth.")
     if path.is_dir():
         if (path / "groundtruth").is_dir():
             path = path / "groundtruth"
@@ -99,7 +89,7 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
         bodies = sorted(path.glob("body.npz")) or sorted(path.glob("body_*.npz"))
         landmarks = path / "landmarks.npy"
     elif path.suffix == ".npz":
-        if "T_WC" in load_npz(path):
+        if "T_WC" in read_npz(path):
             return read_result(path)
         cameras, bodies, landmarks = [], [path], None
     else:
@@ -194,42 +184,29 @@ def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
 
     An optional `present` (t,) marks the frames in which the person is known.
     """
-    arrays = load_npz(path)
-    missing = [name for name in ("poses", "trans", "betas") if name not in arrays]
-    rate = next((n for n in _RATES if n in arrays), None)
-    if missing or rate is None:
-        missing += [] if rate else [_RATES[0]]
-        raise InputError(f"{path}: no array {', '.join(missing)}, only {[*arrays]}.")
-    for name in {"poses", "trans", "betas", "joints", "present", rate} & set(arrays):
-        if arrays[name].dtype.kind not in "fiub":
-            raise InputError(
-                f"{path}: {name} is of type {arrays[name].dtype}, no number."
-            )
-    if arrays[rate].size != 1:
-        raise InputError(f"{path}: {rate} is {arrays[rate].tolist()}, not one number.")
-    poses, trans = _float(arrays["poses"]), _float(arrays["trans"])
-    betas, fps = np.ravel(_float(arrays["betas"])), float(arrays[rate].item())
-    num = len(poses) if poses.ndim == 2 else -1
-    if num < 1 or poses.shape[1] < 66 or trans.shape != (num, 3):
+    archive = read_npz(path, "a true body (.npz)")
+    rate = next((n for n in _RATES if n in archive), _RATES[0])
+    archive.require("poses", "trans", "betas", rate)
+    poses, trans = archive.array("poses", ("t", None)), archive.array("trans", ("t", 3))
+    betas = np.ravel(archive.array("betas"))
+    fps = as_number(path, rate, archive.raw(rate), 1, 1000)
+    num = len(poses)
+    if num < 1 or poses.shape[1] < 66:
         raise InputError(
             f"{path}: poses {poses.shape}, trans {trans.shape}, not (t, 72), (t, 3)."
         )
-    if not 1 <= fps <= 1000:
-        raise InputError(f"{path}: {rate} is {fps}, not a frame rate in 1/s.")
     if poses.shape[1] != 72:
         poses = np.concatenate([poses[:, :66], np.zeros((num, 6))], 1)
     betas = np.pad(betas[:10], (0, max(0, 10 - len(betas))))
-    if "joints" in arrays:
-        found = _float(arrays["joints"])
-        if found.shape != (num, 24, 3):
-            raise InputError(f"{path}: joints {found.shape}, not {(num, 24, 3)}.")
+    if "joints" in archive:
+        found = archive.array("joints", ("t", 24, 3))
     else:
         found = posed_joints(body, poses, betas, trans)
-    for name, array in (("poses", poses), ("trans", trans), ("joints", found)):
-        _check_finite(path, name, array)
-    present = np.ravel(arrays.get("present", np.ones(num))).astype(bool)
-    if len(present) != num:
-        raise InputError(f"{path}: present {present.shape}, not {(num,)}.")
+        # Angles and shapes beyond any body.
+        found = as_array(path, "joints of its poses and betas", found)
+    present = np.ones(num, bool)
+    if "present" in archive:
+        present = archive.array("present", ("t",), kind="boolean")
     return {
         "poses": poses,
         "trans": trans,
@@ -253,7 +230,8 @@ def posed_joints(
         missing = _CHUNK - len(poses[part])
         pose, place = (np.pad(x[part], ((0, missing), (0, 0))) for x in (poses, trans))
         as_body = [jnp.asarray(x, body.dtype) for x in (pose, betas, place)]
-        found.append(_float(_joints(body, *as_body))[: _CHUNK - missing])
+        posed = np.asarray(_joints(body, *as_body), np.float64)
+        found.append(posed[: _CHUNK - missing])
     return np.concatenate(found)
 
 
@@ -266,40 +244,4 @@ _RATES = ("mocap_framerate", "mocap_frame_rate")
 def _landmarks(path: Path | None) -> np.ndarray:
     if path is None or not path.exists():
         return np.zeros((0, 3))
-    try:
-        found = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"{path}: not a readable .npy file ({error}).") from None
-    if found.ndim != 2 or found.shape[1] != 3:
-        raise InputError(f"{path}: shape {found.shape}, expected (landmarks, 3).")
-    _check_finite(path, "landmarks", found)
-    return _float(found)
-
-
-def load_npz(path: Path) -> dict[str, np.ndarray]:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file.")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {n: archive[n] for n in archive.files if n not in _OBJECTS}
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: not a readable .npz file ({error}).") from None
-
-
-_UNREADABLE = (
-    *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, AttributeError),
-    *(OSError, NotImplementedError),
-)
-"""Errors that NumPy raises on damaged archives."""
-
-_OBJECTS = ("marker_data", "marker_labels")
-"""Arrays of AMASS that are not needed, and pickled in some files."""
-
-
-def _float(array: Any) -> np.ndarray:
-    return np.asarray(array, np.float64)
-
-
-def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
-    if array.dtype.kind not in "fiub" or not np.all(np.isfinite(array)):
-        raise InputError(f"{path}: {name} holds values that are not finite numbers.")
+    return as_array(path, "landmarks", read_npy(path), (None, 3))

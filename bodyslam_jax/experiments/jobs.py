@@ -44,7 +44,7 @@ class Plan:
 def check_files(experiment: Experiment, config: Config) -> None:
     """Reads the files that rows will need, before minutes are spent on other rows.
 
-    **Raises:** `FileNotFoundError` or `ValueError`, naming the file or the option.
+    **Raises:** `InputError`, naming the file or the option.
     """
     if experiment.frames is not None and experiment.frames < 2:
         raise InputError(

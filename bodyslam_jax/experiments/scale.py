@@ -66,11 +66,10 @@ def scale_recovery(
         found = case.prepare()
         prepared = without_map(found.problem, found.state, hold_cameras=True)
     problem, state = prepared
-    true_size = graph.rescaled(with_scale(state, 1.0), case.map_scale)
+    true_size = graph.rescaled(problem, with_scale(state, 1.0), case.map_scale)
     state, history = _recover(
         jnp.asarray(perturbations),
-        problem,
-        true_size,
+        *true_size,
         case.truth,
         case.body,
         jnp.asarray(case.bodies.present),
@@ -88,12 +87,12 @@ def scale_recovery(
 def _recover_one(
     perturbation, problem, state, truth, body, present, registered, schedule
 ):
-    start = graph.rescaled(state, 1 / perturbation)
+    start = graph.rescaled(problem, state, 1 / perturbation)
     observe = lambda y: {
         "scale": y.scale,
         "h_ate": _h_ate(y, truth, body, present, registered),
     }
-    return solver.trace(problem, start, observe, schedule=schedule)
+    return solver.trace(*start, observe, schedule=schedule)
 
 
 _recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 7))

@@ -78,8 +78,8 @@ def trajectories(result: Result) -> tuple[str, str]:
         ax = plan.add_subplot()
         _paths(ax, result, (0, 2), low, high)
         _view_directions(ax, result, float(max(size[0], size[2])))
-        ax.set_xlabel("x, m")
-        ax.set_ylabel("z, m")
+        ax.set_xlabel("← x (left of the first camera), m")
+        ax.set_ylabel("z (ahead of the first camera), m")
         _legend(ax, result)
         ax.invert_xaxis()  # Seen from above, with z up the page, x runs to the left.
         along = 0 if size[0] >= size[2] else 2
@@ -89,7 +89,7 @@ def trajectories(result: Result) -> tuple[str, str]:
         _paths(ax, result, (along, 1), low, high)
         if along == 0:
             ax.invert_xaxis()
-        ax.set_xlabel(f"{'xyz'[along]}, m")
+        ax.set_xlabel("← x, m" if along == 0 else "z, m")
         ax.set_ylabel("height y, m")
         return _svg(plan), _svg(side)
 

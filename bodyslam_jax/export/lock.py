@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bodyslam_jax.config.errors import InputError
+
 try:
     import fcntl
 except ImportError:  # Windows: the file's content and age decide
@@ -31,7 +33,7 @@ STALE = 60.0
 _UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL}
 
 
-class FolderInUse(ValueError):
+class FolderInUse(InputError):
     """Another process is writing the run folder."""
 
 

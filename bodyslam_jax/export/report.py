@@ -48,7 +48,7 @@ def write_report(
         answers(result, summary, camera, people, body),
         _in_short(summary, len(people)),
         _pictures(path.parent, still),
-        _reasons(summary, len(people)),
+        _reasons(summary, len(people), _overlay(path.parent)),
         _plots(result, summary, camera, people),
         _warnings(summary.get("warnings") or []),
         _details(result, summary, people, body),
@@ -128,10 +128,32 @@ def _in_short(summary: Mapping[str, Any], num_people: int) -> str:
     )
 
 
-def _reasons(summary: Mapping[str, Any], num_people: int) -> str:
-    """Each reason to doubt the result, with its figure and what to do about it."""
+def _overlay(folder: Path) -> str | None:
+    """The name of the video with the bodies in it, if the folder has one."""
+    names = ("overlay.webm", "overlay.mp4")
+    return next((name for name in names if (folder / name).exists()), None)
+
+
+def _where(reason: Mapping[str, Any], overlay: str | None) -> str:
+    """The frames to look at, as a link to their time in the overlay."""
+    frames, seconds = reason.get("frames"), reason.get("seconds")
+    if not frames:
+        return ""
+    first, last = (int(frame) for frame in frames)
+    words = f"Look at frames {first} to {last}"
+    if overlay is None or not seconds:
+        return f"{words}. "
+    start, end = (float(second) for second in seconds)
+    link = f"{overlay}#t={start:.2f},{max(end, start + 0.5):.2f}"
+    return f'<a href="{link}">{words} ({start:.2f} to {end:.2f} s)</a>. '
+
+
+def _reasons(summary: Mapping[str, Any], num_people: int, overlay: str | None) -> str:
+    """Each reason to doubt the result, with its figure, the frames to look at, and what
+    to do about it."""
     items = "".join(
         f"<li><strong>{html.escape(in_plain_words(reason, num_people))}</strong> "
+        f"{_where(reason, overlay)}"
         f"What to do: {html.escape(str(reason.get('advice', '')))}. "
         f"<small>{html.escape(str(reason.get('message', '')))}</small></li>"
         for reason in summary.get("reasons") or []
@@ -151,22 +173,18 @@ def _pictures(folder: Path, still: bytes | None) -> str:
     if still is not None:
         picture = "data:image/jpeg;base64," + base64.b64encode(still).decode()
     parts = []
-    for name in ("overlay.webm", "overlay.mp4"):
-        if (folder / name).exists():
-            poster = f' poster="{picture}"' if picture else ""
-            shown = (
-                f'<video src="{name}" controls muted loop playsinline '
-                f'preload="metadata"{poster}></video>'
-            )
-            words = f'The video with the bodies in it: <a href="{name}">{name}</a>'
-            parts.append((shown, words))
-            break
-    else:
-        if picture:
-            alt = "a frame of the video with the bodies in it"
-            parts.append(
-                (f'<img src="{picture}" alt="{alt}">', "A frame of the video.")
-            )
+    name = _overlay(folder)
+    if name is not None:
+        poster = f' poster="{picture}"' if picture else ""
+        shown = (
+            f'<video src="{name}" controls muted loop playsinline '
+            f'preload="metadata"{poster}></video>'
+        )
+        words = f'The video with the bodies in it: <a href="{name}">{name}</a>'
+        parts.append((shown, words))
+    elif picture:
+        alt = "a frame of the video with the bodies in it"
+        parts.append((f'<img src="{picture}" alt="{alt}">', "A frame of the video."))
     if (folder / "scene.html").exists():
         frame = (
             '<iframe src="scene.html#embedded" loading="lazy" title="scene in 3D">'
@@ -206,7 +224,11 @@ def _plots(
         beside += _figure(svg, caption)
     return (
         '<section><h2>Paths and speed</h2><div class="two">'
-        + _figure(above, "From above. Arrows: where the camera looks.")
+        + _figure(
+            above,
+            "From above, with z, ahead of the first camera, up the page: x grows to "
+            "the left. Arrows: where the camera looks.",
+        )
         + f"<div>{beside}</div></div></section>"
     )
 

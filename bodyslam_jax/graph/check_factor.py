@@ -13,13 +13,10 @@ from jaxtyping import Array
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.globals import Named, bound
 from bodyslam_jax.graph.padding import check_padding
-from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.state import State, Step, moved_at_random
 from bodyslam_jax.graph.validation import check_measurements, check_state
 from bodyslam_jax.graph.validation_weights import check_precision
 
-_MOVED = 0.01
-"""rad, m and so on: how far from the given state derivatives are looked at, where a
-residual is not 0 by chance."""
 _SAME = {"float64": 1e-9, "float32": 1e-4}
 """Relative difference that rounding may make between two ways of computing a cost."""
 _VARIABLE = {
@@ -65,7 +62,7 @@ def check_factor(factor: Factor, state: State, named: Named = ()) -> FactorRepor
     check_precision(factor, state)
     name = type(factor).__name__
     residual = _residual(factor, state, name)
-    moved = _away_from(state)
+    moved = moved_at_random(state)
     cost = _finite_cost(factor, state, name)
     gradient = _gradient_by_state(factor, moved, name)
     _check_gradient_by_measurements(factor, moved, name)
@@ -182,13 +179,3 @@ def _traced(name: str, way: str, call: Callable[[], Any]) -> Any:
 def _slope(factor: Factor, state: State) -> Step:
     cost = lambda step: factor.cost(state.retract(step))
     return jax.grad(cost)(state.zero_step())
-
-
-@jax.jit
-def _away_from(state: State) -> State:
-    """Another state close by, drawn with a fixed key."""
-    leaves, treedef = jax.tree.flatten(state.zero_step())
-    keys = jax.random.split(jax.random.key(0), len(leaves))
-    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
-    step = [draw(k, x) for k, x in zip(keys, leaves, strict=True)]
-    return state.retract(treedef.unflatten(step))

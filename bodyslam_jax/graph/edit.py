@@ -14,7 +14,11 @@ from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
-from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.state import State, Step, moved_at_random
+from bodyslam_jax.graph.tracing import is_traced
+
+_SAME = {"float64": 1e-9, "float32": 1e-4}
+"""Relative difference that rounding may make of a residual in two units of the map."""
 
 
 def disable(problem: Problem, *kinds: type[Factor]) -> Problem:
@@ -56,19 +60,104 @@ def set_constant(free: Step, *names: str) -> Step:
     return dataclasses.replace(free, **held)
 
 
-def rescaled(state: State, factor: Float[Array | np.ndarray, "*f"] | float) -> State:
-    """The same state in a map that is `factor` times as large.
+def rescaled(
+    problem: Problem | State,
+    state: State | Float[Array | np.ndarray, "*f"] | float,
+    factor: Float[Array | np.ndarray, "*f"] | float | None = None,
+) -> tuple[Problem, State]:
+    """A problem and a state of it in a map that is `factor` times as large.
 
-    Camera centres and landmarks are multiplied by `factor`, and the scale s stays, so
-    that lengths in metres grow by it; a solve from there ends with s divided by
-    `factor`. An array of factors gives a batch of states with the array's axes leading.
+    Camera centres and landmarks are multiplied by `factor`, and so is all that the
+    problem's factors measure in units of the map (`Factor.rescaled`). The scale s
+    stays, so that the state's lengths in metres grow by `factor`; a solve from there
+    ends with s divided by it. With `state.scale / factor` the cost is what it was.
+
+    An array of factors gives a batch of both with the array's axes leading.
+
+    **Raises:** `ValueError` for a state alone, for a factor that is not above 0, and
+    for a problem with a custom factor whose residual changes with the unit of the map:
+    it is compared in a map of twice the size, or, where it is traced, must declare
+    `map_units`.
     """
+    if not isinstance(problem, Problem) or not isinstance(state, State):
+        raise ValueError(
+            "rescaled: found a state alone, expected `rescaled(problem, state, "
+            "factor)`, which returns both: ground, priors of landmarks and a camera "
+            "path in the problem are in units of the map, too."
+        )
+    if factor is None or (
+        not is_traced(factor)
+        and not (np.isfinite(factor) & (np.asarray(factor) > 0)).all()
+    ):
+        raise ValueError(f"factor: found {factor}, expected a number above 0.")
+    for each in problem.factors:
+        _check_units(each, state)
     by = jnp.asarray(factor, state.scale.dtype)
-    one = lambda f: eqx.tree_at(
-        lambda s: (s.cameras, s.landmarks),
-        state,
-        (state.cameras.at[:, :3, 3].multiply(f), state.landmarks * f),
-    )
+    whole = (problem, state)
+    if by.ndim:  # `jax.vmap` maps arrays only.
+        as_array = lambda x: jnp.asarray(x, by.dtype) if isinstance(x, float) else x
+        whole = jax.tree.map(as_array, whole)
+    arrays, static = eqx.partition(whole, eqx.is_array)
+
+    def one(by):
+        problem, state = eqx.combine(arrays, static)
+        return eqx.filter(_in_unit(problem, state, by), eqx.is_array)
+
     for _ in range(by.ndim):
         one = jax.vmap(one)
-    return one(by)
+    return eqx.combine(one(by), static)
+
+
+def _in_unit(
+    problem: Problem, state: State, factor: Float[Array, ""]
+) -> tuple[Problem, State]:
+    factors = tuple(f.rescaled(factor) for f in problem.factors)
+    larger = dataclasses.replace(
+        state,
+        cameras=state.cameras.at[:, :3, 3].multiply(factor),
+        landmarks=factor * state.landmarks,
+    )
+    return dataclasses.replace(problem, factors=factors), larger
+
+
+def _check_units(factor: Factor, state: State) -> None:
+    """Refuses a custom factor whose residual depends on the unit of the map.
+
+    In a map of twice the size with half as many metres per unit it must be the same:
+    both are exact in binary floating point.
+    """
+    custom = factor.factor if isinstance(factor, Masked) else factor
+    name = type(custom).__name__
+    if type(custom).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return
+    seen = {key for key, _ in custom.keys} if isinstance(custom, FrameFactor) else None
+    if seen is not None and not seen & {"camera", "scale"}:
+        return
+    advice = (
+        f"declare the power of the map's unit in each of its fields that has one, such "
+        f'as `map_units = {{"position": 1}}`, or `{{}}` ({name}.map_units).'
+    )
+    if is_traced((factor, state)):
+        if custom.map_units is None:
+            raise ValueError(
+                f"problem.factors: {name} is traced, so that it cannot be found out "
+                f"whether it measures in units of the map; {advice}"
+            )
+        return
+    two = jnp.asarray(2.0, state.scale.dtype)
+    moved = moved_at_random(state)
+    larger = dataclasses.replace(
+        moved,
+        scale=moved.scale / two,
+        cameras=moved.cameras.at[:, :3, 3].multiply(two),
+        landmarks=two * moved.landmarks,
+    )
+    before = np.asarray(factor.residual(moved))
+    after = np.asarray(factor.rescaled(two).residual(larger))
+    same = _SAME[state.scale.dtype.name]
+    size = float(abs(before).max(initial=0.0, where=np.isfinite(before)))
+    if not np.allclose(after, before, same, same * size, equal_nan=True):
+        raise ValueError(
+            f"problem.factors: the residual of {name} changes with the unit of the "
+            f"map; {advice}"
+        )

@@ -114,8 +114,23 @@ else:
 class Factor(eqx.Module, _Declared):
     """Measurements of one kind, and how far a state is from explaining them."""
 
+    map_units: ClassVar[Mapping[str, int] | None] = None
+    """The power of the map's unit in each field that has one: `{"position": 1}` for
+    lengths in the map, -1 for their inverse or for metres per unit of the map; `{}`
+    where there is none. Without it a factor is taken for one without, and `rescaled`
+    refuses the problem if the residual says otherwise."""
+
     if not TYPE_CHECKING:
         loss: eqx.AbstractVar[Loss]
+
+    def rescaled(self, factor: Float[Array, ""]) -> "Factor":
+        """The same measurements in a map that is `factor` times as large: fields are
+        multiplied by the powers of `factor` in `map_units`."""
+        found = self
+        for name, power in (self.map_units or {}).items():
+            value = in_unit(getattr(self, name), factor**power)
+            found = eqx.tree_at(lambda f, n=name: getattr(f, n), found, value)
+        return found
 
     @abc.abstractmethod
     def residual(self, state: State) -> Float[Array, "*m d"]:
@@ -125,6 +140,13 @@ class Factor(eqx.Module, _Declared):
         """Negative log-likelihood: `0.5 sum rho(|r|^2)`."""
         s = squared_norm(residual_of(self, state))
         return 0.5 * jnp.sum(self.loss.rho(s))
+
+
+def in_unit(value: Float[Array, "*b"], power: Float[Array, ""]) -> Float[Array, "*b"]:
+    """A quantity in another unit; infinite ones, as the sigma of what is missing, stay,
+    and have the derivative 0 by the unit."""
+    known = jnp.isfinite(value)
+    return jnp.where(known, jnp.where(known, value, 0.0) * power, value)
 
 
 @eqx.filter_jit

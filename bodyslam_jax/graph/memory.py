@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry.lengths import LENGTHS
 from bodyslam_jax.graph.layout import Layout
 from bodyslam_jax.graph.ordering import CHUNK
@@ -45,13 +46,13 @@ def memory_needed(layout: Layout, state: State) -> int:
 def check_memory(layout: Layout, state: State) -> None:
     """Refuses a problem that does not fit; memory grows linearly with frames.
 
-    **Raises:** `ValueError` with the number of frames that fit.
+    **Raises:** `InputError` with the number of frames that fit.
     """
     need, have = memory_needed(layout, state), memory()
     if need > have:
         most = int(layout.num_chunks * CHUNK * have / need)
         fit = max((x for x in LENGTHS if x <= most), default=most)
-        raise ValueError(
+        raise InputError(
             f"{len(state.cameras)} frames need about {need / 2**30:.1f} GiB, found "
             f"{have / 2**30:.1f} GiB: about {fit} frames fit."
         )

@@ -19,12 +19,9 @@ from jaxtyping import Array, Bool
 from bodyslam_jax.graph.annotations import array_annotations
 from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss
-from bodyslam_jax.graph.state import State
+from bodyslam_jax.graph.state import State, moved_at_random
 from bodyslam_jax.graph.tracing import is_traced
 
-_PERTURBATION = 0.01
-"""Standard deviation (rad, m, ...) of the random step from the first state to the state
-at which costs are compared: in the first state a residual may be 0 by chance."""
 _RTOL = {"float64": 1e-8, "float32": 1e-3}
 """Allowed relative difference of costs."""
 
@@ -67,6 +64,9 @@ class Masked(FrameFactor):
     @property
     def limbs(self):
         return self.factor.limbs
+
+    def rescaled(self, factor):
+        return dataclasses.replace(self, factor=self.factor.rescaled(factor))
 
     def frame_of_row(self, num_frames):
         active = self.present.reshape(-1, num_frames).any(axis=0)
@@ -211,12 +211,7 @@ def check_padding(factor: FrameFactor, state: State) -> None:
 @eqx.filter_jit
 def _costs(factor, padded, state, num_frames):
     """Costs with padding and without, at a perturbed state."""
-    step = state.zero_step()
-    leaves, treedef = jax.tree.flatten(step)
-    keys = jax.random.split(jax.random.key(0), len(leaves))
-    draw = lambda key, x: _PERTURBATION * jax.random.normal(key, x.shape, x.dtype)
-    step = treedef.unflatten([draw(k, x) for k, x in zip(keys, leaves, strict=True)])
-    moved = state.retract(step)
+    moved = moved_at_random(state)
     cut = dataclasses.replace(
         moved,
         cameras=moved.cameras[:num_frames],

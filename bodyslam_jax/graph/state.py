@@ -15,6 +15,9 @@ from jaxtyping import Array, Float
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 
+_MOVED = 0.01
+"""rad, m and so on: standard deviation of a step to a state close by."""
+
 
 class Step(eqx.Module):
     """An element of the tangent space of a `State`."""
@@ -136,6 +139,17 @@ def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
     """T_WH in metres: `r_WH = s r'_WC + C_WC r_CH`, `C_WH = C_WC C_CH`."""
     cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
     return cameras @ state.roots
+
+
+@jax.jit
+def moved_at_random(state: State) -> State:
+    """Another state close by, drawn with a fixed key: there a residual or a derivative
+    is not 0 by chance."""
+    leaves, treedef = jax.tree.flatten(state.zero_step())
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
+    step = [draw(k, x) for k, x in zip(keys, leaves, strict=True)]
+    return state.retract(treedef.unflatten(step))
 
 
 def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:

@@ -13,6 +13,8 @@ Size = tuple[float, float]
 
 _SAME_ASPECT = 0.015
 """Relative difference of two aspect ratios that rounding to even sizes may leave."""
+_MAX_SIDE = 1e6
+"""px; a larger number is not the side of an image."""
 _BEYOND = 0.1
 """Share of the points outside the declared size from which that size is not theirs."""
 
@@ -67,9 +69,9 @@ def _two(value: Any) -> tuple[Any, Any] | None:
 def _size(width: Any, height: Any) -> Size | None:
     try:
         size = float(width), float(height)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
-    return size if all(np.isfinite(n) and n >= 2 for n in size) else None
+    return size if all(2 <= n <= _MAX_SIDE for n in size) else None
 
 
 def factor_to(

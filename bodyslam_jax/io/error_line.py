@@ -5,8 +5,14 @@ def error_line(error: BaseException) -> str:
     """What went wrong, in one line: the file and the system's reason, the message of an
     error of the input, or else the kind of the error and the start of its message."""
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'file'}: {error.strerror}."
-    text = " ".join(str(error).split())
+        return _printable(f"{error.filename or 'file'}: {error.strerror}.")
+    text = _printable(str(error))
     if isinstance(error, (OSError, ValueError)) and text:
         return text
     return f"{type(error).__name__}: {text[:300]}"
+
+
+def _printable(text: str) -> str:
+    """The text in one line, without what no terminal or file takes."""
+    line = " ".join(text.encode("utf-8", "backslashreplace").decode().split())
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

@@ -8,6 +8,7 @@ is taken, with a warning.
 import re
 from collections.abc import Callable, Iterable, Sequence
 
+from bodyslam_jax.io.budget import last_frame_problem
 from bodyslam_jax.io.video import IMAGE_SUFFIXES
 
 Warn = Callable[[str], None]
@@ -18,9 +19,8 @@ _SUFFIX = re.compile(
 )
 
 
-_SPARSEST = 100
-"""Ratio of the last number to the count of names above which the numbers are no frame
-numbers, but times for example."""
+_MAX_DIGITS = 255
+"""Digits of a number in a name: file systems allow no longer names."""
 
 
 class InvalidContent(ValueError):
@@ -106,10 +106,16 @@ def _numbers(stems: list[str]) -> list[int] | None:
         return None
     if len({re.sub(r"\d+", "#", stem) for stem in stems}) == 1:
         for column in reversed(list(zip(*groups, strict=True))):
-            found = [int(digits) for digits in column]
+            found = [_number(digits) for digits in column]
             if len(set(found)) == len(found):
                 return found
-    return [int(g[-1]) for g in groups]
+    return [_number(g[-1]) for g in groups]
+
+
+def _number(digits: str) -> int:
+    if len(digits) > _MAX_DIGITS:
+        raise InvalidContent(f"a number of {len(digits)} digits in a name")
+    return int(digits)
 
 
 def _refuse_two_of_one(names: list[str], numbers: list[int]) -> None:
@@ -146,10 +152,10 @@ def _first(
     first, last = min(numbers), max(numbers)
     unbroken = len(set(numbers)) == last - first + 1
     if num_frames is None:
-        if last > _SPARSEST * (len(numbers) + 10):
-            raise InvalidContent(
-                f"{what} of frame {last}, but {len(numbers)} names: no numbers"
-            )
+        # Counted from the first if none is missing, as of a cut-out.
+        span = last - first if unbroken and complete else last
+        if problem := last_frame_problem(span, len(numbers), what):
+            raise InvalidContent(problem)
         num_frames = len(numbers) if complete and unbroken else last + 1
     if unbroken and len(numbers) == num_frames:
         return first  # also a cut-out of a longer video

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.archive import open_npz
+from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
+from bodyslam_jax.io.images import read_image
 from bodyslam_jax.io.video import list_images
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, MaskUse
 
@@ -107,18 +108,20 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
 
     **Raises:** `InputError`, naming the file, if there is no such array.
     """
-    with open_npz(path) as archive:
-        names = archive.files
-        name = "masks" if "masks" in names or len(names) != 1 else names[0]
-        if name not in names:
-            raise InputError(f"{path}: arrays {', '.join(names)}, expected `masks`.")
-        stack = archive[name]
+    archive = read_npz(path)
+    names = archive.names
+    name = "masks" if "masks" in names or len(names) != 1 else names[0]
+    if name not in names:
+        raise InputError(f"{path}: arrays {', '.join(names)}, expected `masks`.")
+    stack = archive.raw(name)
     if stack.ndim not in (3, 4) or stack.dtype.kind not in "biuf":
         raise InputError(
             f"{path}: `{name}` {stack.dtype}{stack.shape}, expected numbers (frames, "
             "height, width) or (frames, people, height, width)."
         )
-    found = np.asarray(stack > (0 if stack.dtype.kind in "bu" else 0.5))
+    if stack.dtype.kind != "b":
+        stack = stack > (0 if stack.dtype.kind == "u" else 0.5)
+    found = np.asarray(stack)
     return np.asarray(found.any(axis=1)) if found.ndim == 4 else found
 
 
@@ -128,10 +131,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
 
     **Raises:** `InputError`, naming the file, if it is no image.
     """
-    data = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if image is None:
-        raise InputError(f"{path}: not an image that OpenCV can read.")
+    image = read_image(path, cv2.IMREAD_UNCHANGED)
     if image.ndim == 3 and image.shape[2] == 4:
         color, alpha = image[..., :3].max(axis=2), image[..., 3]
         image = alpha if np.ptp(color) == 0 and np.ptp(alpha) > 0 else color

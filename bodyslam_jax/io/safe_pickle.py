@@ -1,318 +1,274 @@
 """Pickled files without running what is in them.
 
 Pickle, joblib, PyTorch's zip files and object arrays of NumPy can hold code that runs
-on loading. This unpickler makes numbers, text, lists, dictionaries and arrays, by
-functions of its own, and refuses every other name before it is called. Objects of
-libraries that the caller names become inert stand-ins that keep their state.
+on loading. Here they are unpacked within a budget, and run by an interpreter
+(`pickle_machine`) that makes plain data only: numbers, text, lists, dictionaries and
+new arrays. Objects of libraries that the caller names become inert stand-ins that keep
+their state.
 """
 
 import bz2
-import collections
-import dataclasses
-import gzip
-import io
 import lzma
-import pickle
+import os
 import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import plain_arrays
+from bodyslam_jax.io.pickle_machine import Machine
+from bodyslam_jax.io.pickle_names import STORAGES
+from bodyslam_jax.io.pickle_values import Name, StandIn, Storage
+from bodyslam_jax.io.plain_arrays import Account, Damaged, Refused, shown
 
-_MAX_BYTES = 8 << 30
-"""A larger array or archive is refused as a decompression bomb."""
-_TEXT_PICKLES = (b"(d", b"(l", b"}", b"]")
-"""How dictionaries and lists begin in protocols 0 and 1, which have no magic number."""
+__all__ = ["StandIn", "restricted_load"]
 
-_STORAGES = {
-    "DoubleStorage": "f8",
-    "FloatStorage": "f4",
-    "HalfStorage": "f2",
-    "LongStorage": "i8",
-    "IntStorage": "i4",
-    "ShortStorage": "i2",
-    "CharStorage": "i1",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
-
-
-class Refused(pickle.UnpicklingError):
-    """The pickle asks for something that is not plain data."""
+_BLOCK = 1 << 20
+_MAX_INDEX_BYTES = 16_000_000
+"""Of the list of files in a zip archive: some 200,000 names."""
+_LZMA_BYTES = 256 << 20
+"""Working memory of xz and lzma; their highest preset takes 65 MiB."""
+_TEXT_PICKLES = (b"(", b"c", b"}", b"]")
+"""How containers and objects begin in protocols 0 and 1, which have no magic number."""
+_OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
 
 
-class StandIn:
-    """An object of a library that is not imported: keeps its state, does nothing."""
-
-    state: Any = None
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> "StandIn":
-        return object.__new__(cls)
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        pass
-
-    def __setstate__(self, state: Any) -> None:
-        # Objects with slots have a pair: dictionary, slots.
-        if isinstance(state, tuple) and state and isinstance(state[0], dict):
-            state = state[0]
-        self.state = state
-
-
-@dataclasses.dataclass(frozen=True)
-class _Names:
-    """What stands for each name that a pickle may ask for."""
-
-    stand_ins: tuple[str, ...] = ()
-    """Packages whose classes become `StandIn`s."""
-
-    def find(self, module: str, name: str) -> Any:
-        key = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
-        if key in _ALLOWED:
-            return _ALLOWED[key]
-        if any(f"{module}.".startswith(f"{package}.") for package in self.stand_ins):
-            return type(name, (StandIn,), {})
-        raise Refused(f"it wants to load {module}.{name}")
-
-
-def restricted_load(path: Path, stand_ins: tuple[str, ...] = ()) -> Any:
+def restricted_load(
+    path: Path, stand_ins: tuple[str, ...] = (), *, objects: bool = True
+) -> Any:
     """Loads a pickle, joblib, `.pt`, `.npz` or `.npy` file made of plain data.
 
-    Tensors become NumPy arrays.
+    Tensors become NumPy arrays, and arrays of objects nested lists. Arrays are new,
+    writable, by row, and in the machine's order of bytes.
 
     Args:
         stand_ins: packages, such as `"scipy.sparse"`, whose objects become `StandIn`s
             instead of being refused. The packages are not imported.
+        objects: whether arrays of objects in an `.npz` are read; else they are left
+            out.
 
-    **Raises:** `InputError`, one line that names the file, if it is damaged or holds
-    anything else.
+    **Raises:** `InputError`, one line that names the file, if it is damaged, holds
+    anything else, or makes more than 1 GB.
     """
-    allowed = _Names(stand_ins)
     try:
         with path.open("rb") as file:
-            head = file.read(8)
+            size = os.fstat(file.fileno()).st_size
+            account = Account(size)
+            account.check(size, "a file")
+            head = file.read(16)
             file.seek(0)
             if head.startswith(b"PK\x03\x04"):
-                return _load_zip(file, allowed)
+                return _load_zip(file, size, account, stand_ins, objects)
             if head.startswith(b"\x93NUMPY"):
-                return _load_array(file, allowed)
-            stream = _decompressed(file, head)
-            start = stream.tell()
-            if not stream.read(2).startswith((b"\x80", *_TEXT_PICKLES)):
-                raise InputError("neither a pickle nor an archive")
-            stream.seek(start)
-            return _Unpickler(stream, allowed).load()
+                return _load_array(file, size, account, stand_ins)
+            return _load_pickle(file, head, account, stand_ins)
     except Refused as error:
-        raise InputError(f"{path}: refused, {error}.") from None
+        raise InputError(
+            f"{path}: refused, {error}; expected plain data (numbers, text, lists, "
+            "dictionaries, arrays)."
+        ) from None
     except (MemoryError, RecursionError, Exception) as error:
-        # A damaged pickle can fail anywhere, with any error.
-        what = f"{type(error).__name__}: {error}".splitlines()[0][:150]
-        raise InputError(f"{path}: not a readable result file ({what}).") from None
+        # A damaged file can fail anywhere, with any error.
+        if isinstance(error, OSError) and error.filename is not None:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        kind = "" if isinstance(error, Damaged) else f"{type(error).__name__}: "
+        what = " ".join(f"{kind}{error}".split())[:150]
+        raise InputError(
+            f"{path}: not a readable result file ({what}); expected a whole pickle, "
+            "joblib, .pt, .npz or .npy file."
+        ) from None
 
 
-def _load_array(file: io.BufferedIOBase, allowed: _Names) -> Any:
-    """Reads one array in NumPy's format; a lone pickled object is returned as it is."""
-    version = np.lib.format.read_magic(file)
-    reader = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }.get(version)
-    if reader is None:
-        raise Refused(f"unknown version {version} of NumPy's format")
-    start = file.tell()
-    shape, _, dtype = reader(file)
-    if not dtype.hasobject:
-        file.seek(start - 8)
-        return np.lib.format.read_array(file, allow_pickle=False)
-    found = _Unpickler(file, allowed).load()
-    is_lone = shape == () and isinstance(found, np.ndarray) and found.size == 1
-    return found.item() if is_lone else found
+def _load_pickle(
+    file: Any, head: bytes, account: Account, stand_ins: tuple[str, ...]
+) -> Any:
+    """A pickle or joblib's file, compressed or not."""
+    if head.startswith(b'\x04"M\x18'):
+        raise Refused(
+            "it is packed with lz4, expected zlib, gzip, bz2, xz or no packing"
+        )
+    data = _unpacked(file, head, account)
+    if data.startswith(_OLD_TORCH):
+        raise Refused(
+            "it is PyTorch's format before version 1.6, expected the one of today "
+            "(load it in PyTorch and save it again)"
+        )
+    if not data.startswith((b"\x80", *_TEXT_PICKLES)):
+        raise Damaged("neither a pickle nor an archive")
+    account.spend(len(data))
+    return Machine(data, 0, account, stand_ins).load()
 
 
-# The implementation in Python: joblib's arrays are read within its loop.
-_Base: Any = getattr(pickle, "_Unpickler")
-
-
-class _Unpickler(_Base):
-    dispatch = dict(_Base.dispatch)
-
-    def __init__(self, file: io.BufferedIOBase, allowed: _Names):
-        # latin1 is what Python 2's arrays need.
-        super().__init__(file, encoding="latin1")
-        self.raw, self.allowed = file, allowed
-
-    def find_class(self, module: str, name: str) -> Any:
-        return self.allowed.find(module, name)
-
-    def persistent_load(self, pid: Any) -> Any:
-        raise Refused("it refers to data outside the file")
-
-    def load_build(self) -> None:
-        # Setting attributes of anything else could change this program's own functions.
-        changeable = np.ndarray | np.dtype | _JoblibArray | StandIn
-        if not isinstance(self.stack[-2], changeable):
-            raise Refused(f"it wants to change a {type(self.stack[-2]).__name__}")
-        super().load_build()
-        if isinstance(self.stack[-1], _JoblibArray):
-            # joblib writes an array's bytes behind the object that describes it.
-            self.stack[-1] = self.stack[-1].read(self)
-
-    dispatch[pickle.BUILD[0]] = load_build
-
-
-class _JoblibArray:
-    """Stands for joblib's `NumpyArrayWrapper`: a header, with the bytes behind it."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    order: str
-
-    def read(self, unpickler: _Unpickler) -> Any:
-        if self.dtype.hasobject:
-            return _Unpickler(unpickler.raw, unpickler.allowed).load()
-        if getattr(self, "numpy_array_alignment_bytes", None) is not None:
-            (padding,) = unpickler.raw.read(1)
-            unpickler.raw.read(padding)
-        count = int(np.prod(self.shape, dtype=np.int64))
-        size = count * self.dtype.itemsize
-        if not 0 <= size <= _MAX_BYTES:
-            raise Refused(f"an array of {size} bytes")
-        array = np.frombuffer(unpickler.raw.read(size), self.dtype, count)
-        order = "F" if self.order == "F" else "C"
-        return array.reshape(self.shape, order=order).copy()
-
-
-class _Storage:
-    """PyTorch's storages, by name: only the type of their numbers matters."""
-
-    def __init__(self, dtype: str):
-        self.dtype = np.dtype(dtype)
-
-
-def _load_zip(file: io.BufferedIOBase, allowed: _Names) -> Any:
-    """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
-    with zipfile.ZipFile(file) as archive:
-        total = sum(entry.file_size for entry in archive.infolist())
-        if total > _MAX_BYTES:
-            raise Refused(f"{total} bytes unpacked")
-        pickles = [n for n in archive.namelist() if n.endswith("/data.pkl")]
-        if not pickles:
-            return {
-                n.removesuffix(".npy"): _load_array(
-                    io.BytesIO(archive.read(n)), allowed
-                )
-                for n in archive.namelist()
-                if n.endswith(".npy")
-            }
-        folder = pickles[0].removesuffix("data.pkl")
-        unpickler = _Unpickler(io.BytesIO(archive.read(pickles[0])), allowed)
-
-        def storage(pid: Any) -> np.ndarray:
-            kind, storage_type, key, _, count = pid
-            if kind != "storage" or not isinstance(storage_type, _Storage):
-                raise Refused(f"unknown reference {kind!r}")
-            data = archive.read(f"{folder}data/{key}")
-            return np.frombuffer(data, storage_type.dtype, int(count))
-
-        unpickler.persistent_load = storage
-        return unpickler.load()
-
-
-def _decompressed(file: io.BufferedIOBase, head: bytes) -> io.BufferedIOBase:
-    """joblib's compressed files look like what they are compressed with."""
-    if head[:1] == b"x":
-        unpacked = zlib.decompressobj().decompress(file.read(), _MAX_BYTES)
-        return io.BytesIO(unpacked)
-    openers: dict[bytes, Any] = {
-        b"\x1f\x8b": gzip.open,
-        b"BZh": bz2.open,
-        b"\xfd7zXZ": lzma.open,
+def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
+    """The whole file. joblib's files look like what they are compressed with."""
+    unpackers = {
+        b"x": zlib.decompressobj,
+        b"\x1f\x8b": lambda: zlib.decompressobj(zlib.MAX_WBITS | 16),
+        b"BZh": bz2.BZ2Decompressor,
+        b"\xfd7zXZ": lambda: lzma.LZMADecompressor(memlimit=_LZMA_BYTES),
+        b"]\x00": lambda: lzma.LZMADecompressor(memlimit=_LZMA_BYTES),
     }
-    for magic, opener in openers.items():
-        if head.startswith(magic):
-            with opener(file) as unpacked:
-                return io.BytesIO(unpacked.read(_MAX_BYTES))
-    return file
+    make = next((unpackers[k] for k in unpackers if head.startswith(k)), None)
+    if make is None:
+        return file.read()
+    unpacker: Any = make()
+    out = bytearray()
+    while not unpacker.eof:
+        block = file.read(_BLOCK)
+        if not block:
+            out += unpacker.flush() if hasattr(unpacker, "flush") else b""
+            if unpacker.eof:
+                break
+            raise Damaged(f"its compressed part is cut short after {len(out)} bytes")
+        # What does not fit one step is kept by bz2 and xz, and handed back by zlib.
+        while block or not getattr(unpacker, "needs_input", True):
+            out += unpacker.decompress(block, _BLOCK)
+            account.check_unpacked(len(out))
+            block = getattr(unpacker, "unconsumed_tail", b"")
+            if unpacker.eof:
+                break
+    return out
 
 
-def _reconstruct(_subtype: Any, _shape: Any, _kind: Any) -> np.ndarray:
-    """An empty array, whose state follows; the shape given here is never used."""
-    return np.ndarray((0,), dtype=np.uint8)
+def _taken(file: Any, count: int) -> bytearray:
+    """Exactly `count` bytes, which must be the last; so an archive's checksum is read.
+
+    **Raises:** `Damaged` if there are more or fewer.
+    """
+    found = bytearray()
+    while len(found) <= count:
+        block = file.read(min(_BLOCK, count + 1 - len(found)))
+        if not block:
+            break
+        found += block
+    if len(found) != count:
+        raise Damaged(
+            f"{count} bytes, {'more' if len(found) > count else len(found)} are there"
+        )
+    return found
 
 
-def _from_buffer(
-    buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: str
-) -> np.ndarray:
-    array = np.frombuffer(buffer, dtype=dtype)
-    return array.reshape(shape, order="F" if order == "F" else "C").copy()
+def _load_array(
+    file: Any, size: int, account: Account, stand_ins: tuple[str, ...]
+) -> Any:
+    """Reads one array in NumPy's format; a lone pickled object is returned as it is.
+
+    Args:
+        size: bytes of the array with its head, as far as the file or archive tells.
+    """
+    of, shape, by_column, used = plain_arrays.read_header(file)
+    if of.kind == "O":
+        # The head of an array of objects repeats what its pickle says.
+        account.check(size, "an array of objects")
+        data = _taken(file, size - used)
+        account.spend(len(data))
+        return Machine(data, 0, account, stand_ins).load()
+    wanted = plain_arrays.num_bytes(of, shape, account)
+    if wanted != size - used:
+        what = f"an array {of.code}{shape} has {wanted} bytes"
+        raise Damaged(f"{what}, {size - used} are there")
+    if by_column:
+        account.spend(wanted)
+    return plain_arrays.array_of(_taken(file, wanted), of, shape, account, by_column)
 
 
-def _scalar(dtype: np.dtype, data: Any = b"") -> Any:
-    data = data.encode("latin1") if isinstance(data, str) else data
-    if dtype.hasobject:
-        raise Refused("a scalar of objects")
-    return np.frombuffer(data, dtype, 1)[0]
+class _Guarded:
+    """A file of which no reader takes more at once than it needs for its index."""
+
+    def __init__(self, file: Any, size: int) -> None:
+        self.seek, self.tell, self._file, self._size = file.seek, file.tell, file, size
+
+    def seekable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(self._size - self._file.tell(), 0)
+        if min(size if size >= 0 else left, left) > _MAX_INDEX_BYTES:
+            raise Refused(
+                f"an archive with an index of more than {_MAX_INDEX_BYTES} bytes"
+            )
+        return self._file.read(size)
 
 
-def _encode(text: str, encoding: str = "latin1") -> bytes:
-    """Bytes, as Python 2 pickles them."""
-    return text.encode("latin1")
+def _load_zip(
+    file: Any,
+    size: int,
+    account: Account,
+    stand_ins: tuple[str, ...],
+    objects: bool,
+) -> Any:
+    """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
+    with zipfile.ZipFile(_Guarded(file, size)) as archive:  # pyright: ignore
+        members = {entry.filename: entry for entry in archive.infolist()}
+        if len(members) < len(archive.infolist()):
+            raise Refused("an archive with two files of one name")
+        packings = {entry.compress_type for entry in members.values()}
+        if not packings <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise Refused("an archive packed otherwise than by deflate")
+        account.check_unpacked(sum(entry.file_size for entry in members.values()))
+        pickles = [name for name in members if name.endswith("/data.pkl")]
+        if len(pickles) > 1:
+            raise Refused(f"{len(pickles)} pickles in one archive")
+        if pickles:
+            return _Torch(archive, pickles[0], account, stand_ins).load()
+        found = {}
+        for name, entry in members.items():
+            if not name.endswith(".npy"):
+                continue
+            with archive.open(entry) as member:
+                if not objects and plain_arrays.read_header(member)[0].kind == "O":
+                    continue
+            with archive.open(entry) as member:
+                array = _load_array(member, entry.file_size, account, stand_ins)
+                found[name.removesuffix(".npy")] = array
+        return found
 
 
-def _tensor(storage: np.ndarray, offset: int, size: Any, stride: Any, *_: Any) -> Any:
-    """A copy of a strided view, checked to lie within its storage."""
-    size, stride, offset = tuple(size), tuple(stride), int(offset)
-    if not all(isinstance(n, int) and n >= 0 for n in (*size, *stride, offset)):
-        raise Refused("a tensor of impossible shape")
-    if 0 in size:
-        return np.zeros(size, storage.dtype)
-    last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
-    if last >= len(storage) or np.prod(size, dtype=np.float64) > _MAX_BYTES:
-        raise Refused("a tensor larger than its storage")
-    steps = [s * storage.dtype.itemsize for s in stride]
-    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
+class _Torch:
+    """PyTorch's archive: a pickle, and beside it the numbers of each storage."""
 
+    def __init__(
+        self,
+        archive: zipfile.ZipFile,
+        name: str,
+        account: Account,
+        stand_ins: tuple[str, ...],
+    ) -> None:
+        self.archive, self.folder = archive, name.removesuffix("data.pkl")
+        self.account, self.stand_ins = account, stand_ins
+        self.storages: dict[tuple[str, str], Storage] = {}
 
-def _parameter(data: Any, *_: Any) -> Any:
-    return data
+    def load(self) -> Any:
+        order = f"{self.folder}byteorder"
+        if order in self.archive.namelist() and self._read(order) != b"little":
+            raise Refused("numbers whose most significant byte comes first")
+        data = self._read(f"{self.folder}data.pkl")
+        self.account.spend(len(data))
+        return Machine(data, 0, self.account, self.stand_ins, self.storage).load()
 
+    def storage(self, pid: Any) -> Storage:
+        """The storage that a reference of the pickle names."""
+        if type(pid) is not tuple or len(pid) != 5 or pid[0] != "storage":
+            raise Refused("it refers to data outside the file")
+        _, kind, key, _, count = pid
+        code = STORAGES.get(kind.key) if isinstance(kind, Name) else None
+        if code is None or type(key) is not str or type(count) is not int:
+            raise Refused(f"it refers to a storage {shown(key)} of an unknown type")
+        known = self.storages.get((kind.key, key))
+        if known is None:
+            of = plain_arrays.array_type(code)
+            content = self._read(f"{self.folder}data/{key}")
+            shape = (len(content) // of.size,)
+            numbers = plain_arrays.array_of(content, of, shape, self.account)
+            known = Storage(of, numbers, kind.key == "torch.BFloat16Storage")
+            self.storages[kind.key, key] = known
+        if len(known.numbers) != count:
+            what = f"a storage of {count} numbers"
+            raise Damaged(f"{what}, {len(known.numbers)} are there")
+        return known
 
-def _reconstructor(cls: Any, _base: Any, _state: Any) -> StandIn:
-    """An instance of a new-style class, as Python 2 pickles it."""
-    if isinstance(cls, type) and issubclass(cls, StandIn):
-        return cls()
-    raise Refused(f"it wants to make a {cls}")
-
-
-_ALLOWED: dict[str, Any] = {
-    "collections.OrderedDict": dict,
-    "collections.defaultdict": lambda *_: {},
-    "collections.deque": collections.deque,
-    "__builtin__.long": int,
-    "copy_reg._reconstructor": _reconstructor,
-    "copyreg._reconstructor": _reconstructor,
-    "_codecs.encode": _encode,
-    "pathlib.PosixPath": lambda *parts: "/".join(str(p) for p in parts),
-    "numpy.ndarray": np.ndarray,
-    "numpy.dtype": np.dtype,
-    "numpy.core.multiarray._reconstruct": _reconstruct,
-    "numpy.core.multiarray.scalar": _scalar,
-    "numpy.core.numeric._frombuffer": _from_buffer,
-    "joblib.numpy_pickle.NumpyArrayWrapper": _JoblibArray,
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": _parameter,
-    "torch.Size": tuple,
-}
-_ALLOWED |= {f"torch.{name}": _Storage(dtype) for name, dtype in _STORAGES.items()}
-_ALLOWED |= {
-    f"{module}.{kind.__name__}": kind
-    for module in ("builtins", "__builtin__")
-    for kind in (
-        *(object, list, dict, tuple, set, frozenset, slice),
-        *(int, float, complex),
-    )
-}
-"""What is called for each name; every other one is refused."""
+    def _read(self, name: str) -> bytearray:
+        entry = self.archive.getinfo(name)
+        with self.archive.open(entry) as member:
+            return _taken(member, entry.file_size)

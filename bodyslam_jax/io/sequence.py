@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyslam_jax.config import Association, Known
+from bodyslam_jax.config import Association, Config, Known
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import budget
 from bodyslam_jax.io.aspect import aspect_warnings, at_size_of
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import guess_camera, read_camera, with_focal
@@ -68,6 +69,7 @@ def read_sequence(
     **Raises:** `InputError`, one line that names the file, what was found and what was
     expected. All arrays of the result are finite and all indices in range.
     """
+    limits = known.limits if isinstance(known, Config) else budget.current()
     given = {
         "keypoints": keypoints,
         "bodies": bodies,
@@ -82,7 +84,8 @@ def read_sequence(
             f"{path}: no video.mp4, images/ or tracks.npz, nor one other video "
             f"({' '.join(VIDEO_SUFFIXES)}) or images ({' '.join(IMAGE_SUFFIXES)})."
         )
-    return _read_parts(Path(path), parts, config, known)
+    with budget.granted(limits):
+        return _read_parts(Path(path), parts, config, known)
 
 
 def _read_parts(

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.archive import numbers, open_npz
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.budget import last_frame_problem
 from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.types import Tracks
 
@@ -28,22 +29,11 @@ def read_tracks(
 
     **Raises:** `InputError`, naming the file, if they do not fit the video.
     """
-    with open_npz(path) as archive:
-        missing = [k for k in ("frame", "landmark", "uv") if k not in archive.files]
-        if missing:
-            raise InputError(f"{path}: no {', '.join(missing)}; only {archive.files}.")
-        frame, landmark, uv = (
-            numbers(path, archive, k, finite=False) for k in ("frame", "landmark", "uv")
-        )
-    if (
-        uv.ndim != 2
-        or uv.shape[1] != 2
-        or not frame.shape == landmark.shape == (len(uv),)
-    ):
-        raise InputError(
-            f"{path}: frame {frame.shape}, landmark {landmark.shape}, uv {uv.shape}; "
-            "expected (m,), (m,), (m, 2)."
-        )
+    archive = read_npz(path)
+    archive.require("frame", "landmark", "uv")
+    frame = archive.array("frame", ("m",), finite=False, low=0)
+    landmark = archive.array("landmark", ("m",), finite=False)
+    uv = archive.array("uv", ("m", 2), finite=False)
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(frame) & np.isfinite(landmark)
     if not finite.all():
         text = f"{int((~finite).sum())} of {len(uv)} observations not finite"
@@ -53,9 +43,13 @@ def read_tracks(
         frame, landmark, uv = frame[finite], landmark[finite], uv[finite]
     if not len(uv):
         raise InputError(f"{path}: no observation.")
-    if (frame % 1 != 0).any() or (landmark % 1 != 0).any() or frame.min() < 0:
+    if (frame % 1 != 0).any() or (landmark % 1 != 0).any():
         raise InputError(f"{path}: frame and landmark must be whole numbers from 0.")
-    if num_frames is not None and frame.max() >= num_frames:
+    if num_frames is None:
+        observed = len(np.unique(frame))
+        if problem := last_frame_problem(int(frame.max()), observed, "tracks"):
+            raise InputError(f"{path}: {problem}.")
+    elif frame.max() >= num_frames:
         raise InputError(
             f"{path}: tracks up to frame {frame.max():.0f}, but the video has "
             f"{num_frames} frames."

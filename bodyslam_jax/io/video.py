@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.budget import check_pixels
+from bodyslam_jax.io.images import read_image
 from bodyslam_jax.io.repeats import Repeats, repeats_warning, without_repeats
 from bodyslam_jax.types import Sequence
 
@@ -99,7 +101,7 @@ def picked(items: Iterable[T], picks: Int[np.ndarray, " t"]) -> Iterator[T]:
 
 
 def _read_video(path: Path, gray: bool) -> Iterator[np.ndarray]:
-    capture = _open(path)
+    capture = open_video(path)
     try:
         while True:
             ok, image = capture.read()
@@ -122,18 +124,29 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
     return [(0, int(p)) if p.isdigit() else (1, p) for p in parts]
 
 
-def _open(path: Path) -> cv2.VideoCapture:
+def open_video(path: Path) -> cv2.VideoCapture:
+    """The video, opened, after a look at its header; the caller releases it.
+
+    **Raises:** `InputError`, naming the file, if it is no video or is of absurd size.
+    """
+    if not path.is_file():
+        found = "not a file" if path.exists() else "no such file"
+        raise InputError(f"{path}: {found}, expected a video.")
     # FFmpeg only: OpenCV's other backends take `a.txt` for a pattern of image names.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(f"{path}: not a video that OpenCV can read.")
+    width, height = (
+        round(capture.get(p))
+        for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    )
+    if width and height:  # some containers tell it with the first frame only
+        check_pixels(path, width, height)
     return capture
 
 
 def _look_at_video(path: Path) -> Footage:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
-    capture = _open(path)
+    capture = open_video(path)
     try:
         ok, image = capture.read()
         if not ok:
@@ -242,10 +255,9 @@ def _look_at_images(folder: Path, fps: float | None) -> Footage:
     times = np.arange(len(images)) / fps
     repeats = Repeats()
     for path in images:
-        data = np.fromfile(path, dtype=np.uint8)
         # A quarter of the size is decoded in a fraction of the time.
         flag = _QUARTER if max(width, height) > _LARGE else cv2.IMREAD_GRAYSCALE
-        repeats.look(cv2.imdecode(data, flag) if data.size else None)
+        repeats.look(read_image(path, flag))
     stamps, picks, more = _timed(folder, times, fps, repeats)
     return Footage(
         folder, stamps, width, height, (*warnings, *more), len(images), picks
@@ -264,13 +276,7 @@ def _read_images(folder: Path, gray: bool) -> Iterator[np.ndarray]:
 
 
 def _read_image(path: Path, gray: bool) -> np.ndarray:
-    flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
-    # Through memory: `imread` cannot open every path and warns on standard error.
-    data = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(data, flag) if data.size else None
-    if image is None:
-        raise InputError(f"{path}: not an image that OpenCV can read.")
-    return image
+    return read_image(path, cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
 
 
 def _size(shape: tuple[int, ...]) -> str:

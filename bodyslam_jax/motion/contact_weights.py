@@ -6,7 +6,6 @@ Layers are kept in float16, in half the space; read without pickle.
 import dataclasses
 import json
 from pathlib import Path
-from zipfile import BadZipFile
 
 import equinox as eqx
 import jax
@@ -15,6 +14,8 @@ import numpy as np
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.files import reading
 from bodyslam_jax.motion.contact_network import ContactModel
 
 _FORMAT = "bodyslam-contact-1"
@@ -42,29 +43,26 @@ def save_contact_model(path: Path | str, model: ContactModel) -> None:
 def load_contact_model(path: Path | str | None = None) -> ContactModel:
     """Reads a contact network (float32); without a path, the one that ships.
 
-    **Raises:** `FileNotFoundError`; `ValueError` if the file holds none.
+    **Raises:** `InputError` if the file holds none.
     """
     path = _SHIPPED if path is None else Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such contact network.")
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
-        if header.get("format") != _FORMAT:
-            raise InputError(f"format {header.get('format')!r}, expected {_FORMAT!r}")
-        half, width = int(header["half"]), tuple(header["width"])
-        init = lambda key: ContactModel.init(
-            key, header["body"], float(header["fps"]), half, width
-        )
+        raise InputError(f"{path}: no such contact network.")
+    archive = read_npz(path, "a contact network (.npz)")
+    header = archive.json("header")
+    header.text("format", among=(_FORMAT,))
+    half, fps = header.whole("half", 1, 1000), header.number("fps", 1, 1000)
+    width = header.array("width", (None,), kind="whole", low=1, high=10_000)
+    body, about = header.text("body"), header.value("about")
+    arrays = [archive.array(f"array_{i}") for i in range(len(archive.names) - 1)]
+    if len(width) > 100:
+        raise InputError(f"{path}: {len(width)} layers, expected at most 100.")
+    init = lambda key: ContactModel.init(key, body, fps, half, tuple(width.tolist()))
+    with reading(path, "a contact network's sizes"):
         like = eqx.filter_eval_shape(init, jax.random.key(0))
-        expected = [leaf.shape for leaf in jax.tree.leaves(like)]
-        if expected != [array.shape for array in arrays]:
-            raise InputError("arrays do not fit the header's sizes")
-        if not all(np.isfinite(array).all() for array in arrays):
-            raise InputError("NaN or infinite weights")
-    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise InputError(f"{path}: not a contact network ({error}).") from None
+    expected = [leaf.shape for leaf in jax.tree.leaves(like)]
+    if expected != [array.shape for array in arrays]:
+        raise InputError(f"{path}: its arrays do not fit the sizes in its header.")
     leaves = [jnp.asarray(array, jnp.float32) for array in arrays]
     model = jax.tree.unflatten(jax.tree.structure(like), leaves)
-    return dataclasses.replace(model, about=json.dumps(header["about"]))
+    return dataclasses.replace(model, about=json.dumps(about))

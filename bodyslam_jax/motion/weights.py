@@ -6,7 +6,6 @@ and metrics.
 
 import json
 from pathlib import Path
-from zipfile import BadZipFile
 
 import equinox as eqx
 import jax
@@ -15,11 +14,16 @@ import numpy as np
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.declared import Fields
+from bodyslam_jax.io.files import reading
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
 
 _FORMAT = "bodyslam-motion-1"
+_MAX_WIDTH, _MAX_FRAMES, _MAX_MEMBERS = 10_000, 1000, 100
+"""Width of a layer, frames that a network sees, and layers or networks, at most."""
 _ASSETS = Path(__file__).parent / "assets"
 SHIPPED = ("default", "paper")
 """Motion models that come with the package: the default, and the paper's network."""
@@ -75,32 +79,20 @@ def save_motion_model(
 def load_motion_model(path: Path | str | None = None) -> MotionModel:
     """Reads a model's weights (float32): of a file, or by name of `SHIPPED`.
 
-    **Raises:** `FileNotFoundError`; `ValueError` if the file holds no motion model.
+    **Raises:** `InputError` if the file holds no motion model.
     """
     name = "default" if path is None else str(path)
     path = _ASSETS / f"{name}.npz" if name in SHIPPED else Path(name)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such motion model.")
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            arrays = [archive[f"array_{i}"] for i in range(len(archive.files) - 1)]
-    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise InputError(f"{path}: not a motion model ({error}).") from None
-    if header.get("format") != _FORMAT:
-        raise InputError(
-            f"{path}: format {header.get('format')!r}; expected {_FORMAT!r}."
-        )
-    try:
-        like = _untrained(header)
-        body, fps, about = header["body"], float(header["fps"]), header["about"]
-        past = int(header["sizes"]["past"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: header lacks or misstates {error}.") from None
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError(
-            f"{path}: {fps:g} frames per second; expected a positive number."
-        )
+        raise InputError(f"{path}: no such motion model.")
+    archive = read_npz(path, "a motion model (.npz)")
+    header = archive.json("header")
+    header.text("format", among=(_FORMAT,))
+    like = _untrained(header)
+    body, about = header.text("body"), header.value("about")
+    fps = header.number("fps", 1, 1000)
+    past = header.fields("sizes").whole("past", 1, _MAX_FRAMES)
+    arrays = [archive.array(f"array_{i}") for i in range(len(archive.names) - 1)]
     wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
     found = [array.shape for array in arrays]
     if wanted != found:
@@ -108,27 +100,33 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
             f"{path}: arrays {found[:3]}... do not fit the header's sizes; "
             f"expected {wanted[:3]}..."
         )
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise InputError(f"{path}: NaN or infinite weights.")
     network = jax.tree.unflatten(
         jax.tree.structure(like), [jnp.asarray(a, jnp.float32) for a in arrays]
     )
     return MotionModel(network, body, fps, past, json.dumps(about))
 
 
-def _untrained(header: dict) -> MetricNetwork | PaperNetwork:
-    """Shapes and types of the network in a header."""
-    sizes, key = header["sizes"], jax.random.key(0)
-    if header["network"] == "paper":
-        make = lambda: PaperNetwork.init(key, sizes["past"], sizes["width"])
+def _untrained(header: Fields) -> MetricNetwork | PaperNetwork:
+    """Shapes and types of the network in a header.
+
+    **Raises:** `InputError`, naming the file, if there is no network of these sizes.
+    """
+    sizes, key = header.fields("sizes"), jax.random.key(0)
+    past = sizes.whole("past", 1, _MAX_FRAMES)
+    if header.text("network", among=("paper", "metric")) == "paper":
+        width = sizes.whole("width", 1, _MAX_WIDTH)
+        make = lambda: PaperNetwork.init(key, past, width)
     else:
+        members = sizes.whole("members", 1, _MAX_MEMBERS)
+        widths = sizes.array("width", (None,), kind="whole", low=1, high=_MAX_WIDTH)
+        if not 1 <= len(widths) <= _MAX_MEMBERS:
+            raise InputError(
+                f"{header.path}: {len(widths)} layers, expected 1 to {_MAX_MEMBERS}."
+            )
+        names = ("future", "posture_frames", "posture_width")
+        more = [sizes.whole(name, 0, _MAX_FRAMES) for name in names]
         make = lambda: MetricNetwork.init(
-            key,
-            sizes["past"],
-            tuple(sizes["width"]),
-            sizes["members"],
-            sizes["future"],
-            sizes["posture_frames"],
-            sizes["posture_width"],
+            key, past, tuple(widths.tolist()), members, *more
         )
-    return eqx.filter_eval_shape(make)
+    with reading(header.path, "a motion model's sizes"):
+        return eqx.filter_eval_shape(make)

@@ -25,6 +25,7 @@ from jaxtyping import Float, UInt8
 from bodyslam_jax.config import Detect
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import BODY25_FROM, atomic
+from bodyslam_jax.io.files import open_binary
 from bodyslam_jax.people.networks import check_onnxruntime, make_session
 
 log = logging.getLogger(__name__)
@@ -282,5 +283,5 @@ def _fetch(model: Model, path: Path) -> None:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_binary(path, "a network (ONNX)") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

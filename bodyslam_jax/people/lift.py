@@ -16,10 +16,10 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bodyslam_jax.geometry.camera import unproject
+from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
 
 ASSET = Path(__file__).parent / "assets" / "lifter.npz"
@@ -86,9 +86,9 @@ def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
 @functools.cache
 def load_lifter(path: Path = ASSET) -> Lifter:
     """The network that ships with the package, or another, in float32."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = ("first", "hidden", "last", "bias", "last_bias")
-        return Lifter(*(jnp.asarray(archive[n], jnp.float32) for n in names))
+    archive = read_npz(path, "a lifting network (.npz)")
+    names = ("first", "hidden", "last", "bias", "last_bias")
+    return Lifter(*(jnp.asarray(archive.array(n), jnp.float32) for n in names))
 
 
 @eqx.filter_jit

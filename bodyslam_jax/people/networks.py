@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.files import read_bytes
 
 _FOLDER = Path(__file__).parent / "assets" / "networks"
 _MOST_THREADS = 4
@@ -60,11 +61,10 @@ def check_network(network: Network) -> None:
     """**Raises:** `InputError` if the file is missing or its checksum is another."""
     advice = "install bodyslam-jax again, or give keypoints/"
     try:
-        digest = hashlib.sha256(network.path.read_bytes()).hexdigest()
-    except OSError as error:
+        digest = hashlib.sha256(read_bytes(network.path)).hexdigest()
+    except InputError as error:
         raise InputError(
-            f"{network.path}: cannot be read ({error.strerror}); expected the network "
-            f"that finds people: {advice}."
+            f"{str(error).rstrip('.')}, the network that finds people: {advice}."
         ) from error
     if digest != network.sha256:
         raise InputError(

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.io.archive import read_npz
+
 ASSET = Path(__file__).parent / "assets" / "posture_prior.npz"
 NUM_HANDS = 2
 _TRAINED_AT = 30.0
@@ -70,8 +72,8 @@ def load_posture_prior(
 
 @functools.cache
 def _read() -> dict[str, np.ndarray]:
-    with np.load(ASSET, allow_pickle=False) as archive:
-        return {name: archive[name].astype(float) for name in archive if name in _NAMES}
+    archive = read_npz(ASSET)
+    return {name: archive.array(name) for name in _NAMES}
 
 
 _NAMES = ("mean", "basis", "lower", "upper", "typical", "autoregression")

@@ -7,6 +7,7 @@ from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.export.summary import describe
+from bodyslam_jax.io.budget import granted
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.people_stage import check_people, with_warnings
 from bodyslam_jax.pipeline.pictures import check_overlay, write_pictures
@@ -29,7 +30,7 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
     cache = stage_cache_of(sequence, out)
     check_people(sequence, config)
     export.check_folder(out, cache.source, cache.owner())
-    with export.locked(out):
+    with export.locked(out), granted(config.limits):
         return run_in_locked_folder(sequence, out, config, cache)
 
 

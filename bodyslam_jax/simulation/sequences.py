@@ -143,7 +143,7 @@ def simulate(
     - `settings`: which sequence, family, length, seed, motion and noise.
     - `body`: the body model, whose pose blend shapes are ignored; the default without.
 
-    **Raises:** `FileNotFoundError` or `ValueError`, naming the file, if the motion
+    **Raises:** `InputError`, naming the file, if the motion
     cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames,
     for a negative seed, a bias that is no number, a number of people that is not
     between 1 and 3, or an exposure or readout that is not between 0 and a frame.

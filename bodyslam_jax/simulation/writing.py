@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
+from bodyslam_jax.io.files import read_json
 from bodyslam_jax.simulation.as_types import shapes_regressed
 from bodyslam_jax.simulation.camera_paths import FPS
 from bodyslam_jax.simulation.film import render
@@ -162,8 +163,8 @@ def _earlier(folder: Path) -> dict[str, Any] | None:
     if not (folder / _MARK).exists():
         return None
     try:
-        found = json.loads((folder / _MARK).read_text())
-    except ValueError:
+        found = read_json(folder / _MARK)
+    except InputError:
         return {}
     return found if isinstance(found, dict) else {}
 

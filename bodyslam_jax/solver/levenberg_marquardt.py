@@ -1,6 +1,7 @@
 """Levenberg-Marquardt on the factor graph, in optimistix's loop.
 
-Steps are damped, and accepted on the true robust cost (`_trial`). The linearisation is
+A stage begins at the best scale for its people (`best_scale`). Steps are damped, and
+accepted on the true robust cost (`_trial`). The linearisation is
 kept after a rejected step. The motion model's prediction is frozen within a step and
 made anew after each accepted one. Steps that gain
 little know what keypoints bend (`_curvature`). Landmarks that no step would bring back
@@ -21,6 +22,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, residual_of, robustify
+from bodyslam_jax.solver.best_scale import at_best_scale
 from bodyslam_jax.solver.blocks import Linearisation, sizes_of
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
@@ -113,10 +115,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         args = _held(args, self.free[at])
         sizes = sizes_of(args, y, self.dtype)
 
-        lin, prediction = jax.lax.cond(
+        begins = (state.steps[at] == 0) & ~last
+        lin, prediction, y, gained = jax.lax.cond(
             state.stale,
-            lambda _: _linearise_anew(args, state.observations, y, self.dtype),
-            lambda _: (state.final.lin, state.prediction),
+            lambda _: _linearise_anew(args, state.observations, y, self.dtype, begins),
+            lambda _: (state.final.lin, state.prediction, y, jnp.zeros_like(y.scale)),
             None,
         )
         problem: Problem = args.with_prediction(prediction)
@@ -180,7 +183,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
             nu=jnp.where(accept | over, 2.0, 2 * state.nu).astype(dtype),
             cost=cost,
-            first_cost=jnp.where(jnp.sum(state.steps) == 0, known, state.first_cost),
+            first_cost=jnp.where(
+                jnp.sum(state.steps) == 0, known + gained, state.first_cost
+            ),
             steps=steps,
             share=jnp.where(over, 0.0, share).astype(dtype),
             bent=state.bent & ~last,
@@ -220,7 +225,9 @@ def _is_done(
 
 
 def _first(problem, observations, state, dtype):
-    lin, prediction = _linearise_anew(problem, observations, state, dtype)
+    lin, prediction, *_ = _linearise_anew(
+        problem, observations, state, dtype, jnp.array(False)
+    )
     sizes = sizes_of(problem, state, dtype)
     extra = damped(diagonals(lin, sizes), jnp.ones_like(state.scale))
     return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
@@ -232,10 +239,18 @@ def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
     return Final(lin, eliminated.factor, None if people is None else people.roots)
 
 
-def _linearise_anew(problem, observations, state, dtype):
+def _linearise_anew(problem, observations, state, dtype, begins):
+    """The equations with the motion predicted anew, and the state that they are at:
+    where a stage `begins`, that of the best scale; and what that gained."""
     seen = problem.predict(state)
     problem = problem.with_prediction(seen)
-    return linearise(problem, observations, state, dtype), seen
+    state, gained = jax.lax.cond(
+        begins,
+        lambda s: at_best_scale(problem, s),
+        lambda s: (s, jnp.zeros_like(s.scale)),
+        state,
+    )
+    return linearise(problem, observations, state, dtype), seen, state, gained
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:

@@ -18,6 +18,7 @@ _WORDS = (
     (optx.RESULTS.nonfinite, "cost is not finite"),
 )
 _OTHERWISE = "no step lowers the cost"
+_BETTER = "converged, but a better scale is known: {:.6g}"
 
 
 class Solution(eqx.Module):
@@ -34,13 +35,22 @@ class Solution(eqx.Module):
     """Iterations of each stage, accepted or not."""
     first_cost: Float[Array, ""]
     """Negative log-likelihood at the start, with the motion predicted there."""
+    better_scale: Float[Array, ""] = eqx.field(
+        default_factory=lambda: jnp.array(jnp.nan)
+    )
+    """Another s with a lower cost, all else as in `state`; NaN if none is known."""
 
     @property
     def status(self) -> str | np.ndarray:
-        """`converged`, or what kept it from that; of mapped solves an array of such."""
+        """`converged`, or what kept it from that; of mapped solves an array of such.
+        Where robust losses leave several scales, it says if a better one is known."""
         found = np.array(_OTHERWISE)
         for result, words in _WORDS:
             found = np.where(self.result == result, words, found)
+        better = np.asarray(self.better_scale)
+        known = [_BETTER.format(x) for x in better.ravel()]
+        other = np.isfinite(better) & (found == "converged")
+        found = np.where(other, np.reshape(known, better.shape), found)
         return found if found.ndim else str(found)
 
 

@@ -15,6 +15,7 @@ from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
 from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
+from bodyslam_jax.solver.best_scale import WORTH, at_best_scale, is_quadratic
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.implicit import cotangent_of_problem
 from bodyslam_jax.solver.levenberg_marquardt import (
@@ -161,7 +162,8 @@ def _run(problem, state, method):
         lifted, method, state, problem, max_steps=None, throw=False
     )
     stats = _with_last_cost(problem, found.value, found.stats)
-    return outcome(state, found.value, found.result, stats)
+    solution, final = outcome(state, found.value, found.result, stats)
+    return _with_better_scale(problem, solution, method), final
 
 
 def _with_last_cost(problem: Problem, state: State, stats: dict[str, Any]) -> Any:
@@ -180,6 +182,23 @@ def _with_last_cost(problem: Problem, state: State, stats: dict[str, Any]) -> An
         history, cost=put(history.cost, cost), terms=put(history.terms, terms)
     )
     return {**stats, "cost": cost, "history": history}
+
+
+def _with_better_scale(
+    problem: Problem, solution: Solution, method: StructuredLevenbergMarquardt
+) -> Solution:
+    """The solution with another s that is better, where a stage has moved s and robust
+    losses may have several best ones."""
+    if is_quadratic(problem):
+        none = jnp.full_like(solution.cost, jnp.nan)
+        return dataclasses.replace(solution, better_scale=none)
+    now = problem.refresh(solution.state)
+    moved, gain = at_best_scale(now, solution.state)
+    steps = jnp.stack(solution.num_steps)
+    frees = method.free[:, VARIABLES.index("scale")]
+    known = (gain > WORTH) & ((frees > 0) & (steps > 0)).any()
+    other = jnp.where(known, moved.scale, jnp.nan)
+    return dataclasses.replace(solution, better_scale=other)
 
 
 @eqx.filter_custom_vjp

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import cv2
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.video import open_video
 
 _WIDTH, _QUALITY = 240, 70
 """px; of JPEG, 0 to 100"""
@@ -17,7 +19,10 @@ def write_thumbnail(video: Path, path: Path) -> bool:
     """
     if path.exists() and path.stat().st_mtime >= video.stat().st_mtime:
         return True
-    capture = cv2.VideoCapture(str(video))
+    try:
+        capture = open_video(video)
+    except InputError:
+        return False
     try:
         count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, count // 2))

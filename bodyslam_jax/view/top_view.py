@@ -118,5 +118,5 @@ class Plan:
         wedge = np.stack([eye, eye + reach * (ahead - 0.5 * right)])
         wedge = np.concatenate([wedge, [eye + reach * (ahead + 0.5 * right)]])
         cv2.polylines(inset, [self._to_inset(wedge)], True, CAMERA, 2, cv2.LINE_AA, 4)
-        write_text(inset, f"grid {self.step:g} m", (6, self.side - 7), 0.4)
+        write_text(inset, f"grid {self.step:g} m, x left", (6, self.side - 7), 0.4)
         blend_inset(image, inset, corner)

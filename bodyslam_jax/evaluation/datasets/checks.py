@@ -7,6 +7,7 @@ import numpy as np
 
 from bodyslam_jax import io
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.safe_pickle import restricted_load
 
 _HOME = {
@@ -18,9 +19,9 @@ _HOME = {
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
-def not_there(path: Path, dataset: str) -> FileNotFoundError:
+def not_there(path: Path, dataset: str) -> InputError:
     """The error for a missing file, with the address where to register."""
-    return FileNotFoundError(
+    return InputError(
         f"{path}: not there; {dataset} is given to researchers who register at "
         f"{_HOME[dataset]}."
     )
@@ -59,7 +60,7 @@ def array(
     """`values` as finite float64 of this shape; `None` is any length but 0."""
     try:
         found = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         kind = type(values).__name__
         raise InputError(
             f"{file}: {name}: a {kind}, not an array of numbers."
@@ -68,7 +69,7 @@ def array(
         n == wanted or (wanted is None and n > 0)
         for n, wanted in zip(found.shape, shape, strict=True)
     )
-    if not fits or not np.all(np.isfinite(found)):
+    if not fits or not np.all(np.abs(found) <= MAX_MAGNITUDE):
         wanted = str(shape).replace("None", "any")
         raise InputError(
             f"{file}: {name}: {found.shape} values, not {wanted} finite numbers."
@@ -108,7 +109,7 @@ def images(folder: Path, num: int = 1) -> list[Path]:
     to wrong frames.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of images.")
+        raise InputError(f"{folder}: no such folder of images.")
     found = (p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     listed = sorted(found, key=lambda file: file.name)
     if not listed:

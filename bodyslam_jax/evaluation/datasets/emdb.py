@@ -16,8 +16,8 @@ def convert_emdb(source: Path, out: Path, body_model: Path | None = None) -> Pat
     `body_model` is SMPL of the gender that the file names, or a folder with it: it
     makes the true joints. The person is present in the file's good frames.
 
-    **Raises:** `FileNotFoundError` that says where to register, or `ValueError` naming
-    the file and what is wrong with it.
+    **Raises:** `InputError` that says where to register, or names the file and
+    what is wrong with it.
     """
     found = sorted(source.glob("*_data.pkl")) if source.is_dir() else []
     if not found:

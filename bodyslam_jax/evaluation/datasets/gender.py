@@ -15,7 +15,8 @@ import numpy as np
 from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
 from bodyslam_jax.body.files import VARIABLE, candidates, named_gender
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.evaluation.readers import load_npz, read_groundtruth
+from bodyslam_jax.evaluation.readers import read_groundtruth
+from bodyslam_jax.io.archive import Archive, read_npz
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
@@ -70,14 +71,14 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
     **Raises:** as `read_groundtruth` and `load_body_model`.
     """
     if body_model and not body_model.exists():
-        raise FileNotFoundError(f"{body_model}: no such body model.")
+        raise InputError(f"{body_model}: no such body model.")
     files = _bodies(path)
-    needs = [None if "joints" in x else _needed(x) for x in files.values()]
+    needs = [None if "joints" in x else _needed(x) for x in files]
     wanted = sorted({need for need in needs if need})
     if not wanted:
         return read_groundtruth(path, load_body_model(DEFAULT))  # poses nobody
     bodies = {need: _body_at_hand(body_model, *need) for need in wanted}
-    for file, need in zip(files, needs, strict=True):
+    for file, need in zip((x.path for x in files), needs, strict=True):
         if need and (wrong := bodies[need][1]):
             log.warning(
                 "%s: no joints in it; its parameters are of %s, %s, but posed with %s, "
@@ -91,8 +92,8 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
     return dataclasses.replace(read[wanted[0]], joints=joints)
 
 
-def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
-    """The body files of a ground truth in the order of its people, read."""
+def _bodies(path: Path) -> list[Archive]:
+    """The body files of a ground truth in the order of its people."""
     if not path.is_dir():
         files = [path] if path.is_file() and path.suffix == ".npz" else []
     elif not (path / "groundtruth").is_dir() and (path / "result.npz").exists():
@@ -100,14 +101,16 @@ def _bodies(path: Path) -> dict[Path, dict[str, np.ndarray]]:
     else:
         folder = path / "groundtruth" if (path / "groundtruth").is_dir() else path
         files = sorted(folder.glob("body.npz")) or sorted(folder.glob("body_*.npz"))
-    return {file: load_npz(file) for file in files}
+    return [read_npz(file, "a true body (.npz)") for file in files]
 
 
-def _needed(person: dict[str, np.ndarray]) -> tuple[str, tuple[str, ...]]:
+def _needed(person: Archive) -> tuple[str, tuple[str, ...]]:
     """Gender of an AMASS file, and which kinds of body it fits; the best first."""
-    width = np.shape(person["poses"])[-1:] if "poses" in person else ()
+    width = person.header("poses")[0][-1:] if "poses" in person else ()
     kinds = _KINDS.get(width[0] if width else 0, ("smpl", "smplh"))
-    return gender_of(person.get("gender")) or "neutral", kinds
+    has_text = "gender" in person and person.header("gender")[1].kind in "SU"
+    gender = gender_of(person.text("gender")) if has_text else None
+    return gender or "neutral", kinds
 
 
 def _is_installed(gender: str) -> bool:

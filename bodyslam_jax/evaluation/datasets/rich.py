@@ -1,6 +1,5 @@
 """RICH: several people, of whom one still camera is taken."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.datasets import checks, folder
 from bodyslam_jax.evaluation.datasets.gender import body_for, gender_of
 from bodyslam_jax.evaluation.readers import posed_joints
+from bodyslam_jax.io.files import read_json, read_text, reading
 
 _PARTS = {"global_orient": 3, "body_pose": 63, "betas": 10, "transl": 3}
 _GENDERS_FROM = "https://github.com/paulchhuang/rich_toolkit, resource/gender.json"
@@ -75,15 +75,11 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
     paths = [folder / "gender.json" for folder in folders] if file is None else [file]
     file = next((path for path in paths if path.is_file()), None)
     if file is None:
-        raise FileNotFoundError(
+        raise InputError(
             f"{paths[0]}: not there, and RICH's own files do not name genders; it is "
             f"in {_GENDERS_FROM}, and can be named with --genders."
         )
-    try:
-        table = json.loads(file.read_text())
-    except ValueError as error:
-        raise InputError(f"{file}: not JSON ({error}).") from None
-    table = checks.fields(file, "", table, ())
+    table = checks.fields(file, "", read_json(file, "RICH's gender.json"), ())
     found = {}
     for subject in subjects:
         number = str(_number(file, subject))
@@ -115,7 +111,7 @@ def _person(files: list[Path], row: dict[int, int], num: int) -> dict[str, Any]:
 
 def _number(file: Path, name: str) -> int:
     """The number that a name begins with."""
-    found = re.match(r"\d+", name)
+    found = re.match(r"\d{1,12}(?!\d)", name)
     if found is None:
         raise InputError(f"{file}: {name!r} does not begin with a number.")
     return int(found[0])
@@ -123,18 +119,18 @@ def _number(file: Path, name: str) -> int:
 
 def _camera(xml: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
     """World to camera, calibration matrix and `k1 k2 p1 p2`, from OpenCV's XML."""
-    try:
-        tree = ElementTree.parse(xml)
+    what = "a calibration with CameraMatrix, Intrinsics and Distortion"
+    text = read_text(xml, what)
+    if "<!" in text.replace("<!--", ""):  # an entity may stand for gigabytes
+        raise InputError(f"{xml}: it declares a type of document, expected {what}.")
+    with reading(xml, what):
+        tree = ElementTree.fromstring(text)
         numbers = lambda name: [
             float(word) for word in (tree.findtext(f"./{name}/data") or "").split()
         ]
         T_CW = np.vstack([np.reshape(numbers("CameraMatrix"), (3, 4)), [0, 0, 0, 1]])
         K = np.reshape(numbers("Intrinsics"), (3, 3))
         distortion = (*numbers("Distortion"), 0.0, 0.0, 0.0, 0.0)[:4]
-    except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(
-            f"{xml}: not a calibration with CameraMatrix, Intrinsics and Distortion "
-            f"({error})."
-        ) from None
+    checks.array(xml, "Distortion", distortion, (4,))
     checks.extrinsics(xml, "CameraMatrix", T_CW[None], 1)
     return T_CW, checks.array(xml, "Intrinsics", K, (3, 3)), distortion

@@ -75,8 +75,10 @@ def export(
             _check_target(format, target)
             jobs.append((format, write, target, part))
     with atomic.hidden_folder(path if inside else path.parent) as partial:
-        places = [partial / f"{k}-{job[2].name}" for k, job in enumerate(jobs)]
+        # In a folder each, under its own name: some formats have that in their header.
+        places = [partial / str(k) / job[2].name for k, job in enumerate(jobs)]
         for place, (format, write, _, part) in zip(places, jobs, strict=True):
+            place.parent.mkdir()
             write(place, part)
             if not format.suffix:
                 (place / _MARK).write_text(json.dumps(_origin(format, part)) + "\n")

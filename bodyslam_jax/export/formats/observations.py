@@ -1,18 +1,16 @@
 """Pixel observations of a run's landmarks, read from the stage results it keeps."""
 
 import dataclasses
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.types import Result
 
-_ARRAYS = (".tracks.frame", ".tracks.landmark", ".tracks.uv", ".keep")
 _ZOOM = ".zoom"
-_UNREADABLE = (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,18 +36,20 @@ def read_observations(run: Path, result: Result) -> Observations | None:
     found = sorted((run / ".cache").glob("cameras-*.npz"))
     if len(found) != 1 or not len(result.landmarks):
         return None
+    t, l = len(result.timestamps), len(result.landmarks)
     try:
-        with np.load(found[0], allow_pickle=False) as archive:
-            frame, landmark, uv, keep = (archive[name] for name in _ARRAYS)
-            zoom = archive[_ZOOM] if _ZOOM in archive.files else None
-            num_landmarks = len(archive[".landmarks"])
-    except _UNREADABLE:
+        archive = read_npz(found[0])
+        if archive.header(".landmarks")[0] != (l, 3):
+            return None
+        index = {"kind": "whole", "low": 0}
+        frame = archive.array(".tracks.frame", ("m",), high=t - 1, **index)
+        landmark = archive.array(".tracks.landmark", ("m",), high=l - 1, **index)
+        uv = archive.array(".tracks.uv", ("m", 2))
+        keep = archive.array(".keep", ("m",), kind="boolean")
+        zoom = archive.array(_ZOOM, (t,)) if _ZOOM in archive else None
+    except InputError:
         return None
-    t = len(result.timestamps)
-    fits = num_landmarks == len(result.landmarks) and frame.max(initial=0) < t
-    if not fits or (zoom is not None and len(zoom) != t):
-        return None
-    frame, landmark, uv = frame[keep], landmark[keep], uv[keep].astype(np.float64)
+    frame, landmark, uv = frame[keep], landmark[keep], uv[keep]
     if zoom is None:
         return Observations(frame, landmark, uv)
     # The stages work on images whose zoom is undone about the principal point.

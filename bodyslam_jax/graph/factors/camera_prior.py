@@ -6,11 +6,13 @@ Dimensionless: a rotation vector over rad, then a centre over units of the map. 
 `config.PATH_SIGMA` = 0.01 of each, in frames in which a camera path was given. Ours.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor
+from bodyslam_jax.graph.factor import FrameFactor, in_unit
 from bodyslam_jax.graph.losses import Loss, Squared
 
 
@@ -24,6 +26,13 @@ class CameraPrior(FrameFactor):
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
     keys = (("camera", 0),)
+
+    def rescaled(self, factor):
+        return dataclasses.replace(
+            self,
+            cameras=self.cameras.at[:, :3, 3].multiply(factor),
+            sigma=self.sigma.at[:, 3:].set(in_unit(self.sigma[:, 3:], factor)),
+        )
 
     def frame_residual(self, data, window, shared):
         measured, sigma = data

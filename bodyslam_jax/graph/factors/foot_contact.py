@@ -46,6 +46,7 @@ class FootContact(FrameFactor):
     toe, left heel, right toe, right heel."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
+    map_units = {"scale": -1}
     keys = tuple((name, lag) for name in ("camera", "root", "pose") for lag in range(2))
 
     @property

@@ -45,6 +45,7 @@ class GroundContact(FrameFactor):
     all frames, so this is its standard deviation times the root of their number."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
+    map_units = {"offset": 1}
     keys = (("camera", 0), ("root", 0), ("pose", 0), ("scale", 0), ("shape", 0))
 
     @property

@@ -25,6 +25,7 @@ class LandmarkPrior(Factor):
     whitening: Float[Array, "l 3 3"]
     """`W` with `W^T W` the inverse of the covariance; 0 without a prior."""
     loss: Loss = Squared()
+    map_units = {"position": 1, "whitening": -1}
 
     def residual(self, state: State) -> Float[Array, "l 3"]:
         error = state.landmarks - self.position

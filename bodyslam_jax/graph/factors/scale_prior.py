@@ -22,6 +22,7 @@ class ScalePrior(FrameFactor):
     """m per unit of the map; finite in one frame, `inf` in all others."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
+    map_units = {"scale": -1, "sigma": -1}
     keys = (("scale", 0),)
 
     def frame_residual(self, data, window, shared):

@@ -3,12 +3,17 @@
 Errors are `InvalidContent`, to which the caller adds the file's name.
 """
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
+from bodyslam_jax.io.budget import MAX_PEOPLE
+from bodyslam_jax.io.declared import as_array
 from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
 from bodyslam_jax.io.keypoints.associate import identify
 from bodyslam_jax.types import Intrinsics
@@ -17,6 +22,7 @@ PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 """J_0 of SMPL's neutral template, m."""
 PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
+_NOWHERE = Path("bodies")
 _BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
 """Grid of the size of a body about its middle, in the plane of the image, m."""
 
@@ -31,10 +37,14 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
     """
     if not isinstance(data, dict) or key not in data:
         raise InvalidContent(f"no `{key}`")
+    value = data[key]
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        value = value.tolist()
     try:
-        array = np.asarray(data[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidContent(f"`{key}` does not hold numbers") from None
+        array = as_array(_NOWHERE, key, value, finite=False)
+    except InputError as error:  # the caller knows the file
+        text = str(error).removeprefix(f"{_NOWHERE}: ").rstrip(".")
+        raise InvalidContent(text) from None
     array = np.where(np.isfinite(array), array, np.nan)
     if shape is not None:
         fits = array.ndim == len(shape) and all(
@@ -48,7 +58,9 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
 
 def betas_of(data: dict, key: str, n: int) -> np.ndarray:
     """The first ten β of each of `n` bodies; one row may stand for all."""
-    betas = numbers_of(data, key, None)
+    betas = np.atleast_1d(numbers_of(data, key, None))
+    if betas.size == 0 or betas.size // betas.shape[-1] not in (1, n):
+        raise InvalidContent(f"`{key}` is {betas.shape}, not (10,) or ({n}, 10)")
     betas = np.broadcast_to(betas.reshape(-1, betas.shape[-1]), (n, betas.shape[-1]))
     if betas.shape[1] < 10:
         raise InvalidContent(
@@ -107,6 +119,10 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
     size in the image. With at most one body per frame it is one person."""
     if len(np.unique(frame)) == len(frame):
         return np.zeros(len(frame), dtype=np.int64)
+    if (busiest := np.unique(frame, return_counts=True)[1].max()) > MAX_PEOPLE:
+        raise InvalidContent(
+            f"{busiest} bodies in one frame, expected at most {MAX_PEOPLE}"
+        )
     fx, fy, cx, cy = video.camera.params[:4]
     order = np.argsort(frame, kind="stable")
     x, y, z = trans[order].T[:, :, None]

@@ -17,9 +17,16 @@ from bodyslam_jax.config import Association
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.bodies.amass import body_pose, is_smplx
 from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, join, whole_of
+from bodyslam_jax.io.bodies.parts import (
+    PELVIS_SMPL,
+    PELVIS_SMPLX,
+    join,
+    numbers_of,
+    whole_of,
+)
 from bodyslam_jax.io.bodies.slahmr import with_track_info
 from bodyslam_jax.io.bodies.tools import READERS, from_spin
+from bodyslam_jax.io.budget import check_bytes, last_frame_problem
 from bodyslam_jax.io.frame_index import InvalidContent, Warn
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.types import Bodies, Intrinsics
@@ -28,6 +35,8 @@ _log = logging.getLogger(__name__)
 
 _MAX_DISTANCE = 200.0
 """Of a body from the camera, m; further away, `trans` is in another unit."""
+_MAX_BETA = 100.0
+"""Standard deviations of SMPL's shapes; those of people are within 5."""
 _MIN_FINITE = 0.5
 """Share of the bodies that must be finite."""
 
@@ -81,8 +90,11 @@ def _read(path: Path, data: Any, video: Video) -> Rows:
                 return read(data, video)
     except InvalidContent as error:
         raise InputError(f"{path}: {error}.") from None
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        what = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+    except InputError:
+        raise
+    except Exception as error:
+        # Dictionaries of other tools, nested in any way: whatever fails is theirs.
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise InputError(f"{path}: incomplete or damaged bodies ({what}).") from None
     supported = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
     keys = ", ".join(str(k) for k in list(data)[:6])
@@ -99,7 +111,7 @@ def _from_contract(data: dict, video: Video) -> Rows:
         rows = from_spin({**data, "pose": data["poses"]}, video)
         return dataclasses.replace(rows, shapes_regressed=regressed)
     arrays = {}
-    n = len(np.atleast_1d(np.asarray(data["frame"])))
+    n = numbers_of(data, "frame", None).size
     data = _as_smpl(data)
     person = data.get("person", np.zeros(n))
     for name, value, shape in (
@@ -109,25 +121,21 @@ def _from_contract(data: dict, video: Video) -> Rows:
         ("betas", data["betas"], (n, 10)),
         ("trans", data["trans"], (n, 3)),
     ):
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
-            raise InvalidContent(f"`{name}` holds {array.dtype}, not numbers")
-        if array.shape != shape:
-            raise InvalidContent(f"`{name}` is {array.shape}, not {shape}")
+        array = numbers_of({name: value}, name, shape)
         whole = name in ("frame", "person")
-        arrays[name] = whole_of(array, name) if whole else array.astype(np.float64)
+        arrays[name] = whole_of(array, name) if whole else array
     return Rows(**arrays, shapes_regressed=regressed)
 
 
 def _as_smpl(data: dict) -> dict:
     """The data with SMPL's poses, if they are as wide as SMPL-H's or SMPL-X's."""
-    poses, betas = np.asarray(data["poses"]), np.asarray(data["betas"])
+    poses, betas = (numbers_of(data, name, None) for name in ("poses", "betas"))
     if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
         poses72 = poses
     else:
         poses72 = body_pose(poses)
         if is_smplx(data, poses.shape[1]):
-            trans = np.asarray(data["trans"]) + PELVIS_SMPLX - PELVIS_SMPL
+            trans = numbers_of(data, "trans", (-1, 3)) + PELVIS_SMPLX - PELVIS_SMPL
             return {
                 **data,
                 "poses": poses72,
@@ -154,6 +162,8 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
     cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
     camera_file = next((p for p in cameras if p.is_file()), None)
     camera = restricted_load(camera_file) if camera_file else {}
+    if not isinstance(camera, dict):
+        raise InputError(f"{camera_file}: not a dictionary, expected TRAM's camera.")
     shared = {k: camera[k] for k in ("img_focal", "img_center") if k in camera}
     rows = []
     for track in tracks:
@@ -161,7 +171,10 @@ def _read_tram_folder(folder: Path, video: Video) -> Rows:
         if not isinstance(data, dict):
             raise InputError(f"{track}: not a dictionary of arrays.")
         one = _read(track, {**data, **shared}, video)
-        number = int(re.findall(r"\d+", track.stem)[-1])
+        digits = re.findall(r"\d{1,9}", track.stem)
+        if not digits:
+            raise InputError(f"{track}: no number of a person in its name.")
+        number = int(digits[-1])
         person = np.full(len(one.frame), number)
         rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
     return join(rows)
@@ -192,15 +205,24 @@ def _gather(
     """Checks the rows and sorts them by person and frame."""
     if not len(rows.frame):
         raise InputError(f"{path}: no body in any frame.")
-    for name in ("person", "poses", "betas", "trans"):
-        array = getattr(rows, name)
-        if len(array) != len(rows.frame):
+    m = len(rows.frame)
+    for name, more in (
+        ("person", ()),
+        ("poses", (72,)),
+        ("betas", (10,)),
+        ("trans", (3,)),
+    ):
+        shape = getattr(rows, name).shape
+        if shape != (m, *more):
             raise InputError(
-                f"{path}: {len(rows.frame)} frames for {len(array)} of `{name}`."
+                f"{path}: {m} frames for `{name}` of {shape}, expected {(m, *more)}."
             )
     rows = _finite(path, rows, warn)
     low, high = int(rows.frame.min()), int(rows.frame.max())
     if num_frames is None:
+        observed = len(np.unique(rows.frame))
+        if problem := last_frame_problem(high, observed, "bodies"):
+            raise InputError(f"{path}: {problem}.")
         num_frames = high + 1
     if low < 0 or high >= num_frames:
         raise InputError(
@@ -214,8 +236,15 @@ def _gather(
     turn = float(np.linalg.norm(rows.poses.reshape(-1, 3), axis=-1).max())
     if turn > 20:
         raise InputError(f"{path}: a joint turned by {turn:.0f} rad; degrees?")
+    widest = float(np.abs(rows.betas).max(initial=0))
+    if widest > _MAX_BETA:
+        raise InputError(
+            f"{path}: a shape of {widest:.3g} standard deviations (`betas`), expected "
+            f"at most {_MAX_BETA:g}."
+        )
     people, index = np.unique(rows.person, return_inverse=True)
     size = (len(people), num_frames)
+    check_bytes(path, 8 * 85 * len(people) * num_frames, "as a table ")
     present = np.zeros(size, dtype=bool)
     if len(np.unique(index * num_frames + rows.frame)) < len(index):
         raise InputError(f"{path}: two bodies of one `person` in the same `frame`.")

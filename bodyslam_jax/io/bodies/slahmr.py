@@ -5,13 +5,11 @@ folder up, `track_info.json`: the part of the video, and when each person is vis
 """
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
@@ -20,9 +18,13 @@ from bodyslam_jax.io.bodies.parts import (
     numbers_of,
     refocused,
 )
+from bodyslam_jax.io.budget import current
+from bodyslam_jax.io.declared import Fields
+from bodyslam_jax.io.files import read_json_fields
 from bodyslam_jax.io.frame_index import InvalidContent
 
 _INFO = "track_info"
+_INFO_FILE = "SLAHMR's track_info.json"
 
 
 def is_slahmr(data: dict) -> bool:
@@ -38,10 +40,7 @@ def with_track_info(path: Path, data: Any) -> Any:
     for folder in (path.parent, path.parent.parent):
         file = folder / "track_info.json"
         if file.is_file():
-            try:
-                return {**data, _INFO: json.loads(file.read_text())}
-            except (OSError, ValueError) as error:
-                raise InputError(f"{file}: not a JSON file ({error}).") from None
+            return {**data, _INFO: _Info.of(read_json_fields(file, _INFO_FILE))}
     return data
 
 
@@ -55,16 +54,17 @@ class _Info:
     """By index of a person: whether they are visible in each frame from `first` on."""
 
     @classmethod
-    def of(cls, data: Any) -> "_Info | None":
-        if data is None:
-            return None
-        start, end = (int(k) for k in data["meta"]["seq_interval"])
-        before = int(data["meta"]["data_interval"][0])
-        masks = {
-            int(track["index"]): np.asarray(track["vis_mask"], float)[start:end] > 0
-            for track in data["tracks"].values()
-        }
-        return cls(before + start, masks)
+    def of(cls, data: Fields) -> "_Info":
+        meta, frames = data.fields("meta"), current().frames
+        interval = {"kind": "whole", "low": 0, "high": frames}
+        start, end = meta.array("seq_interval", (2,), **interval)
+        before = int(meta.array("data_interval", (2,), **interval)[0])
+        tracks, masks = data.fields("tracks"), {}
+        for name in tracks.names():
+            track = tracks.fields(name)
+            visible = track.array("vis_mask", (None,), kind="boolean")
+            masks[track.whole("index")] = visible[start:end]
+        return cls(before + int(start), masks)
 
     def visible(self, people: int, frames: int) -> np.ndarray:
         """Whether each person is visible in each frame, (people, frames)."""
@@ -83,7 +83,7 @@ def from_slahmr(data: dict, video: Video) -> Rows:
         )
     trans = numbers_of(data, "trans", (-1, -1, 3))
     p, t = trans.shape[:2]
-    info = _Info.of(data.get(_INFO))
+    info = data.get(_INFO)
     if info is None and video.num_frames not in (None, t):
         raise InvalidContent(
             f"{t} frames, but the video has {video.num_frames}; SLAHMR's "

@@ -7,10 +7,7 @@ ARKit's axes, y up and z back; `K` by columns). Pixels have centres at whole num
 as in ARKit.
 """
 
-import json
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,10 +15,21 @@ from jaxtyping import Float
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.colmap import FoundCamera
+from bodyslam_jax.io.declared import Fields, as_array, fields
+from bodyslam_jax.io.files import (
+    parse_json,
+    read_csv,
+    read_json_fields,
+    read_zip,
+    reading,
+)
 
 PATH_FILES = ("odometry.csv", "metadata.json", "metadata")
 CAMERA_FILES = ("camera_matrix.csv", "metadata.json", "metadata")
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_RECORD3D = "Record3D's metadata"
+_MAX_TIME = 1e19
+"""A time in nanoseconds since 1970 has 19 digits."""
 _TO_OPENCV = np.array([1.0, -1.0, -1.0])
 """Signs of the camera's axes, from y up and z back to y down and z forward."""
 
@@ -32,7 +40,7 @@ def is_path(path: Path) -> bool:
         path.suffix == ".r3d"
         or path.name == "metadata"
         or path.name == "odometry.csv"
-        or (path.suffix == ".json" and "poses" in _peek(path))
+        or (path.suffix == ".json" and _has_poses(path))
     )
 
 
@@ -52,21 +60,21 @@ def read_arkit_poses(
     """
     if path.suffix == ".csv":
         table = _table(path)
+        _check_times(path, table[:, 0])
         return table[:, 0] - table[0, 0], _poses(path, table[:, 5:], table[:, 2:5])
     data = _metadata(path)
-    try:
-        rows = np.asarray(data["poses"], float)
-        times = np.arange(len(rows)) / float(data.get("fps") or 0)
-        if data.get("frameTimestamps"):
-            times = np.asarray(data["frameTimestamps"], float)
-            times = times - times[0]
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{path}: not Record3D's metadata ({error!r}).") from None
-    if rows.ndim != 2 or rows.shape[1] != 7 or len(times) != len(rows):
+    rows = data.array("poses")
+    if rows.ndim != 2 or rows.shape[1] != 7 or not len(rows):
         raise InputError(
-            f"{path}: poses of shape {rows.shape} at {len(times)} times, expected rows "
-            "of `qx qy qz qw x y z`."
+            f"{path}: poses of shape {rows.shape}, expected rows of "
+            "`qx qy qz qw x y z`."
         )
+    if data.data.get("frameTimestamps"):
+        times = data.array("frameTimestamps", (len(rows),), high=_MAX_TIME)
+        _check_times(path, times)
+        times = times - times[0]
+    else:
+        times = np.arange(len(rows)) / data.number("fps", 0.1, 1000)
     T_WC = _poses(path, rows[:, :4], rows[:, 4:])
     T_WC[:, :3, :3] *= _TO_OPENCV
     return times, T_WC
@@ -78,21 +86,15 @@ def read_arkit_camera(path: Path, size: tuple[int, int] | None) -> FoundCamera:
     **Raises:** `InputError`, naming the file, if it is of none of these recorders.
     """
     if path.suffix == ".csv":
-        try:
-            K = np.loadtxt(path, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise InputError(f"{path}: not a matrix ({error}).") from None
+        K = _numbers(path, read_csv(path, "a camera matrix"))
         if size is None:
             raise InputError(f"{path}: of what image size? It needs the video.")
         width, height = size
     else:
         data = _metadata(path)
-        try:
-            K = np.asarray(data["K"], float).reshape(3, 3).T
-            width, height = int(data["w"]), int(data["h"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: not Record3D's metadata ({error!r}).") from None
-    if K.shape != (3, 3) or not np.isfinite(K).all():
+        K = data.array("K", (9,), (3, 3)).reshape(3, 3).T
+        width, height = (data.whole(name, 1, 1_000_000) for name in ("w", "h"))
+    if K.shape != (3, 3):
         raise InputError(
             f"{path}: a matrix of shape {K.shape}, expected 3 x 3 numbers."
         )
@@ -101,18 +103,26 @@ def read_arkit_camera(path: Path, size: tuple[int, int] | None) -> FoundCamera:
 
 
 def _table(path: Path) -> Float[np.ndarray, "n 9"]:
-    try:
-        head, *lines = path.read_text().splitlines()
-        rows = [line.split(",") for line in lines if line.strip()]
-        table = np.asarray(rows, float)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not Stray Scanner's odometry ({error}).") from None
-    names = tuple(word.strip() for word in head.split(","))[: len(_COLUMNS)]
-    if names != _COLUMNS or table.ndim != 2 or table.shape[1] < len(_COLUMNS):
+    head, *rows = read_csv(path, "Stray Scanner's odometry") or [[]]
+    names = tuple(word.strip() for word in head)[: len(_COLUMNS)]
+    if names != _COLUMNS or not rows:
         raise InputError(
-            f"{path}: columns {', '.join(names)}, expected {', '.join(_COLUMNS)}."
+            f"{path}: not Stray Scanner's odometry: columns {', '.join(names)[:80]} "
+            f"and {len(rows)} rows, expected {', '.join(_COLUMNS)}."
         )
-    return table[:, : len(_COLUMNS)]
+    return _numbers(path, [row[: len(_COLUMNS)] for row in rows])
+
+
+def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
+    if (np.diff(times) <= 0).any():
+        raise InputError(f"{path}: times of poses that do not increase.")
+
+
+def _numbers(path: Path, rows: list[list[str]]) -> Float[np.ndarray, "n m"]:
+    """A table of numbers."""
+    with reading(path, "a table of numbers"):
+        table = np.array([[float(word) for word in row] for row in rows], float)
+    return as_array(path, "table", table, (None, None), high=_MAX_TIME)
 
 
 def _poses(
@@ -127,22 +137,17 @@ def _poses(
     return T_WC
 
 
-def _metadata(path: Path) -> dict[str, Any]:
-    try:
-        if path.suffix == ".r3d":
-            with zipfile.ZipFile(path) as archive:
-                found = json.loads(archive.read("metadata"))
-        else:
-            found = json.loads(path.read_text())
-    except (KeyError, ValueError, UnicodeDecodeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not Record3D's metadata ({error}).") from None
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: a JSON object expected, found a list.")
-    return found
+def _metadata(path: Path) -> Fields:
+    if path.suffix != ".r3d":
+        return read_json_fields(path, _RECORD3D)
+    content = read_zip(path, "Record3D's archive").read("metadata")
+    with reading(path, f"{_RECORD3D} in text"):
+        text = content.decode()
+    return fields(path, parse_json(text, path, _RECORD3D))
 
 
-def _peek(path: Path) -> dict[str, Any]:
+def _has_poses(path: Path) -> bool:
     try:
-        return _metadata(path)
-    except (ValueError, OSError):
-        return {}
+        return "poses" in _metadata(path)
+    except InputError:
+        return False

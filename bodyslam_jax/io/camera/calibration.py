@@ -1,10 +1,8 @@
 """Intrinsics from a camera file, or a guess; projection with them."""
 
 import dataclasses
-import json
 import logging
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +11,8 @@ from jaxtyping import Float
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
+from bodyslam_jax.io.files import read_json_fields
+from bodyslam_jax.io.images import exif_focal_35mm
 from bodyslam_jax.types import Intrinsics
 
 _log = logging.getLogger(__name__)
@@ -21,6 +21,10 @@ _GUESSED_FOCAL = 1.2
 """Focal length over the longer side: COLMAP's default, a field of view of 45
 degrees."""
 
+MAX_SIDE = 1_000_000
+"""Width or height of an image, px, at most: more than any format can hold."""
+_MAX_PARAMETER = 1e8
+"""A focal length, in px, of a hundred times the widest image."""
 _NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
 """Models of `camera.json` and the number of their parameters."""
 
@@ -53,38 +57,22 @@ def read_camera(
         return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
     if path.suffix in (".txt", ".bin"):
         return _from_cameras(path, read_cameras(path), size), None
-    try:
-        data = json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a JSON file ({error}).") from None
-    if not isinstance(data, dict):
-        raise InputError(
-            f"{path}: a JSON object expected, {type(data).__name__} found."
-        )
+    data = read_json_fields(path, "a camera (JSON)")
     if "model" not in data and ("fl_x" in data or "frames" in data):
         return _from_cameras(path, read_cameras(path), size), None
     missing = [k for k in ("model", "width", "height", "params") if k not in data]
     if missing:
-        raise InputError(f"{path}: no {', '.join(missing)}; only {', '.join(data)}.")
-    model = data["model"]
-    if not isinstance(model, str) or model not in _NUM_PARAMS:
+        found = ", ".join(data.names()[:12])
+        raise InputError(f"{path}: no {', '.join(missing)}; only {found}.")
+    model = data.text("model", among=tuple(_NUM_PARAMS))
+    params = data.array("params", (None,))
+    width, height = (data.whole(k, 1, MAX_SIDE) for k in ("width", "height"))
+    if len(params) != _NUM_PARAMS[model]:
         raise InputError(
-            f"{path}: model {model!r}, not one of {', '.join(_NUM_PARAMS)}."
+            f"{path}: {len(params)} params for {model}, not {_NUM_PARAMS[model]}."
         )
-    try:
-        params = np.asarray(data["params"], dtype=np.float64)
-        width, height = (_whole(data[k], k) for k in ("width", "height"))
-        fps = None if data.get("fps") is None else float(data["fps"])
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: numbers expected ({error}).") from None
-    if params.shape != (_NUM_PARAMS[model],):
-        found = (
-            f"{params.size} params" if params.ndim == 1 else "params in no plain list"
-        )
-        raise InputError(f"{path}: {found} for {model}, not {_NUM_PARAMS[model]}.")
     intrinsics = _intrinsics(path, model, params, width, height)
-    if fps is not None and not 0.1 <= fps <= 1000:
-        raise InputError(f"{path}: fps {fps:g}, not between 0.1 and 1000.")
+    fps = data.number("fps", 0.1, 1000) if data.data.get("fps") is not None else None
     return intrinsics, fps
 
 
@@ -116,10 +104,14 @@ def _intrinsics(
 
     **Raises:** `InputError`, naming the file, if no camera has such parameters.
     """
+    expected = _NUM_PARAMS.get(model, 5)
+    if params.shape != (expected,):
+        raise InputError(f"{path}: {params.size} params for {model}, not {expected}.")
     params = _from_colmap(model, params)
-    if not np.isfinite(params).all() or (params[:2] <= 0).any():
+    is_camera = np.isfinite(params).all() and (params[:2] > 0).all()
+    if not is_camera or np.abs(params).max() > _MAX_PARAMETER:
         raise InputError(f"{path}: params {params.tolist()} are not those of a camera.")
-    if width <= 0 or height <= 0:
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError(f"{path}: size {width}x{height} px is not that of an image.")
     if not (-width < params[2] < 2 * width and -height < params[3] < 2 * height):
         raise InputError(
@@ -127,12 +119,6 @@ def _intrinsics(
             f"image of {width}x{height} px."
         )
     return Intrinsics(params, width, height)
-
-
-def _whole(value: Any, name: str) -> int:
-    if isinstance(value, bool) or not float(value).is_integer():
-        raise InputError(f"{name} {value} is no whole number of pixels")
-    return int(value)
 
 
 def guess_camera(
@@ -209,14 +195,8 @@ def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
 
 def _focal_from_exif(image: Path, longer_side: float) -> float | None:
     """px, from the 35 mm equivalent in EXIF data; `None` if there is none."""
-    from PIL import Image  # comes with matplotlib
-
-    try:
-        with Image.open(image) as opened:
-            equivalent = opened.getexif().get_ifd(0x8769).get(0xA405)
-    except (OSError, ValueError, SyntaxError):
+    equivalent = exif_focal_35mm(image)
+    if equivalent is None:
         return None
-    if not equivalent or not 5 <= float(equivalent) <= 500:
-        return None
-    _log.info("%s: focal length %s mm (35 mm equivalent).", image.name, equivalent)
-    return float(equivalent) / 36.0 * longer_side
+    _log.info("%s: focal length %g mm (35 mm equivalent).", image.name, equivalent)
+    return equivalent / 36.0 * longer_side

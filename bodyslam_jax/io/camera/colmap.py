@@ -7,7 +7,6 @@ back), the same pixels.
 """
 
 import dataclasses
-import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +17,12 @@ from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.io.declared import Fields, as_array, shown
+from bodyslam_jax.io.files import read_bytes, read_json_fields, read_lines, reading
 
 _HALF = 0.5
 """px that COLMAP's pixel coordinates exceed those with centres at whole numbers."""
+_TRANSFORMS = "nerfstudio's transforms.json"
 _MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -54,14 +56,13 @@ def read_cameras(path: Path) -> list[FoundCamera]:
     **Raises:** `InputError`, naming the file, if it is none of these.
     """
     if path.suffix == ".json":
-        return [_nerfstudio_camera(path, _load(path))]
-    try:
+        return [_nerfstudio_camera(read_json_fields(path, _TRANSFORMS))]
+    what = "COLMAP's cameras"
+    with reading(path, what):
         found = list(_binary_cameras(path) if path.suffix == ".bin" else _text(path))
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not COLMAP's cameras ({error}).") from None
     if not found:
-        raise InputError(f"{path}: no camera in it, expected COLMAP's cameras.")
-    return [_centred(camera) for camera in found]
+        raise InputError(f"{path}: no camera in it, expected {what}.")
+    return [_centred(path, camera) for camera in found]
 
 
 def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
@@ -71,17 +72,14 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     **Raises:** `InputError`, naming the file, if it is none of these.
     """
     if path.suffix == ".json":
-        return _nerfstudio_poses(path, _load(path))
-    try:
+        return _nerfstudio_poses(read_json_fields(path, _TRANSFORMS))
+    what = "COLMAP's images"
+    with reading(path, what):
         rows = list(_binary_images(path) if path.suffix == ".bin" else _images(path))
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not COLMAP's images ({error}).") from None
     if not rows:
-        raise InputError(f"{path}: no image in it, expected COLMAP's images.")
+        raise InputError(f"{path}: no image in it, expected {what}.")
     names, numbers = zip(*rows, strict=True)
-    numbers = np.asarray(numbers, float)
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{path}: a pose that is not finite numbers.")
+    numbers = as_array(path, "poses", list(numbers), (None, 7))
     length = np.linalg.norm(numbers[:, :4], axis=1)
     if (abs(length - 1) > 0.05).any():
         raise InputError(f"{path}: a quaternion of length {length.max():.3g}, not 1.")
@@ -92,7 +90,15 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     return list(names), T_WC
 
 
-def _centred(camera: FoundCamera) -> FoundCamera:
+def _centred(path: Path, camera: FoundCamera) -> FoundCamera:
+    expected = dict(_MODELS).get(camera.model)
+    if expected is None or len(camera.params) != expected:
+        known = ", ".join(name for name, _ in _MODELS)
+        raise InputError(
+            f"{path}: {len(camera.params)} parameters of camera model "
+            f"{camera.model[:40]}, expected "
+            f"{expected if expected else f'one of {known}'}."
+        )
     first = 1 if camera.model.startswith("SIMPLE") or camera.model == "RADIAL" else 2
     params = list(camera.params)
     for at in (first, first + 1):
@@ -101,7 +107,7 @@ def _centred(camera: FoundCamera) -> FoundCamera:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    for line in path.read_text().splitlines():
+    for line in read_lines(path, "COLMAP's text"):
         if not line.startswith("#"):
             yield line.strip()
 
@@ -124,9 +130,11 @@ class _Reader:
     """Little-endian numbers, one after the other."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = path.read_bytes(), 0
+        self.data, self.at = read_bytes(path, "COLMAP's binary file"), 0
 
     def take(self, form: str) -> tuple[Any, ...]:
+        if self.at > len(self.data):
+            raise ValueError(f"ends after {len(self.data)} bytes")
         found = struct.unpack_from("<" + form, self.data, self.at)
         self.at += struct.calcsize("<" + form)
         return found
@@ -137,7 +145,7 @@ def _binary_cameras(path: Path) -> Iterator[FoundCamera]:
     for _ in range(reader.take("Q")[0]):
         _, model, width, height = reader.take("iiQQ")
         if not 0 <= model < len(_MODELS):
-            raise InputError(f"camera model number {model}")
+            raise ValueError(f"camera model number {model}")
         name, count = _MODELS[model]
         yield FoundCamera(name, width, height, list(reader.take(f"{count}d")))
 
@@ -154,60 +162,44 @@ def _binary_images(path: Path) -> Iterator[tuple[str, list[float]]]:
         yield name, numbers
 
 
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a JSON file ({error}).") from None
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: a JSON object expected, found a list.")
-    return found
+def _nerfstudio_camera(data: Fields) -> FoundCamera:
+    frames = list(data.each("frames")) if "frames" in data else []
 
+    def of(name: str) -> Fields:
+        """What has the value: the file, else its first frame."""
+        is_shared = data.data.get(name) is not None or not frames
+        return data if is_shared else frames[0]
 
-def _nerfstudio_camera(path: Path, data: dict[str, Any]) -> FoundCamera:
-    frames = data.get("frames")
-    first = frames[0] if isinstance(frames, list) and frames else {}
+    def bent(name: str) -> float:
+        within = of(name)
+        return within.number(name) if within.data.get(name) is not None else 0.0
 
-    def value(name: str) -> Any:
-        """Of all frames, else of the first; `None` if neither has it."""
-        return data.get(name, first.get(name))
-
-    needed = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-    missing = [name for name in needed if value(name) is None]
-    if missing:
-        raise InputError(f"{path}: no {', '.join(missing)}, expected nerfstudio's.")
-    model = str(value("camera_model") or "OPENCV")
+    model = "OPENCV"
+    if of("camera_model").data.get("camera_model") is not None:
+        model = of("camera_model").text("camera_model")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"):
         raise InputError(
-            f"{path}: camera_model {model}, expected OPENCV or PINHOLE: "
+            f"{data.path}: camera_model {shown(model)}, expected OPENCV or PINHOLE: "
             "undistort the images first."
         )
-    try:
-        fx, fy, cx, cy = (float(value(n)) for n in needed[:4])
-        bent = [float(value(n) or 0.0) for n in ("k1", "k2", "p1", "p2")]
-        width, height = int(value("w")), int(value("h"))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: numbers expected ({error}).") from None
+    fx, fy, cx, cy = (of(n).number(n) for n in ("fl_x", "fl_y", "cx", "cy"))
+    width, height = (of(n).whole(n, 1, 1_000_000) for n in ("w", "h"))
     params = [fx, fy, cx - _HALF, cy - _HALF]
-    if any(bent):
-        return FoundCamera("OPENCV", width, height, params + bent)
+    distortion = [bent(name) for name in ("k1", "k2", "p1", "p2")]
+    if any(distortion):
+        return FoundCamera("OPENCV", width, height, params + distortion)
     return FoundCamera("PINHOLE", width, height, params)
 
 
-def _nerfstudio_poses(
-    path: Path, data: dict[str, Any]
-) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
-    try:
-        rows = data["frames"]
-        names = [str(row["file_path"]) for row in rows]
-        T_WC = np.asarray([row["transform_matrix"] for row in rows], float)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not nerfstudio's frames ({error!r}).") from None
-    if T_WC.ndim != 3 or T_WC.shape[1:] not in ((4, 4), (3, 4)) or not len(T_WC):
-        raise InputError(f"{path}: transform_matrix of shape {T_WC.shape[1:]}.")
-    found = np.tile(np.eye(4), (len(T_WC), 1, 1))
-    found[:, :3] = T_WC[:, :3] * [1.0, -1.0, -1.0, 1.0]
+def _nerfstudio_poses(data: Fields) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
+    path, rows = data.path, list(data.each("frames"))
+    names = [row.text("file_path") for row in rows]
+    matrices = [row.array("transform_matrix", (4, 4), (3, 4))[:3] for row in rows]
+    if not rows:
+        raise InputError(f"{path}: no frame in it, expected {_TRANSFORMS}.")
+    found = np.tile(np.eye(4), (len(rows), 1, 1))
+    found[:, :3] = np.stack(matrices) * [1.0, -1.0, -1.0, 1.0]
     rigid = found[:, :3, :3] @ np.swapaxes(found[:, :3, :3], 1, 2)
-    if not np.isfinite(found).all() or np.abs(rigid - np.eye(3)).max() > 0.01:
+    if np.abs(rigid - np.eye(3)).max() > 0.01:
         raise InputError(f"{path}: a transform_matrix that is no rigid motion.")
     return names, found

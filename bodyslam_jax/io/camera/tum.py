@@ -10,6 +10,13 @@ from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.io.declared import MAX_MAGNITUDE
+from bodyslam_jax.io.files import read_lines
+
+_LONGEST = 1000
+"""Characters of a line that are read: eight numbers have some two hundred."""
+_MAX_NUMBER = 1e19
+"""A time in nanoseconds since 1970 has 19 digits; positions are far smaller."""
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
@@ -18,19 +25,17 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     **Raises:** `InputError` naming the file, what was found and what was expected.
     """
     rows = []
-    try:
-        lines = path.read_text().splitlines()
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: a binary file, not a TUM trajectory.") from None
+    lines = read_lines(path, "a TUM trajectory")
     for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].replace(",", " ").split()
+        # No more than is needed to see that a line is too long.
+        words = line[:_LONGEST].partition("#")[0].replace(",", " ").split()
         if not words:
             continue
         try:
             row = [float(word) for word in words]
         except ValueError:
             row = []
-        if len(row) != 8 or not np.all(np.isfinite(row)):
+        if len(row) != 8 or not all(abs(x) <= _MAX_NUMBER for x in row):
             raise InputError(
                 f"{path}, line {number}: {line.strip()[:60]!r}, not eight numbers "
                 "`timestamp tx ty tz qx qy qz qw`."
@@ -46,6 +51,11 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     if np.any(abs(length - 1) > 0.05):
         worst = float(length[np.argmax(abs(length - 1))])
         raise InputError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
+    if np.abs(table[:, 1:4]).max() > MAX_MAGNITUDE:
+        raise InputError(
+            f"{path}: a camera {np.abs(table[:, 1:4]).max():.3g} m away, expected at "
+            f"most {MAX_MAGNITUDE:g}."
+        )
     T_WC = np.tile(np.eye(4), (len(table), 1, 1))
     T_WC[:, :3, :3] = so3.from_quaternion(table[:, 4:])
     T_WC[:, :3, 3] = table[:, 1:4]

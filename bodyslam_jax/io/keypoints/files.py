@@ -4,7 +4,7 @@
 """
 
 import dataclasses
-import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,19 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.archive import numbers, open_npz
+from bodyslam_jax.io.archive import Archive, read_npz
+from bodyslam_jax.io.budget import last_frame_problem
+from bodyslam_jax.io.declared import as_array, as_whole
 from bodyslam_jax.io.declared_size import Size, size_in
+from bodyslam_jax.io.files import read_json, reading
 from bodyslam_jax.io.keypoints.names import names_in
 
 _JSON_SUFFIX = "_keypoints.json"
 _SMALL = 300
 """Entries of an array that may be metadata."""
+
+_MAX_PERSON = 10**15
+"""A larger one is no number of a person."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,12 +59,12 @@ def read_openpose(folder: Path) -> Listed:
     rows = []
     for file in files:
         rows += [(file.name, *found) for found in _read_openpose_frame(file)]
-    first = _load_json(files[0])
+    first = read_json(files[0])
     return Listed(rows, [f.name for f in files], detector=_detector(first))
 
 
 def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
-    data = _load_json(file)
+    data = read_json(file)
     people = data.get("people") if isinstance(data, dict) else None
     if not isinstance(people, list):
         raise InputError(f"{file}: no list `people`, so not OpenPose's output.")
@@ -73,12 +79,12 @@ def _read_openpose_frame(file: Path) -> list[tuple[np.ndarray, int]]:
     return found
 
 
-def read_json(path: Path) -> Listed:
+def read_json_keypoints(path: Path) -> Listed:
     """A JSON file of AlphaPose, MMPose, COCO or easy_ViTPose, recognised by content.
 
     **Raises:** `InputError`, naming the file, if it is none of these or incomplete.
     """
-    data = _load_json(path)
+    data = read_json(path)
     for recognise, read in _JSON_READERS:
         if recognise(data):
             return read(path, data)
@@ -143,7 +149,8 @@ def _read_mmpose(path: Path, data: Any) -> Listed:
     rows, names = [], []
     try:
         for i, info in enumerate(data["instance_info"]):
-            names.append(str(int(info.get("frame_id", i))))
+            frame = as_whole(path, "frame_id", info.get("frame_id", i))
+            names.append(str(frame))
             for person in info["instances"]:
                 xy = _array(path, person["keypoints"])
                 score = _array(path, person["keypoint_scores"])
@@ -216,36 +223,36 @@ _JSON_READERS: list[tuple[Callable[[Any], bool], Callable[[Path, Any], Listed]]]
 ]
 
 
-def read_npz(path: Path, num_frames: int | None) -> Listed:
+def read_npz_keypoints(path: Path, num_frames: int | None) -> Listed:
     """Generic: `keypoints` (t, j, 3) or (h, t, j, 3), or `uv` and `confidence`.
 
     Without an axis of people it is one person; along the axis, people are tracked.
     """
-    with open_npz(path) as archive:
-        if "keypoints" in archive.files:
-            points = numbers(path, archive, "keypoints", finite=False)
-        elif {"uv", "confidence"} <= set(archive.files):
-            uv, confidence = (
-                numbers(path, archive, k, finite=False) for k in ("uv", "confidence")
-            )
-            if uv.shape != (*confidence.shape, 2):
-                raise InputError(
-                    f"{path}: uv {uv.shape}, confidence {confidence.shape}."
-                )
-            points = np.concatenate([uv, confidence[..., None]], axis=-1)
-        else:
-            raise InputError(f"{path}: no array `keypoints`, only {archive.files}.")
-        header = {k: archive[k] for k in archive.files if archive[k].size < _SMALL}
-    header = {k: v.tolist() for k, v in header.items() if v.dtype.kind in "fiuU"}
+    archive = read_npz(path)
+    if "keypoints" in archive:
+        shapes = ("t", "j", 3), ("h", "t", "j", 3)
+        points = archive.array("keypoints", *shapes, finite=False)
+    elif "uv" in archive and "confidence" in archive:
+        shapes = ("t", "j", 2), ("h", "t", "j", 2)
+        uv = archive.array("uv", *shapes, finite=False)
+        shape = uv.shape[:-1]
+        confidence = archive.array("confidence", shape, finite=False)
+        points = np.concatenate([uv, confidence[..., None]], axis=-1)
+    else:
+        found = ", ".join(archive.names[:12])
+        raise InputError(f"{path}: no array `keypoints`, only {found}.")
+    header = _header(archive)
     if points.ndim == 3:
         points = points[None]
-    if points.ndim != 4 or points.shape[-1] != 3:
-        raise InputError(f"{path}: keypoints {points.shape}, not (t, j, 3).")
     if num_frames is not None and points.shape[1] != num_frames:
         raise InputError(
             f"{path}: keypoints of {points.shape[1]} frames, but the video has "
             f"{num_frames}."
         )
+    if num_frames is None and (
+        problem := last_frame_problem(points.shape[1] - 1, points.shape[1], "keypoints")
+    ):
+        raise InputError(f"{path}: {problem}.")
     rows = [
         (str(k), points[h, k], int(h))
         for h, k in np.argwhere(~(points[..., 2] <= 0).all(axis=-1))
@@ -259,19 +266,28 @@ def read_npz(path: Path, num_frames: int | None) -> Listed:
     )
 
 
-def _load_json(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{file}: not a JSON file ({error}).") from None
+def _header(archive: Archive) -> dict[str, Any]:
+    """The small arrays of numbers or text beside the keypoints, as lists."""
+    found = {}
+    for name in archive.names:
+        shape, dtype = archive.header(name)
+        if math.prod(shape) < _SMALL and dtype.kind in "fiuU":
+            with reading(archive.path, f"`{name}` of numbers or text"):
+                found[name] = archive.raw(name).tolist()
+    return found
 
 
 def _array(path: Path, values: Any) -> np.ndarray:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: keypoints that are not numbers.") from None
-    return array
+    if isinstance(values, list):  # `null` is how JSON writes a missing number
+        values = _without_null(values)
+    return as_array(path, "keypoints", values, finite=False)
+
+
+def _without_null(values: list) -> list:
+    return [
+        math.nan if x is None else _without_null(x) if isinstance(x, list) else x
+        for x in values
+    ]
 
 
 def _triples(path: Path, flat: Any) -> np.ndarray:
@@ -291,6 +307,7 @@ def _who(path: Path, entry: dict, *keys: str) -> int:
     if value is None:
         return -1
     try:
-        return int(value)
+        number = int(value)
     except (TypeError, ValueError, OverflowError):
         return -1  # not a number, such as a name: people are tracked by position
+    return number if 0 <= number < _MAX_PERSON else -1

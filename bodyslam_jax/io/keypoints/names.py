@@ -87,7 +87,7 @@ def names_in(data: Any) -> list[str] | None:
             return found
     by_name = data.get("keypoint_name2id")
     if isinstance(by_name, dict):
-        return _listed({v: k for k, v in by_name.items()})
+        return _listed({str(v): k for k, v in by_name.items()})
     categories = data.get("categories")
     for category in categories if isinstance(categories, list) else []:
         if isinstance(category, dict) and (found := _listed(category.get("keypoints"))):
@@ -104,7 +104,7 @@ def _listed(value: Any) -> list[str] | None:
     if isinstance(value, dict):
         try:
             value = {int(k): v for k, v in value.items()}
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             return None
         if sorted(value) != list(range(len(value))):
             return None

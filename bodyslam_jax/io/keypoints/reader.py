@@ -11,11 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
 from bodyslam_jax.io.keypoints.detector import UNKNOWN, definition_of
-from bodyslam_jax.io.keypoints.files import read_json, read_npz, read_openpose
+from bodyslam_jax.io.keypoints.files import (
+    read_json_keypoints,
+    read_npz_keypoints,
+    read_openpose,
+)
 from bodyslam_jax.io.keypoints.turned import turned_back
 
 _log = logging.getLogger(__name__)
@@ -67,10 +72,10 @@ def read_detections(
     if path.is_dir():
         listed = read_openpose(path)
     elif path.suffix.lower() == ".npz":
-        listed = read_npz(path, num_frames)
+        listed = read_npz_keypoints(path, num_frames)
         images = ()  # its frames are rows, not names
     else:
-        listed = read_json(path)
+        listed = read_json_keypoints(path)
     try:
         frames = frames_of_names(
             listed.names,
@@ -89,6 +94,11 @@ def read_detections(
         listed.rows, arranged(path, listed, warn), strict=True
     ):
         by_frame[frames[name]].append((points, who))
+    busiest = max(map(len, by_frame), default=0)
+    if busiest > MAX_PEOPLE:
+        raise InputError(
+            f"{path}: {busiest} people in one frame, expected at most {MAX_PEOPLE}."
+        )
     points = [np.array([p for p, _ in f]).reshape(-1, 25, 3) for f in by_frame]
     person = [np.array([who for _, who in f], dtype=np.int64) for f in by_frame]
     person = _checked(person, warn)

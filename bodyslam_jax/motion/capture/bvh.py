@@ -17,6 +17,8 @@ from jaxtyping import Array, Float
 from bodyslam_jax.body import PARENTS
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.io.declared import MAX_MAGNITUDE, as_array
+from bodyslam_jax.io.files import read_bytes
 from bodyslam_jax.motion.capture.clips import (
     Clip,
     leg_length,
@@ -57,6 +59,9 @@ _ROTATIONS = ("xrotation", "yrotation", "zrotation")
 _UNITS = (1.0, 0.01, 0.0254, 0.056444, 0.001)
 """Metres per unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
 
+_MAX_JOINTS = 500
+"""Joints of a skeleton: with fingers and face it has some hundred."""
+
 
 @dataclasses.dataclass
 class _Joint:
@@ -77,8 +82,6 @@ def read_bvh(path: Path) -> Clip:
     """
     path = Path(path)
     joints, values, fps = _parse(path)
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}: NaN or infinite channel; expected numbers.")
     index = {joint.name: i for i, joint in enumerate(joints)}
     source = [
         next((index[name] for name in names.split(",") if name in index), None)
@@ -176,7 +179,8 @@ def _forward(
 
 
 def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
-    words = path.read_text(errors="replace").split()
+    content = read_bytes(path, "a BVH file")
+    words = content.decode("utf-8", errors="replace").split()
     try:
         start = words.index("MOTION")
         joints, stack, i = [], [-1], 0
@@ -193,20 +197,28 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
             elif word == "}":
                 stack.pop()
             elif word == "OFFSET":
-                joints[-1].offset = np.array(words[i + 1 : i + 4], float)
+                joints[-1].offset = _numbers(words[i + 1 : i + 4])
+                if joints[-1].offset.shape != (3,):
+                    raise ValueError("an OFFSET of less than three numbers")
             elif word == "CHANNELS":
                 count = int(words[i + 1])
+                if not 0 <= count <= 6:
+                    raise ValueError("a joint of more than six channels")
                 named = words[i + 2 : i + 2 + count]
                 joints[-1].channels = [name.lower() for name in named]
             i += 1
         frames = int(words[words.index("Frames:", start) + 1])
         time = words.index("Time:", start)
         step = float(words[time + 1])
-        values = np.array(words[time + 2 :], float)
+        values = _numbers(words[time + 2 :])
     except (ValueError, IndexError):
         raise InputError(f"{path}: not a BVH file (HIERARCHY and MOTION).") from None
+    if len(joints) > _MAX_JOINTS:
+        raise InputError(
+            f"{path}: {len(joints)} joints, expected at most {_MAX_JOINTS}."
+        )
     for joint in joints:
-        if not np.isfinite(joint.offset).all():
+        if not (np.abs(joint.offset) <= MAX_MAGNITUDE).all():
             raise InputError(
                 f"{path}: OFFSET {joint.offset.tolist()} of {joint.name}; expected "
                 "numbers."
@@ -228,4 +240,11 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
         raise InputError(
             f"{path}: {values.size} numbers; expected {frames} frames of {width}."
         )
-    return joints, values.reshape(frames, width), 1 / step
+    values = as_array(path, "MOTION", values.reshape(frames, width))
+    return joints, values, 1 / step
+
+
+def _numbers(words: list[str]) -> np.ndarray:
+    """Words as numbers, one after the other: NumPy would first make a table as wide as
+    the longest of them."""
+    return np.array([float(word) for word in words])

@@ -15,7 +15,7 @@ _UPRIGHT = 0.7
 """Smallest mean cosine between the world's and the body's up axis of who stands."""
 
 
-class NoLegs(ValueError):
+class NoLegs(InputError):
     """The motion is valid, but its leg length cannot be determined."""
 
 

@@ -6,14 +6,14 @@ finite numbers, right widths, a rate; errors are one line that names the file.
 
 import dataclasses
 import logging
-import zlib
-from collections.abc import Callable
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.archive import Archive, read_npz
+from bodyslam_jax.io.declared import shown
+from bodyslam_jax.io.files import reading
 from bodyslam_jax.motion.capture.bvh import read_bvh
 from bodyslam_jax.motion.capture.clips import Clip, leg_length, rest_from_offsets
 from bodyslam_jax.motion.capture.legs import NoLegs, leg_from_height, leg_from_joints
@@ -33,17 +33,16 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
     In a folder, `.npz` files of other things are passed over, and so, with a warning,
     are sequences without bone lengths in which nobody stands.
 
-    **Raises:** `FileNotFoundError` if there is nothing at `path`; `ValueError` if a
-    file is damaged or if no file holds a usable sequence.
+    **Raises:** `InputError` if there is nothing at `path`, if a file is damaged
+    or if no file holds a usable sequence.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder of motion data.")
+        raise InputError(f"{path}: no such file or folder of motion data.")
     if path.is_file():
         if clips := _read_file(path):
             return clips
-        with np.load(path, allow_pickle=False) as archive:
-            names = ", ".join(archive.files[:8]) or "nothing"
+        names = ", ".join(read_npz(path).names[:8])
         raise InputError(
             f"{path}: no motion, but {names}; expected `poses` and `trans` of AMASS, "
             "or a CMU archive."
@@ -81,49 +80,20 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
 def _read_file(path: Path) -> tuple[Clip, ...]:
     if path.suffix.lower() == ".bvh":
         return (read_bvh(path),)
-    with open(path, "rb") as file:
-        try:
-            archive = np.load(file, allow_pickle=False)
-            names = set(archive.files)
-        except (OSError, EOFError, AttributeError, ValueError, BadZipFile):
-            raise InputError(f"{path}: not a readable .npz file.") from None
-        if "seq_start" in names:
-            return _read_cmu(path, _taker(path, archive))
-        if "trans" in names and names & {"poses", "root_orient", "pose_body"}:
-            return (_read_amass(path, names, _taker(path, archive)),)
+    archive = read_npz(path, "motion (.npz)")
+    if "seq_start" in archive:
+        return _read_cmu(archive)
+    if "trans" in archive and {"poses", "root_orient", "pose_body"} & {*archive.names}:
+        return (_read_amass(archive),)
     return ()
 
 
-def _taker(path: Path, archive) -> Callable[[str], np.ndarray]:
-    """One array by name; an object array, which would be a pickle, is refused."""
-
-    def take(name: str) -> np.ndarray:
-        if name not in archive.files:
-            raise InputError(f"{path}: no array `{name}`, only {archive.files}.")
-        try:
-            return archive[name]
-        except (BadZipFile, zlib.error, EOFError):
-            raise InputError(f"{path}: `{name}` is damaged; copy it again.") from None
-        except ValueError:
-            raise InputError(
-                f"{path}: `{name}` is a pickled object; expected a plain array."
-            ) from None
-
-    return take
-
-
-def _numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind not in "fiub":
-        raise InputError(
-            f"{path}: `{name}` is of type {array.dtype}; expected real numbers."
-        )
-    return array
-
-
-def _rate(path: Path, fps: np.ndarray) -> float:
+def _rate(archive: Archive, name: str) -> float:
+    fps = archive.array(name)
     if fps.size != 1 or not 1 <= fps.item() <= 1000:
         raise InputError(
-            f"{path}: frame rate {fps.tolist()}; expected one number of 1 to 1000."
+            f"{archive.path}: frame rate {shown(fps.tolist())}; expected one number of "
+            "1 to 1000."
         )
     return float(fps.item())
 
@@ -142,44 +112,59 @@ def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
             )
 
 
-def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]:
+def _read_cmu(archive: Archive) -> tuple[Clip, ...]:
     """The archive of CMU trials as SMPL rotations, one clip per trial and phase."""
-    data = {name: take(name) for name in _CMU_ARRAYS}
-    for name in ("poses", "trans", "fps", "subject_offsets"):
-        _numbers(path, name, data[name])
-    poses, trans = data["poses"], data["trans"]
-    if poses.ndim != 3 or poses.shape[1:] != (24, 3) or trans.shape[1:] != (3,):
+    path = archive.path
+    archive.require(*_CMU_ARRAYS)
+    poses = archive.array("poses", ("n", 24, 3), finite=False)
+    trans = archive.array("trans", ("n", 3), finite=False)
+    fps = _rate(archive, "fps")
+    parents = archive.array("parents", (24,), kind="whole", low=-1, high=23).tolist()
+    if any(p >= k for k, p in enumerate(parents) if k):
+        raise InputError(f"{path}: `parents` has a joint before its parent.")
+    offsets_of = archive.array("subject_offsets", ("subjects", 24, 3))
+    subjects = {name: i for i, name in enumerate(_words(archive, "subjects"))}
+    within = {"kind": "whole", "low": 0, "high": len(poses)}
+    starts = archive.array("seq_start", ("s",), **within)
+    lengths = archive.array("seq_length", ("s",), **within)
+    phase = archive.array("seq_phase", ("s",), kind="whole")
+    names = _words(archive, "seq_name")
+    texts = ("seq_subject", "seq_motion", "seq_split")
+    of_subject, motion, split = (_words(archive, name) for name in texts)
+    each = {len(starts), *map(len, (names, of_subject, motion, split))}
+    if len(each) > 1 or len(subjects) != len(offsets_of):
         raise InputError(
-            f"{path}: poses {poses.shape}, trans {trans.shape}; expected (n, 24, 3) "
-            "and (n, 3)."
+            f"{path}: {len(starts)} sequences of {sorted(each)} entries and "
+            f"{len(subjects)} subjects with {len(offsets_of)} skeletons."
         )
-    fps = _rate(path, data["fps"])
-    parents = [int(p) for p in data["parents"]]
-    subjects = {str(name): i for i, name in enumerate(data["subjects"])}
-    phase, names = data["seq_phase"], data["seq_name"]
+    phases_of = dict.fromkeys(names, 1)
+    phases_of |= {name: 4 for name, k in zip(names, phase, strict=True) if k > 0}
     clips = []
-    for i, (start, length) in enumerate(
-        zip(data["seq_start"], data["seq_length"], strict=True)
-    ):
+    for i, (start, length) in enumerate(zip(starts, lengths, strict=True)):
         rows = slice(int(start), int(start) + int(length))
-        _check(path, str(names[i]), poses[rows], trans[rows])
-        subject = str(data["seq_subject"][i])
+        if not length or rows.stop > len(poses):
+            raise InputError(
+                f"{path}: {names[i]} is frames {rows.start} to {rows.stop} of "
+                f"{len(poses)}."
+            )
+        _check(path, names[i], poses[rows], trans[rows])
+        subject = of_subject[i]
         if subject not in subjects:
             raise InputError(f"{path}: no skeleton of subject {subject!r}.")
-        offsets = np.array(data["subject_offsets"][subjects[subject]])
+        offsets = offsets_of[subjects[subject]].astype(np.float32)
         clips.append(
             Clip(
-                name=str(names[i]),
+                name=names[i],
                 subject=subject,
-                motion=str(data["seq_motion"][i]),
-                split=str(data["seq_split"][i]),
+                motion=motion[i],
+                split=split[i],
                 fps=fps,
-                poses=poses[rows],
-                trans=trans[rows],
+                poses=poses[rows].astype(np.float32),
+                trans=trans[rows].astype(np.float32),
                 offsets=offsets,
                 leg_length=float(leg_length(rest_from_offsets(offsets, parents))),
                 phase=int(phase[i]),
-                phases=4 if (phase[names == names[i]] > 0).any() else 1,
+                phases=phases_of[names[i]],
             )
         )
     if not clips:
@@ -187,18 +172,30 @@ def _read_cmu(path: Path, take: Callable[[str], np.ndarray]) -> tuple[Clip, ...]
     return tuple(clips)
 
 
-def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
+def _words(archive: Archive, name: str) -> list[str]:
+    """The texts of an array."""
+    found = archive.raw(name)
+    if found.ndim != 1 or found.dtype.kind not in "SUiu":
+        raise InputError(
+            f"{archive.path}: `{name}` is {found.dtype}{found.shape}, expected texts."
+        )
+    with reading(archive.path, f"texts in `{name}`"):
+        return [str(word) for word in found.tolist()]
+
+
+def _read_amass(archive: Archive) -> Clip:
     """One AMASS sequence, SMPL-H or SMPL-X release, or a body that this project wrote.
 
     `reference.md` of nghorbani/amass: `poses` (t, 156) of SMPL-H, of which SMPL has
     the first 66; `mocap_framerate` or `mocap_frame_rate`. The project's own files have
     `joints` (t, 24, 3) besides, in the world, m.
     """
-    number = lambda name: _numbers(path, name, take(name))
+    path, names = archive.path, {*archive.names}
+    number = lambda name: archive.array(name, finite=False)
     rate = next((name for name in _RATES if name in names), None)
     if rate is None:
         raise InputError(f"{path}: no `mocap_framerate`; expected frames per second.")
-    fps = _rate(path, number(rate))
+    fps = _rate(archive, rate)
     parts = ("poses",) if "poses" in names else ("root_orient", "pose_body")
     angles = [_rows(number(name)) for name in parts]
     trans = number("trans")
@@ -207,7 +204,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         wanted = "(t, 3) and (t, 63)" if len(parts) > 1 else "(t, 66 or more)"
         raise InputError(f"{path}: {shapes}; expected {wanted}.")
     poses = np.concatenate(angles, -1)
-    if poses.shape[1] < 66 or trans.shape[1:] != (3,):
+    if poses.shape[1] < 66 or trans.ndim != 2 or trans.shape[1] != 3:
         raise InputError(
             f"{path}: poses {poses.shape}, trans {trans.shape}; expected (t, 66 or "
             "more) and (t, 3)."
@@ -216,7 +213,7 @@ def _read_amass(path: Path, names: set[str], take: Callable) -> Clip:
         raise InputError(f"{path}: the sequence has no frame.")
     run = slice(None)
     if "present" in names:
-        run = _longest(path, take("present"), len(poses))
+        run = _longest(path, archive.raw("present"), len(poses))
     poses, trans = poses[run], trans[run]
     _check(path, "the sequence", poses, trans)
     hands = np.zeros((len(poses), 6))
@@ -262,10 +259,7 @@ def _rows(angles: np.ndarray) -> np.ndarray:
 
 def gender(path: Path) -> str:
     """The gender that an AMASS file states, whether stored as text or as bytes."""
-    with np.load(path, allow_pickle=False) as archive:
-        value = _taker(path, archive)("gender").item()
-    text = value.decode() if isinstance(value, bytes) else str(value)
-    text = text.strip("b'\" ").lower()
+    text = read_npz(path).text("gender").strip("b'\" ").lower()
     return text if text in ("female", "male", "neutral") else "neutral"
 
 

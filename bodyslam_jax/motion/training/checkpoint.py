@@ -5,7 +5,6 @@ import hashlib
 import json
 from pathlib import Path
 from typing import TypeVar
-from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
+from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.motion.training.sampling import Corpus
 
 Tree = TypeVar("Tree")
@@ -43,14 +43,13 @@ def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:
 
     **Raises:** `InputError` if it is damaged or of another run.
     """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            found = str(archive["mark"])
-            leaves = [archive[f"leaf_{i}"] for i in range(len(archive.files) - 1)]
-    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise InputError(f"{path}: not a training checkpoint ({error}).") from None
-    if found != mark:
+    archive = read_npz(path, "a training checkpoint")
+    if archive.text("mark") != mark:
         raise InputError(
             f"{path}: checkpoint of other settings or data; remove it to start anew."
         )
+    leaves = [archive.raw(f"leaf_{i}") for i in range(len(archive.names) - 1)]
+    wanted = [np.shape(leaf) for leaf in jax.tree.leaves(like)]
+    if [leaf.shape for leaf in leaves] != wanted:
+        raise InputError(f"{path}: its arrays are not those of this training.")
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, leaves))

@@ -30,7 +30,7 @@ def train_from_data(
     epochs, measures)` is called after each epoch. The model will know the skeleton of
     `body_model`, by default the one that `load_body_model` finds, and no other.
 
-    **Raises:** `FileNotFoundError`; `ValueError` if there is no usable motion in
+    **Raises:** `InputError` if there is no usable motion in
     `data`, no usable body model, or if `out` does not end in `.npz` or cannot be
     written.
     """

@@ -1,0 +1,591 @@
+"""An interpreter of pickles that can make plain data only.
+
+A pickle is a program for a machine with a stack. Python's own machine looks up and
+calls what the program names; this one knows lists, dictionaries, sets, tuples, numbers
+and text, and inert stand-ins for the few names that result files hold: NumPy's arrays
+and types, joblib's arrays, PyTorch's tensors. No object of a library is made by what
+the program says: an array is made here, once its type, shape and bytes agree. What the
+program makes, how deep, and in how many instructions is bounded.
+
+The instructions are those of protocols 0 to 5, documented in CPython's `pickletools`.
+"""
+
+import codecs
+import re
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bodyslam_jax.io import plain_arrays
+from bodyslam_jax.io.pickle_names import CALLS, INERT, set_type
+from bodyslam_jax.io.pickle_values import (
+    ArrayToFill,
+    Blob,
+    JoblibArray,
+    Name,
+    Plain,
+    StandIn,
+    content_of,
+)
+from bodyslam_jax.io.plain_arrays import (
+    VALUE_BYTES,
+    Account,
+    ArrayType,
+    Damaged,
+    Refused,
+    shown,
+)
+
+MAX_PICKLES = 4
+"""Pickles within pickles, as joblib's arrays of objects are."""
+MAX_LINE_BYTES = 65_536
+"""Of a line of protocol 0 that is no text: a name or a number."""
+MAX_COLLISIONS = 100
+"""Keys that are tuples and share a hash: a few by chance, more by intent."""
+OBJECT_BYTES = 300
+"""What a container costs in memory: an empty set, the largest, takes 240."""
+BLOB_BYTES = 4096
+"""Bytes and Python 2's texts from this length on stay in the file until used."""
+
+Persistent = Callable[[Any], Any]
+
+
+class Machine:
+    """Runs one pickle.
+
+    Args:
+        data: of the file, unpacked.
+        at: where the pickle begins; after `load`, where it ended.
+        stand_ins: packages whose objects become `StandIn`s.
+        persistent: what stands for a reference to data outside the pickle.
+    """
+
+    def __init__(
+        self,
+        data: bytes | bytearray,
+        at: int,
+        account: Account,
+        stand_ins: tuple[str, ...] = (),
+        persistent: Persistent | None = None,
+        level: int = 0,
+    ) -> None:
+        if level >= MAX_PICKLES:
+            raise Refused(f"more than {MAX_PICKLES} pickles within each other")
+        self.data, self.view, self.at = data, memoryview(data), at
+        self.account, self.stand_ins, self.level = account, stand_ins, level
+        self.persistent = persistent
+        self.stack: list[Any] = []
+        self.marked: list[list[Any]] = []
+        """Stacks below the marks that are open."""
+        self.memo: dict[int, Any] = {}
+        self.names: dict[tuple[str, str], Name] = {}
+        self.hashes: dict[int, tuple] = {}
+        self.collisions = 0
+
+    def load(self) -> Any:
+        """The plain data that the pickle makes.
+
+        **Raises:** `Refused` or `Damaged`; `IndexError` and others of Python's if the
+        pickle is damaged.
+        """
+        data, account = self.data, self.account
+        while True:
+            code = data[self.at]
+            self.at += 1
+            if code == _STOP:
+                break
+            account.steps -= 1
+            if account.steps < 0:
+                raise Refused("more instructions than its size on disk accounts for")
+            step = _STEPS.get(code)
+            if step is None:
+                raise Damaged(f"{bytes([code])!r} is no instruction of a pickle")
+            step(self)
+        if len(self.stack) != 1 or self.marked:
+            raise Damaged(f"it ends with {len(self.stack)} objects, not with one")
+        return Plain(account).of(self.stack[0])
+
+    # What instructions are made of
+
+    def bytes_at(self, count: int) -> memoryview:
+        """The next bytes, which are not copied."""
+        end = self.at + count
+        if end > len(self.data):
+            raise Damaged(f"{count} bytes, {len(self.data) - self.at} are there")
+        found = self.view[self.at : end]
+        self.at = end
+        return found
+
+    def number(self, layout: struct.Struct) -> Any:
+        return layout.unpack(self.bytes_at(layout.size))[0]
+
+    def line(self, most: int = MAX_LINE_BYTES) -> bytes:
+        end = self.data.find(b"\n", self.at, self.at + most)
+        if end < 0:
+            raise Damaged(f"no end of a line within {most} bytes")
+        found = bytes(self.view[self.at : end])
+        self.at = end + 1
+        return found
+
+    def push(self, value: Any, cost: int = VALUE_BYTES) -> None:
+        self.account.spend(cost)
+        self.stack.append(value)
+
+    def pop_mark(self) -> list[Any]:
+        """All objects above the last mark, which goes."""
+        items, self.stack = self.stack, self.marked.pop()
+        return items
+
+    def named(self, module: Any, name: Any) -> Name:
+        """The stand-in for a name.
+
+        **Raises:** `Refused` for every name that result files do not need.
+        """
+        if not (isinstance(module, str) and isinstance(name, str)):
+            raise Refused("it wants to load a name that is no text")
+        found = self.names.get((module, name))
+        if found is not None:
+            return found
+        root, _, rest = module.partition(".")
+        root = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(root, root)
+        key = ".".join([root, rest, name] if rest else [root, name])
+        key = key.replace("numpy._core.", "numpy.core.")
+        if key in CALLS or key in INERT:
+            found = Name(key)
+        elif any(f"{module}.".startswith(f"{package}.") for package in self.stand_ins):
+            self.account.spend(OBJECT_BYTES + len(key))
+            found = Name(key, is_stand_in=True)
+        else:
+            raise Refused(f"it wants to load {shown(f'{module}.{name}')[1:-1]}")
+        self.names[module, name] = found
+        return found
+
+    def call(self, function: Any, arguments: Any) -> None:
+        """Pushes what a function or class makes of its arguments."""
+        if not isinstance(function, Name) or not isinstance(arguments, tuple):
+            raise Refused(f"it wants to call {shown(function)}")
+        if function.is_stand_in:
+            return self.push(StandIn(function.key), 2 * OBJECT_BYTES)
+        make = CALLS.get(function.key)
+        if make is None:
+            raise Refused(f"it wants to call {function.key}")
+        self.push(make(self, *arguments), OBJECT_BYTES)
+
+    def key(self, value: Any) -> Any:
+        """A value as the key of a dictionary or the element of a set."""
+        if isinstance(value, Blob):
+            value = content_of(value, self.account)
+        if type(value) in (str, int, float, bool, bytes, type(None)):
+            return value
+        simple = (str, int, float, bool, bytes)
+        if type(value) is not tuple or not all(type(x) in simple for x in value):
+            raise Refused(f"{shown(value)} as the key of a dictionary")
+        # Python spreads keys by their hash; that of numbers can be made the same.
+        if self.hashes.setdefault(hash(value), value) != value:
+            self.collisions += 1
+            if self.collisions > MAX_COLLISIONS:
+                raise Refused("keys that are made to be slow")
+        return value
+
+    def set_items(self, target: Any, items: list[Any]) -> None:
+        if type(target) is not dict:
+            raise Refused(f"it wants to change {shown(target)}")
+        self.account.spend(2 * VALUE_BYTES * len(items))
+        if len(items) % 2:
+            raise Damaged("a key without a value")
+        for k in range(0, len(items), 2):
+            target[self.key(items[k])] = items[k + 1]
+
+    def extend(self, target: Any, items: list[Any]) -> None:
+        if type(target) is not list:
+            raise Refused(f"it wants to change {shown(target)}")
+        target.extend(items)
+
+    def set_of(self, items: Any) -> set:
+        self.account.spend(2 * VALUE_BYTES * len(items))
+        return {self.key(item) for item in items}
+
+    def remember(self, place: int) -> None:
+        if self.memo.get(place) is None:
+            self.account.spend(2 * VALUE_BYTES)
+        self.memo[place] = self.stack[-1]
+
+    def build(self) -> None:
+        """Gives an object its state: only a stand-in can have one."""
+        state = self.stack.pop()
+        target = self.stack[-1]
+        if isinstance(target, StandIn):
+            # Objects with slots have a pair: dictionary, slots.
+            if type(state) is tuple and state and type(state[0]) is dict:
+                state = state[0]
+            target.state = state
+        elif isinstance(target, ArrayType):
+            set_type(target, state)
+        elif isinstance(target, ArrayToFill):
+            target.value = self._array(state)
+        elif isinstance(target, JoblibArray):
+            # joblib writes an array's bytes behind the object that describes it.
+            self.stack[-1] = self._joblib_array(state)
+        else:
+            raise Refused(f"it wants to change {shown(target)}")
+
+    def _array(self, state: Any) -> Any:
+        """What `numpy.ndarray.__setstate__` would make."""
+        if type(state) is not tuple or len(state) not in (4, 5):
+            raise Refused("an array without shape, type and content")
+        shape, of, by_column, content = state[-4:]
+        shape = plain_arrays.shape_of(shape)
+        if not isinstance(of, ArrayType) or type(by_column) not in (bool, int):
+            raise Refused("an array without a type")
+        if of.kind == "O":
+            if type(content) is not list:
+                raise Refused(f"{shown(content)} as the objects of an array")
+            plain_arrays.num_bytes(of, shape, self.account)
+            self.account.spend(VALUE_BYTES * len(content))
+            return plain_arrays.listed(list(content), shape, self.account)
+        return self.array(content, of, shape, bool(by_column))
+
+    def array(
+        self, content: Any, of: Any, shape: Any, by_column: bool = False
+    ) -> np.ndarray:
+        """An array of bytes that the pickle holds."""
+        if not isinstance(of, ArrayType):
+            raise Refused("an array without a type")
+        if isinstance(content, Blob):
+            content = content.view
+        elif type(content) is str:  # as Python 2 wrote bytes
+            self.account.spend(len(content))
+            content = content.encode("latin1")
+        elif type(content) is not bytes:
+            raise Refused(f"{shown(content)} as the bytes of an array")
+        shape = plain_arrays.shape_of(shape)
+        return plain_arrays.array_of(content, of, shape, self.account, by_column)
+
+    def _joblib_array(self, state: Any) -> Any:
+        if type(state) is not dict or not {"shape", "order", "dtype"} <= set(state):
+            raise Refused("an array of joblib's without shape, order and type")
+        of, order = state["dtype"], state["order"]
+        shape = plain_arrays.shape_of(state["shape"])
+        if not isinstance(of, ArrayType) or order not in ("C", "F"):
+            raise Refused("an array of joblib's without order and type")
+        if of.kind == "O":
+            inner = Machine(
+                self.data, self.at, self.account, self.stand_ins, level=self.level + 1
+            )
+            found = inner.load()
+            self.at = inner.at
+            return found
+        if state.get("numpy_array_alignment_bytes") is not None:
+            self.bytes_at(self.bytes_at(1)[0])
+        content = self.bytes_at(plain_arrays.num_bytes(of, shape, self.account))
+        return plain_arrays.array_of(content, of, shape, self.account, order == "F")
+
+
+def _whole(value: int) -> int:
+    """A whole number that fits 64 bits; later code converts it to such."""
+    if not -(2**63) <= value < 2**64:
+        raise Refused("a whole number of more than 64 bits")
+    return value
+
+
+def _fixed(layout: str) -> Callable[[Machine], None]:
+    number = struct.Struct(layout)
+    return lambda machine: machine.push(machine.number(number))
+
+
+def _constant(value: Any) -> Callable[[Machine], None]:
+    return lambda machine: machine.push(value)
+
+
+def _long(layout: str) -> Callable[[Machine], None]:
+    width = struct.Struct(layout)
+
+    def step(machine: Machine) -> None:
+        count = machine.number(width)
+        if not 0 <= count <= 9:
+            raise Refused("a whole number of more than 64 bits")
+        value = int.from_bytes(machine.bytes_at(count), "little", signed=True)
+        machine.push(_whole(value))
+
+    return step
+
+
+def _written_int(machine: Machine) -> None:
+    text = machine.line()
+    if text in (b"00", b"01"):
+        return machine.push(text == b"01")
+    if not re.fullmatch(rb"[+-]?\d{1,20}L?", text):
+        raise Damaged(f"{text[:40]!r} as a whole number")
+    machine.push(_whole(int(text.rstrip(b"L"))))
+
+
+def _written_float(machine: Machine) -> None:
+    text = machine.line()
+    if not re.fullmatch(rb"[+-]?(\d+\.?\d*|\.\d+|inf|nan)(e[+-]?\d+)?", text.lower()):
+        raise Damaged(f"{text[:40]!r} as a number")
+    machine.push(float(text))
+
+
+def _written_string(machine: Machine) -> None:
+    """A text of Python 2, in quotes."""
+    text = machine.line(len(machine.data))
+    if len(text) < 2 or text[:1] not in b"'\"" or text[:1] != text[-1:]:
+        raise Damaged(f"{text[:40]!r} as a text in quotes")
+    machine.account.spend(2 * len(text))
+    plain: Any = codecs.escape_decode(text[1:-1])[0]  # pyright: ignore
+    machine.push(plain.decode("latin1"))
+
+
+def _written_unicode(machine: Machine) -> None:
+    line = machine.line(len(machine.data))
+    machine.account.spend(4 * len(line))
+    text = line.decode("raw-unicode-escape")
+    if not text.isascii():
+        text.encode("utf-8")  # fails for halves of characters: no file takes them
+    machine.push(text)
+
+
+def _sized(layout: str, kind: type, is_text: bool = False) -> Callable[[Machine], None]:
+    """Bytes, or a text, behind their length."""
+    width = struct.Struct(layout)
+
+    def step(machine: Machine) -> None:
+        count = machine.number(width)
+        if count < 0:
+            raise Damaged(f"a text of {count} characters")
+        view = machine.bytes_at(count)
+        if kind is str:
+            # One character beyond latin1 makes all of a text four bytes wide.
+            is_wide = count < BLOB_BYTES or np.frombuffer(view, "u1").max() > 0xC3
+            machine.account.spend(4 * count if is_wide else count)
+            return machine.push(str(view, "utf-8"))
+        if count >= BLOB_BYTES:
+            return machine.push(Blob(view, is_text), OBJECT_BYTES)
+        value = str(view, "latin1") if is_text else bytes(view)
+        machine.push(value, VALUE_BYTES + count)
+
+    return step
+
+
+def _tuple_of(count: int) -> Callable[[Machine], None]:
+    def step(machine: Machine) -> None:
+        if len(machine.stack) < count:
+            raise Damaged("a tuple of more objects than there are")
+        items = tuple(machine.stack[len(machine.stack) - count :])
+        del machine.stack[len(machine.stack) - count :]
+        machine.push(items, 2 * VALUE_BYTES)
+
+    return step
+
+
+def _of_marked(make: Callable[[Machine, list], Any]) -> Callable[[Machine], None]:
+    """A container of all objects above the mark."""
+
+    def step(machine: Machine) -> None:
+        items = machine.pop_mark()
+        machine.push(make(machine, items), OBJECT_BYTES + 8 * len(items))
+
+    return step
+
+
+def _marked_dict(machine: Machine, items: list) -> dict:
+    found: dict[Any, Any] = {}
+    machine.set_items(found, items)
+    return found
+
+
+def _empty(make: Callable[[], Any]) -> Callable[[Machine], None]:
+    return lambda machine: machine.push(make(), OBJECT_BYTES)
+
+
+def _mark(machine: Machine) -> None:
+    machine.account.spend(2 * VALUE_BYTES)
+    machine.marked.append(machine.stack)
+    machine.stack = []
+
+
+def _pop(machine: Machine) -> None:
+    if machine.stack:
+        machine.stack.pop()
+    else:
+        machine.pop_mark()
+
+
+def _pop_mark(machine: Machine) -> None:
+    machine.pop_mark()
+
+
+def _append(machine: Machine) -> None:
+    item = machine.stack.pop()
+    machine.extend(machine.stack[-1], [item])
+
+
+def _appends(machine: Machine) -> None:
+    items = machine.pop_mark()
+    machine.extend(machine.stack[-1], items)
+
+
+def _set_item(machine: Machine) -> None:
+    value, key = machine.stack.pop(), machine.stack.pop()
+    machine.set_items(machine.stack[-1], [key, value])
+
+
+def _set_items(machine: Machine) -> None:
+    items = machine.pop_mark()
+    machine.set_items(machine.stack[-1], items)
+
+
+def _add_items(machine: Machine) -> None:
+    items, target = machine.pop_mark(), machine.stack[-1]
+    if type(target) is not set:
+        raise Refused(f"it wants to change {shown(target)}")
+    target.update(machine.set_of(items))
+
+
+def _put(layout: str) -> Callable[[Machine], None]:
+    place = struct.Struct(layout)
+    return lambda machine: machine.remember(machine.number(place))
+
+
+def _get(layout: str) -> Callable[[Machine], None]:
+    place = struct.Struct(layout)
+    return lambda machine: machine.push(machine.memo[machine.number(place)], 8)
+
+
+def _place(machine: Machine) -> int:
+    text = machine.line()
+    if not re.fullmatch(rb"\d{1,10}", text):
+        raise Damaged(f"{text[:40]!r} as a number of an object")
+    return int(text)
+
+
+def _global(machine: Machine) -> None:
+    module, name = machine.line().decode(), machine.line().decode()
+    machine.push(machine.named(module, name), 8)
+
+
+def _stack_global(machine: Machine) -> None:
+    name, module = machine.stack.pop(), machine.stack.pop()
+    machine.push(machine.named(module, name), 8)
+
+
+def _reduce(machine: Machine) -> None:
+    arguments, function = machine.stack.pop(), machine.stack.pop()
+    machine.call(function, arguments)
+
+
+def _new_with_names(machine: Machine) -> None:
+    named = machine.stack.pop()
+    if named != {}:
+        raise Refused("it wants to make an object with named arguments")
+    _reduce(machine)
+
+
+def _instance(machine: Machine) -> None:
+    """An object of an old class of Python 2, by its name."""
+    of = machine.named(machine.line().decode(), machine.line().decode())
+    machine.call(of, tuple(machine.pop_mark()))
+
+
+def _object(machine: Machine) -> None:
+    items = machine.pop_mark()
+    machine.call(items[0], tuple(items[1:]))
+
+
+def _reference(machine: Machine) -> None:
+    pid = machine.stack.pop()
+    if machine.persistent is None:
+        raise Refused("it refers to data outside the file")
+    machine.push(machine.persistent(pid), OBJECT_BYTES)
+
+
+def _outside(_: Machine) -> None:
+    raise Refused("it refers to data outside the file")
+
+
+def _protocol(machine: Machine) -> None:
+    (version,) = machine.bytes_at(1)
+    if version > 5:
+        raise Refused(f"a pickle of protocol {version}, expected 0 to 5")
+
+
+def _frame(machine: Machine) -> None:
+    """The length of a part, for those who read in parts."""
+    length = machine.number(struct.Struct("<Q"))
+    if length > len(machine.data) - machine.at:
+        raise Damaged(f"{length} bytes, {len(machine.data) - machine.at} are there")
+
+
+_STOP = ord(".")
+_STEPS: dict[int, Callable[[Machine], None]] = {
+    ord(code): step
+    for code, step in {
+        "(": _mark,
+        "0": _pop,
+        "1": _pop_mark,
+        "2": lambda machine: machine.push(machine.stack[-1], 8),
+        "F": _written_float,
+        "G": _fixed(">d"),
+        "I": _written_int,
+        "J": _fixed("<i"),
+        "K": _fixed("<B"),
+        "M": _fixed("<H"),
+        "L": _written_int,
+        "\x8a": _long("<B"),
+        "\x8b": _long("<i"),
+        "N": _constant(None),
+        "\x88": _constant(True),
+        "\x89": _constant(False),
+        "S": _written_string,
+        "T": _sized("<i", bytes, is_text=True),
+        "U": _sized("<B", bytes, is_text=True),
+        "B": _sized("<I", bytes),
+        "C": _sized("<B", bytes),
+        "\x8e": _sized("<Q", bytes),
+        "\x96": _sized("<Q", bytes),
+        "V": _written_unicode,
+        "X": _sized("<I", str),
+        "\x8c": _sized("<B", str),
+        "\x8d": _sized("<Q", str),
+        ")": _empty(tuple),
+        "t": _of_marked(lambda _, items: tuple(items)),
+        "\x85": _tuple_of(1),
+        "\x86": _tuple_of(2),
+        "\x87": _tuple_of(3),
+        "]": _empty(list),
+        "l": _of_marked(lambda _, items: items),
+        "a": _append,
+        "e": _appends,
+        "}": _empty(dict),
+        "d": _of_marked(_marked_dict),
+        "s": _set_item,
+        "u": _set_items,
+        "\x8f": _empty(set),
+        "\x90": _add_items,
+        "\x91": _of_marked(Machine.set_of),
+        "c": _global,
+        "\x93": _stack_global,
+        "R": _reduce,
+        "\x81": _reduce,
+        "\x92": _new_with_names,
+        "i": _instance,
+        "o": _object,
+        "b": Machine.build,
+        "p": lambda machine: machine.remember(_place(machine)),
+        "q": _put("<B"),
+        "r": _put("<I"),
+        "\x94": lambda machine: machine.remember(len(machine.memo)),
+        "g": lambda machine: machine.push(machine.memo[_place(machine)], 8),
+        "h": _get("<B"),
+        "j": _get("<I"),
+        "P": _outside,
+        "Q": _reference,
+        "\x97": _outside,
+        "\x98": _outside,
+        "\x80": _protocol,
+        "\x95": _frame,
+    }.items()
+}
+"""The instructions by their codes; those that import through a registry are missing."""
