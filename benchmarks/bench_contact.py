@@ -85,6 +85,18 @@ def figures(case: Case, prepared: Prepared, standing: Standing) -> dict[str, flo
     return {name: float(value) for name, value in row.items()}
 
 
+def result_row(name: str, frames: int, keypoints: bool) -> dict[str, float]:
+    """`figures` with standing feet held as by default."""
+    case = make_case(name, frames, keypoints)
+    prepared = case.prepare()
+    solution, _ = solve_stage(prepared.problem, prepared.state, case.config, "joint")
+    standing = hold_standing_feet(
+        *(prepared, solution.state, case.sequence, case.cameras, case.body),
+        case.config,
+    )
+    return figures(case, prepared, standing)
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

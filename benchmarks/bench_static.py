@@ -121,6 +121,14 @@ def figures(scene: sequences.SimulatedSequence, result: Result) -> dict[str, Any
     }
 
 
+def row(name: str, people: int, frames: int, height: float) -> dict[str, Any]:
+    """`figures` of one scene, from simulated keypoints."""
+    scene = static_scene(name, people, frames, height)
+    return figures(
+        scene, pipeline.run(input_of(scene, False, Cache(None), None), CONFIG)
+    )
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])

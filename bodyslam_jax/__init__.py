@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.graph import FrameFactor as FrameFactor
     from bodyslam_jax.graph import Problem as Problem
     from bodyslam_jax.graph import State as State
+    from bodyslam_jax.graph import Variable as Variable
     from bodyslam_jax.graph import check_factor as check_factor
     from bodyslam_jax.graph import rescaled as rescaled
     from bodyslam_jax.graph import weights as weights
@@ -49,6 +50,7 @@ _HOME = {
     "Result": "types",
     "Sequence": "types",
     "State": "graph",
+    "Variable": "graph",
     "build": "pipeline.problem_builder",
     "check_factor": "graph",
     "evaluate": "evaluation",

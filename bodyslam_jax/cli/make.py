@@ -22,7 +22,14 @@ from bodyslam_jax.config import (
 )
 
 _Experiment = Literal[
-    "table1", "scale", "landmarks", "motion", "ablation", "weights", "video"
+    "table1",
+    "scale",
+    "landmarks",
+    "motion",
+    "ablation",
+    "weights",
+    "video",
+    "calibration",
 ]
 log = logging.getLogger(__name__)
 

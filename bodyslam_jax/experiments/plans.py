@@ -15,6 +15,8 @@ from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments import ablation as ablation_
 from bodyslam_jax.experiments import reports
 from bodyslam_jax.experiments import video as video_
+from bodyslam_jax.experiments.calibration import jobs as calibration_jobs
+from bodyslam_jax.experiments.calibration import write_calibration
 from bodyslam_jax.experiments.comparison import compare_methods
 from bodyslam_jax.experiments.jobs import Job, Plan, by_sequence, cases, cost, named
 from bodyslam_jax.experiments.learning import described, judge
@@ -211,6 +213,12 @@ def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
     return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
 
 
+def calibration(experiment: Experiment, config: Config, stages: Path) -> Plan:
+    """Errors over claims, on people whom no prior knows."""
+    write = functools.partial(write_calibration, about=about(experiment, config))
+    return Plan(calibration_jobs(experiment, config, stages), write)
+
+
 PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
     "table1": table1,
     "scale": scale,
@@ -219,4 +227,5 @@ PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
     "ablation": ablation,
     "weights": weights,
     "video": video,
+    "calibration": calibration,
 }

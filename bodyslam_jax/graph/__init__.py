@@ -47,6 +47,8 @@ from bodyslam_jax.graph.factors.scale_prior import ScalePrior as ScalePrior
 from bodyslam_jax.graph.factors.shape_prior import ShapePrior as ShapePrior
 from bodyslam_jax.graph.factors.stature import Stature as Stature
 from bodyslam_jax.graph.factors.upright_prior import UprightPrior as UprightPrior
+from bodyslam_jax.graph.globals import GlobalPrior as GlobalPrior
+from bodyslam_jax.graph.globals import Variable as Variable
 from bodyslam_jax.graph.keypoint_jacobian import turning_joints as turning_joints
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from bodyslam_jax.graph.factor import Factor, FrameFactor
+from bodyslam_jax.graph.globals import Named, bound
 from bodyslam_jax.graph.padding import check_padding
 from bodyslam_jax.graph.state import State, Step, moved_at_random
 from bodyslam_jax.graph.validation import check_measurements, check_state
@@ -25,6 +26,7 @@ _VARIABLE = {
     "poses": "pose",
     "shapes": "shape",
     "intrinsics": "intrinsics",
+    "globals": "globals",
 }
 """Fields of a state, and the names that `keys` has for them."""
 
@@ -44,17 +46,18 @@ class FactorReport:
     given state."""
 
 
-def check_factor(factor: Factor, state: State) -> FactorReport:
+def check_factor(factor: Factor, state: State, named: Named = ()) -> FactorReport:
     """Refuses a factor that does not fit a state, or that the solver cannot use.
 
     Shapes, kinds and values must fit; a residual may depend on the variables in `keys`
     only; values and derivatives must be finite, close to `state` and with respect to
     the measurements; appended frames must not change the cost; `jit` and `vmap` must
-    give the same cost.
+    give the same cost. `named` is `Problem.globals`, for a factor of named globals.
 
     **Raises:** `ValueError` in one line: where, what was found, what was expected.
     """
     sizes = check_state(state)
+    factor = bound(factor, named)
     check_measurements(factor, sizes)
     check_precision(factor, state)
     name = type(factor).__name__
@@ -119,7 +122,7 @@ def _gradient_by_state(factor: Factor, state: State, name: str) -> dict[str, flo
         size = float(abs(values).max(initial=0.0))
         if not isinstance(factor, FrameFactor):
             largest[field] = size
-        elif variable in {key for key, _ in factor.keys}:
+        elif variable in {key for key, _ in factor.touched}:
             largest[field] = size
         elif size > 0:
             expected = f"({variable!r}, 0)" if variable else "no landmarks"

@@ -30,7 +30,10 @@ Key = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
 
 _OF_PEOPLE = ("root", "pose", "shape")
-_SHARED = ("scale", "shape", "intrinsics")
+_SHARED = ("scale", "shape", "intrinsics", "globals")
+BUILT_IN = ("camera", "root", "pose", *_SHARED)
+"""Names of variables that every state has; other names in `keys` are of named globals
+(`graph.globals`)."""
 
 
 class Frame(eqx.Module):
@@ -61,6 +64,23 @@ class Shared(eqx.Module):
     """s, m per unit of the map."""
     person_shape: Float[Array, " 10"] | None
     intrinsics: Float[Array, " i"]
+    globals: Float[Array, " g"]
+    """All named globals, one after another."""
+    names: tuple[tuple[str, int, int], ...] = eqx.field(static=True, default=())
+    """Name, start and end of each named global that the factor has in its `keys`."""
+
+    def __getitem__(self, name: str) -> Float[Array, " n"]:
+        """The named global `name`.
+
+        **Raises:** `ValueError` if `(name, 0)` is not among the factor's `keys`.
+        """
+        for known, start, end in self.names:
+            if known == name:
+                return self.globals[start:end]
+        raise ValueError(
+            f"shared[{name!r}]: found {[known for known, *_ in self.names]}, expected "
+            f"`({name!r}, 0)` among the factor's `keys`."
+        )
 
     @property
     def shape(self) -> Float[Array, " 10"]:
@@ -156,6 +176,11 @@ class FrameFactor(Factor):
     they are counted once (`once`). Missing measurements have `sigma = inf`.
     """
 
+    globals_at: tuple[tuple[str, int, int], ...] = eqx.field(
+        static=True, default=(), kw_only=True, repr=False
+    )
+    """Name, start and end in `State.globals` of each named global in `keys`; the
+    problem sets it."""
     loss = Squared()
     """The robust loss; a subclass makes it a field with `loss: Loss = Squared()`."""
     padding: ClassVar[Mapping[str, float] | None] = None
@@ -173,8 +198,15 @@ class FrameFactor(Factor):
         @abc.abstractmethod
         def keys(self) -> tuple[Key, ...]:
             """The variables: among `camera`, `root`, `pose` with a lag, and `scale`,
-            `shape`, `intrinsics` with lag 0. A class attribute, or a property where
-            they depend on the factor's settings."""
+            `shape`, `intrinsics` with lag 0, and names of globals (`variables`) with
+            lag 0. A class attribute, or a property where they depend on the factor's
+            settings."""
+
+    @property
+    def touched(self) -> tuple[Key, ...]:
+        """`keys` with the vector of all globals in place of named ones."""
+        known = ((n, k) if n in BUILT_IN else ("globals", k) for n, k in self.keys)
+        return tuple(dict.fromkeys(known))
 
     @property
     def of_people(self) -> bool:
@@ -190,7 +222,7 @@ class FrameFactor(Factor):
     @property
     def once(self) -> bool:
         """Whether its measurements depend on no frame, and are counted once."""
-        return not self.time_fields and all(name in _SHARED for name, _ in self.keys)
+        return not self.time_fields and all(n in _SHARED for n, _ in self.touched)
 
     def data(self) -> Any:
         """Measurements, leading axes `h t` (or `t`): by default a tuple of
@@ -263,7 +295,9 @@ class FrameFactor(Factor):
                 )
                 for lag in range(self.num_lags)
             )
-            shared = Shared(state.scale, shape, state.intrinsics)
+            shared = Shared(
+                *(state.scale, shape, state.intrinsics, state.globals), self.globals_at
+            )
             over = lambda d, w, e: function(d, w, shared, e)
             return jax.vmap(over)(data, windows, extra)
 

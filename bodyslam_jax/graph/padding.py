@@ -82,11 +82,13 @@ class Masked(FrameFactor):
 
     def frame_residual(self, data, window, shared):
         present, measured = data
+        shared = dataclasses.replace(shared, names=self.factor.globals_at)
         residual = self.factor.frame_residual(measured, window, shared)
         return _zero_unless(present, residual)
 
     def jacobian(self, data, window, shared):
         present, measured = data
+        shared = dataclasses.replace(shared, names=self.factor.globals_at)
         found = self.factor.jacobian(measured, window, shared)
         if found is None:
             return None

@@ -19,6 +19,14 @@ from bodyslam_jax.graph.factors.human_motion import HumanMotion
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.reprojection import Reprojection
+from bodyslam_jax.graph.globals import (
+    GlobalPrior,
+    Named,
+    Variable,
+    bound,
+    split,
+    vector_of,
+)
 from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
@@ -35,7 +43,10 @@ from bodyslam_jax.graph.validation import (
 from bodyslam_jax.graph.validation_weights import check_mask, check_precision
 from bodyslam_jax.motion import Clock, leg_length
 
-VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics")
+VARIABLES = (
+    *("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics"),
+    "globals",
+)
 
 
 class MotionPredictor(eqx.Module):
@@ -75,17 +86,25 @@ class Problem(eqx.Module):
     variables: tuple[str, ...] = eqx.field(static=True, default=VARIABLES)
     """Groups of variables with at least one free coordinate. Blocks of the Hessian of
     the other groups are not formed."""
+    globals: Named = eqx.field(static=True, default=())
+    """Names and sizes of the variables in `State.globals`."""
 
-    def cost(self, state: State) -> Float[Array, ""]:
+    def cost(self, state: State, *, held: bool = False) -> Float[Array, ""]:
         """Negative log-likelihood, up to a constant.
 
-        Predictions of the motion model are those stored in the factors (`refresh`).
+        Predictions of the motion model are made at `state`, and no gradient flows
+        through them; with `held` they are those that the factors have, as within a step
+        of the solver.
         """
-        return sum(self.cost_by_term(state).values(), jnp.zeros_like(state.scale))
+        costs = self.cost_by_term(state, held=held).values()
+        return sum(costs, jnp.zeros_like(state.scale))
 
-    def cost_by_term(self, state: State) -> dict[str, Float[Array, ""]]:
-        """The cost of each factor, by the name of its class."""
-        costs = [factor.cost(state) for factor in self.factors]
+    def cost_by_term(
+        self, state: State, *, held: bool = False
+    ) -> dict[str, Float[Array, ""]]:
+        """The cost of each factor, by the name of its class; `held` as in `cost`."""
+        problem = self if held else self.refresh(state)
+        costs = [factor.cost(state) for factor in problem.factors]
         return dict(zip(self.names, costs, strict=True))
 
     @property
@@ -151,10 +170,52 @@ class Problem(eqx.Module):
         other = dataclasses.replace(self.motion, predict=predict, model=parameters)
         return dataclasses.replace(self, motion=other)
 
+    def with_variables(
+        self, state: State, **variables: Variable
+    ) -> tuple["Problem", State]:
+        """The same problem and state with more named globals, which are free.
+
+        Their priors are factors (`GlobalPrior`). Other factors that depend on them are
+        put in with `with_factors`.
+
+        **Raises:** `ValueError` for a name that is taken or no identifier, a value that
+        is not finite, or a sigma that is not above 0.
+        """
+        dtype = state.scale.dtype
+        found = {n: vector_of(n, v, dtype) for n, v in variables.items()}
+        taken = [name for name, _ in self.globals if name in found]
+        if taken:
+            raise ValueError(f"variables: {taken[0]!r} is a variable already.")
+        values = [value for value, _ in found.values()]
+        more = jnp.concatenate([state.globals[:0], *values])
+        state = dataclasses.replace(
+            state, globals=jnp.concatenate([state.globals, more])
+        )
+        free = dataclasses.replace(
+            self.free,
+            globals=jnp.concatenate([self.free.globals, jnp.ones_like(more)]),
+        )
+        named = (*self.globals, *((n, len(v)) for n, (v, _) in found.items()))
+        kept = tuple(
+            v for v in VARIABLES if v in self.variables or (v == "globals" and named)
+        )
+        problem = dataclasses.replace(self, free=free, globals=named, variables=kept)
+        priors = [
+            GlobalPrior(mean=value, sigma=sigma, name=name)
+            for name, (value, sigma) in found.items()
+            if is_traced(sigma) or np.isfinite(np.asarray(sigma)).any()
+        ]
+        return problem.with_factors(*priors), state
+
+    def named(self, values: Float[Array, "*b g"]) -> dict[str, Float[Array, "*b _"]]:
+        """Each named global of `State.globals`, by its name."""
+        return dict(split(self.globals, values))
+
     def with_factors(self, *factors: Factor) -> "Problem":
         """The same problem with more factors; states of this problem fit it as before.
 
-        Checks and layout are those of `make_problem`. What is held stays held, except
+        Checks and layout are those of `make_problem`. Named globals of `factors` must
+        be variables of the problem (`with_variables`). What is held stays held, except
         a scale that no factor depended on so far and one of `factors` does: it is free
         in what this returns. A custom factor is best checked first (`check_factor`).
 
@@ -162,6 +223,7 @@ class Problem(eqx.Module):
         values do not fit, or if there would be two `Reprojection`.
         """
         sizes = dict[str, int]()
+        factors = tuple(bound(factor, self.globals) for factor in factors)
         check_shapes(self.free, "problem.free", sizes)
         sample = _sample_state(self.free)
         for factor in factors:
@@ -178,7 +240,9 @@ class Problem(eqx.Module):
         if "scale" in _variables_of(factors) - _variables_of(self.factors):
             free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
             variables = tuple(v for v in VARIABLES if v in (*variables, "scale"))
-        return Problem(everything, free, self.motion, layout, variables)
+        return dataclasses.replace(
+            self, factors=everything, free=free, layout=layout, variables=variables
+        )
 
 
 def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
@@ -222,6 +286,7 @@ def make_problem(
     free_intrinsics: bool = False,
     free: Step | None = None,
     common_sizes: bool | None = None,
+    named: Named = (),
 ) -> Problem:
     """Checks factors against a first state, fixes the gauge, and lays out the blocks.
 
@@ -234,13 +299,21 @@ def make_problem(
     without people that has 200 frames or more and more than six landmarks a frame is
     not padded so: it compiles a program of its own, whose steps take half the time.
 
+    `named` has the names and sizes of `state.globals`; `Problem.with_variables` adds
+    named globals to a problem with their priors.
+
     **Raises:** `ValueError` if shapes or dtypes of arrays do not fit, a value is not
     finite or not valid (a pose that is not rigid, sigma 0, a correlation of 1, a weight
     in a frame without an earlier one), an index is out of range, padding changes the
     cost of a custom factor, or the problem does not fit into memory.
     """
-    factors = tuple(factors)
     sizes = check_state(state)
+    known = sum(size for _, size in named)
+    if known != sizes["g"]:
+        raise ValueError(
+            f"named: {known} coordinates, expected the {sizes['g']} of state.globals."
+        )
+    factors = tuple(bound(factor, named) for factor in factors)
     for factor in factors:
         check_measurements(factor, sizes)
         check_precision(factor, state)
@@ -264,6 +337,7 @@ def make_problem(
             shapes=ones.shapes,
             landmarks=ones.landmarks,
             intrinsics=ones.intrinsics * float(free_intrinsics),
+            globals=ones.globals,
         )
     else:
         # `solve` knows a problem's precision by its mask.
@@ -271,13 +345,13 @@ def make_problem(
     moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
     movable = jax.tree.map(moves, mask)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
-    return Problem(factors, mask, motion, layout, variables)
+    return Problem(factors, mask, motion, layout, variables, named)
 
 
 def _variables_of(factors: Sequence[Factor]) -> set[str]:
     """Names of the variables (as in `Key`) that any `FrameFactor` depends on."""
     over_frames = [f for f in factors if isinstance(f, FrameFactor)]
-    return {name for factor in over_frames for name, _ in factor.keys}
+    return {name for factor in over_frames for name, _ in factor.touched}
 
 
 def _layout_of(
@@ -322,4 +396,5 @@ def _sample_state(free: Step) -> State:
         shapes=jnp.zeros_like(free.shapes),
         landmarks=jnp.zeros_like(free.landmarks).at[:, 2].set(3.0),
         intrinsics=intrinsics.at[:4].set(jnp.array([500.0, 500.0, 320.0, 240.0])),
+        globals=jnp.zeros_like(free.globals),
     )

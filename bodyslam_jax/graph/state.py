@@ -5,6 +5,8 @@ with a linear `s`. People are anchored in the camera (`T_CH`, not `T_WH`), so th
 keypoint factors depend neither on the cameras nor on `s`, which can then change freely.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,12 @@ class Step(eqx.Module):
     """units of the map"""
     intrinsics: Float[Array, " i"]
     """px for focal length and centre; dimensionless for distortion."""
+    globals: Float[Array, " g"] = None  # pyright: ignore[reportAssignmentType]
+    """Named variables that all frames have in common, one after another."""
+
+    def __post_init__(self):
+        if self.globals is None:
+            self.globals = _no_globals(self.scale)
 
 
 class State(eqx.Module):
@@ -52,6 +60,13 @@ class State(eqx.Module):
     """Static points in the world frame, units of the map."""
     intrinsics: Float[Array, " i"]
     """`fx fy cx cy` px, then `k1 k2 p1 p2` if distorted."""
+    globals: Float[Array, " g"] = None  # pyright: ignore[reportAssignmentType]
+    """Named variables that all frames have in common, one after another, each in its
+    own unit; `Problem.globals` has their names and sizes. None without it."""
+
+    def __post_init__(self):
+        if self.globals is None:
+            self.globals = _no_globals(self.scale)
 
     def retract(self, step: Step) -> "State":
         """Moves by `step`: rotations through the exponential map, the rest added."""
@@ -66,6 +81,7 @@ class State(eqx.Module):
             shapes=self.shapes + step.shapes,
             landmarks=self.landmarks + step.landmarks,
             intrinsics=self.intrinsics + step.intrinsics,
+            globals=self.globals + step.globals,
         )
 
     def zero_step(self) -> Step:
@@ -78,7 +94,13 @@ class State(eqx.Module):
             shapes=jnp.zeros_like(self.shapes),
             landmarks=jnp.zeros_like(self.landmarks),
             intrinsics=jnp.zeros_like(self.intrinsics),
+            globals=jnp.zeros_like(self.globals),
         )
+
+
+def _no_globals(scale: Any) -> Float[Array, " 0"]:
+    """An empty vector of the precision of `scale`."""
+    return jnp.zeros((0,), getattr(scale, "dtype", None))
 
 
 def retract_pose(

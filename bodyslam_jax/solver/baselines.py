@@ -36,7 +36,7 @@ def run(name, problem, state, stage):
     A state that is not finite, or whose cost is not, is not returned: the one that the
     stage began with is.
     """
-    cost_of = lambda state: problem.refresh(state).cost(state)
+    cost_of = problem.cost
     before = cost_of(state)
     found, count, result = _METHODS[name](problem, state, stage)
     cost = cost_of(found)
@@ -83,8 +83,7 @@ class _Flat(eqx.Module):
 
     def cost(self, step):
         """With the motion predicted anew, and held."""
-        place = self.retract(step)
-        return self.problem.refresh(place).cost(place)
+        return self.problem.cost(self.retract(step))
 
 
 def _flat(problem, state):

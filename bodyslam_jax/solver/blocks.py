@@ -29,6 +29,8 @@ class Sizes(eqx.Module):
     """Places between a chunk and the next in time, at most."""
     intrinsics: int = eqx.field(static=True)
     """0 where they are held."""
+    named: int = eqx.field(static=True)
+    """Coordinates of named globals; 0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
     lasting: int = eqx.field(static=True)
     """Landmarks that are eliminated last."""
@@ -48,14 +50,19 @@ class Sizes(eqx.Module):
         return tuple((len(list(same)), 3 * count) for count, same in of_width)
 
     @property
+    def common(self) -> int:
+        """Scale, intrinsics and named globals: what no single person has."""
+        return 1 + self.intrinsics + self.named
+
+    @property
     def own_globals(self) -> int:
-        """Scale, intrinsics and the shape of one person."""
-        return 1 + self.intrinsics + 10
+        """Scale, intrinsics, named globals and the shape of one person."""
+        return self.common + 10
 
     @property
     def globals(self) -> int:
-        """Scale, intrinsics and all shapes."""
-        return 1 + self.intrinsics + 10 * self.people
+        """Scale, intrinsics, named globals and all shapes."""
+        return self.common + 10 * self.people
 
     @property
     def arrow(self) -> int:
@@ -154,13 +161,14 @@ def shifted(x: Array, by: int, axis: int) -> Array:
 
 def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> Sizes:
     """`dtype` of blocks, the state's without it."""
-    held = "intrinsics" not in problem.variables
+    size = lambda name, x: x.shape[0] if name in problem.variables else 0
     return Sizes(
         people=state.roots.shape[0],
         chunks=problem.layout.num_chunks,
         bandwidth=problem.layout.bandwidth,
         reach=problem.layout.reach,
-        intrinsics=0 if held else state.intrinsics.shape[0],
+        intrinsics=size("intrinsics", state.intrinsics),
+        named=size("globals", state.globals),
         variables=problem.variables,
         lasting=problem.layout.lasting,
         limbs=problem.layout.limbs,
@@ -177,9 +185,22 @@ def mask_of(problem: Problem) -> Step:
     return Step(**parts)
 
 
+def globals_of(step: Step, sizes: Sizes) -> Float[Array, " g"]:
+    """All globals of a step in one vector, in the order of the arrowhead's corner."""
+    return jnp.concatenate(
+        [
+            step.scale[None],
+            step.intrinsics[: sizes.intrinsics],
+            step.globals[: sizes.named],
+            step.shapes.reshape(-1),
+        ]
+    )
+
+
 def own_to_global(sizes: Sizes, person: int | None) -> Array:
-    """Where scale, intrinsics and the shape of a person stand among all globals."""
-    common = jnp.arange(1 + sizes.intrinsics)
+    """Where scale, intrinsics, named globals and the shape of a person stand among all
+    globals."""
+    common = jnp.arange(sizes.common)
     if person is None:
         return common
     return jnp.concatenate([common, len(common) + 10 * person + jnp.arange(10)])

@@ -19,6 +19,7 @@ from bodyslam_jax.solver.blocks import (
     CAMERAS,
     Linearisation,
     Sizes,
+    globals_of,
     own_to_global,
     sizes_of,
 )
@@ -46,6 +47,8 @@ class Marginals(eqx.Module):
     """Of pelvis joints in the world, m^2"""
     intrinsics: Float[Array, "i i"]
     """px^2; without a coordinate where none is free."""
+    globals: Float[Array, "g g"]
+    """Of named globals; without a coordinate where none is free."""
     shapes: Float[Array, "h 10 10"]
     landmarks: Float[Array, "l 3 3"]
     """Of `s l'`, m^2"""
@@ -132,12 +135,13 @@ def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     landmarks = _landmarks(problem, state, sizes, lin, damping, windows, arrow)
     i = sizes.intrinsics
     h = sizes.people
-    shapes = common[1 + i :, 1 + i :].reshape(h, 10, h, 10)
+    shapes = common[sizes.common :, sizes.common :].reshape(h, 10, h, 10)
     return Marginals(
         scale=common[0, 0],
         cameras=cameras,
         people=people,
         intrinsics=common[1 : 1 + i, 1 : 1 + i],
+        globals=common[1 + i : sizes.common, 1 + i : sizes.common],
         shapes=jnp.stack([shapes[p, :, p] for p in range(h)])
         if h
         else jnp.zeros((0, 10, 10), common.dtype),
@@ -153,9 +157,7 @@ def _free_globals(problem: Problem, sizes: Sizes) -> Array:
     free = problem.free
     shapes = free.shapes if "shapes" in sizes.variables else 0 * free.shapes
     scale = free.scale if "scale" in sizes.variables else 0 * free.scale
-    return jnp.concatenate(
-        [scale[None], free.intrinsics[: sizes.intrinsics], shapes.reshape(-1)]
-    )
+    return globals_of(dataclasses.replace(free, scale=scale, shapes=shapes), sizes)
 
 
 def _centres(problem, state, sizes, fronts):
@@ -255,9 +257,11 @@ def _from_cameras(bucket, table, damp, windows, sizes):
         chunk, cross, side, inverse = group
         known = windows[chunk][index[:, None], index[None, :]]
         count = cross.shape[-1]
-        # The scale moves no landmark of the map: a row of zeros in its place.
-        still = jnp.zeros((1, 3, count), cross.dtype)
-        w = jnp.concatenate([cross.reshape(width, 3, count), still, side])
+        # Neither the scale nor named globals move a landmark: rows of zeros for them.
+        still = lambda rows: jnp.zeros((rows, 3, count), cross.dtype)
+        w = jnp.concatenate(
+            [cross.reshape(width, 3, count), still(1), side, still(sizes.named)]
+        )
         gain = -jnp.einsum("wag,abg->wbg", w, inverse)
         moved = (known @ gain.reshape(len(index), -1)).reshape(gain.shape)
         spread = inverse + jnp.einsum("wag,wbg->abg", gain, moved)

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 
 from bodyslam_jax.graph import Problem, Step
 from bodyslam_jax.solver.apart import split_poses
-from bodyslam_jax.solver.blocks import Linearisation
+from bodyslam_jax.solver.blocks import Linearisation, Sizes, globals_of
 
 
-def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisation:
+def with_gradient(
+    problem: Problem, lin: Linearisation, sizes: Sizes, step: Step
+) -> Linearisation:
     """The same blocks of `J^T J`, with the gradient `step`."""
-    count = lin.globals.shape[0] - 1 - step.shapes.size
     poses = split_poses(step.poses, problem.layout.joints)
     gradient = {}
     for name, known in lin.gradient.items():
@@ -28,9 +29,7 @@ def with_gradient(problem: Problem, lin: Linearisation, step: Step) -> Linearisa
         gradient["camera_alone"] = step.cameras
     elif "camera" in gradient:
         gradient["camera"] = gradient["camera"].at[0].set(step.cameras)
-    common = jnp.concatenate(
-        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
-    )
+    common = globals_of(step, sizes)
     # Padding points at a row of zeros, so that groups are filled by plain gathering.
     tables = tuple(
         eqx.tree_at(

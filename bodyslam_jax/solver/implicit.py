@@ -77,7 +77,7 @@ def _cotangent_of_problem(problem, state, cotangent):
         # About the place moved to, as the solver holds single coordinates: in the
         # chart of another place they are others, and what pulls at them is not 0.
         def cost(d):
-            return fixed.cost(moved.retract(d))
+            return fixed.cost(moved.retract(d), held=True)
 
         return jax.grad(cost)(zero)
 
@@ -140,9 +140,12 @@ def diagonal_of(problem: Problem, state: State) -> Step:
         cameras=diagonal["camera"],
         roots=diagonal["root"],
         poses=join_poses(known, sizes.joints, zero.poses),
-        shapes=diagonal["globals"][1 + count :].reshape(zero.shapes.shape),
+        shapes=diagonal["globals"][sizes.common :].reshape(zero.shapes.shape),
         landmarks=landmarks,
         intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,
+        globals=diagonal["globals"][1 + count : sizes.common]
+        if sizes.named
+        else zero.globals,
     )
 
 
@@ -155,7 +158,7 @@ def normal_solver(problem: Problem, state: State) -> Callable[[Step], Step]:
     damping = damped(diagonals(lin, sizes), little)
 
     def apply(right: Step) -> Step:
-        there = with_gradient(problem, lin, jax.tree.map(jnp.negative, right))
+        there = with_gradient(problem, lin, sizes, jax.tree.map(jnp.negative, right))
         eliminated = eliminate(problem, there, sizes, damping)
         return solve_step(problem, state, there, sizes, eliminated)
 

@@ -24,6 +24,7 @@ from bodyslam_jax.solver.blocks import (
     Linearisation,
     Sizes,
     cast,
+    globals_of,
     own_to_global,
 )
 from bodyslam_jax.solver.elimination.person import (
@@ -165,18 +166,21 @@ def solve_step(
         cameras=cameras,
         roots=roots,
         poses=poses,
-        shapes=common[1 + i : sizes.globals].reshape(h, 10),
+        shapes=common[sizes.common : sizes.globals].reshape(h, 10),
         landmarks=landmarks,
         intrinsics=intrinsics,
+        globals=common[1 + i : sizes.common] if sizes.named else zero.globals,
     )
     return cast(step, state.scale.dtype)
 
 
-def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
+def quadratic(
+    problem: Problem, diagonal: dict, sizes: Sizes, step: Step
+) -> Float[Array, ""]:
     """`δ^T diag(H) δ`"""
     total = jnp.sum(diagonal["camera"] * step.cameras**2)
     total = total + jnp.sum(diagonal["root"] * step.roots**2)
-    total = total + jnp.sum(diagonal["globals"] * _globals(diagonal, step) ** 2)
+    total = total + jnp.sum(diagonal["globals"] * globals_of(step, sizes) ** 2)
     for name, moved in split_poses(step.poses, problem.layout.joints).items():
         if name in diagonal:
             total = total + jnp.sum(diagonal[name] * moved**2)
@@ -186,9 +190,9 @@ def quadratic(problem: Problem, diagonal: dict, step: Step) -> Float[Array, ""]:
     return total
 
 
-def slope_along(problem, lin, step):
+def slope_along(problem, lin, sizes, step):
     """`g^T δ`"""
-    total = jnp.sum(lin.globals_gradient * _globals({"globals": lin.globals}, step))
+    total = jnp.sum(lin.globals_gradient * globals_of(step, sizes))
     gradient = lin.gradient
     if "camera_alone" in gradient:
         total = total + jnp.sum(gradient["camera_alone"] * step.cameras)
@@ -203,11 +207,3 @@ def slope_along(problem, lin, step):
         moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
         total = total + jnp.sum(table.gradient * moved)
     return total
-
-
-def _globals(like, step):
-    """Globals in one vector; intrinsics only if they are among them."""
-    count = like["globals"].shape[0] - 1 - step.shapes.size
-    return jnp.concatenate(
-        [step.scale[None], step.intrinsics[:count], step.shapes.reshape(-1)]
-    )

@@ -48,7 +48,9 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
         extend_state(state, frames),
         landmarks=extend(state.landmarks, 0, landmarks, 0.0),
     )
-    padded_problem = Problem(factors, free, motion, problem.layout, problem.variables)
+    padded_problem = dataclasses.replace(
+        problem, factors=factors, free=free, motion=motion
+    )
     return _typed((padded_problem, padded))
 
 
@@ -69,6 +71,7 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
         shapes=state.shapes,
         landmarks=jnp.asarray(cut(state.landmarks)[:num_landmarks]),
         intrinsics=state.intrinsics,
+        globals=state.globals,
     )
 
 

@@ -120,7 +120,7 @@ def _blocks_of(factor, problem, state, sizes):
         ("pose", "root", 0): jnp.pad(pose[..., :3], (*_NONE, (0, 0), (0, 3))),
     }
     if "shapes" in problem.variables:
-        before = (1 + sizes.intrinsics, 0)
+        before = (sizes.common, 0)
         wide = lambda x, rows: jnp.pad(x, (*_NONE, (0, rows), before))
         blocks["root", "globals", 0] = wide(by_shape[..., :3, :], 3)
         blocks["pose", "globals", 0] = wide(limbs(by_shape[..., 3:, :], 2), 0)

@@ -161,8 +161,27 @@ def _run(problem, state, method):
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )
-    solution, final = outcome(state, found.value, found.result, found.stats)
+    stats = _with_last_cost(problem, found.value, found.stats)
+    solution, final = outcome(state, found.value, found.result, stats)
     return _with_better_scale(problem, solution, method), final
+
+
+def _with_last_cost(problem: Problem, state: State, stats: dict[str, Any]) -> Any:
+    """What the loop recorded, with the cost where it ended as `Problem.cost` has it:
+    with the motion predicted there, not at the state before its last step."""
+    terms = jnp.stack(list(problem.cost_by_term(state).values()))
+    steps, history = stats["steps"], stats["history"]
+    ran = jnp.where(steps[: len(history.cost)] > 0, jnp.arange(len(history.cost)), -1)
+    stage = jnp.max(ran)
+    at = jnp.where(stage < 0, -1, stage), steps[stage]
+    put = lambda rows, value: rows.at[at].set(
+        jnp.where(stage < 0, rows[at], value), mode="drop"
+    )
+    cost = jnp.where(stage < 0, stats["cost"], jnp.sum(terms))
+    history = dataclasses.replace(
+        history, cost=put(history.cost, cost), terms=put(history.terms, terms)
+    )
+    return {**stats, "cost": cost, "history": history}
 
 
 def _with_better_scale(
@@ -218,7 +237,7 @@ def _backward(
     if cotangent.cost is not None:
         # At a minimum the state's own share of the cost's derivative is 0.
         arrays, static = eqx.partition(problem, eqx.is_inexact_array)
-        by_cost = jax.grad(lambda a: eqx.combine(a, static).refresh(found).cost(found))
+        by_cost = jax.grad(lambda a: eqx.combine(a, static).cost(found))
         more = by_cost(arrays)
         given = jax.tree.map(lambda a, b: a + cotangent.cost * b, given, more)
     return given
@@ -261,4 +280,4 @@ def _baseline(alone: bool) -> Callable[..., Any]:
 
 @eqx.filter_jit
 def _cost(problem, state):
-    return problem.refresh(state).cost(state)
+    return problem.cost(state)

@@ -89,9 +89,9 @@ def attempt(
     )
     eliminated = eliminate(problem, lin, sizes, extra)
     move = solve_step(problem, state, lin, sizes, eliminated)
-    length = quadratic(problem, diagonal, move)
-    slope = -slope_along(problem, lin, move)
-    predicted = 0.5 * (quadratic(problem, extra, move) + slope)
+    length = quadratic(problem, diagonal, sizes, move)
+    slope = -slope_along(problem, lin, sizes, move)
+    predicted = 0.5 * (quadratic(problem, extra, sizes, move) + slope)
     finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
     move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
     slope = jnp.where(finite, slope, 0.0)

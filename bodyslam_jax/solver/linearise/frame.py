@@ -29,16 +29,17 @@ _GROUP = {
     "shape": "shapes",
     "scale": "scale",
     "intrinsics": "intrinsics",
+    "globals": "globals",
 }
 _LOCAL = ("pose", "root", "camera")
-_COMMON = ("scale", "intrinsics", "shape")
+_COMMON = ("scale", "intrinsics", "globals", "shape")
 
 
 def linearise_frames(
     problem: Problem, factor: FrameFactor, state: State, sums: Sums
 ) -> None:
     """Adds all blocks of one factor to `sums`; held coordinates have zeros."""
-    keys = [t for t in factor.keys if _GROUP[t[0]] in problem.variables]
+    keys = [t for t in factor.touched if _GROUP[t[0]] in problem.variables]
     if not keys:
         sums.costs.append(factor.cost(state))
         return
@@ -65,7 +66,7 @@ def linearise_frames(
         columns.append(rows(part, part.shape[-1]) * free[..., None, :])
     common = [name for name in _COMMON if (name, 0) in keys]
     if common:
-        widths = dict(scale=1, intrinsics=sums.sizes.intrinsics, shape=10)
+        widths = _common_widths(sums.sizes)
         for name in _COMMON:
             if name in common:
                 free = _free_of_shared(problem, name, factor.of_people)
@@ -84,7 +85,7 @@ def _derivatives(factor, keys, state, sums):
     local = [t for t in keys if t[0] in _LOCAL]
     common = [t for t in keys if t[0] not in _LOCAL]
     width = {"pose": 3 if factor.per_joint else 69, "root": 6, "camera": 6}
-    width |= {"scale": 1, "intrinsics": sums.sizes.intrinsics, "shape": 10}
+    width |= _common_widths(sums.sizes)
     ordered = [*local, *common]
     ends = [sum(width[n] for n, _ in ordered[: i + 1]) for i in range(len(ordered))]
     parts = {
@@ -118,6 +119,12 @@ def _derivatives(factor, keys, state, sums):
         turn = so3.inverse_right_jacobian(state.poses)
         turns = tuple(shift_back(turn, lag) for lag in range(factor.num_lags))
     return factor.map_frames(one, state, turns)
+
+
+def _common_widths(sizes):
+    """Coordinates of each group of globals."""
+    named = {"intrinsics": sizes.intrinsics, "globals": sizes.named}
+    return {"scale": 1, **named, "shape": 10}
 
 
 def _add_products(sums, local, has_common, columns, weight, factor):
@@ -172,7 +179,7 @@ def _add_products(sums, local, has_common, columns, weight, factor):
             block = shift(turned(gram[..., beyond(spread), parts[i]]), lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if has_common:
-        n = sums.sizes.own_globals if of_people else 1 + sums.sizes.intrinsics
+        n = sums.sizes.own_globals if of_people else sums.sizes.common
         total = jnp.sum(gram[..., beyond(spread), spread], axis=1).astype(whole.dtype)
         down = jnp.sum(slope[..., spread], axis=1)
         for person in range(total.shape[0]):
@@ -238,7 +245,7 @@ def _free_of(problem, name, lag, joint):
 def _free_of_shared(problem, name, of_people):
     if name == "scale":
         return problem.free.scale[None]
-    if name == "intrinsics":
-        return problem.free.intrinsics
+    if name in ("intrinsics", "globals"):
+        return getattr(problem.free, name)
     free = problem.free.shapes[:, None, None, :]
     return free if of_people else free[0]

@@ -74,8 +74,8 @@ def linearise_landmarks(
         # The scale, first of the globals, moves no pixel.
         sums.add_globals(
             None,
-            jnp.pad(pixels.intrinsics, ((1, 0), (1, 0))),
-            jnp.pad(pixels.intrinsics_slope, (1, 0)),
+            jnp.pad(pixels.intrinsics, ((1, sizes.named), (1, sizes.named))),
+            jnp.pad(pixels.intrinsics_slope, (1, sizes.named)),
         )
     free_c = jnp.zeros((len(seen.chunk), CHUNK, 6), dtype)
     if "cameras" in sizes.variables:
@@ -149,7 +149,8 @@ def _add_cameras(
     sums.add_gradient("camera_alone", (turn @ slope)[..., 0])
     if sizes.intrinsics:
         mixed = low @ of_frames(total([both_ways(x) for x in pixels.by_intrinsics]))
-        sums.add(("alone", "globals", 0), jnp.pad(mixed, ((0, 0), (0, 0), (1, 10))))
+        around = (1, sizes.named + 10)
+        sums.add(("alone", "globals", 0), jnp.pad(mixed, ((0, 0), (0, 0), around)))
 
 
 def add_prior(

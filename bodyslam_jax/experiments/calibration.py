@@ -1,0 +1,362 @@
+"""`bodyslam experiment calibration`: errors over claimed standard deviations.
+
+A claim of uncertainty is right if errors divided by it have a root mean square of 1 and
+lie within it as often as a normal distribution says. It is measured here on people,
+motions, cameras, floors and errors that are drawn from distributions which no prior of
+the estimator knows:
+
+- statures of a population (`POPULATION`), a third of the other components of shape
+  beyond one standard deviation of the prior, and limbs that are longer or shorter by
+  themselves (`LIMB_SPREAD`), which no β of the body model can follow;
+- errors of keypoints and bodies of other strength and other correlation in time, of
+  another share of outliers and of exchanged sides, and keypoints between SMPL's and
+  COCO's definition;
+- floors that are level (half), slope by up to 4 degrees, or are uneven by 3 cm;
+- any of the ten kinds of camera and motion, both families, 90 to 210 frames.
+
+Seeds start at `FIRST_SEED`, apart from all that anything was fitted to. The inputs are
+a regressor's bodies, keypoints, or rendered images alone, in turn.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import body as body_
+from bodyslam_jax import evaluation, io, pipeline, simulation
+from bodyslam_jax.body.skeleton import PARENTS
+from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.experiments.jobs import COMPILE, Job
+from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.tables import (
+    Column,
+    intro,
+    markdown,
+    to_csv,
+    write_text,
+)
+from bodyslam_jax.pipeline.stage_cache import Cache
+from bodyslam_jax.simulation import sequences
+from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.room import Room
+from bodyslam_jax.simulation.terrain import Height, Terrain, lifted
+from bodyslam_jax.types import Result
+
+COUNTS = {"bodies": 35, "keypoints": 35, "pixels": 30}
+"""People by input."""
+FIRST_SEED = 7_000_000
+POPULATION = ((1.754, 0.075), (1.613, 0.071))
+"""Mean and standard deviation of the statures of men and women, m: adults of NHANES
+2015-2018 (Fryar, Carroll, Gu, Afful, Ogden, Vital and Health Statistics 3:46, 2021)."""
+LIMB_SPREAD = 0.035
+"""Standard deviation of a limb's length over that of a person of this stature: the
+coefficient of variation of thigh, shin, upper arm and forearm within a stature in
+ANSUR II is 3 to 4 % (Gordon et al., 2014)."""
+SLOPE = math.radians(4.0)
+UNEVEN = 0.03
+"""m"""
+LIMBS = (
+    *((1, 4, 7), (2, 5, 8), (4, 7, 10), (5, 8, 11)),
+    *((16, 18, 20), (17, 19, 21), (18, 20, 22), (19, 21, 23)),
+)
+"""Joint, the next joint on the limb, and the one after it: thighs, shins, upper arms,
+forearms; left and right of a person are alike."""
+QUANTITIES = {
+    "scale": "scale",
+    "stature": "stature",
+    "up": "up",
+    "joints": "joints within the body",
+}
+"""Claimed quantities by the field of a row; roots and heights have no claim yet."""
+COVERED = {68: (0.989, 3.506), 95: (3.841, 7.815)}
+"""Quantiles of χ² at 68 and 95 % for one coordinate and for three."""
+FORM: dict[str, Any] = {
+    **{f"z_{name}": float for name in QUANTITIES},
+    **{f"joints_within_{share}": float for share in COVERED},
+    "input": str,
+    "status": str,
+}
+
+
+def jobs(experiment: Experiment, config: Config, stages: Path) -> list[Job]:
+    """One row for each person; the families and sequences that are asked for."""
+    found, seed = [], FIRST_SEED + 1000 * (experiment.seed or 0)
+    for which, count in COUNTS.items():
+        for number in range(count):
+            seed += 1
+            settings, floor = drawn(seed, experiment, which)
+            label = f"{which}-{number:02d}-{settings.sequence}-{settings.family}"
+            compute = lambda s=settings, f=floor, w=which: person_row(
+                s, f, w, config, stages
+            )
+            seconds = COMPILE + 0.4 * (settings.length or 0)
+            key = (settings, floor, which, config)
+            found.append(Job(label, key, seconds, compute, {"sequence": str, **FORM}))
+    return found
+
+
+def drawn(
+    seed: int, experiment: Experiment, which: str
+) -> tuple[Simulation, tuple[str, float, float]]:
+    """Settings of one simulation, and its floor: kind, size (rad, m), direction."""
+    rng = np.random.default_rng([seed, 1])
+    strength = lambda spread: float(np.exp(spread * rng.standard_normal()))
+    names = experiment.sequences or sequences.LENGTH
+    families = ("room", "follow")
+    if experiment.family in families:
+        families = (experiment.family,)
+    settings = Simulation(
+        sequence=str(rng.choice(list(names))),  # pyright: ignore[reportArgumentType]
+        family=str(rng.choice(families)),  # pyright: ignore[reportArgumentType]
+        length=experiment.frames or int(rng.integers(90, 211)),
+        seed=seed,
+        motion=experiment.motion,
+        noise=experiment.noise,
+        keypoint_errors=strength(0.35),
+        body_errors=strength(0.35),
+        body_jitter=strength(0.5),
+        outliers=float(rng.uniform(0.0, 0.05)),
+        exchanged=float(rng.uniform(0.0, 0.02)),
+        detector_bias=float(rng.uniform(0.0, 1.0)),
+        render=which == "pixels",
+    )
+    kind = str(rng.choice(["level", "level", "slope", "uneven"]))
+    size = {"level": 0.0, "slope": SLOPE * rng.uniform(), "uneven": UNEVEN}[kind]
+    return settings, (kind, float(size), float(rng.uniform(0, 2 * np.pi)))
+
+
+def floor_of(floor: tuple[str, float, float]) -> Height:
+    """The height of a floor, m, at places (x, z)."""
+    kind, size, direction = floor
+    along = np.array([np.cos(direction), np.sin(direction)])
+    if kind == "slope":
+        return lambda at: np.tan(size) * (at @ along)
+    if kind == "uneven":
+        side = np.array([-along[1], along[0]])
+        return lambda at: size * np.sin(2.1 * (at @ along)) * np.sin(1.7 * (at @ side))
+    return lambda at: np.zeros(at.shape[:-1])
+
+
+def of_population(person: Person, rng: np.random.Generator) -> Person:
+    """A person of a stature of the population, with limbs of their own lengths."""
+    mean, spread = POPULATION[int(rng.integers(2))]
+    stature = mean + spread * rng.standard_normal()
+    shape = 1.3 * rng.standard_normal(10)
+    for _ in range(2):  # the height of the mesh is linear but for its highest vertex
+        there = person.of_shape(shape)
+        height = np.ptp(there.skin[:, 1])
+        more = [person.of_shape(shape + 0.1 * np.eye(10)[i]) for i in range(10)]
+        slope = np.array([(np.ptp(p.skin[:, 1]) - height) / 0.1 for p in more])
+        shape = shape + slope * (stature - height) / (slope @ slope)
+    return with_limbs(person.of_shape(shape), 1 + LIMB_SPREAD * rng.standard_normal(4))
+
+
+def with_limbs(person: Person, factors: Float[np.ndarray, "4"]) -> Person:
+    """The person with thighs, shins, upper arms and forearms of `factors` times their
+    length; the skin of a limb stretches along with it."""
+    rest, skin = person.rest.copy(), person.skin.copy()
+    for k, (start, end, _) in enumerate(LIMBS):
+        grown = (factors[k // 2] - 1) * (rest[end] - rest[start])
+        axis = rest[end] - rest[start]
+        # Everything beyond the limb moves along, the limb's own skin in proportion.
+        beyond = sorted(_descendants(end))
+        share = np.clip((skin - rest[start]) @ axis / (axis @ axis), 0.0, 1.0)
+        own = person.weights[:, start] * share
+        moved = own + person.weights[:, beyond].sum(axis=1)
+        skin += moved[:, None] * grown
+        rest[beyond] += grown
+    person.rest, person.skin = rest, skin
+    return person
+
+
+def _descendants(joint: int) -> set[int]:
+    """The joint and all that hang on it."""
+    found = {joint}
+    for child, parent in enumerate(PARENTS):
+        if parent in found:
+            found.add(child)
+    return found
+
+
+def scene_of(
+    settings: Simulation, floor: tuple[str, float, float], body: Any
+) -> sequences.SimulatedSequence:
+    """The simulated sequence with another person and floor."""
+    flat = simulation.simulate(settings, body)
+    rng = np.random.default_rng([settings.seed or 0, 2])
+    leg = lambda p: np.linalg.norm(p.rest[[4, 7]] - p.rest[[1, 4]], axis=1).sum()
+    person = of_population(flat.person, rng)
+    ratio = leg(person) / leg(flat.person)
+    height = floor_of(floor)
+    # Legs of another length take other steps, with the pelvis at another height.
+    middle = flat.walk.pelvis.mean(axis=0) * [1, 0, 1]
+    pelvis = middle + (flat.walk.pelvis - middle) * ratio
+    walk = dataclasses.replace(flat.walk, pelvis=pelvis)
+    walk = lifted(person, walk, height)
+    room: Room = flat.room
+    T_WC = flat.T_WC.copy()
+    if floor[0] != "level":
+        room = Terrain(room.walls, room.boxes, height)
+        T_WC[:, 1, 3] += height(T_WC[:, :3, 3].mean(axis=0)[[0, 2]])
+    streams = tuple(np.random.default_rng(flat.seed).spawn(4)[1:])
+    return sequences.measure(
+        settings, flat.name, person, walk, T_WC, room, streams, []  # pyright: ignore
+    )  # fmt: skip
+
+
+def person_row(
+    settings: Simulation,
+    floor: tuple[str, float, float],
+    which: str,
+    config: Config,
+    stages: Path,
+) -> Row:
+    """Errors over claims of one person's estimate."""
+    body = body_.load_body_model(config.body_model)
+    scene = scene_of(settings, floor, body)
+    config = dataclasses.replace(config, overlay=False)
+    if which == "pixels":
+        film = simulation.film_scene(stages / f"calibration-{settings.seed}", scene)
+        sequence = pipeline.find_people(io.read_sequence(film), config, Cache(None))
+    else:
+        sequence = simulation.as_sequence(scene)
+        if which == "keypoints":
+            sequence = dataclasses.replace(sequence, bodies=None)
+    result = pipeline.run(sequence, config)
+    labels = {"sequence": f"{settings.seed}", "input": which, "floor": floor[0]}
+    return {**labels, **claims(result, scene, body)}
+
+
+def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row:
+    """z values (error over claimed sigma) of a result; `None` where nothing is claimed.
+
+    `z_up` and `z_joints` are root mean squares of a coordinate: an angle has two, a
+    joint's place three.
+    """
+    pair = evaluation.associate(result, simulation.as_truth(scene), body)
+    errors = evaluation.evaluate(*pair)
+    summary = result.summary
+    row: Row = {"status": summary["status"], "scale": float(errors["scale"])}
+    known = lambda x: x is not None and math.isfinite(x) and x > 0
+    ratio = lambda e, s: float(e / s) if known(s) and math.isfinite(e) else None
+    claimed = summary["scale"]["sigma"]
+    relative = claimed / result.scale if known(claimed) else None
+    row["z_scale"] = ratio(-math.log(float(errors["scale"])), relative)
+    # The person whom the camera films is the one nearest to the truth in the pairing.
+    person = summary["people"][0] if summary["people"] else {}
+    stature = float(np.ptp(scene.person.skin[:, 1]))
+    row["z_stature"] = ratio(
+        (person.get("stature_m") or math.nan) - stature, person.get("stature_sigma_m")
+    )
+    up = summary["up"]["sigma_degrees"]
+    tilt = math.degrees(float(errors["gravity_error"]))
+    row["z_up"] = ratio(tilt / math.sqrt(2), up)
+    row |= _of_joints(result, pair)
+    return row
+
+
+def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
+    """Of joints after alignment of the body in each frame, as `joint_sigma` is claimed:
+    the root mean square distance within the body."""
+    none = {"z_joints": None, **{f"joints_within_{s}": None for s in COVERED}}
+    if result.joint_sigma is None or not len(result.joints):
+        return none
+    mine, theirs = pair
+    present = np.asarray(mine.present & theirs.present)[0]
+    if not present.any():
+        return none
+    x, y = np.asarray(mine.joints)[0][present], np.asarray(theirs.joints)[0][present]
+    error = np.linalg.norm(_aligned(x, y) - y, axis=-1)
+    sigma = _claimed_there(result, mine, present)
+    use = sigma > 0
+    squares = (error[use] / sigma[use]) ** 2
+    row: Row = {"z_joints": float(np.sqrt(squares.mean()))}
+    for share, (_, of_three) in COVERED.items():
+        row[f"joints_within_{share}"] = float((3 * squares < of_three).mean())
+    return row
+
+
+def _claimed_there(
+    result: Result, mine: Any, present: np.ndarray
+) -> Float[np.ndarray, "f 24"]:
+    """`joint_sigma` at the frames of a pairing, which may be cut to common times."""
+    sigma = np.asarray(result.joint_sigma)[0]
+    frames = np.flatnonzero(present)
+    return sigma[frames[frames < len(sigma)]]
+
+
+def _aligned(
+    x: Float[np.ndarray, "f 24 3"], y: Float[np.ndarray, "f 24 3"]
+) -> Float[np.ndarray, "f 24 3"]:
+    """x after a similarity to y in each frame (Umeyama, 1991)."""
+    mx, my = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    a, b = x - mx, y - my
+    U, D, Vt = np.linalg.svd(np.einsum("fja,fjb->fab", b, a))
+    sign = np.ones_like(D)
+    sign[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    R = np.einsum("fab,fb,fbc->fac", U, sign, Vt)
+    s = (D * sign).sum(axis=1) / (a**2).sum(axis=(1, 2))
+    return my + s[:, None, None] * np.einsum("fab,fjb->fja", R, a)
+
+
+def write_calibration(out: Path, rows: list[Row], *, about: str) -> list[Path]:
+    """`calibration.md`, `calibration.csv`: root mean square of errors over claims, and
+    how many lie within them."""
+    text = intro(
+        "Errors over claimed standard deviations",
+        about,
+        "People, floors, cameras and errors of distributions that no prior knows "
+        "(`experiments/calibration.py` has them). Right claims have a root mean square "
+        "of 1, 68 % of the errors within one claimed standard deviation and 95 % "
+        "within 1.96. Of joints, coverage is that of a normal distribution in three "
+        "coordinates. ± is a standard error. Simulated.",
+    )
+    columns = [
+        Column("claim", "what"),
+        Column("input", "input"),
+        Column("people", "count", digits=0),
+        Column("rms of error over claim", "rms"),
+        Column("within 68 %", "within_68"),
+        Column("within 95 %", "within_95"),
+    ]
+    text += markdown(columns, list(_summaries(rows)))
+    write_text(out / "calibration.md", text)
+    kept = [Column(name, name, digits=3) for name in ("sequence", "input", *FORM)]
+    write_text(out / "calibration.csv", to_csv(kept, rows, about))
+    return [out / "calibration.md", out / "calibration.csv"]
+
+
+def _summaries(rows: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
+    for name, title in QUANTITIES.items():
+        for which in (*COUNTS, "all"):
+            own = [r for r in rows if which in ("all", r["input"])]
+            own = [r for r in own if r.get(f"z_{name}") is not None]
+            z = np.array([r[f"z_{name}"] for r in own])
+            if not len(z):
+                continue
+            row: Row = {"what": title, "input": which, "count": len(z)}
+            row["rms"] = _with_error(z**2, math.sqrt)
+            for share, (limit, _) in COVERED.items():
+                if name == "joints":
+                    inside = np.array([r[f"joints_within_{share}"] for r in own])
+                elif name == "up":
+                    # Two coordinates: χ² with two degrees of freedom.
+                    inside = 2 * z**2 < -2 * math.log(1 - share / 100)
+                else:
+                    inside = z**2 < limit
+                row[f"within_{share}"] = _with_error(np.asarray(inside, float), float)
+            yield row
+
+
+def _with_error(values: np.ndarray, root: Callable[[float], float]) -> str:
+    """A mean, or its root, with the standard error over people."""
+    mean = float(values.mean())
+    error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0
+    if root is math.sqrt:
+        mean, error = math.sqrt(mean), error / (2 * math.sqrt(max(mean, 1e-12)))
+    return f"{mean:.2f} ± {error:.2f}"

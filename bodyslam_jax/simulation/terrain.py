@@ -1,0 +1,83 @@
+"""Floors that are not level: the room's faces and the walker's path follow them."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from bodyslam_jax.simulation.gait_synthesis import Soles, Walk
+from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.room import Room, Surface
+
+Height = Callable[[Float[np.ndarray, "*n 2"]], Float[np.ndarray, "*n"]]
+"""Of the floor at (x, z), m."""
+
+TREAD = 0.35
+"""Length of the tiles of which a floor is made, and of a step of stairs, m."""
+_UP = np.array([0.0, 1.0, 0.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Terrain(Room):
+    """A room whose floor has another height at each place."""
+
+    height: Height
+
+    def faces(self) -> tuple[Surface, ...]:
+        raised = [
+            dataclasses.replace(
+                box, centre=box.centre + self.height(box.centre[[0, 2]]) * _UP
+            )
+            for box in self.boxes
+        ]
+        whole = Room(self.walls, tuple(raised)).faces()
+        walls = [strip for face in whole for strip in self._strips(face)]
+        others = [face for face in whole if face.kind not in ("wall", "floor")]
+        return (*others, *walls, *self._tiles())
+
+    def _strips(self, wall: Surface) -> Iterator[Surface]:
+        """The part of a wall that is above the floor."""
+        if wall.kind != "wall":
+            return
+        count = int(np.ceil(np.linalg.norm(wall.edge_u) / TREAD))
+        for k in range(count):
+            origin, u = wall.origin + k / count * wall.edge_u, wall.edge_u / count
+            foot = self.height((origin + u / 2)[[0, 2]])
+            yield dataclasses.replace(
+                wall, origin=origin, edge_u=u, edge_v=-(origin[1] - foot) * _UP
+            )
+
+    def _tiles(self) -> Iterator[Surface]:
+        """The floor."""
+        low, high = (self.walls.centre + s * self.walls.half for s in (-1, 1))
+        at = [
+            TREAD * np.arange(np.floor(low[i] / TREAD), high[i] / TREAD) for i in (0, 2)
+        ]
+        corners = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 2)
+        middle = corners + TREAD / 2
+        slope = [
+            (self.height(middle + d) - self.height(middle - d)) / 0.02
+            for d in 0.01 * np.eye(2)
+        ]
+        for (x, z), y, a, b in zip(middle, self.height(middle), *slope, strict=True):
+            u, v = TREAD * np.array([1.0, a, 0.0]), TREAD * np.array([0.0, b, 1.0])
+            normal = np.array([-a, 1.0, -b]) / np.sqrt(1 + a * a + b * b)
+            origin = np.array([x, y, z]) - u / 2 - v / 2
+            yield Surface(origin, u, v, normal, "floor")
+
+
+def lifted(person: Person, walk: Walk, height: Height, drift: float = 0.0) -> Walk:
+    """Returns the walk with the foot that carries on the floor.
+
+    With a `drift`, m, the walker rises and sinks by as much over the floor, as recorded
+    motion does.
+    """
+    soles = Soles(person)(walk.poses, walk.pelvis)
+    share = np.exp(-(soles[..., 1] - soles[..., 1].min(axis=1, keepdims=True)) / 0.01)
+    share /= share.sum(axis=1, keepdims=True)
+    lift = gaussian_filter1d((share * height(soles[..., [0, 2]])).sum(axis=1), 2.0)
+    t = len(lift)
+    lift = lift + drift * (1 - np.cos(1.6 * np.pi * np.arange(t) / t)) / 2
+    return Walk(walk.poses, walk.pelvis + lift[:, None] * [0, 1, 0])
