@@ -78,7 +78,7 @@ def assess(
     ground_factor = ground_scale(result) if cameras.kind == "moving" else None
     scale_sigma = reported_sigma(result.scale, joint.scale_sigma, joint.start)
     gaits = [gait(result, h) for h in range(len(result.poses))]
-    found = measured(sequence, joint, sequence.fps)
+    found = measured(sequence, joint, body)
     people = [
         assess_person(sequence, result, body, joint, h, steps, found)
         for h, steps in enumerate(gaits)

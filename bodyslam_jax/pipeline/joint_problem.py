@@ -56,6 +56,9 @@ class Prepared:
     """Lines for the report."""
     passengers: tuple[int, ...] = ()
     """People (rows) whom something carries."""
+    legs_shown: Bool[np.ndarray, "h t"] | None = None
+    """Frames in which people's legs are not only guessed (`people.legs_shown`); `None`
+    without people."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +73,8 @@ class _StartingPeople:
     """Whether the bodies were fitted to keypoints, not regressed from images."""
     statures: dict[int, Measured]
     """Measured statures and their sigma, m, by person."""
+    legs_shown: Bool[np.ndarray, "h t"]
+    """Frames whose steps and feet are measured, whatever the bodies are from."""
 
 
 def prepare(
@@ -127,6 +132,8 @@ def prepare(
                 initialisation.without_contacts(state, sequence.fps, body, weights)
             )
         present = roots.present & cameras.registered
+        standing = present & crowd.legs_shown
+        steps = initialisation.steps_shown(prediction, crowd.legs_shown)
         motion_factors = functools.partial(
             _motion_factors,
             shared_error=_shared_error(crowd.fitted, config),
@@ -135,17 +142,18 @@ def prepare(
             config=config,
         )
         if body_only_solve:
-            start_factors = motion_factors(prediction, state, passengers)
+            start_factors = motion_factors(steps, state, passengers)
             problem = make([*factors, *start_factors], state)
             state, stage = solve_body_only(problem, state, config)
             stages = (stage,)
             prediction = predict(predictor, state)
+            steps = initialisation.steps_shown(prediction, crowd.legs_shown)
         if floor is not None:
             found = on_floor(
                 state,
                 stands and contact_probability(stands, state, sequence.fps),
                 View(
-                    present,
+                    standing,
                     sequence.keypoints,
                     crowd.fitted,
                     sequence.fps,
@@ -161,9 +169,9 @@ def prepare(
             factors = [rough if factor is contact else factor for factor in factors]
             contact = rough
         start, passengers = _start_of_scale(
-            sequence, cameras, crowd, state, prediction, contact, present, config
+            sequence, cameras, crowd, state, steps, contact, present, config
         )
-        factors += motion_factors(prediction, state, passengers)
+        factors += motion_factors(steps, state, passengers)
     elif moving and np.isfinite(cameras.path_scale):
         start = ScaleStart(
             path=cameras.path_scale, path_error=PATH_SIGMA * cameras.path_scale
@@ -182,7 +190,15 @@ def prepare(
         problem = dataclasses.replace(problem, motion=None)
     warnings = initialisation.lines_of_carried(passengers)
     return Prepared(
-        problem, state, start, roots, moving, stages, warnings, tuple(passengers)
+        problem,
+        state,
+        start,
+        roots,
+        moving,
+        stages,
+        warnings,
+        tuple(passengers),
+        crowd.legs_shown,
     )
 
 
@@ -228,7 +244,9 @@ def _starting_people(
         # The prior of a fitted shape has a sigma that is smaller than its uncertainty
         # (`diagnostics.scale_uncertainty`), so it must not pull away from the stature.
         shape = np.where(fitted[:, None], roots.shape, shape)
-    return _StartingPeople(roots, shape, fitted, statures)
+    shown = people.shown_keypoints(sequence, body)
+    legs = people.legs_shown(shown, roots.present, sequence.fps)
+    return _StartingPeople(roots, shape, fitted, statures, legs)
 
 
 def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
@@ -270,8 +288,7 @@ def _people_factors(
     if cameras.kind == "moving":
         contact = initialisation.ground_contact(
             state,
-            roots,
-            cameras.registered,
+            roots.present & cameras.registered & crowd.legs_shown,
             sequence.keypoints,
             body,
             weights,

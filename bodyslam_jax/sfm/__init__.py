@@ -9,6 +9,7 @@ from bodyslam_jax.sfm.moving_points import (
     second_motion_warning as second_motion_warning,
 )
 from bodyslam_jax.sfm.person_mask import SILHOUETTE_STEP as SILHOUETTE_STEP
+from bodyslam_jax.sfm.person_mask import person_masks as person_masks
 from bodyslam_jax.sfm.scene_tracks import track as track
 from bodyslam_jax.sfm.segments import Segments as Segments
 from bodyslam_jax.sfm.segments import find_segments as find_segments
