@@ -72,9 +72,12 @@ def shown_keypoints(sequence: Sequence, body: BodyModel) -> Bool[np.ndarray, "h 
 def legs_shown(
     shown: Bool[np.ndarray, "h t 25"], present: Bool[np.ndarray, "h t"], fps: float
 ) -> Bool[np.ndarray, "h t"]:
-    """Frames about which most of a person's knees and ankles are shown: in half a
-    second before and after, as far as the person is present. The others' postures of
-    legs, and so their steps, are inferred, not measured."""
+    """Frames in which a person's legs, and so the steps, are not only inferred.
+
+    Inferred are stretches of frames with fewer than `MOSTLY` of the knees and ankles
+    shown, if it is so in the second about one of the frames, too: legs that hide each
+    other for a moment are not. Frames in which the person is absent do not count.
+    """
     share = shown[..., KNEES_AND_ANKLES].mean(axis=-1)
     window = max(1, round(_STRIDE * fps))
     mean = lambda x: uniform_filter1d(x, window, mode="constant")
@@ -82,7 +85,11 @@ def legs_shown(
     for h, frames in enumerate(present):
         for run in runs(frames):
             here = share[h, run]
-            found[h, run] = mean(here) >= (MOSTLY - 1e-9) * mean(np.ones(len(here)))
+            lasting = mean(here) < (MOSTLY - 1e-9) * mean(np.ones(len(here)))
+            inferred = np.zeros(len(here), bool)
+            for stretch in runs(lasting | (here < MOSTLY)):
+                inferred[stretch] = lasting[stretch].any()
+            found[h, run] = ~inferred
     return found
 
 
