@@ -139,7 +139,7 @@ def estimate_uncertainty(
             variance, shapes, best.scale, best.shapes, body, sigma, anywhere
         )
     # Smooth motion of people alone is no measurement of size: of a camera that follows
-    # somebody it makes the path too short (0.57 of the truth, with a variance of 0.32²).
+    # somebody it makes the path too short (0.57 of the truth, 0.32 its stated error).
     metric = np.isfinite(prepared.scale.standard_error)
     scale_sigma = covariance_sigma(
         float(variance), moving=prepared.moving, metric=bool(metric)
