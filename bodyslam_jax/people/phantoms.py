@@ -4,7 +4,7 @@ Two witnesses beside the detector's score are asked. A second network, BlazePose
 looks at each detection by itself: of 17 false detections on boxes it saw none in the
 same place, of 28 images of real people cut off or hidden from the hips down all (and of
 real people who are mostly hidden by others at least every fourth frame). And motion:
-keypoints of real people move against each other by 6 % of their height and more within
+keypoints of real people move against each other by 5 % of their height and more within
 any two seconds, of somebody who sits still, too; those of a statue stay where the view
 of a rigid thing puts them.
 """

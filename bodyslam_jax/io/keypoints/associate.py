@@ -93,8 +93,8 @@ def associate(
     found = given
     if found is None:
         found = identify(detections, max(1, round(config.max_gap * fps)))
-    people, twice = _once(_collect(detections, found))
     least = min(max(1, round(config.min_duration * fps)), len(detections))
+    people, twice = _once(_collect(detections, found), least)
     kept = [p for p in people if len(p.frames) >= least] or people
     others = [dict(zip(p.frames, p.points, strict=True)) for p in kept]
     gap = max(1, round(config.max_gap * fps))
@@ -165,9 +165,9 @@ def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
     return [people[number] for number in sorted(people)]
 
 
-def _once(people: list[_Track]) -> tuple[list[_Track], list[int]]:
-    """Everybody once, and by how many more tracks people were followed who were
-    followed more than once. The surest detection of a frame is kept."""
+def _once(people: list[_Track], least: int) -> tuple[list[_Track], list[int]]:
+    """Everybody once, and by how many more tracks of `least` frames people were
+    followed who were followed more than once. The surer track's detection is kept."""
     order = sorted(range(len(people)), key=lambda i: -people[i].presence())
     tracks = [dict(zip(p.frames, p.points, strict=True)) for p in people]
     found = {
@@ -182,7 +182,8 @@ def _once(people: list[_Track]) -> tuple[list[_Track], list[int]]:
         if i not in found:
             frames = sorted(track)
             kept.append(_Track(frames, [track[k] for k in frames]))
-    counts = [list(found.values()).count(person) for person in set(found.values())]
+    long = [person for i, person in found.items() if len(people[i].frames) >= least]
+    counts = [long.count(person) for person in dict.fromkeys(long)]
     return kept, counts
 
 
