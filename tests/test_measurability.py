@@ -209,11 +209,12 @@ def test_without_keypoints_limbs_outside_the_image_are_inferred(tmp_path):
     assert summary["people"][0]["not_measured"]["legs"] == 1.0
     assert "legs_inferred" in names(summary) and (sigma[..., ANKLES] > 0.15).all()
     # So it is where the masks of people end there.
+    small = Intrinsics(sequence.intrinsics.params / 10, CENTRE // 5, CENTRE // 5)
+    mask = np.zeros((small.height, small.width), np.uint8)
+    mask[: bottom // 10] = 255
     for k in range(FRAMES):
-        mask = np.zeros((2 * CENTRE, 2 * CENTRE), np.uint8)
-        mask[:bottom] = 255
         cv2.imwrite(str(tmp_path / f"{k:04d}.png"), mask)
-    masked = dataclasses.replace(alone, masks=tmp_path)
+    masked = dataclasses.replace(alone, masks=tmp_path, intrinsics=small)
     summary, _ = judged(masked, cameras, joint)
     assert summary["people"][0]["not_measured"]["legs"] == 1.0
     assert any("on the masks of people" in line for line in summary["warnings"])
