@@ -123,7 +123,8 @@ def test_joints_are_less_sure_the_longer_they_are_hidden():
     assert (np.diff(knee[29:40]) > 0).all() and (np.diff(knee[40:51]) < 0).all()
     assert knee[40] == pytest.approx(0.16, abs=0.02)
     (person,) = summary["people"]
-    assert person["status"] == "doubtful" and person["inferred_frames"] == [[30, 49]]
+    ((first, last),) = person["inferred_frames"]
+    assert person["status"] == "doubtful" and 28 <= first <= 30 and 49 <= last <= 51
     assert person["not_measured"]["legs"] == pytest.approx(20 / FRAMES)
     # For a moment one leg hides the other in every stride.
     summary, _ = judged(hidden(sequence, LEGS, frames[:8]), *rest)
