@@ -55,7 +55,7 @@ def shown_keypoints(sequence: Sequence, body: BodyModel) -> Bool[np.ndarray, "h 
         for h in range(len(shown)):
             sigma = keypoint_sigma(keypoints, sequence.intrinsics, h)
             shown[h] = sigma <= KEYPOINT_SIGMA / SURE
-        there = (keypoints.confidence > 0).any(axis=-1)
+        there = np.asarray((keypoints.confidence > 0).any(axis=-1))
     if bodies is None or not (bodies.present & ~there).any():
         return shown
     inside = _inside(sequence, bodies, body)
@@ -100,8 +100,8 @@ def without_keypoints(sequence: Sequence) -> Bool[np.ndarray, " h"]:
         return np.zeros(people_in(sequence), bool)
     detected = np.zeros(people_in(sequence), bool)
     if sequence.keypoints is not None:
-        detected = (sequence.keypoints.confidence > 0).any(axis=(1, 2))
-    return sequence.bodies.present.any(axis=1) & ~detected
+        detected = np.asarray((sequence.keypoints.confidence > 0).any(axis=(1, 2)))
+    return np.logical_and(sequence.bodies.present.any(axis=1), ~detected)
 
 
 def people_in(sequence: Sequence) -> int:
