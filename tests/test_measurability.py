@@ -211,8 +211,6 @@ def test_without_keypoints_limbs_outside_the_image_are_inferred(tmp_path):
     assert summary["people"][0]["not_measured"]["legs"] > 0.95
     assert "legs_inferred" in names(summary)
     assert (sigma[..., ANKLES] > 0.15).mean() > 0.9
-        "legs_inferred" in names(summary) and (sigma[..., ANKLES] > 0.15).mean() > 0.9
-    )
     # So it is where the masks of people end there.
     small = Intrinsics(sequence.intrinsics.params / 10, CENTRE // 5, CENTRE // 5)
     mask = np.zeros((small.height, small.width), np.uint8)
