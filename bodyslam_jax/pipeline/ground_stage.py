@@ -32,13 +32,13 @@ def with_ground_of(
     itself if there is no ground, or not enough of it any more."""
     factors = prepared.problem.factors
     old = next((f for f in factors if isinstance(f, graph.GroundContact)), None)
-    if old is None or prepared.legs_shown is None:
-        return prepared
-    present = prepared.roots.present & registered & prepared.legs_shown
+    present = prepared.roots.present & registered
+    if prepared.legs_shown is not None:
+        present = present & prepared.legs_shown
     contact = initialisation.ground_contact(
         state, present, keypoints, body, weights, fps
     )
-    if contact is None:
+    if old is None or contact is None:
         return prepared
     contact = initialisation.with_wander(contact, state, fps)
     changed = tuple(contact if factor is old else factor for factor in factors)

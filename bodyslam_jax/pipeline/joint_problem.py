@@ -58,7 +58,7 @@ class Prepared:
     """People (rows) whom something carries."""
     legs_shown: Bool[np.ndarray, "h t"] | None = None
     """Frames in which people's legs are not only guessed (`people.legs_shown`); `None`
-    without people."""
+    where all are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +198,7 @@ def prepare(
         stages,
         warnings,
         tuple(passengers),
-        crowd.legs_shown,
+        crowd.legs_shown if anybody else None,
     )
 
 
