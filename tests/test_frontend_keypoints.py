@@ -290,3 +290,44 @@ def test_whoever_is_half_as_large_is_somebody_else():
     people, said = associate(frames, Association(), 30.0)
     assert people.confidence.shape[0] == 2
     assert any("may be person" in line for line in said)
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_two_at_one_place_are_one_person(tracked):
+    """A detector finds somebody twice, now and then once under either number."""
+    noise = np.random.default_rng(3)
+    frames, numbers = [], []
+    for k in range(60):
+        twice = [person(k) + noise.normal(0, [2, 2, 0], (25, 3)) for _ in range(2)]
+        twice[1][:, 2] = 0.4
+        chosen = [0, 1] if k % 3 else [k % 2]
+        frames.append(np.stack([twice[i] for i in chosen]))
+        numbers.append(np.array(chosen))
+    given = numbers if tracked else None
+    people, said = associate(frames, Association(), 30.0, given)
+    assert people.confidence.shape[0] == 1 and (people.confidence[0] > 0).all()
+    assert not any("dropped" in line for line in said)
+    # Somebody beside them is somebody else.
+    beside = [np.concatenate([f, person(k, 190)[None]]) for k, f in enumerate(frames)]
+    given = [np.append(n, 2) for n in numbers] if tracked else None
+    assert len(associate(beside, Association(), 30.0, given)[0].uv) == 2
+
+
+def test_stray_points_of_somebody_are_no_people():
+    """Parts of a person are found as a person of their own for some frames."""
+    frames = []
+    for k in range(60):
+        found = [person(k)]
+        if k in (20, 21, 40, 41, 42):
+            part = person(k)
+            part[5:] = 0.0
+            part[:5, :2] += 9.0
+            found.append(part)
+        frames.append(np.stack(found))
+    people, said = associate(frames, Association(), 30.0)
+    assert len(people.uv) == 1 and said == ()
+    # Elsewhere they are somebody who was there for a moment.
+    for k in (20, 21):
+        frames[k][1, :5, 0] += 150
+    people, said = associate(frames, Association(), 30.0)
+    assert len(people.uv) == 1 and "1 person detected for less than" in said[0]

@@ -172,9 +172,8 @@ def _lowest(person, body):
 
 def ground_of(height, lift: float | np.ndarray = 0.0, table=False):
     state, person, body = standing(height, lift, table=table)
-    registered = np.ones(person.present.shape[1], bool)
     found = initialisation.ground_contact(
-        state, person, registered, None, body, GraphWeights(), FPS
+        state, person.present, None, body, GraphWeights(), FPS
     )
     assert found is not None
     return found, state

@@ -3,18 +3,29 @@
 import dataclasses
 import functools
 
+import cv2
 import estimates
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bodyslam_jax import evaluation, export, simulation
+from bodyslam_jax import (
+    evaluation,
+    export,
+    initialisation,
+    motion,
+    people,
+    simulation,
+)
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.body.skeleton import BODY25, KNEES, WRISTS
-from bodyslam_jax.config import Config, Simulation
+from bodyslam_jax.body.skeleton import ANKLES, BODY25, KNEES, WRISTS
+from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.diagnostics.reprojection import projected_keypoints
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.people import PersonState, bodies_from_roots
 from bodyslam_jax.pipeline.run import assemble
-from bodyslam_jax.types import Intrinsics, Keypoints
+from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 LEGS = [BODY25[f"{side}_{n}"] for side in ("left", "right") for n in ("knee", "ankle")]
 FEET = [k for name, k in BODY25.items() if "toe" in name or "heel" in name]
@@ -112,10 +123,14 @@ def test_joints_are_less_sure_the_longer_they_are_hidden():
     knee = sigma[0, :, KNEES[0]]
     assert (np.diff(knee[29:40]) > 0).all() and (np.diff(knee[40:51]) < 0).all()
     assert knee[40] == pytest.approx(0.16, abs=0.02)
-    # Not most of the frames, which are one stretch: the share says it, nothing else.
+    (person,) = summary["people"]
+    ((first, last),) = person["inferred_frames"]
+    assert person["status"] == "doubtful" and 28 <= first <= 30 and 49 <= last <= 51
+    assert person["not_measured"]["legs"] == pytest.approx(20 / FRAMES)
+    # For a moment one leg hides the other in every stride.
+    summary, _ = judged(hidden(sequence, LEGS, frames[:8]), *rest)
     (person,) = summary["people"]
     assert person["status"] == "ok" and person["inferred_frames"] == []
-    assert person["not_measured"]["legs"] == pytest.approx(20 / FRAMES)
 
 
 def test_a_short_stretch_of_hidden_legs_is_a_warning():
@@ -129,21 +144,116 @@ def test_a_short_stretch_of_hidden_legs_is_a_warning():
     assert any("frames 80 to 89" in line for line in summary["warnings"])
 
 
-def test_a_body_of_a_regressor_measures_hidden_legs():
+def with_body(sequence, joint):
+    """The sequence with the body of somebody who regresses it without an error."""
+    present = joint.present
+    shapes = np.broadcast_to(joint.shapes[:, None], (*present.shape, 10))
+    turns = so3.log(joint.roots[..., :3, :3])[..., None, :]
+    poses = np.concatenate([turns, joint.poses], axis=-2)
+    state = PersonState(present, joint.roots, joint.poses, joint.shapes)
+    trans = bodies_from_roots(state, load_body_model()).trans
+    bodies = Bodies(present, poses.reshape(*present.shape, 72), shapes.copy(), trans)
+    return dataclasses.replace(sequence, bodies=bodies)
+
+
+def test_a_body_of_a_regressor_measures_no_hidden_legs():
     sequence, cameras, joint = scene()
-    made = simulation.as_sequence(
-        simulation.simulate(
-            Simulation(
-                sequence="E1", family="follow", length=FRAMES, seed=3, noise="none"
-            )
-        )
+    whole, sure = judged(with_body(sequence, joint), cameras, joint)
+    assert names(whole) == set() and sure.max() < 0.06
+    assert whole["people"][0]["not_measured"] == {"arms": 0.0, "legs": 0.0, "feet": 0.0}
+    unseen = hidden(sequence, LEGS + FEET, np.arange(FRAMES))
+    summary, sigma = judged(with_body(unseen, joint), cameras, joint)
+    (person,) = summary["people"]
+    assert person["status"] == "doubtful" and names(summary) == {"legs_inferred"}
+    assert person["not_measured"] == {"arms": 0.0, "legs": 1.0}
+    assert (0.15 < sigma[..., ANKLES]).all() and (sigma[..., ANKLES] < 0.2).all()
+    np.testing.assert_array_equal(sigma[..., WRISTS], sure[..., WRISTS])
+    assert "regressor's bodies guess them" in str(summary["reasons"])
+
+
+def test_one_hidden_leg_of_a_regressor_is_inferred():
+    sequence, cameras, joint = scene()
+    left = [k for name, k in BODY25.items() if name in ("left_knee", "left_ankle")]
+    feet = [k for k in FEET if k in (19, 20, 21)]
+    summary, sigma = judged(
+        with_body(hidden(sequence, left + feet, np.arange(FRAMES)), joint),
+        cameras,
+        joint,
     )
-    sequence = hidden(sequence, LEGS + FEET, np.arange(FRAMES))
-    sequence = dataclasses.replace(sequence, bodies=made.bodies)
-    summary, sigma = judged(sequence, cameras, joint)
-    assert "legs_inferred" not in names(summary)
-    assert summary["people"][0]["not_measured"]["legs"] == 0
-    assert sigma.max() < 0.06
+    assert summary["people"][0]["not_measured"]["legs"] == pytest.approx(0.5)
+    assert names(summary) == {"legs_inferred"}
+    assert (sigma[..., ANKLES[0]] > 0.15).all() and (sigma[..., ANKLES[1]] < 0.1).all()
+
+
+def test_hidden_arms_of_a_regressor_are_inferred():
+    sequence, cameras, joint = scene()
+    arms = [k for name, k in BODY25.items() if "wrist" in name or "elbow" in name]
+    summary, sigma = judged(
+        with_body(hidden(sequence, arms, np.arange(FRAMES)), joint), cameras, joint
+    )
+    assert summary["people"][0]["not_measured"]["arms"] == 1.0
+    assert names(summary) == set() and (sigma[..., WRISTS] > 0.1).all()
+
+
+def test_without_keypoints_limbs_outside_the_image_are_inferred(tmp_path):
+    sequence, cameras, joint = scene()
+    alone = with_body(dataclasses.replace(sequence, keypoints=None), joint)
+    summary, sigma = judged(alone, cameras, joint)
+    assert names(summary) == set() and sigma.max() < 0.06
+    (assumed,) = [line for line in summary["warnings"] if "no keypoints" in line]
+    assert "person 0" in assumed and "in the image" in assumed
+    # The image ends above the knees.
+    uv = np.asarray(projected_keypoints(load_body_model(), joint))
+    bottom = int(uv[..., [BODY25["left_knee"], BODY25["right_knee"]], 1].min()) - 5
+    lens = Intrinsics(sequence.intrinsics.params, 2 * CENTRE, bottom)
+    cut = dataclasses.replace(alone, intrinsics=lens)
+    summary, sigma = judged(cut, cameras, joint)
+    assert summary["people"][0]["not_measured"]["legs"] > 0.95
+    assert "legs_inferred" in names(summary)
+    assert (sigma[..., ANKLES] > 0.15).mean() > 0.9
+    # So it is where the masks of people end there.
+    small = Intrinsics(sequence.intrinsics.params / 10, CENTRE // 5, CENTRE // 5)
+    mask = np.zeros((small.height, small.width), np.uint8)
+    mask[: bottom // 10] = 255
+    for k in range(FRAMES):
+        cv2.imwrite(str(tmp_path / f"{k:04d}.png"), mask)
+    masked = dataclasses.replace(alone, masks=tmp_path, intrinsics=small)
+    summary, _ = judged(masked, cameras, joint)
+    assert summary["people"][0]["not_measured"]["legs"] > 0.95
+    assert any("on the masks of people" in line for line in summary["warnings"])
+
+
+def test_who_has_no_keypoints_beside_others_who_do():
+    sequence, cameras, joint = scene()
+    two, joints = both(sequence, joint, lambda name, x: x)
+    assert two.keypoints is not None
+    two.keypoints.confidence[1] = 0.0
+    shown = people.shown_keypoints(with_body(two, joints), load_body_model())
+    assert shown.all()
+    # Frames in which the detector lost somebody are as the nearest others.
+    two.keypoints.confidence[1, :10] = 1.0
+    two.keypoints.confidence[1, :10, LEGS] = 0.0
+    shown = people.shown_keypoints(with_body(two, joints), load_body_model())
+    assert not shown[1][:, LEGS].any() and shown[1][:, BODY25["neck"]].all()
+
+
+def test_steps_of_hidden_legs_tell_no_size():
+    frames = np.zeros((1, 30), bool)
+    frames[0, 12:] = True
+    one = motion.Prediction(
+        translation=jnp.ones((30, 3)),
+        covariance=jnp.broadcast_to(jnp.eye(3), (30, 3, 3)),
+        body_pose=jnp.zeros((30, 23, 3)),
+        rotation=jnp.zeros((30, 3)),
+        valid=jnp.ones(30, bool),
+    )
+    prediction = jax.tree.map(lambda x: x[None], one)
+    steps = initialisation.steps_shown(prediction, frames)
+    factor = initialisation.motion_factor(
+        steps, jnp.zeros((1, 10)), load_body_model(), GraphWeights()
+    )
+    weight = np.abs(np.asarray(factor.whitening)).sum(axis=(2, 3))[0]
+    assert (weight[:12] == 0).all() and (weight[12:] > 0).all()
 
 
 def smaller(sequence, joint, factor):

@@ -5,8 +5,9 @@ import pytest
 
 from bodyslam_jax.people.appearance import describe, difference, mean_look
 from bodyslam_jax.people.linking import link, remarks
+from bodyslam_jax.people.phantoms import is_phantom
 from bodyslam_jax.people.regions import behind, regions
-from bodyslam_jax.people.tracking import Tracker, between
+from bodyslam_jax.people.tracking import Tracker, Tracklet, between
 
 # COCO's 17 keypoints of somebody who stands, in units of the height.
 STANDING = np.array(
@@ -200,3 +201,76 @@ def test_colours_tell_people_apart_and_light_hardly_does():
     assert np.isnan(difference(red, np.full_like(red, np.nan)))
     both = mean_look(np.stack([red, np.full_like(red, np.nan)]))
     np.testing.assert_array_equal(both, red)
+
+
+def tracklet(number, frames, detections, colour=0.3):
+    looks = [clothes(colour) for _ in frames]
+    return Tracklet(number, list(frames), list(detections), looks)
+
+
+def test_a_part_of_a_person_found_whole_is_nobody_elses_return():
+    """Somebody hides; when they come out, their legs are found a frame before a new
+    track of all of them is followed backwards."""
+    before = [standing(300 + 2 * k) for k in range(25)]
+    after = [standing(360 + 2 * k) for k in range(40)]
+    legs = standing(362, score=0.4)
+    legs[:11] = legs[11:13].mean(axis=0)
+    first = tracklet(0, [*range(25), 39], [*before, legs])
+    second = tracklet(1, range(38, 78), after)
+    people = link([first, second], 30.0)
+    assert [[len(t.frames) for t in pieces] for pieces in people] == [[25, 40]]
+    # A return as sure as anybody stays.
+    first.points[-1] = standing(900)
+    assert len(link([first, second], 30.0)) == 2
+
+
+def faint(x, k, legs=0.05, face=0.2, trunk=0.4):
+    """A false detection: keypoints that jitter, none of a leg."""
+    points = standing(x)
+    points[:, :2] += np.random.default_rng(k).normal(0, 4, (17, 2))
+    points[:, 2] = trunk
+    points[13:, 2], points[:5, 2] = legs, face
+    return points
+
+
+@pytest.mark.parametrize("face", [0.2, 0.6])
+def test_what_only_one_network_sees_without_legs_is_a_thing(face):
+    track = tracklet(0, range(60), [faint(300, k, face=face) for k in range(60)])
+    assert is_phantom([track], set(), 30.0)
+    # Another network that finds it now and then makes a person of it.
+    confirmed = {(0, k) for k in range(0, 60, 5)}
+    assert not is_phantom([track], confirmed, 30.0)
+
+
+def test_who_sits_behind_a_table_is_a_person():
+    """No hips, so that the other network cannot be asked; the face speaks."""
+    seated = [faint(300, k, face=0.5) for k in range(60)]
+    for points in seated:
+        points[11:, 2] = 0.02
+    assert not is_phantom([tracklet(0, range(60), seated)], set(), 30.0)
+    for points in seated:
+        points[:5, 2] = 0.1
+    assert is_phantom([tracklet(0, range(60), seated)], set(), 30.0)
+
+
+@pytest.mark.parametrize("frames", [45, 90])
+def test_what_never_moves_is_a_statue(frames):
+    """The camera moves on and turns about it; for less than two seconds anybody may
+    keep still."""
+    noise = np.random.default_rng(1)
+    detections = []
+    for k in range(frames):
+        points = standing(0, height=200 + k, y=0)
+        points[:, :2] @= np.array([[np.cos(k / 200), 0.002 * k], [0.0, 1.0]])
+        points[:, :2] += [300 + 3 * k, 100] + noise.normal(0, 2, (17, 2))
+        detections.append(points)
+    confirmed = {(0, k) for k in range(frames)}
+    statue = tracklet(0, range(frames), detections)
+    assert is_phantom([statue], confirmed, 30.0) == (frames == 90)
+    # A keypoint of which the detector is not sure jumps; who waves an arm is none.
+    for points in detections[20:50]:
+        points[9, :2] -= [0, 12]
+    assert is_phantom([statue], confirmed, 30.0) == (frames == 90)
+    for points in detections[20:50]:
+        points[[7, 8, 10], :2] -= [0, 25]
+    assert not is_phantom([statue], confirmed, 30.0)

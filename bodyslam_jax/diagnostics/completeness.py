@@ -64,11 +64,12 @@ def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
 
 
 def scale_undetermined(
-    result: Result, cameras: SfmResult, start: ScaleStart
+    result: Result, cameras: SfmResult, start: ScaleStart, *, legs_hidden: bool = False
 ) -> list[Reason]:
     """Reasons to doubt or reject the scale of a moving camera that sees people.
 
-    Either no cue determines the scale, or the estimated scale is not positive.
+    Either no cue determines the scale, or the estimated scale is not positive. With
+    `legs_hidden` nobody's legs are seen in any frame.
     """
     if cameras.kind != "moving" or not result.present.any():
         return []
@@ -90,11 +91,21 @@ def scale_undetermined(
         ]
     if np.isfinite(start.standard_error):
         return []
+    if legs_hidden:
+        advice = (
+            "give a camera path in metres (--camera-path-metric), or a part of the "
+            "video in which legs are in view (--start, --end); a stature (--height) or "
+            "a regressor's bodies (--bodies) tell how far people are from the camera, "
+            "but not how far it moves"
+        )
     return [
         Reason(
             "scale_unknown",
-            "neither people's motion nor the ground under their feet determines how "
-            "large the scene is.",
+            "nobody's legs are seen: no step and no foot determines how large the "
+            "scene is."
+            if legs_hidden
+            else "neither people's motion nor the ground under their feet determines "
+            "how large the scene is.",
             "people who walk, or stand on ground that is in view",
             advice,
         )

@@ -32,6 +32,11 @@ _RUNNERS_STEPS = 2.4
 """Cadence from which steps may be of a run, steps a second."""
 _GETS_ON = 0.8
 """Speed from which feet have to stand in turn, m/s."""
+_OF_LEGS = (
+    *("standing_foot_speed", "gliding", "quick_steps", "step_short_of_reach"),
+    *("step_beyond_reach", "step_beyond_reach_of_runner", "feet_off_ground"),
+    *("ground_slope", "knee", "straighter_knee", "hip_over_ankle"),
+)
 
 
 def person_figures(
@@ -79,6 +84,15 @@ def person_figures(
         }
         found |= standing_height_figures(joints, present, fps, ground)
     return found
+
+
+def with_legs_of(
+    everything: dict[str, float], legs: dict[str, float]
+) -> dict[str, float]:
+    """The figures of one person, those of feet and steps from `legs`: figures of the
+    frames in which legs are not only guessed."""
+    kept = {name: x for name, x in everything.items() if name not in _OF_LEGS}
+    return kept | {name: x for name, x in legs.items() if name in _OF_LEGS}
 
 
 def camera_figures(T_WC: Float[np.ndarray, "t 4 4"], fps: float) -> dict[str, float]:

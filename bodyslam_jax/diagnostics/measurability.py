@@ -7,16 +7,14 @@ metres; of people whose legs are hidden the posture is inferred.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bodyslam_jax import people
 from bodyslam_jax.body.skeleton import PELVIS
-from bodyslam_jax.diagnostics.measured import LIMBS, Measured, pixels_per_metre
+from bodyslam_jax.diagnostics.measured import Measured, pixels_per_metre
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, DETECTOR_FLOOR
 from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence
 
-_MOSTLY = 0.55
-"""Share of knees and ankles that must be measured in a stretch of frames: with fewer,
-postures err by twice as much as those of people in full view."""
 _PLAN = [0, 2]
 _FEWEST = 3
 """Keypoints by whose spread in the image a depth is measured."""
@@ -28,17 +26,11 @@ _WALKING = 1.25
 
 
 def inferred_legs(
-    found: Measured, person: int, present: Bool[np.ndarray, " t"]
+    found: Measured, person: int, present: Bool[np.ndarray, " t"], fps: float
 ) -> Bool[np.ndarray, " t"]:
-    """Frames of the stretches in which a person's legs were mostly inferred.
-
-    A stretch is a run of consecutive frames in which the person is present.
-    """
-    legs = found.keypoint[person][:, LIMBS["legs"]] | found.body[person][:, None]
-    inferred = np.zeros(len(present), bool)
-    for run in runs(present):
-        inferred[run] = legs[run].mean() < _MOSTLY
-    return inferred
+    """Frames about which a person's legs were mostly inferred (`people.legs_shown`)."""
+    shown = people.legs_shown(found.keypoint[person][None], present[None], fps)
+    return present & ~shown[0]
 
 
 def measurement_figures(
@@ -57,8 +49,8 @@ def measurement_figures(
             "appears_within": within[h],
             "seen_in_pieces": _in_pieces(present, sequence.fps),
         }
-        if sequence.keypoints is not None and present.any():
-            inferred = inferred_legs(found, h, present)
+        if present.any():
+            inferred = inferred_legs(found, h, present, sequence.fps)
             figures["legs_inferred"] = 100 * float(inferred[present].mean())
         out.append(figures)
     return out
@@ -88,6 +80,7 @@ def speed_noise(
         return np.nan
     stretch = max(runs(joint.present[person]), key=lambda run: run.stop - run.start)
     here = found.keypoint[person, stretch]
+    here = here & (sequence.keypoints.confidence[person, stretch] > 0)
     enough = here.sum(axis=1) >= _FEWEST
     if not enough.any():
         return np.inf

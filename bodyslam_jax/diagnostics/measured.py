@@ -1,10 +1,8 @@
 """Which parts of people were measured, which were inferred, and how sure joints are.
 
-A keypoint is measured where it is in the image and the detector is at least half as
-confident of it as of this person's surest keypoints: of less certain ones the error is
-two to five times as large (`benchmarks/video.md`). What no keypoint measures, hidden
-limbs and those out of the image, is inferred from priors of posture and motion. A
-person with a regressor's body in a frame is measured there entirely.
+A keypoint is measured where something in the image shows it (`people.shown`). What
+nothing shows, hidden limbs and those out of the image, is inferred: from priors of
+posture and motion, or by a regressor, whose bodies are whole in any case.
 """
 
 import dataclasses
@@ -13,13 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax import people
+from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25
-from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import DETECTOR_FLOOR
 from bodyslam_jax.types import JointEstimate, Sequence
 
-_SURE = 0.5
-"""Least confidence of a measured keypoint, of that of the person's surest."""
 _SIDES = ("left", "right")
 _points = lambda *names: tuple(BODY25[f"{s}_{n}"] for n in names for s in _SIDES)
 LIMBS: dict[str, tuple[int, ...]] = {
@@ -42,7 +38,9 @@ _OF_JOINT: dict[str, tuple[tuple[int, int], float, float, float]] = {
 }
 """Joints (left, right); RMS error where measured; what is added (in squares) where the
 joint is hidden for long; RMS error with a regressor's body. All in m, of 28 rendered
-sequences, after alignment of the body (`benchmarks/video.md`)."""
+sequences, after alignment of the body (`benchmarks/video.md`); bodies there were
+simulated without regard to what hides a limb, so that what is added is that of bodies
+fitted to keypoints."""
 _BY_KEYPOINT = {"foot": ("ankle", "big_toe", "heel"), "hand": ("wrist",)}
 """Keypoints any of which measures a joint, where it is not the one of its name."""
 _FORGETS = 0.1
@@ -57,10 +55,9 @@ class Measured:
     """What was measured of `h` people in `t` frames."""
 
     keypoint: Bool[np.ndarray, "h t 25"]
-    """Keypoints of BODY_25 that were measured; those that no detector gives here are
-    not."""
+    """Keypoints of BODY_25 that something in the image shows."""
     body: Bool[np.ndarray, "h t"]
-    """Frames with a body that a regressor measured, or that was given."""
+    """Frames with a body of a regressor, or that was given."""
     joint_sigma: Float[np.ndarray, "h t 24"]
     """Expected error (RMS distance) of each joint within the body, m; 0 where the
     person is absent. Errors of the body's place and size are not in it."""
@@ -77,32 +74,22 @@ class Measured:
         for limb, points in LIMBS.items():
             here = self.keypoint[person][:, points]
             if here.any() or limb != "feet":
-                given = here | self.body[person][:, None]
-                found[limb] = float(1 - given[present].mean())
+                found[limb] = float(1 - here[present].mean())
         return found
 
 
-def measured(sequence: Sequence, joint: JointEstimate, fps: float) -> Measured:
+def measured(sequence: Sequence, joint: JointEstimate, body: BodyModel) -> Measured:
     """What of the people of `joint` was measured, and how sure their joints are."""
     h, t = joint.present.shape
     keypoint, given = np.zeros((h, t, 25), bool), np.zeros((h, t), bool)
+    if h:
+        keypoint = people.shown_keypoints(sequence, body)
     if sequence.bodies is not None:
         given = sequence.bodies.present & joint.present
-    if sequence.keypoints is not None and h:
-        points, _ = people.correct_left_right(sequence.keypoints, fps)
-        for k in range(h):
-            sigma = people.keypoint_sigma(points, sequence.intrinsics, k)
-            keypoint[k] = sigma <= KEYPOINT_SIGMA / _SURE
-    sigma = (
-        np.stack(
-            [
-                joint_sigma(keypoint[k], given[k], pixels_per_metre(joint, k), fps)
-                for k in range(h)
-            ]
-        )
-        if h
-        else np.zeros((0, t, 24))
-    )
+    sigma = np.zeros((h, t, 24))
+    for k in range(h):
+        pixels = pixels_per_metre(joint, k)
+        sigma[k] = joint_sigma(keypoint[k], given[k], pixels, sequence.fps)
     sigma = np.where(joint.present[..., None], sigma, 0.0)
     return Measured(keypoint, given, sigma)
 
@@ -129,8 +116,8 @@ def joint_sigma(
             points = [BODY25[f"{side}_{one}"] for one in names]
             here = np.asarray(keypoint[:, points].any(axis=1))
             grown = 1 - np.exp(-_time_to_nearest(here, fps) / _FORGETS)
-            inferred = np.sqrt((usual * small) ** 2 + hidden**2 * grown)
-            sigma[:, joint] = np.where(given, with_body, inferred)
+            known = np.where(given, with_body, usual * small)
+            sigma[:, joint] = np.sqrt(known**2 + hidden**2 * grown)
     return sigma
 
 

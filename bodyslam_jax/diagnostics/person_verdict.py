@@ -83,7 +83,7 @@ def assess_person(
                 moments=dict.fromkeys(figures, moments.seen(present)),
                 times=result.timestamps,
             )
-    inferred = runs(measurability.inferred_legs(found, person, present))
+    inferred = runs(measurability.inferred_legs(found, person, present, sequence.fps))
     known = "ok" if present.any() else "absent"
     return PersonVerdict(
         frames=int(present.sum()),

@@ -55,7 +55,8 @@ def implausible(
         statures: of each person, m; `None` if unknown.
         of_measurement: figures of `measurability.measurement_figures` of each person.
         measurable: people who are judged, and who count as people in the world.
-        inferred: frames in which a person's legs were mostly inferred.
+        inferred: frames in which a person's legs were mostly inferred; their feet and
+            steps are not judged.
     """
     fps, of_people = sequence.fps, []
     walking = False
@@ -68,6 +69,10 @@ def implausible(
         own: dict[str, moments.Frames] = {}
         ground = ground_heights(result, h, there)
         of_person = figures.person_figures(result.joints[h], there, fps, ground)
+        stepping = there & ~inferred[h]
+        if not stepping[there].all():
+            of_legs = figures.person_figures(result.joints[h], stepping, fps, ground)
+            of_person = figures.with_legs_of(of_person, of_legs)
         walking |= "trunk_lean" in of_person
         if there.any():
             stature = statures[h]
@@ -88,7 +93,9 @@ def implausible(
         where = {name: own.get(name, whole) for name in of_person}
         of_people.append(judged(PERSON_CHECKS, of_person, h, where))
     of_camera: dict[str, moments.Frames] = {}
-    of_world = {"floors_apart": figures.floors_apart(result.joints, present, fps)}
+    of_world = {
+        "floors_apart": figures.floors_apart(result.joints, present & ~inferred, fps)
+    }
     if walking:
         of_world["up_against_trunks"] = np.degrees(up.trunks)
         of_world["slope_of_ground"] = np.degrees(up.ground)
@@ -97,7 +104,8 @@ def implausible(
     if cameras.kind == "moving" and result.present.any():
         of_world |= figures.camera_figures(result.T_WC[cameras.within], fps)
         of_camera = moments.of_camera(result.T_WC, cameras.within, fps)
-        of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
+        if np.isfinite(scale_sigma):  # Else `scale_unknown` says why.
+            of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
         of_world["ground_under_feet"] = ground_factor
     anybody = moments.seen(np.any(result.present, axis=0))

@@ -25,9 +25,10 @@ _LEAST_FACTOR = 1.25
 def covariance_sigma(variance: float, *, moving: bool, metric: bool) -> float:
     """Standard deviation of the scale by the joint problem, m per unit of the map.
 
-    Infinite where neither people nor a metric camera path determine metres (`metric`
-    is false): the scale is held at 1, and its variance of 0 means nothing. NaN where
-    the variance was not computed, or the camera does not move.
+    Infinite where neither people's steps and feet nor a metric camera path determine
+    metres (`metric` is false): the scale is held at 1 then, or what smooth motion makes
+    of it, and its variance means nothing. NaN where the variance was not computed, or
+    the camera does not move.
     """
     if np.isnan(variance) or not moving:
         return np.nan

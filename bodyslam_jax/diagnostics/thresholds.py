@@ -221,13 +221,14 @@ PERSON_CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "legs_inferred",
-        "share of the frames in stretches with most of the legs hidden or out of the "
+        "share of the frames about which most of the legs are hidden or out of the "
         "image",
         "%",
         15.0,
-        "there the posture is inferred, not measured, and errs by twice as much as "
-        "usual: leave these frames out (--start, --end; `inferred_frames` of the "
-        "person in summary.json), or give a regressor's bodies (--bodies)",
+        "there legs are inferred, not measured, and err by twice as much as usual; a "
+        "regressor's bodies guess them, too, and their steps tell no size. Leave these "
+        "frames out (--start, --end; `inferred_frames` of the person in summary.json), "
+        "or use no legs of them",
         "a judgement on rendered people: posture errors in stretches with fewer than "
         "55 % of knees and ankles measured are twice those of people in full view",
     ),
@@ -355,8 +356,9 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "standard error of all lengths",
         "%",
         20.0,
-        "sizes are hardly known: a known focal length, more steps, the ground in view "
-        "or a regressor's bodies (--bodies) help",
+        "sizes are hardly known: a known focal length, more steps of legs in view, the "
+        "ground in view, or a camera path in metres help; so do a regressor's bodies "
+        "(--bodies) of people whose legs are in view",
         "people differ by 5 to 6 %",
     ),
     Check(

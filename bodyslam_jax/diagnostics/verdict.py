@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax import people as people_
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import measurability
@@ -86,17 +87,21 @@ def assess(
         joint: the optimum of which `result` is the metric, upright version.
         up: how the vertical of the result was found.
     """
-    ground_factor = ground_scale(result) if cameras.kind == "moving" else None
     scale_sigma = reported_sigma(result.scale, joint.scale_sigma, joint.start)
-    gaits = [gait(result, h) for h in range(len(result.poses))]
-    found = measured(sequence, joint, sequence.fps)
+    found = measured(sequence, joint, body)
+    # Feet and steps of legs that nothing shows are a guess, which is not judged.
+    legs = people_.legs_shown(found.keypoint, result.present, sequence.fps)
+    stepping = dataclasses.replace(result, present=result.present & legs)
+    ground_factor = ground_scale(stepping) if cameras.kind == "moving" else None
+    gaits = [gait(stepping, h) for h in range(len(result.poses))]
     people = [
         assess_person(sequence, result, body, joint, h, steps, found)
         for h, steps in enumerate(gaits)
     ]
     of_world: tuple[Reason, ...] = ()
     whole = incomplete(result, cameras)
-    whole += scale_undetermined(result, cameras, joint.start)
+    hidden = bool(result.present.any()) and not stepping.present.any()
+    whole += scale_undetermined(result, cameras, joint.start, legs_hidden=hidden)
     if not any(reason.fatal for reason in whole):
         factor = ground_factor or 1.0
         doubts = implausible(
@@ -111,13 +116,7 @@ def assess(
             statures=[person.stature for person in people],
             of_measurement=measurability.measurement_figures(sequence, found, result),
             measurable=np.array([p.status == "ok" for p in people], bool),
-            inferred=np.array(
-                [
-                    measurability.inferred_legs(found, h, present)
-                    for h, present in enumerate(result.present)
-                ],
-                bool,
-            ).reshape(result.present.shape),
+            inferred=result.present & ~legs,
         )
         people = with_doubts(people, doubts)
         of_world = doubts.of_whole
@@ -131,6 +130,7 @@ def assess(
     warnings = _warnings(sequence, cameras, joint, ground_factor)
     warnings += guess_warning(sequence, cameras, lengths)
     warnings += warnings_of_people(people)
+    warnings += _assumed_shown(sequence, result)
     for h, steps in enumerate(gaits):
         warnings += cadence_warning(h, steps, scale_sigma / result.scale, sequence.fps)
     of_given = tuple(
@@ -229,6 +229,21 @@ def _warnings(
             "off, or they stand on something else."
         )
     return warnings
+
+
+def _assumed_shown(sequence: Sequence, result: Result) -> list[str]:
+    """A line for people without keypoints: what hides them is not known."""
+    lone = people_.without_keypoints(sequence) & result.present.any(axis=1)
+    if not lone.any():
+        return []
+    who = ", ".join(str(h) for h in np.flatnonzero(lone))
+    where = "in the image" if sequence.masks is None else "on the masks of people"
+    return [
+        f"person {who}: a body and no keypoints, so nothing tells which limbs are "
+        f"hidden; all are taken to be seen that the body has {where}. If legs are "
+        "hidden, as by a table, give keypoints (--keypoints): guessed steps make sizes "
+        "wrong."
+    ]
 
 
 def cadence_warning(

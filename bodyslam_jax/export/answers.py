@@ -87,6 +87,9 @@ def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
     sigma = scale.get("sigma")
     if str(summary.get("camera_motion")) in _STILL:
         return _sizes_of_stature(result, summary)
+    reasons = summary.get("reasons") or []
+    if any(reason.get("name") == "scale_unknown" for reason in reasons):
+        return ["sizes are not known", "nothing in the video tells how large it is"]
     if sigma is None or not np.isfinite(sigma) or result.scale <= 0:
         return ["in metres", "how well they are known was not computed"]
     share = sigma / result.scale

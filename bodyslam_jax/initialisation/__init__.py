@@ -31,6 +31,7 @@ from bodyslam_jax.initialisation.motion_factors import motion_factor as motion_f
 from bodyslam_jax.initialisation.motion_factors import (
     optional_factors as optional_factors,
 )
+from bodyslam_jax.initialisation.motion_factors import steps_shown as steps_shown
 from bodyslam_jax.initialisation.people_factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation.people_factors import people_factors as people_factors
 from bodyslam_jax.initialisation.people_factors import stature_factor as stature_factor

@@ -15,7 +15,6 @@ from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
 from bodyslam_jax.initialisation.upright import mean_up
-from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONFIDENCE = 0.2
@@ -42,8 +41,7 @@ that rises steadily from the plane is in the mean 1.7 of its standard deviations
 
 def ground_contact(
     state: graph.State,
-    roots: PersonState,
-    registered: Bool[np.ndarray, " t"],
+    present: Bool[np.ndarray, "h t"],
     keypoints: Keypoints | None,
     body: BodyModel,
     weights: GraphWeights,
@@ -56,8 +54,11 @@ def ground_contact(
     Where it does not, on stairs or uneven ground, or where there is no plane, it is the
     height of these landmarks, in frames in which there are enough, if people then have
     one scale more nearly than on the plane. Up is the mean direction of their trunks.
+
+    Args:
+        present: frames with a camera and a person whose legs are not only guessed.
     """
-    visible = with_visible_feet(roots.present & registered, keypoints)
+    visible = with_visible_feet(present, keypoints)
     if weights.ground_sigma is None or visible.sum() < 2:
         return None
     contact, used = _ground(state, visible, body, fps)

@@ -6,7 +6,7 @@ from collections.abc import Collection
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
@@ -50,6 +50,22 @@ def motion_factor(
         correlation=graph.ar1_correlation(prediction.valid, weights.motion_correlation),
         correlated=weights.motion_correlation > 0,
         body=body if weights.motion_in_legs else None,
+    )
+
+
+def steps_shown(
+    prediction: motion.Prediction, legs: Bool[np.ndarray, "h t"]
+) -> motion.Prediction:
+    """The prediction without the steps of legs that are only guessed.
+
+    A posture that nothing in the image shows is one of the prior's, or of a regressor:
+    its displacement is that of no step, and tells nothing of the size of the scene.
+
+    Args:
+        legs: frames with legs that are shown (`people.legs_shown`).
+    """
+    return eqx.tree_at(
+        lambda p: p.valid, prediction, prediction.valid & jnp.asarray(legs)
     )
 
 

@@ -18,6 +18,10 @@ from bodyslam_jax.people.networks import network_status as network_status
 from bodyslam_jax.people.person_state import PersonState as PersonState
 from bodyslam_jax.people.person_state import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people.person_state import roots_from_bodies as roots_from_bodies
+from bodyslam_jax.people.shown import joints_of as joints_of
+from bodyslam_jax.people.shown import legs_shown as legs_shown
+from bodyslam_jax.people.shown import shown_keypoints as shown_keypoints
+from bodyslam_jax.people.shown import without_keypoints as without_keypoints
 from bodyslam_jax.people.sides import correct_left_right as correct_left_right
 from bodyslam_jax.people.stature import beyond_reach as beyond_reach
 from bodyslam_jax.people.stature import in_model as in_model

@@ -50,14 +50,15 @@ def cut(tracklet: Tracklet, fps: float) -> list[Tracklet]:
 def part(tracklet: Tracklet, start: int, stop: int, fps: float) -> Tracklet:
     """The detections of indices `start` to `stop` (exclusive), with the velocity at
     their end."""
-    if stop - start == len(tracklet.frames):
+    return chosen(tracklet, list(range(start, stop)), fps)
+
+
+def chosen(tracklet: Tracklet, indices: list[int], fps: float) -> Tracklet:
+    """The detections of these indices, in order of time."""
+    if len(indices) == len(tracklet.frames):
         return tracklet
-    chosen = slice(start, stop)
-    rows = zip(
-        tracklet.frames[chosen],
-        tracklet.points[chosen],
-        tracklet.looks[chosen],
-        strict=True,
+    rows = (
+        (tracklet.frames[i], tracklet.points[i], tracklet.looks[i]) for i in indices
     )
     frame, points, look = next(rows)
     piece = Tracklet(tracklet.number, [frame], [points], [look])

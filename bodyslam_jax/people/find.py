@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
+from bodyslam_jax.io.keypoints.doubles import doubles, is_stray
 from bodyslam_jax.people import blazepose, movenet
 from bodyslam_jax.people.appearance import SIZE, describe
 from bodyslam_jax.people.found import (
@@ -24,8 +25,9 @@ from bodyslam_jax.people.found import (
     find_relative,
 )
 from bodyslam_jax.people.linking import link, remarks
-from bodyslam_jax.people.movenet import Region, sure_points
+from bodyslam_jax.people.movenet import SURE, Region, sure_points
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
+from bodyslam_jax.people.phantoms import SMALLEST_CONFIRMED, is_phantom
 from bodyslam_jax.people.regions import behind, covered, regions, square_around
 from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
 from bodyslam_jax.sfm import SILHOUETTE_STEP
@@ -55,8 +57,6 @@ estimated, relative to that of the most visible person."""
 _BRIEF = 0.2
 """s: shorter tracks are masked without a warning, as they may be false detections."""
 _PRESENCE = 0.5
-_LEAST_FOR_FEET = 60.0
-"""Height of people, px, below which BlazePose is of no use."""
 _Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
 """COCO keypoints, and a score for each person."""
 
@@ -145,10 +145,11 @@ class _Finder:
 
     def result(self) -> Found:
         everybody = link(self.tracker.tracklets, self.fps)
-        people = sorted(
-            filter(self._is_estimated, everybody), key=_presence, reverse=True
-        )
+        phantoms = [p for p in everybody if self._is_phantom(p)]
+        real = [p for p in everybody if not any(p is q for q in phantoms)]
+        people = sorted(filter(self._is_estimated, real), key=_presence, reverse=True)
         people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
+        people = _once(people)
         who = {
             (piece.number, frame): number
             for number, pieces in enumerate(people)
@@ -169,8 +170,16 @@ class _Finder:
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
-        durations = [sum(len(t.frames) for t in pieces) for pieces in everybody]
-        others = sum(n >= _BRIEF * self.fps for n in durations) - len(people)
+        warnings += [_of_phantom(p) for p in filter(self._is_estimated, phantoms)]
+        tracks = [_track(p) for p in people]
+        gap = max(1, round(self.association.max_gap * self.fps))
+        others = 0
+        for pieces in real:
+            if any(pieces is p for p in people):
+                continue
+            track = _track(pieces)
+            if len(track) >= _BRIEF * self.fps:
+                others += not is_stray(track, tracks, gap, SURE)
         if others > 0:
             warnings.append(
                 f"{others} more people, small or seen briefly, are kept out of the map "
@@ -198,6 +207,9 @@ class _Finder:
             float(np.median(heights)) >= self.settings.min_height
             and len(heights) >= least
         )
+
+    def _is_phantom(self, pieces: list[Tracklet]) -> bool:
+        return is_phantom(pieces, set(self.feet), self.fps)
 
     def _search(self, image: np.ndarray) -> list[_Detections]:
         """People anywhere in the image."""
@@ -233,7 +245,7 @@ class _Finder:
         """Somebody found in a frame: their feet and silhouette, too."""
         frame.tracked[number] = points
         square = blazepose.turned_square(points, movenet.SURE)
-        if square is None or height(points) < _LEAST_FOR_FEET:
+        if square is None or height(points) < SMALLEST_CONFIRMED:
             return
         pose = blazepose.read_pose(self.blazepose, frame.image, square)
         apart = blazepose.disagreement(pose, points)
@@ -276,6 +288,38 @@ def _merged(found: list[_Detections]) -> _Detections:
     score = np.concatenate([s for _, s in found])
     kept = movenet.distinct(points, score)
     return points[kept], score[kept]
+
+
+def _once(people: list[list[Tracklet]]) -> list[list[Tracklet]]:
+    """Everybody once: of two at one place at one time the more visible one, with the
+    pieces of the other from when that one is not seen."""
+    twice = doubles([_track(p) for p in people], SURE)
+    for i, j in twice.items():
+        known = {frame for piece in people[j] for frame in piece.frames}
+        more = [t for t in people[i] if known.isdisjoint(t.frames)]
+        people[j] = sorted([*people[j], *more], key=lambda t: t.frames[0])
+    return [p for i, p in enumerate(people) if i not in twice]
+
+
+def _track(pieces: list[Tracklet]) -> dict[int, np.ndarray]:
+    """A person's keypoints by frame."""
+    return {
+        frame: points
+        for t in pieces
+        for frame, points in zip(t.frames, t.points, strict=True)
+    }
+
+
+def _of_phantom(pieces: list[Tracklet]) -> str:
+    """A line for what was taken for a person, and why it is none."""
+    first, last = pieces[0].frames[0], pieces[-1].frames[-1]
+    u, v = np.median([p[:, :2] for t in pieces for p in t.points], axis=(0, 1))
+    return (
+        f"something like a person at ({u:.0f}, {v:.0f}) px, frames {first} to {last}, "
+        "is taken for a thing: no leg or face is seen and a second network finds "
+        "nobody there, or nothing of it moves against the rest. It is kept out of the "
+        "map and not estimated; give keypoints (--keypoints) if it is a person."
+    )
 
 
 def _presence(pieces: list[Tracklet]) -> float:

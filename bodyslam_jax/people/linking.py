@@ -11,8 +11,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.people.appearance import difference, mean_look
-from bodyslam_jax.people.crossings import cut, part
-from bodyslam_jax.people.tracking import GROWTH, Tracklet, displacement, height
+from bodyslam_jax.people.crossings import chosen, cut, part
+from bodyslam_jax.people.regions import behind
+from bodyslam_jax.people.tracking import (
+    AWHILE,
+    GROWTH,
+    Tracklet,
+    displacement,
+    height,
+)
 
 _NEAR = 1.0
 """s: gaps up to which the position in the image is compared."""
@@ -38,6 +45,7 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
     Pieces of one tracklet that are one person's again are that tracklet, or the part of
     it from the first of them to the last.
     """
+    tracklets = without_fragments(tracklets, fps)
     pieces = [piece for t in tracklets for piece in cut(t, fps)]
     if not pieces:
         return []
@@ -64,6 +72,49 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
             i = j
         people.append(person)
     return people
+
+
+def without_fragments(tracklets: list[Tracklet], fps: float) -> list[Tracklet]:
+    """The tracklets without detections that only a part of somebody else explains.
+
+    After a gap a track goes on with whoever is found near the expected place; that may
+    be the limbs of a person who is found whole only afterwards, when a new track is
+    followed backwards. Such detections, mostly covered by a surer one of another track,
+    would be two people at one place at one time.
+    """
+    at: dict[int, list[tuple[int, np.ndarray]]] = {}
+    for t in tracklets:
+        for frame, points in zip(t.frames, t.points, strict=True):
+            at.setdefault(frame, []).append((t.number, points))
+    return [_without_fragments(t, at, fps) for t in tracklets]
+
+
+def _without_fragments(
+    tracklet: Tracklet, at: dict[int, list[tuple[int, np.ndarray]]], fps: float
+) -> Tracklet:
+    kept = list(range(len(tracklet.frames)))
+    ends = [i for i, (a, b) in enumerate(pairwise(tracklet.frames)) if b - a > AWHILE]
+    for i in ends:
+        for j in range(i + 1, len(tracklet.frames)):
+            if j > i + 1 and tracklet.frames[j] - tracklet.frames[j - 1] > AWHILE:
+                break
+            others = [
+                points
+                for number, points in at[tracklet.frames[j]]
+                if number != tracklet.number
+            ]
+            if not _is_part(tracklet.points[j], others):
+                break
+            kept.remove(j)
+    return chosen(tracklet, kept, fps)
+
+
+def _is_part(points: np.ndarray, others: list[np.ndarray]) -> bool:
+    """Whether a detection is mostly covered by a surer one."""
+    if not others:
+        return False
+    every = np.stack([points, *others])
+    return bool(behind(every, every[:, :, 2].mean(axis=1))[0])
 
 
 def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[str]:

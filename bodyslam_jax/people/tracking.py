@@ -30,7 +30,7 @@ OTHER_CLOTHES = 30.0
 """Difference of colours (`appearance.difference`) from which it is another person."""
 _RECENT = 45
 """Frames over which the colours of a person are averaged."""
-_AWHILE = 3
+AWHILE = 3
 """Frames without a detection after which only an unoccluded one continues a track."""
 _FEWEST = 3
 """Keypoints that two detections must have in common to be compared."""
@@ -134,7 +134,7 @@ class Tracker:
                 ]
             )
             away = np.array([frame - t.frames[-1] for t in alive])
-            cost[(away > _AWHILE)[:, None] & ~may_return] = 1e3
+            cost[(away > AWHILE)[:, None] & ~may_return] = 1e3
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:

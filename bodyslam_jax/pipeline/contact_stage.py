@@ -47,7 +47,8 @@ class Standing:
 
     state: graph.State
     probability: Float[np.ndarray, "h t 4"] | None = None
-    """That left toe, left heel, right toe and right heel stand; `None` if unknown."""
+    """That left toe, left heel, right toe and right heel stand, 0 where legs are only
+    guessed; `None` if unknown."""
     stages: tuple[dict, ...] = ()
     """Report entries of what was solved."""
 
@@ -78,6 +79,8 @@ def hold_standing_feet(
             "`prepare(..., feet=True)`."
         )
     probability = contact_probability(predictor, best, sequence.fps)
+    if prepared.legs_shown is not None:
+        probability = np.where(prepared.legs_shown[..., None], probability, 0.0)
     present[list(prepared.passengers)] = False
     contact = initialisation.contact_factor(
         jnp.asarray(probability), best, present, sequence.fps, body, config.weights

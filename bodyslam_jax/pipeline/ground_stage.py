@@ -32,8 +32,11 @@ def with_ground_of(
     itself if there is no ground, or not enough of it any more."""
     factors = prepared.problem.factors
     old = next((f for f in factors if isinstance(f, graph.GroundContact)), None)
+    present = prepared.roots.present & registered
+    if prepared.legs_shown is not None:
+        present = present & prepared.legs_shown
     contact = initialisation.ground_contact(
-        state, prepared.roots, registered, keypoints, body, weights, fps
+        state, present, keypoints, body, weights, fps
     )
     if old is None or contact is None:
         return prepared

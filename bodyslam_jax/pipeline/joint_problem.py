@@ -62,6 +62,9 @@ class Prepared:
     """People (rows) whom something carries."""
     crowd: "StartingPeople | None" = None
     """The people as they start."""
+    legs_shown: Bool[np.ndarray, "h t"] | None = None
+    """Frames in which people's legs are not only guessed (`people.legs_shown`); `None`
+    where all are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +82,8 @@ class StartingPeople:
     """Whether the bodies were fitted to keypoints, not regressed from images."""
     statures: dict[int, Measured]
     """Measured statures and their sigma, m, by person."""
+    legs_shown: Bool[np.ndarray, "h t"]
+    """Frames whose steps and feet are measured, whatever the bodies are from."""
 
 
 def prepare(
@@ -136,6 +141,8 @@ def prepare(
                 initialisation.without_contacts(state, sequence.fps, body, weights)
             )
         present = roots.present & cameras.registered
+        standing = present & crowd.legs_shown
+        steps = initialisation.steps_shown(prediction, crowd.legs_shown)
         motion_factors = functools.partial(
             _motion_factors,
             shared_error=_shared_error(crowd.fitted, config),
@@ -144,17 +151,18 @@ def prepare(
             config=config,
         )
         if body_only_solve:
-            start_factors = motion_factors(prediction, state, passengers)
+            start_factors = motion_factors(steps, state, passengers)
             problem = make([*factors, *start_factors], state)
             state, stage = solve_body_only(problem, state, config)
             stages = (stage,)
             prediction = predict(predictor, state)
+            steps = initialisation.steps_shown(prediction, crowd.legs_shown)
         if floor is not None:
             found = on_floor(
                 state,
                 stands and contact_probability(stands, state, sequence.fps),
                 View(
-                    present,
+                    standing,
                     sequence.keypoints,
                     crowd.fitted,
                     sequence.fps,
@@ -170,9 +178,9 @@ def prepare(
             factors = [rough if factor is contact else factor for factor in factors]
             contact = rough
         start, passengers = _start_of_scale(
-            sequence, cameras, crowd, state, prediction, contact, present, config
+            sequence, cameras, crowd, state, steps, contact, present, config
         )
-        factors += motion_factors(prediction, state, passengers)
+        factors += motion_factors(steps, state, passengers)
     elif moving and np.isfinite(cameras.path_scale):
         start = ScaleStart(
             path=cameras.path_scale, path_error=PATH_SIGMA * cameras.path_scale
@@ -200,6 +208,7 @@ def prepare(
         warnings,
         tuple(passengers),
         crowd,
+        crowd.legs_shown if anybody else None,
     )
 
 
@@ -255,7 +264,9 @@ def _starting_people(
         ),
     )
     roots = people.with_statures(roots, statures, body, unsure)
-    return StartingPeople(roots, unaided, unsure * per_unit, fitted, statures)
+    shown = people.shown_keypoints(sequence, body)
+    legs = people.legs_shown(shown, roots.present, sequence.fps)
+    return StartingPeople(roots, unaided, unsure * per_unit, fitted, statures, legs)
 
 
 def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
@@ -297,8 +308,7 @@ def _people_factors(
     if cameras.kind == "moving":
         contact = initialisation.ground_contact(
             state,
-            roots,
-            cameras.registered,
+            roots.present & cameras.registered & crowd.legs_shown,
             sequence.keypoints,
             body,
             weights,

@@ -11,6 +11,7 @@ from bodyslam_jax.sfm.moving_points import (
 )
 from bodyslam_jax.sfm.path_clock import place_in_time as place_in_time
 from bodyslam_jax.sfm.person_mask import SILHOUETTE_STEP as SILHOUETTE_STEP
+from bodyslam_jax.sfm.person_mask import person_masks as person_masks
 from bodyslam_jax.sfm.scene_tracks import track as track
 from bodyslam_jax.sfm.segments import Segments as Segments
 from bodyslam_jax.sfm.segments import find_segments as find_segments

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.body.kinematics_numpy import pose_joints
-from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.people import joints_of
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 POINTS = slice(1, 15)
@@ -76,13 +75,8 @@ def sure_points(keypoints: Keypoints) -> Float[np.ndarray, "h t 14 2"]:
 
 def body_points(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "h t 14 3"]:
     """Joints of bodies in the camera frame, m."""
-    template = np.asarray(body.joint_template, float)[:22]
-    directions = np.asarray(body.joint_shape_dirs, float)[:22]
     at = bodies.present
-    rest = template + np.einsum("jcb,mb->mjc", directions, bodies.shapes[at])
-    angles = bodies.poses[at].reshape(-1, 24, 3)[:, :22]
-    _, x = pose_joints(so3.exp(angles), rest, rest[:, 0] + bodies.trans[at])
-    points = x[:, _JOINT]
+    points = joints_of(bodies, body)[:, _JOINT]
     points[:, NECK] = (points[:, R_SHOULDER] + points[:, L_SHOULDER]) / 2
     points[:, MID_HIP] = (points[:, R_HIP] + points[:, L_HIP]) / 2
     out = np.full((*at.shape, 14, 3), np.nan)

@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.body.skeleton import BODY25_MIRRORED
 from bodyslam_jax.config import Association
+from bodyslam_jax.io.keypoints.doubles import doubles, is_stray
 from bodyslam_jax.io.keypoints.reader import Detections
 from bodyslam_jax.types import Keypoints
 
@@ -80,8 +81,9 @@ def associate(
     """People in the detections of `t` frames, in the order of their presence, and
     warnings.
 
-    People detected for less than `config.min_duration` are dropped, unless everybody
-    is; and so are those with the least presence beyond `config.max_people`.
+    Two at one place at one time are one person. People detected for less than
+    `config.min_duration` are dropped, unless everybody is; and so are those with the
+    least presence beyond `config.max_people`.
 
     Args:
         fps: frame rate, 1/s.
@@ -91,12 +93,22 @@ def associate(
     found = given
     if found is None:
         found = identify(detections, max(1, round(config.max_gap * fps)))
-    people = _collect(detections, found)
     least = min(max(1, round(config.min_duration * fps)), len(detections))
+    people, twice = _once(_collect(detections, found), least)
     kept = [p for p in people if len(p.frames) >= least] or people
-    brief = len(people) - len(kept)
+    others = [dict(zip(p.frames, p.points, strict=True)) for p in kept]
+    gap = max(1, round(config.max_gap * fps))
+    brief = sum(
+        not is_stray(dict(zip(p.frames, p.points, strict=True)), others, gap, _PRESENT)
+        for p in people
+        if not any(p is k for k in kept)
+    )
     best = sorted(kept, key=_Track.presence, reverse=True)[: config.max_people]
-    warnings: list[str] = []
+    warnings = [
+        f"keypoints of {n + 1} numbers are of one person, at one place at one time: "
+        "taken together."
+        for n in twice
+    ]
     if len(kept) > len(best):
         dropped = len(kept) - len(best)
         warnings.append(f"{dropped} less visible people dropped (max_people).")
@@ -151,6 +163,28 @@ def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
             person.frames.append(frame)
             person.points.append(points)
     return [people[number] for number in sorted(people)]
+
+
+def _once(people: list[_Track], least: int) -> tuple[list[_Track], list[int]]:
+    """Everybody once, and by how many more tracks of `least` frames people were
+    followed who were followed more than once. The surer track's detection is kept."""
+    order = sorted(range(len(people)), key=lambda i: -people[i].presence())
+    tracks = [dict(zip(p.frames, p.points, strict=True)) for p in people]
+    found = {
+        order[i]: order[j]
+        for i, j in doubles([tracks[i] for i in order], _PRESENT).items()
+    }
+    for double, person in found.items():
+        for frame, points in tracks[double].items():
+            tracks[person].setdefault(frame, points)
+    kept = []
+    for i, track in enumerate(tracks):
+        if i not in found:
+            frames = sorted(track)
+            kept.append(_Track(frames, [track[k] for k in frames]))
+    long = [person for i, person in found.items() if len(people[i].frames) >= least]
+    counts = [long.count(person) for person in dict.fromkeys(long)]
+    return kept, counts
 
 
 def _returns(people: list[_Track]) -> list[str]:
