@@ -76,7 +76,11 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
         model = sfm.CameraModel(sequence.intrinsics, None, tracks, found, ())
     else:
         model = sfm.find_camera_model(
-            tracks, sequence.intrinsics, num_frames, config.structure
+            tracks,
+            sequence.intrinsics,
+            num_frames,
+            config.structure,
+            sequence.keypoints,
         )
     sequence = dataclasses.replace(sequence, intrinsics=model.intrinsics)
     cameras = _of_model(sequence, model, config)

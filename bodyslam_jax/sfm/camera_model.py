@@ -1,9 +1,9 @@
 """Intrinsics from the tracks: pixel aspect ratio, radial distortion and zoom.
 
-Reconstruction and self-calibration alternate. A deviation from the assumed camera is
-applied where it is significant, and reported otherwise; values of camera.json are
-overruled only where the tracks contradict them by many standard deviations and the
-reprojection error falls clearly without them.
+An ordinary camera has square pixels, little distortion and one focal length. A camera
+that deviates is used only if its posterior odds are high: prior odds, times the
+likelihood ratio by tracks that had no part in the fit (`sfm.lens`). Then the map must
+be no worse with it, and people no less plausible (`sfm.upright_people`).
 """
 
 import dataclasses
@@ -16,29 +16,45 @@ from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views
 from bodyslam_jax.sfm.burnt_in import noise_of
-from bodyslam_jax.sfm.lens import Lens, examine_lens
+from bodyslam_jax.sfm.lens import Lens, LensPrior, examine_lens
 from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
+from bodyslam_jax.sfm.upright_people import plausibility
 from bodyslam_jax.sfm.zoom import LEAST_ZOOM, tracks_without_zoom, turning_zoom
-from bodyslam_jax.types import Intrinsics, Tracks
+from bodyslam_jax.types import Intrinsics, Keypoints, Tracks
 
 _log = logging.getLogger(__name__)
 
-_ROUNDS = 2
-_SIGMAS = 5.0
-"""A deviation from an assumed camera is applied above this many standard deviations."""
-_GIVEN_SIGMAS, _GIVEN_GAIN = 10.0, 0.1
-"""The same for a camera given in camera.json, and the share by which the reprojection
-error must fall as well."""
-_ZOOM_SIGMAS = 10.0
-"""The same for a zoom of a camera that translates: its errors are correlated over time
-with the drift of the map, which a zoom absorbs (6 standard deviations on a walk of 600
-frames without a zoom; 24 for a zoom by 1.1 over 60 frames)."""
-_LEAST_ASPECT, _MOST_ASPECT_SIGMA = 0.06, 0.045
-"""Least |log(fx / fy)| that is not explained by errors of the tracks, and the largest
-standard deviation of its estimate with which it is used."""
-_LEAST_BEND = 0.008
-"""Least shift by radial distortion at the image's corner that is corrected, as a share
-of half the diagonal."""
+DECISIVE = np.log(100.0)
+"""Logarithm of the posterior odds from which a deviation is used: with prior odds ten
+times smaller it would still be ten times as probable as an ordinary camera."""
+_ODDS = {"aspect": 1e-3, "radial": 1 / 20, "zoom": 1 / 50}
+"""Prior odds: pixels that are not square without a word of the container, distortion
+beyond |k1| 0.05, and a zoom, of videos at large."""
+_CALIBRATED_ODDS = {"aspect": 1e-3, "radial": 1e-3, "zoom": 1 / 50}
+"""The same of a video with a calibration: one in a thousand is of another lens."""
+_ASPECT = (0.003, 0.25)
+"""Standard deviations of log(fx / fy): sensors have square pixels to some parts in a
+thousand, as calibrations show; a stretched video has one of the ratios of video
+standards (ITU-R BT.601 and 709: 0.91, 1.09, 1.21, 1.33, 1.46), which spread so far."""
+_RADIAL, _CALIBRATED_RADIAL = (0.02, 0.2), (0.01, 0.2)
+"""Of k1: an ordinary lens has at most 0.05 (2.5 standard deviations), one with a
+calibration is corrected to some parts in a hundred; action cameras and wide angles of
+phones have 0.1 to 0.35."""
+_ZOOM = (0.01, 0.4)
+"""Of the logarithm of the focal length over time: focus breathing changes it by a
+hundredth or two, a zoom by 1.1 to 2."""
+_CALIBRATED_FOCAL = 0.01
+"""Of the logarithm of a calibrated focal length."""
+_READOUT = 0.3
+"""Of the delay of a rolling shutter's last row, in frames: phones read an image in 5 to
+20 ms, a frame lasts 17 to 40 ms; it may also be none."""
+_OTHER_FOCALS = (0.63, 0.8, 1.25)
+"""Factors on a guessed focal length from which the ordinary camera is tried again: they
+cover two standard deviations of the guess downwards, where wide lenses are, and one
+upwards."""
+_LESS_PLAUSIBLE = -1.0
+"""Logarithm of the likelihood ratio of people from which a camera makes them less
+plausible."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,15 +69,24 @@ class CameraModel:
     """The tracks with the zoom undone."""
     found: Reconstruction
     warnings: tuple[str, ...]
+    alternatives: tuple[Lens, ...] = ()
+    """The ordinary camera and others that were compared, with their evidence."""
 
 
 def find_camera_model(
-    tracks: Tracks, intrinsics: Intrinsics, num_frames: int, config: Structure
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    num_frames: int,
+    config: Structure,
+    people: Keypoints | None = None,
 ) -> CameraModel:
-    """Corrects the given camera where the tracks significantly contradict it.
+    """Corrects the given camera where the tracks and the people contradict it.
 
     Pixel aspect ratio, one radial coefficient and a zoom are estimated if the camera
     translates; only a zoom if it rotates.
+
+    Args:
+        people: keypoints of the people in the images.
     """
     given, zoom = intrinsics, np.zeros(num_frames)
     warnings: list[str] = []
@@ -77,27 +102,31 @@ def find_camera_model(
         unzoomed = reconstruct(tracks, intrinsics, num_frames, config)
         if _no_worse(unzoomed, found):
             zoom, plain, found = np.zeros(num_frames), tracks, unzoomed
-    for turn in range(_ROUNDS):
-        lens = _examine(plain, intrinsics, found)
-        if lens is None:
-            break
-        _log.debug("lens: %s", lens)
-        least = 0.01 if zoom.any() else LEAST_ZOOM
-        better, more, doubts = _improved(
-            lens, intrinsics, given, least, bool(zoom.any())
-        )
-        if turn == 0:
-            warnings += doubts
-        if better is None and more is None:
-            break
-        trial = zoom if more is None else zoom + more - np.median(more)
-        camera = better or intrinsics
-        again_plain = tracks_without_zoom(tracks, trial, centre)
-        again = reconstruct(again_plain, camera, num_frames, config)
-        if not _no_worse(again, found):
-            warnings += [_doubt(lens)] if turn == 0 else []
-            break
-        zoom, plain, found, intrinsics = trial, again_plain, again, camera
+    prior = prior_of(intrinsics, config)
+    lenses = _examine(plain, intrinsics, found, prior)
+    lens = _most_probable(lenses)
+    if lens is not None and lens.log_odds > 0 and intrinsics.is_guess:
+        # Another focal length may explain the tracks with an ordinary camera.
+        better = _other_focal(plain, intrinsics, found, config)
+        if better is not None:
+            intrinsics, found = better
+            lenses = _examine(plain, intrinsics, found, prior)
+            lens = _most_probable(lenses)
+    if lens is not None and lens.log_odds > 0:
+        used = False
+        if lens.log_odds > DECISIVE:
+            trial, camera = _with_lens(lens, intrinsics, zoom)
+            again_plain = tracks_without_zoom(tracks, trial, centre)
+            again = reconstruct(again_plain, camera, num_frames, config)
+            used = _no_worse(again, found) and (
+                plausibility(again, camera, people, trial)
+                - plausibility(found, intrinsics, people, zoom)
+                > _LESS_PLAUSIBLE
+            )
+            if used:
+                zoom, plain, found, intrinsics = trial, again_plain, again, camera
+        if not used:
+            warnings.append(_doubt(lens, intrinsics))
     zooms = np.ptp(zoom) >= LEAST_ZOOM
     if zooms:
         warnings.insert(0, zoom_warning(zoom))
@@ -107,8 +136,73 @@ def find_camera_model(
         found = reconstruct(plain, intrinsics, num_frames, config)
     warnings += _changes(given, intrinsics)
     return CameraModel(
-        intrinsics, zoom if zooms else None, plain, found, tuple(warnings)
+        intrinsics, zoom if zooms else None, plain, found, tuple(warnings), lenses
     )
+
+
+def prior_of(given: Intrinsics, config: Structure, factor: float = 1.0) -> LensPrior:
+    """What is known of a camera before its video was seen.
+
+    A guess, a focal length that a user gave and a calibration differ in their standard
+    deviations. If a calibration is of another camera, its focal length is a guess.
+
+    Args:
+        factor: on the odds of all deviations.
+    """
+    focal = config.focal_sigma
+    if given.focal_sigma is not None:
+        focal = min(given.focal_sigma / float(given.params[0]), focal)
+    calibrated = not given.is_refined
+    odds = _CALIBRATED_ODDS if calibrated else _ODDS
+    return LensPrior(
+        focal=(_CALIBRATED_FOCAL if calibrated else focal, focal),
+        aspect=_ASPECT,
+        radial=_CALIBRATED_RADIAL if calibrated else _RADIAL,
+        zoom=_ZOOM,
+        readout=_READOUT,
+        runs=config.focal_runs,
+        odds=tuple((name, factor * value) for name, value in odds.items()),
+    )
+
+
+def _most_probable(lenses: tuple[Lens, ...]) -> Lens | None:
+    """The most probable deviation from the ordinary camera."""
+    for lens in lenses:
+        _log.debug("lens: %s", lens)
+    return max(lenses[1:], key=lambda lens: lens.log_odds, default=None)
+
+
+def _other_focal(
+    tracks: Tracks, guess: Intrinsics, found: Reconstruction, config: Structure
+) -> tuple[Intrinsics, Reconstruction] | None:
+    """A better map by an ordinary camera of another focal length, if there is one."""
+    best = None
+    for factor in _OTHER_FOCALS:
+        params = np.asarray(guess.params, float).copy()
+        params[:2] *= factor
+        camera = dataclasses.replace(guess, params=params)
+        again = reconstruct(tracks, camera, len(found.registered), config)
+        if _no_worse(again, found) and again.error < found.error:
+            best, found = (camera, again), again
+    return best
+
+
+def _with_lens(
+    lens: Lens, intrinsics: Intrinsics, zoom: Float[np.ndarray, " t"]
+) -> tuple[Float[np.ndarray, " t"], Intrinsics]:
+    """The zoom and the camera with the deviations that a model allows."""
+    params = np.asarray(intrinsics.params, float).copy()
+    aspect, focal = 0.0, lens.focal
+    if "zoom" in lens.model:
+        focal += float(np.median(lens.zoom))
+        zoom = zoom + lens.zoom - np.median(lens.zoom)
+    if "aspect" in lens.model:
+        aspect = lens.aspect
+    params[:2] *= np.exp(focal + np.array([0.5, -0.5]) * aspect)
+    if "radial" in lens.model:
+        params = np.concatenate([params, np.zeros(8 - len(params))])
+        params[4] += lens.radial
+    return zoom, dataclasses.replace(intrinsics, params=params)
 
 
 def zoom_warning(zoom: Float[np.ndarray, " t"]) -> str:
@@ -134,10 +228,11 @@ def _turning_zoom(
 
 
 def _examine(
-    tracks: Tracks, intrinsics: Intrinsics, found: Reconstruction
-) -> Lens | None:
+    tracks: Tracks, intrinsics: Intrinsics, found: Reconstruction, prior: LensPrior
+) -> tuple[Lens, ...]:
+    """The ordinary camera and its alternatives; none unless the camera translates."""
     if found.kind != "moving":
-        return None
+        return ()
     K, distortion = as_opencv(intrinsics.params)
     num = int(tracks.landmark.max()) + 1
     of = np.full(num, -1)
@@ -148,62 +243,14 @@ def _examine(
     views = Views(tracks.frame[use], of[tracks.landmark[use]], xy)
     R_CW = np.swapaxes(found.T_WC[:, :3, :3], 1, 2)
     scene = Scene(R_CW, found.T_WC[:, :3, 3], found.landmarks)
-    return examine_lens(scene, views, found.registered, pixel=1 / K[0, 0])
-
-
-def _improved(
-    lens: Lens,
-    intrinsics: Intrinsics,
-    given: Intrinsics,
-    least_zoom: float,
-    zooms_already: bool,
-) -> tuple[Intrinsics | None, np.ndarray | None, list[str]]:
-    """The corrected camera and the zoom to add, where significant (else `None`); and
-    messages on deviations that are not applied."""
-    params = np.asarray(intrinsics.params, float).copy()
-    K = as_opencv(params)[0]
-    corner = np.hypot(intrinsics.width / K[0, 0], intrinsics.height / K[1, 1]) / 2
-    sigmas = _SIGMAS if given.is_guess else _GIVEN_SIGMAS
-    may = given.is_guess or lens.gain > _GIVEN_GAIN
-    doubts: list[str] = []
-    changed = False
-    ratio, zooms = params[0] / params[1], None
-    needed = _SIGMAS if zooms_already else _ZOOM_SIGMAS
-    if lens.zoom_range > max(least_zoom, needed * lens.zoom_sigma):
-        zooms = lens.zoom
-    elif lens.zoom_range > max(least_zoom, _SIGMAS * lens.zoom_sigma):
-        doubts.append(
-            f"the tracks indicate a zoom by {np.exp(lens.zoom_range):.2f} (logarithm "
-            f"{lens.zoom_range:.2f} ± {lens.zoom_sigma:.2f}), which drift of the map "
-            "explains as well: not used."
-        )
-    if abs(lens.aspect) > max(_LEAST_ASPECT, _SIGMAS * lens.aspect_sigma):
-        sure = abs(lens.aspect) > sigmas * lens.aspect_sigma and may
-        if sure and lens.aspect_sigma < _MOST_ASPECT_SIGMA:
-            focal = lens.focal
-            params[:2] *= np.exp(focal + np.array([0.5, -0.5]) * lens.aspect)
-            changed = True
-        else:
-            shown = ratio * np.exp(lens.aspect)
-            doubts.append(
-                f"the tracks indicate that fx/fy is {shown:.2f} ± "
-                f"{shown * lens.aspect_sigma:.2f}, not {ratio:.2f}: is the video "
-                "stretched? Not used; give camera.json of the video as it is."
-            )
-    bend = abs(lens.radial) * corner**2
-    if bend > _LEAST_BEND and abs(lens.radial) > _SIGMAS * lens.radial_sigma:
-        if abs(lens.radial) > sigmas * lens.radial_sigma and may:
-            params = np.concatenate([params, np.zeros(8 - len(params))])
-            params[4] += lens.radial
-            changed = True
-        else:
-            doubts.append(
-                f"the tracks indicate a distorted lens, k1 = {lens.radial:.3f} ± "
-                f"{lens.radial_sigma:.3f} ({100 * bend:.0f} % at the corners) beyond "
-                "what is known of it: not used; give camera.json."
-            )
-    better = dataclasses.replace(intrinsics, params=params) if changed else None
-    return better, zooms, doubts
+    return examine_lens(
+        scene,
+        views,
+        found.registered,
+        pixel=1 / K[0, 0],
+        rows=intrinsics.height / K[1, 1],
+        prior=prior,
+    )
 
 
 def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
@@ -221,12 +268,26 @@ def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
     )
 
 
-def _doubt(lens: Lens) -> str:
+def _doubt(lens: Lens, intrinsics: Intrinsics) -> str:
+    """What a camera that is not used would be, and what settles it."""
+    said = []
+    if "aspect" in lens.model:
+        ratio = intrinsics.params[0] / intrinsics.params[1]
+        shown = ratio * np.exp(lens.aspect)
+        sigma = shown * lens.aspect_sigma
+        said.append(f"fx/fy = {shown:.2f} ± {sigma:.2f}, not {ratio:.2f}")
+    if "radial" in lens.model:
+        said.append(
+            f"a distorted lens, k1 {lens.radial:+.2f} ± {lens.radial_sigma:.2f}"
+        )
+    if "zoom" in lens.model:
+        said.append(
+            f"a zoom by {np.exp(lens.zoom_range):.2f} (logarithm "
+            f"{lens.zoom_range:.2f} ± {lens.zoom_sigma:.2f})"
+        )
     return (
-        "the tracks do not fit one camera as it is known: a zoom by "
-        f"{np.exp(lens.zoom_range):.2f}, fx/fy times {np.exp(lens.aspect):.2f} and k1 "
-        f"{lens.radial:+.2f} lower their error by {100 * lens.gain:.0f} %, but make no "
-        "better map: not used."
+        f"the tracks indicate {' and '.join(said)}: not used, as it is too rare, makes "
+        "no better map or people less plausible; give camera.json if it is so."
     )
 
 
