@@ -4,7 +4,7 @@
 
 Clips: forty rendered ones (`camera_model_clips.FILMS`); of the sequence folders in
 VIDEOS each whole, in halves and in thirds; and their tracks as a stretched, distorted
-or zooming camera would have them. FOLDER keeps the tracks of clips and the decisions,
+or zooming camera would have them (where the camera stands only as a zooming one). FOLDER keeps the tracks of clips and the decisions,
 so that an interrupted run goes on (delete `FOLDER/decisions` to decide anew, which
 needs no tracking). Prints Markdown tables: counts, then every clip.
 """
@@ -31,6 +31,8 @@ ORDINARY = {"aspect": 0.03, "radial": 0.05, "zoom": 0.04}
 """Deviations up to which a camera is ordinary."""
 ODDS = {"aspect": 1e-3, "radial": 1 / 20, "zoom": 1 / 50}
 WARPS = ({"aspect": 4 / 3}, {"k1": -0.25}, {"zoom": 1.5})
+TRANSLATING = ("davis_hike", "josh_boardwalk", "pexels_walking")
+"""Real clips whose camera moves: on the others only a zoom is observable."""
 KNOWN_RADIAL = {"josh_boardwalk": -0.12}
 """Of real clips with a lens that is known to be distorted."""
 
@@ -69,7 +71,7 @@ def real(folder: Path, videos: Path) -> Iterator[Clip]:
                     return clips.piece(whole, num * i // count, num * (i + 1) // count)
 
                 yield Clip(f"{source.name} {i + 1} of {count}", "real", make, k1=k1)
-        for warp in WARPS:
+        for warp in WARPS if source.name in TRANSLATING else WARPS[2:]:
 
             def bent(source=source, warp=warp):
                 return clips.warped(clips.real(source, folder), **warp)
