@@ -4,9 +4,10 @@
 
 Clips: forty rendered ones (`camera_model_clips.FILMS`); of the sequence folders in
 VIDEOS each whole, in halves and in thirds; and their tracks as a stretched, distorted
-or zooming camera would have them (where the camera stands only as a zooming one). FOLDER keeps the tracks of clips and the decisions,
-so that an interrupted run goes on (delete `FOLDER/decisions` to decide anew, which
-needs no tracking). Prints Markdown tables: counts, then every clip.
+or zooming camera would have them (where the camera stands only as a zooming one).
+FOLDER keeps the tracks of clips and the decisions, so that an interrupted run goes on
+(without `FOLDER/decisions` it decides anew and tracks nothing). Prints Markdown tables:
+counts, then every clip.
 """
 
 import argparse

@@ -112,21 +112,23 @@ def find_camera_model(
             intrinsics, found = better
             lenses = _examine(plain, intrinsics, found, prior)
             lens = _most_probable(lenses)
-    if lens is not None and lens.log_odds > 0:
-        used = False
-        if lens.log_odds > DECISIVE:
-            trial, camera = _with_lens(lens, intrinsics, zoom)
-            again_plain = tracks_without_zoom(tracks, trial, centre)
-            again = reconstruct(again_plain, camera, num_frames, config)
-            used = _no_worse(again, found) and (
-                plausibility(again, camera, people, trial)
-                - plausibility(found, intrinsics, people, zoom)
-                > _LESS_PLAUSIBLE
-            )
-            if used:
-                zoom, plain, found, intrinsics = trial, again_plain, again, camera
-        if not used:
-            warnings.append(_doubt(lens, intrinsics))
+    why = "too rare"
+    decisive = [other for other in lenses[1:] if other.log_odds > DECISIVE]
+    before = plausibility(found, intrinsics, people, zoom) if decisive else 0.0
+    for other in sorted(decisive, key=lambda other: -other.log_odds):
+        trial, camera = _with_lens(other, intrinsics, zoom)
+        again_plain = tracks_without_zoom(tracks, trial, centre)
+        again = reconstruct(again_plain, camera, num_frames, config)
+        if not _no_worse(again, found):
+            why = "makes no better map"
+        elif plausibility(again, camera, people, trial) < before + _LESS_PLAUSIBLE:
+            why = "makes people lean or change in size"
+        else:
+            zoom, plain, found, intrinsics = trial, again_plain, again, camera
+            why = ""
+            break
+    if lens is not None and lens.log_odds > 0 and why:
+        warnings.append(_doubt(lens, intrinsics, why))
     zooms = np.ptp(zoom) >= LEAST_ZOOM
     if zooms:
         warnings.insert(0, zoom_warning(zoom))
@@ -140,14 +142,11 @@ def find_camera_model(
     )
 
 
-def prior_of(given: Intrinsics, config: Structure, factor: float = 1.0) -> LensPrior:
+def prior_of(given: Intrinsics, config: Structure) -> LensPrior:
     """What is known of a camera before its video was seen.
 
     A guess, a focal length that a user gave and a calibration differ in their standard
     deviations. If a calibration is of another camera, its focal length is a guess.
-
-    Args:
-        factor: on the odds of all deviations.
     """
     focal = config.focal_sigma
     if given.focal_sigma is not None:
@@ -161,7 +160,7 @@ def prior_of(given: Intrinsics, config: Structure, factor: float = 1.0) -> LensP
         zoom=_ZOOM,
         readout=_READOUT,
         runs=config.focal_runs,
-        odds=tuple((name, factor * value) for name, value in odds.items()),
+        odds=tuple(odds.items()),
     )
 
 
@@ -268,7 +267,7 @@ def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
     )
 
 
-def _doubt(lens: Lens, intrinsics: Intrinsics) -> str:
+def _doubt(lens: Lens, intrinsics: Intrinsics, why: str) -> str:
     """What a camera that is not used would be, and what settles it."""
     said = []
     if "aspect" in lens.model:
@@ -285,9 +284,10 @@ def _doubt(lens: Lens, intrinsics: Intrinsics) -> str:
             f"a zoom by {np.exp(lens.zoom_range):.2f} (logarithm "
             f"{lens.zoom_range:.2f} ± {lens.zoom_sigma:.2f})"
         )
+    odds = np.exp(min(lens.log_odds, np.log(1e6)))
     return (
-        f"the tracks indicate {' and '.join(said)}: not used, as it is too rare, makes "
-        "no better map or people less plausible; give camera.json if it is so."
+        f"the tracks indicate {' and '.join(said)} (odds {odds:.0f} to 1): {why}, not "
+        "used; give camera.json of the video as it is."
     )
 
 
