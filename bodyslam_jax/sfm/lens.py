@@ -34,9 +34,12 @@ _FRAMES_A_KNOT = 15
 _MOST_KNOTS = 8
 _CAUCHY = 2.0
 """Scale of the loss, in standard deviations of an observation."""
-_ITERATIONS, _LEAST_DECREASE = 150, 1e-5
-"""Most iterations, and the relative decrease in cost that ends them: focal length and
-distortion go along a curved valley."""
+_ITERATIONS, _LEAST_DECREASE, _SMALL = 150, 1e-5, 3
+"""Most iterations, and the relative decrease in cost that ends them if it is as small so
+often in a row: focal length and distortion go along a curved valley."""
+_DAMPING = 1e-6
+"""Initial damping, relative to the diagonal: what a camera's model leaves to be fitted
+has little curvature of its own."""
 _RESTARTS = 3
 _MUCH_LOWER = 0.01
 """Times that the ordinary camera is fitted, and the share by which the cost must fall
@@ -352,7 +355,7 @@ class _Fit:
 
     def solve(self, x: _Unknowns, information: np.ndarray) -> _Unknowns:
         """The most probable unknowns, by Levenberg--Marquardt."""
-        damping = 1e-4
+        damping, small = _DAMPING, 0
         for _ in range(_ITERATIONS):
             sigma = self.sigma(x)
             system = _linearise(self.views, self.basis, x, sigma)
@@ -370,7 +373,8 @@ class _Fit:
             if better is None:
                 break
             (x, new), damping = better, max(damping / 10, 1e-9)
-            if cost - new < _LEAST_DECREASE * cost:
+            small = small + 1 if cost - new < _LEAST_DECREASE * cost else 0
+            if small == _SMALL:
                 break
         return x
 
