@@ -35,8 +35,8 @@ _MOST_KNOTS = 8
 _CAUCHY = 2.0
 """Scale of the loss, in standard deviations of an observation."""
 _ITERATIONS, _LEAST_DECREASE, _SMALL = 150, 1e-5, 3
-"""Most iterations, and the relative decrease in cost that ends them if it is as small so
-often in a row: focal length and distortion go along a curved valley."""
+"""Most iterations, and the relative decrease in cost that ends them if it is as small
+so often in a row: focal length and distortion go along a curved valley."""
 _DAMPING = 1e-6
 """Initial damping, relative to the diagonal: what a camera's model leaves to be fitted
 has little curvature of its own."""
