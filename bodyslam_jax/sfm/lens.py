@@ -46,6 +46,9 @@ _MUCH_LOWER = 0.01
 for another."""
 _BISECTIONS = 4
 """Blocks of tracks are halved so often: 16 blocks of about 19 tracks."""
+_CONSTANT = 4
+"""Parameters of the lens that do not change over time: focal length, aspect, k1 and
+readout; those of the zoom follow."""
 _TIMES = 6
 """Pieces of the video whose frames are left out in turn."""
 
@@ -383,7 +386,8 @@ class _Fit:
 
         Errors of neighbouring tracks are common to a block; those of all tracks at a
         time (shutter, blur, a map that bends) to a piece of the video. The covariance
-        is the sum of both.
+        is the sum of both; without a piece its zoom is not known, so that of a zoom is
+        the first alone.
         """
         sigma, num, count = self.sigma(x), len(x.lens), len(x.R)
         reduced = []
@@ -416,7 +420,10 @@ class _Fit:
             without.append(x.moved(cameras, np.zeros_like(x.points), step[-num:]))
         lenses = np.array([step[-num:] for step in steps])
         covariance = _jackknife(lenses[: len(reduced)])
-        covariance = covariance + _jackknife(lenses[len(reduced) :])
+        constant = np.arange(num) < _CONSTANT
+        covariance = covariance + constant[:, None] * constant * _jackknife(
+            lenses[len(reduced) :]
+        )
         return _Spread(naive, covariance, tuple(without))
 
     def held_out(self, spread: _Spread, sigma: float) -> np.ndarray:
