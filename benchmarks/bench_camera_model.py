@@ -128,12 +128,17 @@ def decide(clip: Clip) -> dict:
 
 def models_at(row: dict, factor: float) -> tuple[str, ...]:
     """The model that the odds decide for, with prior odds `factor` times as high."""
-    best, most = (), DECISIVE
-    for lens in row["lenses"][1:]:
+    odds = {}
+    for lens in row["lenses"]:
         prior = sum(np.log(ODDS[name] * factor) for name in lens["model"])
-        if lens["evidence"] + prior > most:
-            best, most = tuple(lens["model"]), lens["evidence"] + prior
-    return best
+        odds[tuple(lens["model"])] = lens["evidence"] + prior
+
+    def is_decisive(model: tuple[str, ...]) -> bool:
+        simpler = [odds[other] for other in odds if set(other) < set(model)]
+        return all(odds[model] - value > DECISIVE for value in simpler)
+
+    decisive = [model for model in odds if model and is_decisive(model)]
+    return max(decisive, key=lambda model: odds[model], default=())
 
 
 def verdict(row: dict) -> str:

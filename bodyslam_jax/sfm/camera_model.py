@@ -113,7 +113,7 @@ def find_camera_model(
             lenses = _examine(plain, intrinsics, found, prior)
             lens = _most_probable(lenses)
     why = "too rare"
-    decisive = [other for other in lenses[1:] if other.log_odds > DECISIVE]
+    decisive = [other for other in lenses[1:] if is_decisive(other, lenses)]
     before = plausibility(found, intrinsics, people, zoom) if decisive else 0.0
     for other in sorted(decisive, key=lambda other: -other.log_odds):
         trial, camera = _with_lens(other, intrinsics, zoom)
@@ -162,6 +162,12 @@ def prior_of(given: Intrinsics, config: Structure) -> LensPrior:
         runs=config.focal_runs,
         odds=tuple(odds.items()),
     )
+
+
+def is_decisive(lens: Lens, lenses: tuple[Lens, ...]) -> bool:
+    """Whether a model has decisive odds over all of `lenses` that it contains."""
+    simpler = [o for o in lenses if set(o.model) < set(lens.model)]
+    return all(lens.log_odds - other.log_odds > DECISIVE for other in simpler)
 
 
 def _most_probable(lenses: tuple[Lens, ...]) -> Lens | None:
