@@ -304,7 +304,7 @@ BAD_EMDB = {
     "dictionary": (_with("smpl", "trans", {}), "trans: a dict, not an array"),
     "singular": (
         _with("camera", "extrinsics", np.zeros((NUM, 4, 4))),
-        "camera.extrinsics: matrices without an inverse",
+        "camera.extrinsics: matrices that are no rigid motions",
     ),
 }
 

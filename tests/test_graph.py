@@ -169,7 +169,14 @@ def every_factor(rng):
     intrinsics = jnp.concatenate([state.intrinsics, lens])
     state = eqx.tree_at(lambda s: s.intrinsics, state, intrinsics)
     factors = [scenes.reprojection(rng, state), *scenes.person_factors(rng, state)]
-    return [*factors, *scenes.extra_factors(rng, state)], state
+    state = eqx.tree_at(lambda s: s.globals, state, jnp.array([0.3, -1.0]))
+    prior = g.GlobalPrior(
+        mean=jnp.array([0.1, 0.2]),
+        sigma=jnp.array([0.5, 2.0]),
+        name="drift",
+        globals_at=(("drift", 0, 2),),
+    )
+    return [*factors, *scenes.extra_factors(rng, state), prior], state
 
 
 def test_every_residual_has_the_derivative_of_finite_differences(rng):

@@ -271,8 +271,8 @@ def test_weights_of_something_else_are_refused(tmp_path, model, body):
         load_motion_model(tmp_path / "nan.npz")
     header = json.loads(str(arrays["header"]))
     for changes, told in (
-        ({"fps": 0}, "0 frames per second"),
-        ({"sizes": {"past": 16}}, "header lacks or misstates 'width'"),
+        ({"fps": 0}, "`header.fps` is 0, expected 1"),
+        ({"sizes": {"past": 16}}, "no `members` in header.sizes"),
         ({"format": "bodyslam-motion-9"}, "format 'bodyslam-motion-9'"),
     ):
         changed = np.array(json.dumps(header | changes))

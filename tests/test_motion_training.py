@@ -19,6 +19,7 @@ from test_motion_data import make_clip, write_amass, write_cmu
 from bodyslam_jax import cli
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion import (
     Guess,
     MotionNetwork,
@@ -251,7 +252,7 @@ def test_the_output_path_is_checked_before_training(
     folder.mkdir()
 
     def read(path):
-        raise ValueError("read")
+        raise InputError("read")
 
     monkeypatch.setattr("bodyslam_jax.motion.training.command.read_motion", read)
     new = tmp_path / "new" / "m.npz"  # a folder that can be made is no fault

@@ -24,6 +24,7 @@ def known(state, **parts):
         cameras=place(state.cameras[:, 0]),
         people=place(state.roots[:, :, 0]),
         intrinsics=1e-6 * jnp.eye(len(state.intrinsics)),
+        globals=1e-6 * jnp.eye(len(state.globals)),
         shapes=jnp.zeros((h, 10, 10)),
         landmarks=place(state.landmarks),
     )

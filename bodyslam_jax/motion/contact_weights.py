@@ -50,7 +50,10 @@ def load_contact_model(path: Path | str | None = None) -> ContactModel:
         raise InputError(f"{path}: no such contact network.")
     archive = read_npz(path, "a contact network (.npz)")
     header = archive.json("header")
-    header.text("format", among=(_FORMAT,))
+    if (found := header.text("format")) != _FORMAT:
+        raise InputError(
+            f"{path}: not a contact network: format {found!r}, expected {_FORMAT!r}."
+        )
     half, fps = header.whole("half", 1, 1000), header.number("fps", 1, 1000)
     width = header.array("width", (None,), kind="whole", low=1, high=10_000)
     body, about = header.text("body"), header.value("about")

@@ -86,18 +86,25 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
     if not path.exists():
         raise InputError(f"{path}: no such motion model.")
     archive = read_npz(path, "a motion model (.npz)")
+    if "header" not in archive.names:
+        raise InputError(
+            f"{path}: not a motion model: no array `header`, only {archive.names[:4]}."
+        )
     header = archive.json("header")
-    header.text("format", among=(_FORMAT,))
+    if (found := header.text("format")) != _FORMAT:
+        raise InputError(
+            f"{path}: not a motion model: format {found!r}, expected {_FORMAT!r}."
+        )
     like = _untrained(header)
     body, about = header.text("body"), header.value("about")
     fps = header.number("fps", 1, 1000)
     past = header.fields("sizes").whole("past", 1, _MAX_FRAMES)
     arrays = [archive.array(f"array_{i}") for i in range(len(archive.names) - 1)]
     wanted = [leaf.shape for leaf in jax.tree.leaves(like)]
-    found = [array.shape for array in arrays]
-    if wanted != found:
+    shapes = [array.shape for array in arrays]
+    if wanted != shapes:
         raise InputError(
-            f"{path}: arrays {found[:3]}... do not fit the header's sizes; "
+            f"{path}: arrays {shapes[:3]}... do not fit the header's sizes; "
             f"expected {wanted[:3]}..."
         )
     network = jax.tree.unflatten(
