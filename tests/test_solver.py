@@ -596,8 +596,10 @@ def test_covariances_do_not_depend_on_what_is_eliminated_last(monkeypatch):
     for name in ("scale", "cameras", "people", "shapes", "landmarks"):
         one, other = getattr(found, name), getattr(expected, name)
         size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
-        # What landmarks have to do with the scale is little of their covariance.
-        assert (np.abs(one - other) <= 1e-6 * size).all(), name
+        # What landmarks have to do with the scale is little of their covariance; that
+        # of a point without parallax (10 m² and more) is the inverse of rounding.
+        limit = np.where(size < 10, 1e-6, 1e-4) * size
+        assert (np.abs(one - other) <= limit).all(), name
 
 
 @pytest.mark.slow

@@ -275,16 +275,20 @@ def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, family", [("E1", "follow"), ("M2", "room")])
-@pytest.mark.parametrize("frames", [40, 60, 300])
-@pytest.mark.parametrize("hold", [("cameras", "landmarks"), ()], ids=["held", "free"])
+@pytest.mark.parametrize(
+    "name, family, frames, hold",
+    [("E1", "follow", 40, ("cameras", "landmarks")), ("M2", "room", 60, ())],
+    ids=["held", "free"],
+)
 def test_the_scale_is_the_same_in_both_families(name, family, frames, hold):
+    """`benchmarks/bench_rescaled.py` has other lengths."""
     case = bs.simulate_case(name, family=family, frames=frames)
     built = bs.build(case, hold=hold)
-    found = [bs.solve(*bs.rescaled(*built, factor)) for factor in FACTORS]
+    factors = (0.1, 1.0, 5.0)
+    found = [bs.solve(*bs.rescaled(*built, factor)) for factor in factors]
     assert {x.status for x in found} == {"converged"}
-    answers = [float(x.state.scale) * f for x, f in zip(found, FACTORS, strict=True)]
-    np.testing.assert_allclose(answers, answers[3], rtol=1e-6)
+    answers = [float(x.state.scale) * f for x, f in zip(found, factors, strict=True)]
+    np.testing.assert_allclose(answers, answers[1], rtol=1e-6)
 
 
 def test_of_several_scales_the_best_is_taken_from_all_starts():
