@@ -240,3 +240,12 @@ def test_the_share_that_must_fit_follows_from_the_noise():
         assert fit.share > 0.95 * fit.expected and fit.fits
         # Noise of twice the assumed is what is still accepted.
         assert fit.required == pytest.approx(fit.expected * 0.393 / 0.865, rel=0.01)
+
+
+def test_two_poses_of_one_frame_are_refused(tmp_path):
+    rows = [f"{i + 1} 1 0 0 0 0.{i} 0 0 1 frame_{i:04d}.jpg\n\n" for i in (0, 1, 1, 3)]
+    (tmp_path / "images.txt").write_text("".join(rows))
+    with pytest.raises(InputError, match="images.txt: two poses or more of frame 1"):
+        read_camera_path(
+            tmp_path / "images.txt", timestamps=TIMES, metric=False, warn=lambda _: None
+        )

@@ -91,6 +91,11 @@ def read_camera_path(
             raise InputError(f"{path}: {error}.") from None
         at = np.array([frames[name] for name in names])
         order = np.argsort(at)
+        twice = at[order][1:][np.diff(at[order]) == 0]
+        if len(twice):
+            raise InputError(
+                f"{path}: two poses or more of frame {twice[0]}, expected one of each."
+            )
         times, poses, of_frames = timestamps[at[order]], poses[order], True
     else:
         times, poses = read_tum(path)
