@@ -86,24 +86,29 @@ def test_variants_leave_out_and_add_what_they_say(scene):
         lambda *a: None, None, scenes.body_model(), jnp.ones((1, 12), bool)
     )
     problem = g.make_problem(problem.factors, start, motion=predictor)
-    full = problem.cost_by_term(start)
+    full = problem.cost_by_term(start, held=True)
     for name in ("no keypoints", "no motion model", "no regressed postures"):
-        found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(start)
+        found = experiments.VARIANTS[name](problem, start)[0].cost_by_term(
+            start, held=True
+        )
         off = {k for k, v in found.items() if v != full[k]}
         assert len(off) == 1 and float(found[off.pop()]) == 0, name
     prior = scenes.landmark_prior(np.random.default_rng(6), start, problem.factors[0])
     also = g.make_problem([*problem.factors, prior], start, motion=predictor)
     blind, _ = experiments.VARIANTS["no landmarks"](also, start)
-    found = blind.cost_by_term(start)
+    found = blind.cost_by_term(start, held=True)
     assert found["Reprojection"] == found["LandmarkPrior"] == 0
     assert not blind.free.landmarks.any() and blind.free.cameras.any()
     apart, _ = experiments.VARIANTS["no places seen again"](also, start)
-    assert apart.cost_by_term(start) == {**also.cost_by_term(start), "LandmarkPrior": 0}
+    assert apart.cost_by_term(start, held=True) == {
+        **also.cost_by_term(start, held=True),
+        "LandmarkPrior": 0,
+    }
     # Nothing of the kind is there to be left out.
     for name in ("no places seen again", "no ground", "no smooth path"):
         assert experiments.VARIANTS[name](problem, start)[0] is problem
     found, _ = experiments.VARIANTS["with up direction"](problem, start)
-    assert len(found.cost_by_term(start)) == len(full) + 1
+    assert len(found.cost_by_term(start, held=True)) == len(full) + 1
     still, _ = experiments.VARIANTS["nothing that sees scale"](problem, start)
     assert not still.free.scale.any() and still.free.poses.all()
     held, state = experiments.VARIANTS["β held at the regressor's"](problem, start)
@@ -142,7 +147,7 @@ def test_weights_scale_residuals_and_missing_stays_missing(scene):
     @jax.jit
     def costs(log):
         changed = experiments.reweighted(problem, names, log)
-        return changed.cost_by_term(start)
+        return changed.cost_by_term(start, held=True)
 
     before, after = costs(jnp.zeros(len(names))), costs(log)
     for name, value in before.items():
