@@ -237,9 +237,14 @@ def test_who_has_no_keypoints_beside_others_who_do():
     assert not shown[1][:, LEGS].any() and shown[1][:, BODY25["neck"]].all()
 
 
-def test_steps_of_hidden_legs_tell_no_size():
-    frames = np.zeros((1, 30), bool)
-    frames[0, 12:] = True
+@pytest.mark.parametrize(
+    "hidden, told",
+    [(slice(0, 12), False), (slice(18, 30), False), (slice(8, 20), True)],
+    ids=["before", "after", "for less than a stride"],
+)
+def test_steps_of_hidden_legs_tell_no_size(hidden, told):
+    frames = np.ones((1, 30), bool)
+    frames[0, hidden] = False
     one = motion.Prediction(
         translation=jnp.ones((30, 3)),
         covariance=jnp.broadcast_to(jnp.eye(3), (30, 3, 3)),
@@ -248,12 +253,15 @@ def test_steps_of_hidden_legs_tell_no_size():
         valid=jnp.ones(30, bool),
     )
     prediction = jax.tree.map(lambda x: x[None], one)
-    steps = initialisation.steps_shown(prediction, frames)
+    steps = initialisation.steps_shown(prediction, frames, 30.0)
     factor = initialisation.motion_factor(
         steps, jnp.zeros((1, 10)), load_body_model(), GraphWeights()
     )
     weight = np.abs(np.asarray(factor.whitening)).sum(axis=(2, 3))[0]
-    assert (weight[:12] == 0).all() and (weight[12:] > 0).all()
+    assert ((weight > 0) == (frames[0] | told)).all()
+    # Of a gap that lasts as long as a stride or more nothing is known.
+    long = initialisation.steps_shown(prediction, frames, 10.0)
+    assert (np.asarray(long.valid)[0] == frames[0]).all()
 
 
 def smaller(sequence, joint, factor):

@@ -12,6 +12,10 @@ from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
+from bodyslam_jax.geometry.runs import runs
+
+STRIDE = 1.0
+"""Duration of a stride, two steps, of people who walk, s."""
 
 
 def motion_factor(
@@ -54,18 +58,27 @@ def motion_factor(
 
 
 def steps_shown(
-    prediction: motion.Prediction, legs: Bool[np.ndarray, "h t"]
+    prediction: motion.Prediction, legs: Bool[np.ndarray, "h t"], fps: float
 ) -> motion.Prediction:
     """The prediction without the steps of legs that are only guessed.
 
     A posture that nothing in the image shows is one of the prior's, or of a regressor:
-    its displacement is that of no step, and tells nothing of the size of the scene.
+    its displacement is that of no step, and tells nothing of the size of the scene. In
+    a gap shorter than a stride the postures before and after it determine the phase of
+    the gait, so that its steps are kept.
 
     Args:
         legs: frames with legs that are shown (`people.legs_shown`).
     """
+    known = legs.copy()
+    for frames in known:
+        last = len(frames)
+        for gap in runs(~frames):
+            bounded = gap.start > 0 and gap.stop < last
+            if bounded and gap.stop - gap.start < STRIDE * fps:
+                frames[gap] = True
     return eqx.tree_at(
-        lambda p: p.valid, prediction, prediction.valid & jnp.asarray(legs)
+        lambda p: p.valid, prediction, prediction.valid & jnp.asarray(known)
     )
 
 

@@ -142,7 +142,7 @@ def prepare(
             )
         present = roots.present & cameras.registered
         standing = present & crowd.legs_shown
-        steps = initialisation.steps_shown(prediction, crowd.legs_shown)
+        steps = initialisation.steps_shown(prediction, crowd.legs_shown, sequence.fps)
         motion_factors = functools.partial(
             _motion_factors,
             shared_error=_shared_error(crowd.fitted, config),
@@ -156,7 +156,9 @@ def prepare(
             state, stage = solve_body_only(problem, state, config)
             stages = (stage,)
             prediction = predict(predictor, state)
-            steps = initialisation.steps_shown(prediction, crowd.legs_shown)
+            steps = initialisation.steps_shown(
+                prediction, crowd.legs_shown, sequence.fps
+            )
         if floor is not None:
             found = on_floor(
                 state,
