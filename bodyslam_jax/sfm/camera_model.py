@@ -180,14 +180,18 @@ def _most_probable(lenses: tuple[Lens, ...]) -> Lens | None:
 def _other_focal(
     tracks: Tracks, guess: Intrinsics, found: Reconstruction, config: Structure
 ) -> tuple[Intrinsics, Reconstruction] | None:
-    """A better map by an ordinary camera of another focal length, if there is one."""
+    """A better map by an ordinary camera of another focal length, if there is one.
+
+    Its error must be smaller by more than the tolerance of `_no_worse`: where depth and
+    focal length trade off, as before a wall, errors differ by noise alone.
+    """
     best = None
     for factor in _OTHER_FOCALS:
         params = np.asarray(guess.params, float).copy()
         params[:2] *= factor
         camera = dataclasses.replace(guess, params=params)
         again = reconstruct(tracks, camera, len(found.registered), config)
-        if _no_worse(again, found) and again.error < found.error:
+        if _no_worse(again, found) and 1.05 * again.error + 0.02 < found.error:
             best, found = (camera, again), again
     return best
 
