@@ -16,7 +16,7 @@ from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views
 from bodyslam_jax.sfm.burnt_in import noise_of
-from bodyslam_jax.sfm.lens import Lens, LensPrior, examine_lens
+from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, LensPrior, examine_lens
 from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
 from bodyslam_jax.sfm.upright_people import plausibility
 from bodyslam_jax.sfm.zoom import LEAST_ZOOM, tracks_without_zoom, turning_zoom
@@ -30,8 +30,9 @@ times smaller it would still be ten times as probable as an ordinary camera."""
 _ODDS = {"aspect": 1e-3, "radial": 1 / 20, "zoom": 1 / 50}
 """Prior odds: pixels that are not square without a word of the container, distortion
 beyond |k1| 0.05, and a zoom, of videos at large."""
-_CALIBRATED_ODDS = {"aspect": 1e-3, "radial": 1e-3, "zoom": 1 / 50}
-"""The same of a video with a calibration: one in a thousand is of another lens."""
+_CALIBRATED_ODDS = {"focal": 1e-3, "aspect": 1e-3, "radial": 1e-3, "zoom": 1 / 50}
+"""The same of a video with a calibration: one in a thousand is of another lens. Another
+focal length is never used, as the calibration is held; `diagnostics.facts` tells it."""
 _ASPECT = (0.003, 0.25)
 """Standard deviations of log(fx / fy): sensors have square pixels to some parts in a
 thousand, as calibrations show; a stretched video has one of the ratios of video
@@ -113,7 +114,11 @@ def find_camera_model(
             lenses = _examine(plain, intrinsics, found, prior)
             lens = _most_probable(lenses)
     why = "too rare"
-    decisive = [other for other in lenses[1:] if is_decisive(other, lenses)]
+    decisive = [
+        other
+        for other in lenses[1:]
+        if other.model != OTHER_FOCAL and is_decisive(other, lenses)
+    ]
     before = plausibility(found, intrinsics, people, zoom) if decisive else 0.0
     for other in sorted(decisive, key=lambda other: -other.log_odds):
         trial, camera = _with_lens(other, intrinsics, zoom)
@@ -127,7 +132,8 @@ def find_camera_model(
             zoom, plain, found, intrinsics = trial, again_plain, again, camera
             why = ""
             break
-    if lens is not None and lens.log_odds > 0 and why:
+    deviates = lens is not None and lens.model != OTHER_FOCAL
+    if lens is not None and deviates and lens.log_odds > 0 and why:
         warnings.append(_doubt(lens, intrinsics, why))
     zooms = np.ptp(zoom) >= LEAST_ZOOM
     if zooms:
@@ -165,8 +171,11 @@ def prior_of(given: Intrinsics, config: Structure) -> LensPrior:
 
 
 def is_decisive(lens: Lens, lenses: tuple[Lens, ...]) -> bool:
-    """Whether a model has decisive odds over all of `lenses` that it contains."""
-    simpler = [o for o in lenses if set(o.model) < set(lens.model)]
+    """Whether a model has decisive odds over all of `lenses` that it contains.
+
+    Any deviation frees a calibrated focal length, and contains `OTHER_FOCAL`.
+    """
+    simpler = [o for o in lenses if set(o.model) < {*lens.model, *OTHER_FOCAL}]
     return all(lens.log_odds - other.log_odds > DECISIVE for other in simpler)
 
 

@@ -24,6 +24,9 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.grouped_sums import sum_by
 from bodyslam_jax.sfm.bundle import Scene, Views
 
+OTHER_FOCAL = ("focal",)
+"""The ordinary camera with another focal length than a calibration's: what a deviation
+is compared with there, which would otherwise win by freeing the focal length."""
 _SINGLE = ("aspect", "radial", "zoom")
 """Deviations from an ordinary camera."""
 _PAIRS = (("aspect", "radial"), ("radial", "zoom"))
@@ -91,9 +94,11 @@ class Lens:
     """A camera model fitted to the tracks, and the evidence for it."""
 
     model: tuple[str, ...]
-    """Which deviations it allows: aspect, radial, zoom; none for an ordinary camera."""
+    """Which deviations it allows: aspect, radial, zoom; none for an ordinary camera;
+    `OTHER_FOCAL` where a calibration is thought to be wrong."""
     evidence: float
-    """Logarithm of the likelihood ratio to an ordinary camera, by held-out tracks."""
+    """Logarithm of the likelihood ratio to an ordinary camera, by held-out tracks; to
+    that of `OTHER_FOCAL` where that is more probable."""
     log_odds: float
     """Logarithm of the posterior odds."""
     focal: float
@@ -163,23 +168,27 @@ def _compared(
     spread = fit.jackknife(plain, prior.information((), num))
     if spread is None:
         return (), []
-    sigma = fit.sigma(plain)
-    expected = fit.held_out(spread, sigma)
     found = [_lens((), plain, spread, (0.0, 0.0), every)]
     solutions = [plain]
-    for model in (*((name,) for name in _SINGLE), *_PAIRS):
+    simplest = _Simplest.of(fit, (), plain, spread, 0.0)
+    models = (*((name,) for name in _SINGLE), *_PAIRS)
+    if prior.focal[0] < prior.focal[1]:
+        models = (OTHER_FOCAL, *models)
+    for model in models:
         likely = [lens.log_odds > 0 and lens.model[0] in model for lens in found[1:]]
         if len(model) > 1 and not any(likely):
             continue
-        x = fit.solve(plain, prior.information(model, num))
+        x = fit.solve(simplest.x, prior.information(model, num))
         own = fit.jackknife(x, prior.information(model, num))
         if own is None:
             continue
-        gain = (expected - fit.held_out(own, sigma)) / 2
-        evidence = _evidence(model, gain, own) + _occam(model, prior, plain, x, own)
-        odds = evidence + prior.log_odds(model)
+        gain = (simplest.held_out - fit.held_out(own, simplest.sigma)) / 2
+        evidence = _evidence(model, gain, own) + _occam(model, prior, simplest, x, own)
+        odds = simplest.log_odds + evidence + prior.log_odds(model)
         found.append(_lens(model, x, own, (evidence, odds), every))
         solutions.append(x)
+        if model == OTHER_FOCAL and odds > 0:
+            simplest = _Simplest.of(fit, model, x, own, odds)
     return tuple(found), solutions
 
 
@@ -435,9 +444,28 @@ class _Fit:
         return np.array(costs)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Simplest:
+    """The ordinary camera that deviations are compared with: the assumed one, or that
+    of another focal length where a calibration is thought to be wrong."""
+
+    model: tuple[str, ...]
+    x: _Unknowns
+    sigma: float
+    held_out: np.ndarray
+    log_odds: float
+
+    @staticmethod
+    def of(
+        fit: _Fit, model: tuple[str, ...], x: _Unknowns, spread: _Spread, odds: float
+    ) -> "_Simplest":
+        sigma = fit.sigma(x)
+        return _Simplest(model, x, sigma, fit.held_out(spread, sigma), odds)
+
+
 def _free(model: tuple[str, ...], num: int) -> np.ndarray:
     """Indices of the parameters by which a model differs from the ordinary camera."""
-    places = {"aspect": [1], "radial": [2], "zoom": list(range(4, num))}
+    places = {"focal": [0], "aspect": [1], "radial": [2], "zoom": list(range(4, num))}
     return np.array([i for name in model for i in places[name]])
 
 
@@ -460,16 +488,16 @@ def _evidence(model: tuple[str, ...], gain: np.ndarray, spread: _Spread) -> floa
 def _occam(
     model: tuple[str, ...],
     prior: LensPrior,
-    plain: _Unknowns,
+    simplest: _Simplest,
     x: _Unknowns,
     spread: _Spread,
 ) -> float:
     """Logarithm of the ratio of prior densities at the two solutions, and of the
     volumes of the posteriors about them (Laplace's approximation)."""
-    free, num = np.append(_free(model, len(x.lens)), 0), len(x.lens) - 4
+    free, num = np.union1d(_free(model, len(x.lens)), [0]), len(x.lens) - 4
     data = np.linalg.pinv(spread.covariance[np.ix_(free, free)], hermitian=True)
     parts = []
-    for y, allowed in ((plain, ()), (x, model)):
+    for y, allowed in ((simplest.x, simplest.model), (x, model)):
         own = prior.information(allowed, num)[free] / prior.runs
         density = 0.5 * (np.log(own) - own * y.lens[free] ** 2).sum()
         parts.append(density - 0.5 * np.linalg.slogdet(data + np.diag(own))[1])
