@@ -1,7 +1,7 @@
 """Figures of every benchmark by sequence, kept as JSON, and two such files compared.
 
     python benchmarks/figures_by_sequence.py measure FIGURES.json [--parts tens tripods]
-        [--frames 120] [--videos FOLDER] [--motion CMU.npz] [--keep FOLDER]
+        [--inputs pixels] [--frames 120] [--videos FOLDER] [--motion CMU.npz] [--keep FOLDER]
     python benchmarks/figures_by_sequence.py compare BEFORE.json AFTER.json
 
 `measure` adds the rows that the file does not have; an interrupted run goes on. The
@@ -354,7 +354,8 @@ def measure(options: argparse.Namespace) -> None:
     done = {(row["part"], row["input"], row["sequence"]) for row in rows}
     for part in options.parts:
         for name, which, sequence, compute in globals()[part](options):
-            if (name, which, sequence) in done:
+            wanted = not options.inputs or which in options.inputs
+            if not wanted or (name, which, sequence) in done:
                 continue
             row = {"part": name, "input": which, "sequence": sequence, **compute()}
             rows.append(row)
@@ -370,6 +371,7 @@ def main() -> None:
     one = commands.add_parser("measure")
     one.add_argument("file", type=Path)
     one.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    one.add_argument("--inputs", nargs="*", default=[], help="of `tens` and others")
     one.add_argument("--sequences", nargs="*", default=[])
     one.add_argument("--frames", type=int, default=120)
     one.add_argument("--seed", type=int)
