@@ -1,7 +1,8 @@
 """Figures of every benchmark by sequence, kept as JSON, and two such files compared.
 
     python benchmarks/figures_by_sequence.py measure FIGURES.json [--parts tens tripods]
-        [--inputs pixels] [--frames 120] [--videos FOLDER] [--motion CMU.npz] [--keep FOLDER]
+        [--inputs pixels] [--frames 120] [--videos FOLDER] [--motion CMU.npz]
+        [--keep FOLDER]
     python benchmarks/figures_by_sequence.py compare BEFORE.json AFTER.json
 
 `measure` adds the rows that the file does not have; an interrupted run goes on. The

@@ -1,0 +1,57 @@
+"""The counter of numbers that somebody chose (`tools/tuned_literals.py`)."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+_FILE = Path(__file__).parents[1] / "tools" / "tuned_literals.py"
+if not _FILE.exists():
+    pytest.skip("tools are not in a wheel", allow_module_level=True)
+_SPEC = importlib.util.spec_from_file_location("tuned_literals", _FILE)
+assert _SPEC is not None and _SPEC.loader is not None
+counter = importlib.util.module_from_spec(_SPEC)
+sys.modules["tuned_literals"] = counter
+_SPEC.loader.exec_module(counter)
+
+
+def found(text):
+    return [(x.name, x.value, x.has_source) for x in counter.literals(text)]
+
+
+def test_what_somebody_chose_counts_with_its_source():
+    text = """
+_LIMIT = 0.35
+\"\"\"From the data.\"\"\"
+_OTHER = 0.7
+
+def shrink(x, share=0.9):
+    # Twice the noise of tracks.
+    return x * 1.4 if x > 17 else share
+"""
+    assert found(text) == [
+        ("_LIMIT", 0.35, True),
+        ("_OTHER", 0.7, False),
+        ("shrink", 0.9, False),
+        ("shrink", 1.4, True),
+        ("shrink", 17, True),
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x[5:7] + y[-11]",
+        "x.reshape(17, -1) + np.zeros((5, 7))",
+        "x ** 5 + 1e-9 * 100.0",
+        "np.degrees(x) * 180 / np.pi",
+        "f'{x:7.3f}'",
+        "JOINTS = (5, 7, 11, 13)",
+        "def f(x: Float[Array, '5 7']) -> None: ...",
+        "np.mean(x, axis=5)",
+        "x = -0.5 * y + 2 * z - 1",
+    ],
+)
+def test_structure_and_units_do_not(text):
+    assert found(text) == []
