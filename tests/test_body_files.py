@@ -221,6 +221,7 @@ BAD = {
     "self": (edit("kintree_table", put((0, 7), 7)), "cycle"),
     "other tree": (edit("kintree_table", put((0, 13), 12)), "not SMPL's tree"),
     "short tree": (edit("kintree_table", lambda x: x[:, :9]), "(2, 24)"),
+    "no tree": (edit("kintree_table", lambda x: x[:0]), "(2, 24)"),
     "scalar": (edit("J_regressor", lambda x: np.float64(1.0)), "J_regressor"),
 }
 

@@ -44,7 +44,7 @@ def read(out: Path) -> dict[str, Any] | None:
     if not texts or record["status"] not in STATUSES:
         log.warning("%s: not the record of a run; the clip is run again", out / _RECORD)
         return None
-    return record
+    return {name: record[name] for name in _TEXTS}
 
 
 def is_begun(out: Path) -> bool:

@@ -103,7 +103,7 @@ def _sums_to_one(file, name, rows, tolerance) -> None:
 def _parents(file, table, num_joints) -> list[int]:
     """Parent of each joint from row 0 of the kinematic tree; -1 for the root."""
     table = _integers(file, "kintree_table", table)
-    row = table[0] if table.ndim == 2 else table
+    row = table[0] if table.ndim == 2 and len(table) else table
     _expect(
         file, "kintree_table", table, row.shape == (num_joints,), f"(2, {num_joints})"
     )
