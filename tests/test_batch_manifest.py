@@ -87,6 +87,14 @@ MISTAKES = {
     "bodies in a folder": (",a.mp4,,truth,,,,", "2: bodies: {home}/truth: a folder"),
     "no such camera": (",a.mp4,,,c.json,,,", "2: camera: {home}/c.json: no such file"),
     "broken camera": (",a.mp4,,,broken.json,,,", "2: camera: {home}/broken.json: "),
+    "name that no system has, of a camera": (
+        f",a.mp4,,,{'9' * 300},,,",
+        "2: camera: File name too long.",
+    ),
+    "name that no system has, of bodies": (
+        f",a.mp4,,{'9' * 300},,,,",
+        "2: bodies: File name too long.",
+    ),
     "height in cm": (",a.mp4,,,,178,,", "2: height: found 178, expected 0.4 to 2.8 m"),
     "height in words": (",a.mp4,,,,tall,,", "2: height: found 'tall', expected METRES"),
     "no such truth": (",a.mp4,,,,,t,", "2: groundtruth: {home}/t: no such file or"),

@@ -111,13 +111,10 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
     name = row.get("name") or safe_name(video)
     if mistake := wrong_name(name):
         wrong.append(f"name: {mistake}")
-    for column in ("keypoints", "bodies", "camera"):
-        file = at(column)
-        if column == "camera" and file is not None:
-            file, _ = split_camera_name(file)
-        found = _wrong_file(column, file, folder=column != "bodies")
-        wrong += _told(column, found)
     camera = at("camera")
+    wrong += _told("keypoints", _wrong_file("keypoints", at("keypoints"), folder=True))
+    wrong += _told("bodies", _wrong_file("bodies", at("bodies")))
+    wrong += _told("camera", _wrong_camera(camera))
     if camera is not None and camera.suffix == ".json" and os.path.isfile(camera):
         try:
             # A calibration without an image size is checked with its video.
@@ -178,6 +175,12 @@ def _wrong_file(column: str, path: Path | None, folder: bool = False) -> Iterato
         yield f"{column}: {path}: an empty file"
     elif not os.access(path, os.R_OK):
         yield f"{column}: {path}: cannot be read"
+
+
+def _wrong_camera(path: Path | None) -> Iterator[str]:
+    if path is not None:
+        file, _ = split_camera_name(path)
+        yield from _wrong_file("camera", file, folder=True)
 
 
 def _wrong_truth(path: Path | None) -> Iterator[str]:
