@@ -175,7 +175,8 @@ def is_decisive(lens: Lens, lenses: tuple[Lens, ...]) -> bool:
 
     Any deviation frees a calibrated focal length, and contains `OTHER_FOCAL`.
     """
-    simpler = [o for o in lenses if set(o.model) < {*lens.model, *OTHER_FOCAL}]
+    contained = {*lens.model, *OTHER_FOCAL}
+    simpler = [o for o in lenses if o is not lens and set(o.model) <= contained]
     return all(lens.log_odds - other.log_odds > DECISIVE for other in simpler)
 
 
