@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.bundle import Scene, Views, errors
+from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Scene, Views, errors
 from bodyslam_jax.sfm.burnt_in import noise_of
 from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, LensPrior, examine_lens
 from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
@@ -53,8 +53,6 @@ _OTHER_FOCALS = (0.63, 0.8, 1.25)
 """Factors on a guessed focal length from which the ordinary camera is tried again: they
 cover two standard deviations of the guess downwards, where wide lenses are, and one
 upwards."""
-_ERROR_PER_SIGMA = 1.18
-"""Median length of a vector of two normal errors, in their standard deviation."""
 _LEAST_SIGMA = 0.2
 """Of an observation, px: trackers are no more exact."""
 _UNEXPLAINED = 9.21
@@ -211,7 +209,7 @@ def _other_focal(
         again = reconstruct(tracks, camera, len(found.registered), config)
         if not _locates_as_many(again, found):
             continue
-        sigma = max(again.error / _ERROR_PER_SIGMA, _LEAST_SIGMA)
+        sigma = max(again.error / ERROR_PER_SIGMA, _LEAST_SIGMA)
         gain = _misfit(tracks, guess, found, sigma)
         gain -= _misfit(tracks, camera, again, sigma)
         # Errors of a track are correlated: `focal_runs` observations count as one.
@@ -268,7 +266,7 @@ def _turning_zoom(
     K, distortion = as_opencv(intrinsics.params)
     views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
     # Errors of both views, whose variances add up.
-    limit = max(TURNING_ERROR, 2.0 * _ERROR_PER_SIGMA * np.sqrt(2) * noise_of(tracks))
+    limit = max(TURNING_ERROR, 2.0 * ERROR_PER_SIGMA * np.sqrt(2) * noise_of(tracks))
     return turning_zoom(views, num_frames, limit / K[0, 0])
 
 
