@@ -11,8 +11,8 @@ from test_frontend_motion import CAMERA, path, scene
 from bodyslam_jax.config import Structure
 from bodyslam_jax.sfm import find_camera_model
 from bodyslam_jax.sfm.bundle import Scene, Views
-from bodyslam_jax.sfm.camera_model import DECISIVE, prior_of
-from bodyslam_jax.sfm.lens import examine_lens
+from bodyslam_jax.sfm.camera_model import DECISIVE, is_decisive, prior_of
+from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, examine_lens
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.sfm.upright_people import plausibility
 from bodyslam_jax.types import Keypoints, Tracks
@@ -145,6 +145,24 @@ def test_a_rolling_shutter_is_no_stretched_video():
 
     lenses = examined("sideways", 4, bend=bend)
     assert all(lens.log_odds < DECISIVE for lens in lenses[1:])
+
+
+def test_a_deviation_must_beat_all_simpler_cameras_and_not_itself():
+    """With a calibration, also that of another focal length."""
+    numbers = dict.fromkeys([f.name for f in dataclasses.fields(Lens)][3:], 0.0)
+    lens = lambda odds, *model: Lens(
+        model, 0.0, odds, **numbers | {"zoom": np.zeros(3)}
+    )
+    ordinary, other = lens(0.0), lens(20.0, *OTHER_FOCAL)
+    aspect, radial, both = (
+        lens(9.0, "aspect"),
+        lens(18.0, "radial"),
+        lens(25.0, "aspect", "radial"),
+    )
+    assert is_decisive(radial, (ordinary, aspect, radial, both))
+    assert not is_decisive(radial, (ordinary, other, radial))
+    assert is_decisive(both, (ordinary, aspect, radial, both))
+    assert not is_decisive(both, (ordinary, lens(24.0, "radial"), both))
 
 
 def test_a_calibration_is_doubted_less_than_a_guess():

@@ -59,9 +59,5 @@ def test_a_guess_is_kept_where_the_path_says_nothing():
     tracks, _ = scene("sideways", num=NUM, planar=True)
     found = sfm_stage.estimate(sequence(tracks, 0.8, NUM), tracks, Config())
     assert found.kind == "moving" and np.isnan(found.focal_sigma)
-    # Another start may fit the tracks better there; none of them is refined.
-    starts = [0.8 * factor for factor in (1.0, 0.63, 0.8, 1.25)]
-    ratio = found.intrinsics[:2] / CAMERA.params[:2]
-    assert min(abs(ratio[0] - start) for start in starts) < 1e-4
-    np.testing.assert_allclose(ratio[1], ratio[0], rtol=1e-6)
+    np.testing.assert_allclose(found.intrinsics[:2], 0.8 * CAMERA.params[:2], rtol=0.02)
     assert any("focal length not determined" in text for text in found.warnings)

@@ -19,6 +19,7 @@ from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
 from bodyslam_jax.diagnostics.statistics import stature
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.geometry.levelling import level
+from bodyslam_jax.io.camera.calibration import read_camera
 from bodyslam_jax.io.camera.recognise import recognised
 from bodyslam_jax.pipeline import sfm_stage
 from bodyslam_jax.types import (
@@ -374,6 +375,32 @@ def test_a_calibration_that_is_of_no_such_image_is_refused_by_name(
     with pytest.raises(ValueError, match=text) as error:
         read(tmp_path, camera)
     assert "camera" in str(error.value) and "\n" not in str(error.value)
+
+
+def from_the_corner(path, numbers):
+    """COLMAP's or nerfstudio's file of a camera, read: they count pixels from the
+    corner of the image, half a pixel before the centre of the first."""
+    keys = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+    data = dict(zip(keys, [640, 480, *numbers], strict=True)) | {"frames": []}
+    text = f"1 PINHOLE 640 480 {' '.join(map(str, numbers))}\n"
+    path.write_text(text if path.suffix == ".txt" else json.dumps(data))
+    return read_camera(path, (640, 480))[0]
+
+
+@pytest.mark.parametrize("name", ["cameras.txt", "transforms.json"])
+def test_exchanged_coordinates_that_count_from_the_corner_are_put_back(tmp_path, name):
+    said: list[str] = []
+    camera = from_the_corner(tmp_path / name, [525, 525, 240, 320])
+    found = recognised(name, camera, said.append)
+    assert found.params[2:4].tolist() == [319.5, 239.5]
+    assert len(said) == 1 and "cx and cy exchanged" in said[0]
+
+
+@pytest.mark.parametrize("name", ["cameras.txt", "transforms.json"])
+def test_units_of_the_image_that_count_from_the_corner_are_told(tmp_path, name):
+    camera = from_the_corner(tmp_path / name, [0.8203, 1.09375, 0.5, 0.5])
+    with pytest.raises(ValueError, match=r"units of the image.* 525 525 319.5 239.5"):
+        recognised(name, camera, lambda text: None)
 
 
 @pytest.mark.parametrize("centre", [(319.5, 239.5), (331.0, 228.0), (420.0, 290.0)])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax import graph, initialisation, solver
+from bodyslam_jax import graph, initialisation, sfm, solver
 from bodyslam_jax.config import Config, Structure
 from bodyslam_jax.geometry.camera import project_rows
 from bodyslam_jax.types import Intrinsics, SfmResult, Tracks
@@ -20,8 +20,6 @@ log = logging.getLogger(__name__)
 
 HELD_SIGMA = 1e-6
 """Relative sigma of a prior that holds the focal length constant."""
-ERROR_PER_SIGMA = 1.18
-"""Median length of a two-dimensional normal error with unit sigma."""
 
 _SAME_FOCAL = 0.005
 """Relative change of the focal length beyond which the priors of landmarks, which were
@@ -63,7 +61,9 @@ def adjust(
     error = np.linalg.norm(_pixel_errors(cameras.tracks, state), axis=-1)
     keep = cameras.keep
     noise = (
-        clipped_sigma(np.median(error[keep]) / ERROR_PER_SIGMA) if keep.any() else 1.0
+        clipped_sigma(np.median(error[keep]) / sfm.ERROR_PER_SIGMA)
+        if keep.any()
+        else 1.0
     )
     return dataclasses.replace(
         cameras,

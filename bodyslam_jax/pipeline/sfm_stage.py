@@ -13,7 +13,6 @@ import numpy as np
 from bodyslam_jax import sfm
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline.bundle_adjustment import (
-    ERROR_PER_SIGMA,
     HELD_SIGMA,
     adjust,
     clipped_sigma,
@@ -118,7 +117,7 @@ def _with_focal(
 ) -> SfmResult:
     """Cameras with the focal length estimated, if the camera's path determines it."""
     guess = sequence.intrinsics
-    sigma = clipped_sigma(error / ERROR_PER_SIGMA)
+    sigma = clipped_sigma(error / sfm.ERROR_PER_SIGMA)
     adjusted = cameras
     for _ in range(3):
         adjusted = adjust(cameras, sigma, config, guess)
@@ -133,7 +132,7 @@ def _with_focal(
             adjusted.pixel_sigma,
         )
         if again.kind != "moving":
-            if again.error > _ROTATION_REFUSED * ERROR_PER_SIGMA * sigma:
+            if again.error > _ROTATION_REFUSED * sfm.ERROR_PER_SIGMA * sigma:
                 return adjusted  # It moves little, but rotation does not explain it.
             # With a wrong focal length, a rotating camera appeared to move.
             return dataclasses.replace(cameras, focal_sigma=adjusted.focal_sigma)

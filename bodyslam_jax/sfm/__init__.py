@@ -1,5 +1,6 @@
 """Structure from motion: features, tracks, cameras and a map up to scale."""
 
+from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA as ERROR_PER_SIGMA
 from bodyslam_jax.sfm.burnt_in import burnt_in_warning as burnt_in_warning
 from bodyslam_jax.sfm.burnt_in import without_burnt_in as without_burnt_in
 from bodyslam_jax.sfm.camera_model import CameraModel as CameraModel

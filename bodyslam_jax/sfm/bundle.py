@@ -38,6 +38,8 @@ class Views:
         return Views(self.frame[index], self.landmark[index], self.xy[index])
 
 
+ERROR_PER_SIGMA = 1.18
+"""Median length of a vector of two normal errors, in their standard deviation."""
 _NEAR = 1e-6
 _DAMPING, _LEAST = 1e-8, 1e-13
 """Initial and least damping, relative to the diagonal: the smallest eigenvalue of a

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.bundle import Scene, Views
+from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Scene, Views, errors
 from bodyslam_jax.sfm.burnt_in import noise_of
 from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, LensPrior, examine_lens
 from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
@@ -53,6 +53,11 @@ _OTHER_FOCALS = (0.63, 0.8, 1.25)
 """Factors on a guessed focal length from which the ordinary camera is tried again: they
 cover two standard deviations of the guess downwards, where wide lenses are, and one
 upwards."""
+_LEAST_SIGMA = 0.2
+"""Of an observation, px: trackers are no more exact."""
+_UNEXPLAINED = 9.21
+"""Cost of an observation that no point explains: the squared error, in variances, that
+99 % of observations stay below (chi-square of two degrees of freedom)."""
 _LESS_PLAUSIBLE = -1.0
 """Logarithm of the likelihood ratio of people from which a camera makes them less
 plausible."""
@@ -175,7 +180,8 @@ def is_decisive(lens: Lens, lenses: tuple[Lens, ...]) -> bool:
 
     Any deviation frees a calibrated focal length, and contains `OTHER_FOCAL`.
     """
-    simpler = [o for o in lenses if set(o.model) < {*lens.model, *OTHER_FOCAL}]
+    contained = {*lens.model, *OTHER_FOCAL}
+    simpler = [o for o in lenses if o is not lens and set(o.model) <= contained]
     return all(lens.log_odds - other.log_odds > DECISIVE for other in simpler)
 
 
@@ -191,18 +197,37 @@ def _other_focal(
 ) -> tuple[Intrinsics, Reconstruction] | None:
     """A better map by an ordinary camera of another focal length, if there is one.
 
-    Its error must be smaller by more than the tolerance of `_no_worse`: where depth and
-    focal length trade off, as before a wall, errors differ by noise alone.
+    Its posterior odds over the guess must be decisive: where depth and focal length
+    trade off, as before a wall, maps of all focal lengths differ by noise alone.
     """
-    best = None
+    focal_sigma = prior_of(guess, config).focal[0]
+    best, least = None, DECISIVE
     for factor in _OTHER_FOCALS:
         params = np.asarray(guess.params, float).copy()
         params[:2] *= factor
         camera = dataclasses.replace(guess, params=params)
         again = reconstruct(tracks, camera, len(found.registered), config)
-        if _no_worse(again, found) and 1.05 * again.error + 0.02 < found.error:
-            best, found = (camera, again), again
+        if not _locates_as_many(again, found):
+            continue
+        sigma = max(again.error / ERROR_PER_SIGMA, _LEAST_SIGMA)
+        gain = _misfit(tracks, guess, found, sigma)
+        gain -= _misfit(tracks, camera, again, sigma)
+        # Errors of a track are correlated: `focal_runs` observations count as one.
+        odds = gain / config.focal_runs / 2 - (np.log(factor) / focal_sigma) ** 2 / 2
+        if odds > least:
+            best, least = (camera, again), odds
     return best
+
+
+def _misfit(
+    tracks: Tracks, camera: Intrinsics, found: Reconstruction, sigma: float
+) -> float:
+    """Twice the negative log-likelihood of all tracks by a reconstruction, with a noise
+    of `sigma` px; an observation that it does not explain costs `_UNEXPLAINED`."""
+    scene, views = _scene(tracks, camera, found)
+    error = errors(scene, views) * float(np.sqrt(np.prod(camera.params[:2])))
+    cost = np.minimum((error / sigma) ** 2, _UNEXPLAINED)
+    return float(cost.sum() + _UNEXPLAINED * (len(tracks.frame) - len(error)))
 
 
 def _with_lens(
@@ -240,8 +265,8 @@ def _turning_zoom(
         return None
     K, distortion = as_opencv(intrinsics.params)
     views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
-    # Errors of both views, whose length has a median of 1.18 standard deviations.
-    limit = max(TURNING_ERROR, 2.0 * 1.18 * np.sqrt(2) * noise_of(tracks))
+    # Errors of both views, whose variances add up.
+    limit = max(TURNING_ERROR, 2.0 * ERROR_PER_SIGMA * np.sqrt(2) * noise_of(tracks))
     return turning_zoom(views, num_frames, limit / K[0, 0])
 
 
@@ -251,16 +276,9 @@ def _examine(
     """The ordinary camera and its alternatives; none unless the camera translates."""
     if found.kind != "moving":
         return ()
-    K, distortion = as_opencv(intrinsics.params)
-    num = int(tracks.landmark.max()) + 1
-    of = np.full(num, -1)
-    of[found.landmark_ids] = np.arange(len(found.landmark_ids))
+    K, _ = as_opencv(intrinsics.params)
     # Outliers too: under a wrong lens model they carry the information.
-    use = (of[tracks.landmark] >= 0) & found.registered[tracks.frame]
-    xy = rays(tracks.uv[use], K, distortion)
-    views = Views(tracks.frame[use], of[tracks.landmark[use]], xy)
-    R_CW = np.swapaxes(found.T_WC[:, :3, :3], 1, 2)
-    scene = Scene(R_CW, found.T_WC[:, :3, 3], found.landmarks)
+    scene, views = _scene(tracks, intrinsics, found)
     return examine_lens(
         scene,
         views,
@@ -268,6 +286,28 @@ def _examine(
         pixel=1 / K[0, 0],
         rows=intrinsics.height / K[1, 1],
         prior=prior,
+    )
+
+
+def _scene(
+    tracks: Tracks, intrinsics: Intrinsics, found: Reconstruction
+) -> tuple[Scene, Views]:
+    """Cameras and points of a reconstruction, and all observations of these points in
+    frames that it has registered."""
+    K, distortion = as_opencv(intrinsics.params)
+    of = np.full(int(tracks.landmark.max()) + 1, -1)
+    of[found.landmark_ids] = np.arange(len(found.landmark_ids))
+    use = (of[tracks.landmark] >= 0) & found.registered[tracks.frame]
+    xy = rays(tracks.uv[use], K, distortion)
+    views = Views(tracks.frame[use], of[tracks.landmark[use]], xy)
+    R_CW = np.swapaxes(found.T_WC[:, :3, :3], 1, 2)
+    return Scene(R_CW, found.T_WC[:, :3, 3], found.landmarks), views
+
+
+def _locates_as_many(again: Reconstruction, found: Reconstruction) -> bool:
+    """Whether two reconstructions are of one kind, and `again` has no frame less."""
+    return bool(
+        again.kind == found.kind and again.registered.sum() >= found.registered.sum()
     )
 
 
@@ -279,8 +319,7 @@ def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
     """
     explained = lambda r: np.count_nonzero(r.inlier)
     return bool(
-        again.kind == found.kind
-        and again.registered.sum() >= found.registered.sum()
+        _locates_as_many(again, found)
         and explained(again) >= 0.97 * explained(found)
         and again.error <= 1.05 * found.error + 0.02
     )

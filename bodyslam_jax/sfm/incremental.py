@@ -6,12 +6,12 @@ adjustment runs in between. Keyframes first, then the frames between them.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from bodyslam_jax.sfm.bundle import Scene
-from bodyslam_jax.sfm.multiview import relative_pose, resect
+from bodyslam_jax.sfm.multiview import planar_poses, relative_pose, resect
 from bodyslam_jax.sfm.partial_map import Mapper, PartialMap
 from bodyslam_jax.types import CameraPath
 
@@ -24,6 +24,9 @@ MIN_SHARED = 12
 """Points that two frames must share to be related."""
 _RELAXED = 3
 """Rounds with a smaller parallax threshold where cameras cannot be located."""
+_PLANAR = 0.9
+"""Share of a pair's inliers from which a plane explains them, so that its two poses are
+tried: a plane with the outliers that tracks have."""
 FEW_POINTS, _NEIGHBOURS = 25, 10
 """Points below which a camera is located poorly; keyframes before and after it in
 which two candidate maps are compared."""
@@ -167,16 +170,20 @@ class Builder(Mapper):
     ) -> tuple[PartialMap | None, float]:
         best, scores = None, [-1.0]
         for a, b in pairs:
-            started = self._start(int(a), int(b))
-            if started is None:
-                continue
             # A few more cameras discriminate between correct and wrong starts.
             near = keyframes[np.argsort(np.abs(keyframes - (a + b) / 2))][:8]
-            self._grow(started, near)
-            score = self.score(started, near)
-            _log.debug("start from frames %d and %d: %.2f", a, b, score)
-            if score > max(scores):
-                best = started
+            score = -1.0
+            for started in self._starts(int(a), int(b)):
+                self._grow(started, near)
+                own = self.score(started, near)
+                _log.debug("start from frames %d and %d: %.2f", a, b, own)
+                if own > max(score, *scores):
+                    best = started
+                score = max(score, own)
+                if score > 0.9:
+                    break
+            if score < 0:
+                continue
             # Two starts that agree: no better one is expected.
             agrees = score > 0.5 and abs(score - max(scores)) < 0.03
             scores.append(score)
@@ -193,18 +200,38 @@ class Builder(Mapper):
         self._mark(grown)
         grown.shown[self.revisits.track] = self.views.landmark
 
-    def _start(self, a: int, b: int) -> PartialMap | None:
+    def _starts(self, a: int, b: int) -> Iterator[PartialMap]:
+        """Maps of two frames: one for each pose that explains their points."""
         _, i, j = np.intersect1d(
             self.views.landmark[self.of_frame[a]],
             self.views.landmark[self.of_frame[b]],
             return_indices=True,
         )
         if len(i) < MIN_SHARED:
-            return None
+            return
         at_a, at_b = self.of_frame[a][i], self.of_frame[b][j]
-        pose = relative_pose(self.views.xy[at_a], self.views.xy[at_b], self.pixel)
+        xy_a, xy_b = self.views.xy[at_a], self.views.xy[at_b]
+        pose = relative_pose(xy_a, xy_b, self.pixel)
         if pose is None or pose[2].sum() < MIN_SHARED:
-            return None
+            return
+        started = self._started(a, b, pose, at_a, at_b)
+        if started is not None:
+            yield started
+        share = _PLANAR * float(pose[2].mean())
+        for other in planar_poses(xy_a, xy_b, self.pixel, share):
+            started = self._started(a, b, other, at_a, at_b)
+            if started is not None:
+                yield started
+
+    def _started(
+        self,
+        a: int,
+        b: int,
+        pose: tuple[np.ndarray, np.ndarray, np.ndarray],
+        at_a: np.ndarray,
+        at_b: np.ndarray,
+    ) -> PartialMap | None:
+        """The map of two frames by their relative pose, refined."""
         R, t, good = pose
         scene = Scene(
             np.tile(np.eye(3), (self.num_frames, 1, 1)),

@@ -25,6 +25,32 @@ def relative_pose(
     return R, t[:, 0], good.ravel() > 0
 
 
+def planar_poses(
+    xy_a: Float[np.ndarray, "n 2"],
+    xy_b: Float[np.ndarray, "n 2"],
+    threshold: float,
+    share: float,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Poses as of `relative_pose` if a plane explains the share of the points.
+
+    The homography of a plane decomposes into two poses that have all points in front: a
+    translation along the plane, say, and a turn with a translation across it (Faugeras
+    & Lustman, IJPRAI 1988). Two views do not tell them apart, a third does.
+    """
+    H, inlier = cv2.findHomography(xy_a, xy_b, cv2.USAC_MAGSAC, threshold)
+    if H is None or inlier is None or inlier.mean() < share:
+        return []
+    good = inlier.ravel() > 0
+    seen = np.column_stack([xy_a, np.ones(len(xy_a))])
+    found = []
+    for R, t, normal in zip(*cv2.decomposeHomographyMat(H, np.eye(3))[1:], strict=True):
+        in_front = seen[good] @ normal[:, 0] > 0
+        length = float(np.linalg.norm(t))
+        if in_front.mean() > 0.5 and length > 0:
+            found.append((R, t[:, 0] / length, good))
+    return found
+
+
 def fit_rotation(
     ray_a: Float[np.ndarray, "n 3"], ray_b: Float[np.ndarray, "n 3"], scale: float
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"]]:

@@ -101,9 +101,18 @@ def _centred(path: Path, camera: FoundCamera) -> FoundCamera:
         )
     first = 1 if camera.model.startswith("SIMPLE") or camera.model == "RADIAL" else 2
     params = list(camera.params)
-    for at in (first, first + 1):
-        params[at] -= _HALF
+    params[first : first + 2] = _from_corner(*params[first : first + 2])
     return dataclasses.replace(camera, params=params)
+
+
+def _from_corner(cx: float, cy: float) -> list[float]:
+    """The principal point, with centres of pixels at whole numbers.
+
+    That of a file in units of the image stays as it is, to be told and refused.
+    """
+    if max(abs(cx), abs(cy)) <= 1:
+        return [cx, cy]
+    return [cx - _HALF, cy - _HALF]
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -184,7 +193,7 @@ def _nerfstudio_camera(data: Fields) -> FoundCamera:
         )
     fx, fy, cx, cy = (of(n).number(n) for n in ("fl_x", "fl_y", "cx", "cy"))
     width, height = (of(n).whole(n, 1, 1_000_000) for n in ("w", "h"))
-    params = [fx, fy, cx - _HALF, cy - _HALF]
+    params = [fx, fy, *_from_corner(cx, cy)]
     distortion = [bent(name) for name in ("k1", "k2", "p1", "p2")]
     if any(distortion):
         return FoundCamera("OPENCV", width, height, params + distortion)
