@@ -43,7 +43,6 @@ from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
 from bodyslam_jax.people.viterbi import best_path
-from bodyslam_jax.people.walking_knees import with_walking_knees
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
@@ -97,7 +96,7 @@ def fit_bodies(
         if keypoints.depth is not None:
             depth = keypoints.depth[h]
         fitted, chain = _fit_person(
-            scene, keypoints.uv[h], sigma, depth, present, fps, settings, body
+            scene, keypoints.uv[h], sigma, depth, present, fps, settings
         )
         roots.present[h] = present
         roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
@@ -138,7 +137,6 @@ def _fit_person(
     present: np.ndarray,
     fps: float,
     settings: PeopleFit,
-    body: BodyModel,
 ) -> tuple[slice, Chain]:
     """Fits one shape and the postures of all frames to one person's keypoints.
 
@@ -177,11 +175,7 @@ def _fit_person(
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
-    solve = lambda problem, chain: solve_chain(problem, chain, _MOST_STEPS)
-    solved = solve(problem, chain)
-    if settings.walking_knees:
-        solved = with_walking_knees(problem, solved, solve, body, fps)
-    chain, value = solved
+    chain, value = solve_chain(problem, chain, _MOST_STEPS)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
 
