@@ -10,7 +10,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.clean_regressed import prepare_bodies
 from bodyslam_jax.people.fit import fit_bodies
-from bodyslam_jax.people.sides import correct_left_right
+from bodyslam_jax.people.hypotheses import correct_left_right
 from bodyslam_jax.types import Bodies, Sequence
 
 

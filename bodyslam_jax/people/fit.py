@@ -22,6 +22,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.depths import depth_costs
+from bodyslam_jax.people.hypotheses import FIT_NOISE, LIMBS, most_likely
 from bodyslam_jax.people.keypoint_errors import (
     CORRELATION_TIME,
     MIN_KEYPOINTS,
@@ -42,7 +43,6 @@ from bodyslam_jax.people.person_state import (
 from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
-from bodyslam_jax.people.viterbi import best_path
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
@@ -226,8 +226,9 @@ def _start(
     # Half the squared whitened distance of a keypoint is 1 on average by assumption.
     count = np.isfinite(sigma_px[chosen]).sum(axis=1)
     noise = max(1.0, float(np.sqrt(np.median(costs.min(axis=1) / count))))
-    costs = costs + noise**2 * depth_costs(depth[chosen], joints)
-    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps, noise)
+    costs = (costs - costs.min(axis=1, keepdims=True)) / noise**2
+    costs = costs + depth_costs(depth[chosen], joints)
+    path = most_likely(costs, joints[:, :, LIMBS], chosen / fps, FIT_NOISE)
     fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
     broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST

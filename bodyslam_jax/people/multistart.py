@@ -2,8 +2,8 @@
 
 The heading and the order of limbs in depth are ambiguous in one view, and the cost has
 several local minima. So every few frames the body is fitted from each of eight headings
-with a few typical postures, and from the lifted posture (`lift`); `viterbi` chooses the
-sequence among the minima.
+with a few typical postures, and from the lifted posture (`lift`); `hypotheses` chooses
+the sequence among the minima.
 """
 
 from collections.abc import Callable

@@ -25,8 +25,8 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import MIN_DEPTH, project_rows
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
+from bodyslam_jax.people.hypotheses import correct_left_right
 from bodyslam_jax.people.keypoint_errors import keypoint_sigma
-from bodyslam_jax.people.sides import correct_left_right
 from bodyslam_jax.sfm import person_masks
 from bodyslam_jax.types import Bodies, Sequence
 
