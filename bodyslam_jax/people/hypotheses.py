@@ -1,15 +1,14 @@
-"""Which of several readings of each frame is the true one: a hidden Markov model.
+"""Frames in which the other of two readings is true: a hidden Markov model.
 
 - A detector processes single images, and may exchange left and right limbs: of people
   seen from behind, and where legs cross in a view from the side (`correct_left_right`).
 - A regressor may take front for back (`find_turned`).
-- A fit of a single frame has several minima (`fit`).
 
 A reading is a state of the model. Each puts points (joints, limbs about the middle of
 both sides) somewhere; these move at nearly constant velocity, so that where legs cross,
 each goes on and none turns back. A Kalman filter follows them under several hypotheses
 of the last readings; of those that agree in the last frames the most likely one is kept
-(a Viterbi algorithm whose states are the last few readings).
+(a Viterbi algorithm whose states are the last `_REMEMBERED` readings).
 """
 
 import dataclasses
@@ -25,9 +24,9 @@ ARMS = ((2, 5), (3, 6), (4, 7))
 """Shoulders, elbows, wrists of BODY_25: right and left."""
 LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
 """Hips, knees, ankles, big toes, small toes, heels."""
-LIMBS = (1, 2, 4, 5, 7, 8, *range(16, 22))
-"""SMPL's hips, knees, ankles, shoulders, elbows and wrists, which readings of a body
-put elsewhere."""
+_LIMBS = (1, 2, 4, 5, 7, 8, *range(16, 22))
+"""SMPL's hips, knees, ankles, shoulders, elbows and wrists, which a turned body has
+elsewhere."""
 _RARE, _LASTS = 13.5, 1.0
 """-log odds of an error a second (frames closer than 1/30 s are alike), and of a change
 between error and none from frame to frame."""
@@ -36,9 +35,6 @@ _INDEPENDENT = 0.5
 _NOISE = 0.045
 """m: standard deviation of a coordinate of a keypoint, or of a joint of a regressor: as
 of gross errors, since those of successive frames are alike."""
-FIT_NOISE = 0.02
-"""m: the same of a joint of the right fit, against those 0.1 s before and after: 2.6 cm
-(root mean square) in eleven rendered sequences, 1.8 in twenty simulated ones."""
 _ACCELERATION = 3.5
 """Square root of the spectral density of the points' acceleration, m/s^1.5. In eleven
 rendered sequences 18 of 69 frames keep exchanged legs and 14 of 34 arms, in twenty of
@@ -48,8 +44,9 @@ _FORGOTTEN = 0.5
 _GATE = 5.0
 """Standard deviations beyond which an innovation is an outlier: it costs as much as one
 at this bound, and the filter is not updated with it."""
-_HYPOTHESES = 36
-"""Most hypotheses that are followed."""
+_REMEMBERED = 5
+"""Hypotheses with the same readings in this number of last frames are merged: the most
+likely one is kept."""
 _LASTING = 1 / 3
 """s: correlation time of errors of keypoints against a posture: frames within it count
 once."""
@@ -109,7 +106,7 @@ def find_turned(
         costs = 0.5 * robust(squared / noise).sum(-1)
         costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _ALL_WRONG)
     costs *= min(1.0, seconds / _LASTING)
-    return _with_errors(costs, joints[:, :, LIMBS], time, _NOISE)
+    return are_errors(costs, joints[:, :, _LIMBS], time, _NOISE)
 
 
 def _exchanged(
@@ -132,44 +129,26 @@ def _exchanged(
     time = np.arange(len(uv)) / fps
     # 1 px is the error of a vector assumed of any detector in images of any size.
     noise = math.hypot(_NOISE, 1 / (2 * metre))
-    return _with_errors(np.zeros((len(uv), 2)), places, time, noise, seen)
+    return are_errors(np.zeros((len(uv), 2)), places, time, noise, seen)
 
 
-def _with_errors(
+def are_errors(
     costs: Float[np.ndarray, "f 2"],
     places: Float[np.ndarray, "f 2 n d"],
     time: Float[np.ndarray, " f"],
     noise: float,
     seen: Bool[np.ndarray, "f n"] | None = None,
 ) -> Bool[np.ndarray, " f"]:
-    """Frames whose second reading is the true one, as that of an error."""
-    step = np.minimum(np.diff(time, prepend=time[0] - 1 / 30), 1 / 30)
-    costs = costs + np.column_stack([0 * step, _RARE * step])
-    path = most_likely(costs, places, time, noise, seen, _LASTS)
-    return path == 1
-
-
-def most_likely(
-    costs: Float[np.ndarray, "f s"],
-    places: Float[np.ndarray, "f s n d"],
-    time: Float[np.ndarray, " f"],
-    noise: float,
-    seen: Bool[np.ndarray, "f n"] | None = None,
-    change: float = 0.0,
-) -> Int[np.ndarray, " f"]:
-    """The state of each frame on the most likely path.
+    """Frames whose second reading is true, so that what was given is an error.
 
     Args:
-        costs: -log likelihood of each state by the frame itself.
-        places: of the `n` points in each state, m.
+        costs: -log likelihood of both readings by the frame itself.
+        places: of the `n` points in both, m.
         time: of each frame, s, increasing.
         noise: standard deviation of the points' coordinates, m.
         seen: points that are known; all of them without it.
-        change: -log odds of another state than in the frame before.
     """
-    frames, states, points, axes = places.shape
-    remembered = states ** max(1, int(math.log(_HYPOTHESES) / math.log(max(states, 2))))
-    every = np.arange(states)
+    frames, _, points, axes = places.shape
     seen = np.ones((frames, points), bool) if seen is None else seen
     # Axes: hypotheses, points, (place, velocity), coordinates.
     mean = np.zeros((1, points, 2, axes))
@@ -182,30 +161,31 @@ def most_likely(
         mean = move @ mean
         covariance = move @ covariance @ move.T + _ACCELERATION**2 * spread
         variance = covariance[..., 0, 0] + noise**2
-        # Each hypothesis is continued with every state: axes are hypotheses, states,
-        # points, coordinates.
+        # Each hypothesis is continued with both readings: axes are hypotheses,
+        # readings, points, coordinates.
         innovation = places[k] - mean[:, None, :, 0]
         away = (innovation**2).sum(-1) / variance[:, None]
         near = seen[k] & (away < _GATE**2)
         paid = (seen[k] * np.minimum(away, _GATE**2)).sum(-1) * _INDEPENDENT / 2
-        changed = (labels[:, None] % states != every) & (k > 0)
-        total = cost[:, None] + paid + costs[k] + change * changed
+        prior = np.array([0.0, _RARE * min(dt, 1 / 30) if k else _RARE / 30])
+        changed = ((labels[:, None] & 1) != np.arange(2)) & (k > 0)
+        total = cost[:, None] + paid + costs[k] + prior + _LASTS * changed
         gain = (covariance[..., 0] / variance[..., None])[:, None] * near[..., None]
         means = mean[:, None] + gain[..., None] * innovation[..., None, :]
         covariances = (
             covariance[:, None]
             - gain[..., None] * covariance[:, None, :, 0][..., None, :]
         )
-        longer = (labels[:, None] * states + every) % remembered
+        longer = (labels[:, None] << 1 | np.arange(2)) % 2**_REMEMBERED
         kept = _cheapest_of_each(longer.ravel(), total.ravel())
         flat = lambda x: x.reshape(-1, *x.shape[2:])[kept]
         mean, covariance, cost, labels = map(flat, (means, covariances, total, longer))
-        steps.append((kept // states, labels % states))
-    path, last = np.zeros(frames, int), int(cost.argmin())
+        steps.append((kept // 2, labels & 1))
+    found, last = np.zeros(frames, bool), int(cost.argmin())
     for k in range(frames - 1, -1, -1):
-        parents, states_of = steps[k]
-        path[k], last = states_of[last], parents[last]
-    return path
+        parents, readings = steps[k]
+        found[k], last = readings[last], parents[last]
+    return found
 
 
 def _cheapest_of_each(
