@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax import evaluation, graph, simulation
+from bodyslam_jax import diagnostics, evaluation, graph, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, GraphWeights, Simulation
@@ -40,6 +40,7 @@ def make_case(name: str, frames: int, keypoints: bool) -> Case:
     measured = simulation.as_sequence(simulated)
     if keypoints:
         measured = dataclasses.replace(measured, bodies=None)
+    measured = diagnostics.reconcile(measured, body)
     cameras, bodies = before_joint(measured, body, config)
     measured = with_intrinsics(measured, cameras.intrinsics)
     truth = truth_of(simulation.as_truth(simulated))

@@ -67,7 +67,7 @@ def make_case(name: str, floor: str, frames: int) -> Case:
         Terrain(flat.room.walls, flat.room.boxes, height),
         tuple(np.random.default_rng(flat.seed).spawn(3)),  # pyright: ignore
     )
-    measured = simulation.as_sequence(simulated)
+    measured = diagnostics.reconcile(simulation.as_sequence(simulated), body)
     cameras, bodies = before_joint(measured, body, config)
     measured = with_intrinsics(measured, cameras.intrinsics)
     truth = truth_of(simulation.as_truth(simulated))

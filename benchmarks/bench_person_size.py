@@ -20,6 +20,7 @@ import numpy as np
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import (
+    diagnostics,
     graph,
     initialisation,
     motion,
@@ -50,7 +51,7 @@ def errors(simulated, weights):
     """Of the leg, as a share: the regressor's (its shrinkage undone), the estimate's,
     and the standard deviation that the covariance says."""
     body, config = body_.load_body_model(), Config()
-    sequence = simulation.as_sequence(simulated)
+    sequence = diagnostics.reconcile(simulation.as_sequence(simulated), body)
     bodies = people.estimate_bodies(sequence, body, PeopleFit())
     roots = people.roots_from_bodies(bodies, body)
     state = initialisation.first_state(

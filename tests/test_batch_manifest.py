@@ -106,6 +106,10 @@ MISTAKES = {
         ",a.mp4,,,,,,--weights.pixel-sgima 2",
         "2: options: no option --weights.pixel-sgima; did you mean --weights.pixel",
     ),
+    "option of an earlier version": (
+        ",a.mp4,,,,,,--people-fit.walking-knees no",
+        "2: options: --people-fit.walking-knees no longer exists: knees are as",
+    ),
     "option of a wrong kind": (",a.mp4,,,,,,--fps fast", "--fps: found 'fast', exp"),
     "option out of range": (",a.mp4,,,,,,--fps -3", "2: options: fps: found -3.0, exp"),
     "option without a name": (",a.mp4,,,,,,25", "2: options: found '25', expected --"),

@@ -102,6 +102,10 @@ def test_every_option_is_one_that_is_parsed(name):
         ("run x --hieght=1.8", "run: no option --hieght; did you mean --height?"),
         ("run x --pixel-sigma 1", "did you mean --weights.pixel-sigma?"),
         ("run x --weights.pixel-sgima 1", "did you mean --weights.pixel-sigma?"),
+        (
+            "run x --people-fit.no-walking-knees",
+            "--people-fit.no-walking-knees no longer exists: knees are as measured.",
+        ),
         ("evaluate a b --start 3", "it is an option of bodyslam run, demo, batch, sw"),
         ("run x --nosuch", "`bodyslam run --help-all` lists all."),
     ],

@@ -80,6 +80,10 @@ def test_settings_that_mean_something_are_let_in():
     [
         ("tracking: {cells: 8}", "tracking: no setting `cells`; expected one of"),
         ("wieghts: {}", "no setting `wieghts`; did you mean `weights`?"),
+        (
+            "people_fit: {walking_knees: true}",
+            "people_fit: `walking_knees` no longer exists: knees are as measured.",
+        ),
         ("smoothing_hz: 0.0", "smoothing_hz: found 0.0, expected more than 0"),
         (
             "tracking: {num_points: 0}",

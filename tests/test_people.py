@@ -17,11 +17,11 @@ from bodyslam_jax.config import Config, PeopleFit
 from bodyslam_jax.people import (
     bodies,
     costs,
-    multistart,
+    frame_fit,
+    hypotheses,
     posture_prior,
     skeleton,
     trajectory_fit,
-    viterbi,
 )
 from bodyslam_jax.people import fit as fitting
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
@@ -242,10 +242,8 @@ def test_a_guess_weighs_as_much_as_it_is_sure(body):
     )
 
 
-def test_a_guess_is_a_start(body, monkeypatch):
-    """With no steps at all the one that is right is the best end."""
-    monkeypatch.setattr(multistart, "_FIRST_STEPS", 0)
-    monkeypatch.setattr(multistart, "_LAST_STEPS", 0)
+def test_a_guess_is_the_start(body):
+    """With no steps at all it is placed where the keypoints are."""
     fit, _ = random_fit()
     scene = fitting.make_scene(CAMERA, body, FPS, PeopleFit())
     _, local = jax.jit(skeleton.place_points)(
@@ -256,9 +254,9 @@ def test_a_guess_is_a_start(body, monkeypatch):
     sure = (jnp.full_like(fit.latent, 0.5), jnp.asarray(0.3))
     guess = costs.Lifted(fit.orientation, fit.latent, *sure)
     guess = jax.tree.map(lambda a: a[None], guess)
-    fits, _, _ = multistart.fit_frames(scene, uv[None], np.full((1, 25), 5.0), guess)
-    np.testing.assert_allclose(fits.latent[0, 0], fit.latent)
-    np.testing.assert_allclose(fits.position[0, 0], fit.position, atol=1e-3)
+    fits = frame_fit.fit_frames(scene, uv[None], np.full((1, 25), 5.0), guess, steps=0)
+    np.testing.assert_allclose(fits.latent[0], fit.latent)
+    np.testing.assert_allclose(fits.position[0], fit.position, atol=1e-3)
 
 
 def test_the_banded_solver_is_a_dense_one():
@@ -282,48 +280,19 @@ def test_the_banded_solver_is_a_dense_one():
     np.testing.assert_allclose(found.reshape(t * n, 3), wanted, atol=1e-10)
 
 
-def test_the_path_prefers_continuity_to_the_cheaper_jump():
-    """Two postures a metre apart; the second is a little cheaper in one frame."""
-    places = np.zeros((5, 2, 24, 3))
+def test_an_error_is_what_no_motion_explains():
+    """Two readings a metre apart; the second is a little cheaper in one frame."""
+    places = np.zeros((8, 2, 12, 3))
     places[:, 1] = 1.0
-    costs = np.tile([0.0, 4.0], (5, 1))
+    costs = np.tile([0.0, 4.0], (8, 1))
     costs[2] = [2.0, 0.0]
-    upright = np.tile(np.eye(3), (5, 2, 1, 1))
-    path = viterbi.best_path(costs, places, upright, np.arange(5) / 10)
-    assert path.tolist() == [0, 0, 0, 0, 0]
-    costs[:2], costs[2:] = [0.0, 5e3], [5e3, 0.0]
-    path = viterbi.best_path(costs, places, upright, np.arange(5) / 10)
-    assert path.tolist() == [0, 0, 1, 1, 1]
-
-
-def test_legs_go_on_where_they_cross():
-    """Seen from behind, either leg may be in front: the two ends of every frame are
-    mirrored, and the cheaper one turns back each time that the legs pass each other."""
-    time = np.arange(30) / 10
-    swing = 0.35 * np.sin(2 * np.pi * 0.9 * time + 0.4)
-    joints = np.zeros((30, 2, 24, 3))
-    for side, joint in ((1, 4), (1, 7), (1, 10), (-1, 5), (-1, 8), (-1, 11)):
-        reach = 0.5 if joint < 6 else 1.0
-        joints[:, 0, joint, 2] = side * reach * swing
-    joints[:, 1] = joints[:, 0] * [1, 1, -1]
-    forward = np.where(swing > 0, 0, 1)
-    costs = np.zeros((30, 2))
-    costs[np.arange(30), 1 - forward] = 1.0  # the left leg in front is a little cheaper
-    upright = np.tile(np.eye(3), (30, 2, 1, 1))
-    path = viterbi.best_path(costs, joints, upright, time)
-    left = joints[np.arange(30), path, 7, 2]
-    # Either all of it or none is mirrored, but for where both are the same anyway.
-    away = [np.abs(left - sign * swing).max() for sign in (1, -1)]
-    assert min(away) < 0.1
-
-
-def test_a_path_of_one_or_two_frames():
-    joints, costs = np.zeros((2, 3, 24, 3)), np.array([[2.0, 1, 3], [0, 1, 2]])
-    upright = np.tile(np.eye(3), (2, 3, 1, 1))
-    one = viterbi.best_path(costs[:1], joints[:1], upright[:1], np.zeros(1))
-    assert one.tolist() == [1]
-    two = viterbi.best_path(costs, joints, upright, np.arange(2) / 10)
-    assert two.tolist() == [1, 0]
+    time = np.arange(8) / 30
+    assert not hypotheses.are_errors(costs, places, time, 0.05).any()
+    costs[:4], costs[4:] = [0.0, 200.0], [200.0, 0.0]
+    found = hypotheses.are_errors(costs, places, time, 0.05)
+    assert found.tolist() == [False] * 4 + [True] * 4
+    one = hypotheses.are_errors(costs[-1:], places[-1:], time[:1], 0.05)
+    assert one.tolist() == [True]
 
 
 def test_roots_and_back(truth, body):

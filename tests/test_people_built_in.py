@@ -10,7 +10,7 @@ import pytest
 
 from bodyslam_jax import io, people, pipeline, sfm, simulation
 from bodyslam_jax.config import Config, Detect, Simulation
-from bodyslam_jax.people import blazepose, depths, movenet, networks
+from bodyslam_jax.people import blazepose, movenet, networks
 from bodyslam_jax.people import found as found_
 from bodyslam_jax.pipeline import people_stage
 from bodyslam_jax.pipeline.progress import Stopwatch
@@ -244,18 +244,6 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     away = blazepose.disagreement(pose, points)
     np.testing.assert_allclose(away[sure], 0, atol=1e-4)
     np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
-
-
-def test_depths_tell_which_leg_is_in_front():
-    """Of two fits that explain the keypoints alike, mirrored in depth."""
-    depth = np.zeros((1, 25))
-    depth[0, [10, 13, 11, 14]] = [0.2, -0.2, 0.35, -0.3]  # the right leg is behind
-    joints = np.zeros((1, 2, 24, 3))
-    joints[0, 0, [5, 4, 8, 7], 2] = [0.22, -0.15, 0.4, -0.4]
-    joints[0, 1] = -joints[0, 0]
-    right, wrong = depths.depth_costs(depth, joints)[0]
-    assert right < 0.2 and wrong > right + 2
-    np.testing.assert_array_equal(depths.depth_costs(0 * depth, joints), 0)
 
 
 def test_depths_are_those_of_the_person_and_their_ray(scene, found):

@@ -34,8 +34,11 @@ def read_walk():
 @pytest.fixture(scope="module")
 def walk(body):
     """Someone of whom nothing was learnt walks away: joints and keypoints in C, m."""
-    clip = read_walk()
-    poses, trans = clip.poses[:60].astype(float), clip.trans[:60].astype(float)
+    return seen_from_behind(read_walk().poses[:60].astype(float), body)
+
+
+def seen_from_behind(poses, body):
+    trans = read_walk().trans[:60].astype(float)
     bones = skeleton.make_skeleton(body, 0.0)
     place = jax.jit(jax.vmap(skeleton.place_points, in_axes=(None, 0, None)))
     angles = jnp.asarray(poses[:, 1:22].reshape(-1, 63))
@@ -214,41 +217,16 @@ def test_in_single_precision(walk):
     np.testing.assert_allclose(other.latent, found.latent, atol=1e-3)
 
 
-def straighter_knee(poses):
-    """Mean bend of the straighter knee, degrees; `poses` are (t, 24, 3)."""
-    bend = np.linalg.norm(poses[:, [4, 5]], axis=-1)
-    return float(np.degrees(bend.min(axis=1).mean()))
-
-
-def fitted_knee(points, body, on):
-    uv = pixels(points, CAMERA.params)
-    keypoints = Keypoints(uv[None], np.ones((1, len(uv), 25)))
-    settings = PeopleFit(walking_knees=on)
-    bodies = people.fit_bodies(keypoints, CAMERA, body, FPS, settings)
-    return straighter_knee(bodies.poses[0].reshape(-1, 24, 3))
-
-
-def test_knees_of_a_walker_are_as_gait_has_them_and_those_of_others_as_guessed(
-    walk, body, monkeypatch
-):
-    """A guess that bends standing legs by 15 degrees too much, in all frames."""
-    _, _, points = walk
-    true = straighter_knee(read_walk().poses[:60])
-    guess = fit.guess_postures
-
-    def crouched(scene, *args, **kwargs):
-        angles = np.zeros(63)
-        for joint, turn in ((1, -0.5), (4, 1), (7, -0.5), (2, -0.5), (5, 1), (8, -0.5)):
-            angles[3 * (joint - 1)] = np.radians(15.0) * turn
-        shift = np.linalg.lstsq(np.asarray(scene.prior.basis), angles, rcond=None)[0]
-        found = guess(scene, *args, **kwargs)
-        moved = np.asarray(found.latent + shift, found.latent.dtype)
-        return eqx.tree_at(lambda lifted: lifted.latent, found, moved)
-
-    monkeypatch.setattr(fit, "guess_postures", crouched)
-    before, after = (fitted_knee(points, body, on) for on in (False, True))
-    assert before - true > 5.0
-    assert abs(after - true) < 0.5 * (before - true)
-    # Whoever walks backwards may bend their knees otherwise.
-    backwards = points[::-1]
-    assert fitted_knee(backwards, body, True) == fitted_knee(backwards, body, False)
+def test_knees_are_as_measured_and_not_as_those_of_most_people(body):
+    """Somebody who walks with knees bent by 15 degrees more than usual."""
+    poses = read_walk().poses[:60].astype(float)
+    for joint, turn in ((1, -0.5), (4, 1), (7, -0.5), (2, -0.5), (5, 1), (8, -0.5)):
+        poses[:, joint, 0] += np.radians(15.0) * turn
+    _, _, points = seen_from_behind(poses, body)
+    keypoints = Keypoints(pixels(points, CAMERA.params)[None], np.ones((1, 60, 25)))
+    found = people.fit_bodies(keypoints, CAMERA, body, FPS).poses[0]
+    straighter = lambda poses: np.degrees(
+        np.linalg.norm(poses.reshape(-1, 24, 3)[:, [4, 5]], axis=-1).min(axis=1).mean()
+    )
+    # Seen from behind the guess takes 6 degrees of it; a mean of gait would take 10.
+    assert abs(straighter(found) - straighter(poses)) < 8.0

@@ -83,6 +83,8 @@ def heading_error(found: Bodies, truth: Bodies) -> np.ndarray:
 
 
 def estimated(truth: Sequence, bodies, keypoints, body) -> Bodies:
+    if keypoints is not None:
+        keypoints, _ = people.correct_left_right(keypoints, FPS)
     sequence = dataclasses.replace(truth, bodies=bodies, keypoints=keypoints)
     found = people.estimate_bodies(sequence, body)
     assert found.present[0].mean() > 0.9  # nobody is lost

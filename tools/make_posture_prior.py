@@ -12,13 +12,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 NUM_JOINTS = 21  # all but the root and the two hands, which CMU does not measure
 HELD_OUT = ("02", "06", "08", "14", "49", "55")  # subjects that only tests may see
 RANK = 32
 LOCOMOTION_SHARE = 0.5  # weight of walking and running against everything else
-NUM_TYPICAL = 6  # postures that a fit starts from
 LIMIT_QUANTILE = 1e-3
 LIMIT_MARGIN = np.radians(6.0)
 # How far, in m, a radian at each joint moves the keypoints below it, roughly: the
@@ -82,18 +80,6 @@ def main(folder: Path, out: Path) -> None:
     a1 = first * (1 - second) / (1 - first**2)
     a2 = (second - first**2) / (1 - first**2)
 
-    # Typical postures: centres of clusters, in metres, of the groups in equal number.
-    rng = np.random.default_rng(0)
-    picked = np.concatenate(
-        [
-            rng.choice(len(s), 4000) + sum(map(len, stacked[:i]))
-            for i, s in enumerate(stacked)
-        ]
-    )
-    centres, _ = kmeans2(
-        scaled[picked] @ axes, NUM_TYPICAL, minit="++", seed=rng, iter=50
-    )
-
     # Limits without weights: extremes are the point of them.
     lower = np.quantile(frames, LIMIT_QUANTILE, axis=0) - LIMIT_MARGIN
     upper = np.quantile(frames, 1 - LIMIT_QUANTILE, axis=0) + LIMIT_MARGIN
@@ -102,7 +88,6 @@ def main(folder: Path, out: Path) -> None:
         mean=mean.astype(np.float32),
         basis=basis.astype(np.float32),
         autoregression=np.stack([a1, a2], 1),
-        typical=(centres / np.sqrt(variance)).astype(np.float32),
         lower=lower.astype(np.float32),
         upper=upper.astype(np.float32),
         frames=len(frames),

@@ -19,6 +19,7 @@ from bodyslam_jax.cli.commands import COMMANDS, GROUPS
 from bodyslam_jax.cli.options import GENERAL, options, suggestions
 from bodyslam_jax.cli.reference import command_help, overview
 from bodyslam_jax.cli.settings import prepared
+from bodyslam_jax.config import removed
 
 _CLOSED_PIPE = 128 + 13
 """128 + SIGPIPE, as shells report a process that SIGPIPE ended."""
@@ -141,6 +142,8 @@ def _check_options(name: str, argv: list[str]) -> None:
     for arg in argv:
         flag = arg.partition("=")[0].replace("_", "-")
         if arg.startswith("--") and flag not in known:
+            if former := removed(flag):
+                raise WrongUsage(f"{name}: {flag} {former}.")
             raise WrongUsage(
                 f"{name}: no option {flag}; {suggestions(flag, flags, name)}"
             )

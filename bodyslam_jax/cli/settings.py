@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyslam_jax.cli import jax_setup
-from bodyslam_jax.config import Config, MotionTraining
+from bodyslam_jax.config import Config, MotionTraining, removed
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import budget
 from bodyslam_jax.io.declared import as_number, shown
@@ -52,7 +52,7 @@ def read_settings(path: Path, base: Config) -> Config:
     return _merged(read_yaml(path, "settings (config.yaml)"), base, str(path))
 
 
-def _merged(found: Any, base: Any, where: str) -> Any:
+def _merged(found: Any, base: Any, where: str, stage: str = "") -> Any:
     if not isinstance(found, dict):
         raise InputError(f"{where}: found {shown(found)}, expected settings by name.")
     known = {field.name for field in dataclasses.fields(base)}
@@ -60,6 +60,8 @@ def _merged(found: Any, base: Any, where: str) -> Any:
     changes = {}
     for name, value in found.items():
         if name not in known:
+            if former := removed(f"{stage}{name}"):
+                raise InputError(f"{where}: `{name}` {former}.")
             close = difflib.get_close_matches(str(name), known, n=1)
             hint = f"did you mean `{close[0]}`?" if close else ""
             raise InputError(
@@ -71,7 +73,7 @@ def _merged(found: Any, base: Any, where: str) -> Any:
         if type(value) is int and float in (kind, *typing.get_args(kind)):
             value = as_number(Path(where), name, value)
         if dataclasses.is_dataclass(old):
-            value = _merged(value, old, f"{where}: {name}")
+            value = _merged(value, old, f"{where}: {name}", f"{name}.")
         elif isinstance(old, tuple) and isinstance(value, list):
             value = tuple(value)
         elif old is not None and value is not None and type(value) is not type(old):

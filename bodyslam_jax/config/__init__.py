@@ -17,6 +17,7 @@ from bodyslam_jax.config.limits import Limits as Limits
 from bodyslam_jax.config.motion import ContactTraining as ContactTraining
 from bodyslam_jax.config.motion import MotionTraining as MotionTraining
 from bodyslam_jax.config.options import field_names as field_names
+from bodyslam_jax.config.options import removed as removed
 from bodyslam_jax.config.options import with_options as with_options
 from bodyslam_jax.config.options import with_values as with_values
 from bodyslam_jax.config.people import PeopleFit as PeopleFit

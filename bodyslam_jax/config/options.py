@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 from bodyslam_jax.config.errors import InputError
 
 S = TypeVar("S")
+REMOVED = {"people_fit.walking_knees": "knees are as measured"}
+"""Settings of earlier versions, with the stage before a dot, and what replaces them."""
 _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 
 
@@ -55,6 +57,14 @@ def field_names(settings: Any, prefix: str = "") -> list[str]:
     return found
 
 
+def removed(name: str) -> str | None:
+    """What replaces a setting or option of an earlier version, as part of a message;
+    `None` for a name that never was one."""
+    stage, dot, field = name.removeprefix("--").replace("-", "_").rpartition(".")
+    text = REMOVED.get(f"{stage}{dot}{field.removeprefix('no_')}")
+    return None if text is None else f"no longer exists: {text}"
+
+
 def _grouped(words: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Each option's name and values."""
     found: list[tuple[str, list[str]]] = []
@@ -84,6 +94,8 @@ def _parsed_field(settings: Any, name: str, texts: list[str]) -> list[Any]:
         field, texts = field.removeprefix("no_"), ["no"]
     if field not in known or dataclasses.is_dataclass(getattr(within, field)):
         wrong = ".".join([*stages, field])
+        if former := removed(wrong):
+            raise InputError(f"--{name} {former}.")
         close = difflib.get_close_matches(wrong, field_names(settings), n=1)
         hint = f"; did you mean --{close[0].replace('_', '-')}?" if close else "."
         raise InputError(f"no option --{name}{hint}")

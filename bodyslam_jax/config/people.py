@@ -16,9 +16,6 @@ class PeopleFit:
     standard deviations of each component. 0: predictions are initial values only."""
     lift_correlation: float = 0.2
     """Correlation time of the errors of predicted postures, s."""
-    walking_knees: bool = True
-    """Whether the guess's knees are shifted in all frames to what fit and gait together
-    tell, where somebody walks."""
     limit_sigma: float = 0.05
     """Standard deviation beyond a joint's limits, rad."""
     shape_frames: float = 1.0

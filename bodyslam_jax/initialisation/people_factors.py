@@ -1,6 +1,5 @@
 """Factors of people, from keypoints, regressed or fitted bodies and known statures."""
 
-import dataclasses
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -83,10 +82,8 @@ def people_factors(
     factors: list[graph.Factor] = []
     present = jnp.asarray(roots.present)
     if sequence.keypoints is not None:
-        keypoints, _ = people.correct_left_right(sequence.keypoints, sequence.fps)
-        sequence = dataclasses.replace(sequence, keypoints=keypoints)
         pixel = people.as_body_keypoints(
-            keypoints,
+            sequence.keypoints,
             roots,
             people.without_bodies(sequence),
             sequence.intrinsics,

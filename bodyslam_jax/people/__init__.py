@@ -13,6 +13,7 @@ from bodyslam_jax.people.detect import detect_people as detect_people
 from bodyslam_jax.people.find import find_people_tracked as find_people_tracked
 from bodyslam_jax.people.fit import fit_bodies as fit_bodies
 from bodyslam_jax.people.found import Found as Found
+from bodyslam_jax.people.hypotheses import correct_left_right as correct_left_right
 from bodyslam_jax.people.keypoint_errors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.people.networks import network_status as network_status
 from bodyslam_jax.people.person_state import PersonState as PersonState
@@ -22,7 +23,6 @@ from bodyslam_jax.people.shown import joints_of as joints_of
 from bodyslam_jax.people.shown import legs_shown as legs_shown
 from bodyslam_jax.people.shown import shown_keypoints as shown_keypoints
 from bodyslam_jax.people.shown import without_keypoints as without_keypoints
-from bodyslam_jax.people.sides import correct_left_right as correct_left_right
 from bodyslam_jax.people.stature import beyond_reach as beyond_reach
 from bodyslam_jax.people.stature import in_model as in_model
 from bodyslam_jax.people.stature import linear_stature as linear_stature

@@ -10,7 +10,6 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.clean_regressed import prepare_bodies
 from bodyslam_jax.people.fit import fit_bodies
-from bodyslam_jax.people.sides import correct_left_right
 from bodyslam_jax.types import Bodies, Sequence
 
 
@@ -20,8 +19,6 @@ def estimate_bodies(
     """A regressor's bodies, cleaned; bodies fitted to keypoints for people without any;
     no bodies if there are neither."""
     camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
-    if keypoints is not None:
-        keypoints, _ = correct_left_right(keypoints, fps)
     if sequence.bodies is None:
         if keypoints is None:
             return nobody(sequence.num_frames)

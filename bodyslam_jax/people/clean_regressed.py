@@ -20,7 +20,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
-from bodyslam_jax.people.facing import HALF_TURN, find_turned
+from bodyslam_jax.people.hypotheses import find_turned
 from bodyslam_jax.people.keypoint_errors import (
     ROBUST_SCALE,
     in_pixels,
@@ -44,6 +44,8 @@ from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 _DEPTH_ERROR = 0.05
 """Standard deviation of a regressor's depth, as a share of it."""
+_HALF_TURN = np.diag([-1.0, 1.0, -1.0])
+"""About H's y axis."""
 _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
 """Regressed shapes are shrunk to the mean, by a factor of 0.5 to 0.8 with an error of
@@ -164,7 +166,7 @@ def _place_person(
     """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
     dtype = skeleton.offset.dtype
     T_CH = roots.T_CH[person, where]
-    both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ HALF_TURN], axis=1)
+    both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ _HALF_TURN], axis=1)
     angles = roots.body_pose[person, where, :21].reshape(-1, 63)
     depth_sigma = _DEPTH_ERROR * T_CH[:, 2, 3]
     rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
@@ -177,11 +179,9 @@ def _place_person(
     camera = jnp.asarray(intrinsics.params, dtype)
     scale = jnp.asarray(ROBUST_SCALE, dtype)
     found = _place_bodies(skeleton, camera, shape, scale, *padded)
-    position, predicted = (np.asarray(a[: len(where)], float) for a in found)
-    facing = find_turned(
-        T_CH[:, :3, :3], where / fps, predicted, uv, sigma, ROBUST_SCALE
-    )
-    each, state = np.arange(len(where)), facing.turned.astype(int)
+    position, predicted, joints = (np.asarray(a[: len(where)], float) for a in found)
+    turned = find_turned(joints, where / fps, predicted, uv, sigma, ROBUST_SCALE)
+    each, state = np.arange(len(where)), turned.astype(int)
     return both[each, state], _smooth(position[each, state], where, fps)
 
 
@@ -197,10 +197,11 @@ def _place_bodies(
     uv: Float[Array, "t 25 2"],
     sigma: Float[Array, "t 25"],
     depth_sigma: Float[Array, " t"],
-) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2 25 2"]]:
+) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2 25 2"], Float[Array, "t 2 24 3"]]:
     """Pelvis of each frame for either orientation, by robust Gauss--Newton.
 
-    **Returns:** positions in C, and keypoints of the body there, px.
+    **Returns:** positions in C, keypoints of the body there, px, and joints about the
+    pelvis in C.
     """
 
     def one(R, points, start, uv, sigma, depth_sigma):
@@ -227,8 +228,9 @@ def _place_bodies(
         return p, project(intrinsics, rotated + p)
 
     def frame(R, angles, *rest):
-        _, points = place_points(skeleton, angles, shape)
-        return jax.vmap(lambda R: one(R, points, *rest))(R)
+        joints, points = place_points(skeleton, angles, shape)
+        position, predicted = jax.vmap(lambda R: one(R, points, *rest))(R)
+        return position, predicted, jax.vmap(lambda R: joints @ R.T)(R)
 
     return jax.vmap(frame)(orientation, angles, position, uv, sigma, depth_sigma)
 

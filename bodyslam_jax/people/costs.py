@@ -104,14 +104,6 @@ class Normal(eqx.Module):
     cost: Float[Array, "*b"]
 
 
-def joints_about_pelvis(
-    scene: Scene, fit: Fit, shape: Float[Array, " s"]
-) -> Float[Array, "24 3"]:
-    """Joints relative to the pelvis, in C, m."""
-    angles = scene.prior.angles(fit.latent)
-    return place_points(scene.skeleton, angles, shape)[0] @ fit.orientation.T
-
-
 def cost(
     scene: Scene,
     fit: Fit,

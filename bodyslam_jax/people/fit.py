@@ -1,7 +1,7 @@
 """Bodies from keypoints alone, in the manner of SMPLify, over a whole clip.
 
 Bogo et al., Keep it SMPL, ECCV 2016, fits each image by itself. Here every few frames
-are (`multistart`), then all frames of a person are fitted together, with one shape and
+are (`frame_fit`), then all frames of a person are fitted together, with one shape and
 a prior on human motion (`trajectory_fit`). **The metric scale comes from the prior on
 stature**: with β near the mean the depth is that of an adult of average size, so depths
 have a relative error of the stature's, 4 to 6 % (1 σ) for adults, and of the focal
@@ -21,7 +21,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
-from bodyslam_jax.people.depths import depth_costs
+from bodyslam_jax.people.frame_fit import fit_frames
 from bodyslam_jax.people.keypoint_errors import (
     CORRELATION_TIME,
     MIN_KEYPOINTS,
@@ -32,7 +32,6 @@ from bodyslam_jax.people.keypoint_errors import (
     pixels_per_metre,
 )
 from bodyslam_jax.people.lift import lift, load_lifter
-from bodyslam_jax.people.multistart import fit_frames
 from bodyslam_jax.people.person_state import (
     DEPTH_JITTER,
     POSITION_JITTER,
@@ -42,14 +41,12 @@ from bodyslam_jax.people.person_state import (
 from bodyslam_jax.people.posture_prior import PosturePrior, load_posture_prior
 from bodyslam_jax.people.skeleton import NUM_SHAPE, make_skeleton
 from bodyslam_jax.people.trajectory_fit import Chain, ChainProblem, Ties, solve_chain
-from bodyslam_jax.people.viterbi import best_path
-from bodyslam_jax.people.walking_knees import with_walking_knees
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
 
 _START_INTERVAL = 0.1
-"""Time between the frames that are fitted from many starts, s."""
+"""Time between the frames that are fitted by themselves, s."""
 _MOST_STEPS = 30
 """Gauss-Newton steps over all frames."""
 _LEAN_SIGMA = 0.4
@@ -93,11 +90,8 @@ def fit_bodies(
         if not present.any():
             log.warning("person %d has too few keypoints in every frame", h)
             continue
-        depth = np.zeros(sigma.shape)
-        if keypoints.depth is not None:
-            depth = keypoints.depth[h]
         fitted, chain = _fit_person(
-            scene, keypoints.uv[h], sigma, depth, present, fps, settings, body
+            scene, keypoints.uv[h], sigma, present, fps, settings
         )
         roots.present[h] = present
         roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
@@ -134,11 +128,9 @@ def _fit_person(
     scene: Scene,
     uv: Float[np.ndarray, "t 25 2"],
     sigma: Float[np.ndarray, "t 25"],
-    depth: Float[np.ndarray, "t 25"],
     present: np.ndarray,
     fps: float,
     settings: PeopleFit,
-    body: BodyModel,
 ) -> tuple[slice, Chain]:
     """Fits one shape and the postures of all frames to one person's keypoints.
 
@@ -153,7 +145,7 @@ def _fit_person(
     uv, sigma = uv[fitted], sigma[fitted]
     lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
-    start, cuts = _start(scene, uv, sigma_px, depth[fitted], lifted, fps)
+    start, cuts = _start(scene, uv, sigma_px, lifted, fps)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
@@ -177,11 +169,7 @@ def _fit_person(
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
-    solve = lambda problem, chain: solve_chain(problem, chain, _MOST_STEPS)
-    solved = solve(problem, chain)
-    if settings.walking_knees:
-        solved = with_walking_knees(problem, solved, solve, body, fps)
-    chain, value = solved
+    chain, value = solve_chain(problem, chain, _MOST_STEPS)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
 
@@ -209,11 +197,10 @@ def _start(
     scene: Scene,
     uv: np.ndarray,
     sigma_px: np.ndarray,
-    depth: np.ndarray,
     lifted: Lifted,
     fps: float,
 ) -> tuple[Fit, np.ndarray]:
-    """The best path through the fits of every few frames, interpolated to all frames.
+    """Fits of every few frames, interpolated to all frames.
 
     **Returns:** the fits, and the frames at which the trajectory is cut.
     """
@@ -223,18 +210,8 @@ def _start(
     chosen = np.unique(
         [usable[np.argmin(np.abs(usable - k))] for k in range(0, len(uv), stride)]
     )
-    fits, costs, joints = fit_frames(
-        scene,
-        uv[chosen],
-        sigma_px[chosen],
-        jax.tree.map(lambda a: a[chosen], lifted),
-    )
-    # Half the squared whitened distance of a keypoint is 1 on average by assumption.
-    count = np.isfinite(sigma_px[chosen]).sum(axis=1)
-    noise = max(1.0, float(np.sqrt(np.median(costs.min(axis=1) / count))))
-    costs = costs + noise**2 * depth_costs(depth[chosen], joints)
-    path = best_path(costs, joints, np.asarray(fits.orientation), chosen / fps, noise)
-    fit = jax.tree.map(lambda a: a[np.arange(len(chosen)), path], fits)
+    guess = jax.tree.map(lambda a: a[chosen], lifted)
+    fit = fit_frames(scene, uv[chosen], sigma_px[chosen], guess)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
     broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST
     return _interpolate(fit, chosen, broken, len(uv)), chosen[1:][broken]

@@ -8,7 +8,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.types import Intrinsics, Keypoints
 
-_BOX_DIAGONAL = 1.75
+BOX_DIAGONAL = 1.75
 """m: what the keypoints of a standing adult span, nose to toe and arms."""
 DETECTOR_FLOOR = 1.0
 """px: least standard deviation of any detector, in images of any size."""
@@ -68,7 +68,7 @@ def pixels_per_metre(
     valid = diagonal[diagonal > 0]
     # All keypoints in one pixel: not a person, but no reason to fail.
     overall = np.median(valid) if len(valid) else DETECTOR_FLOOR
-    return np.maximum(largest, 0.3 * overall) / _BOX_DIAGONAL
+    return np.maximum(largest, 0.3 * overall) / BOX_DIAGONAL
 
 
 def in_pixels(

@@ -4,7 +4,7 @@ Depth is ambiguous in a single view but better determined by a second of motion.
 Martinez et al., *A simple yet effective baseline for 3d human pose estimation* (ICCV
 2017), dense layers map the keypoints of about a second to the posture and heading in
 its middle, with standard deviations. The fit uses it as a robust measurement beside the
-keypoints and as one more initial value.
+keypoints and as its start.
 
 Trained by `tools/train_lifter.py` on CMU motion capture with random cameras; see
 `assets/README.md`.

@@ -35,8 +35,6 @@ class PosturePrior(eqx.Module):
     lower: Float[Array, " 63"]
     upper: Float[Array, " 63"]
     """Limits of θ, rad."""
-    typical: Float[Array, "s k"]
-    """Latents of a few postures that fits start from."""
     autoregression: Float[Array, "k 2"]
     """`a1, a2` of each component, per frame."""
 
@@ -76,4 +74,4 @@ def _read() -> dict[str, np.ndarray]:
     return {name: archive.array(name) for name in _NAMES}
 
 
-_NAMES = ("mean", "basis", "lower", "upper", "typical", "autoregression")
+_NAMES = ("mean", "basis", "lower", "upper", "autoregression")

@@ -26,7 +26,6 @@ from bodyslam_jax.geometry.camera import MIN_DEPTH, project_rows
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import keypoint_sigma
-from bodyslam_jax.people.sides import correct_left_right
 from bodyslam_jax.sfm import person_masks
 from bodyslam_jax.types import Bodies, Sequence
 
@@ -51,7 +50,6 @@ def shown_keypoints(sequence: Sequence, body: BodyModel) -> Bool[np.ndarray, "h 
     there = np.zeros((people_in(sequence), sequence.num_frames), bool)
     shown = np.zeros((*there.shape, 25), bool)
     if keypoints is not None:
-        keypoints, _ = correct_left_right(keypoints, sequence.fps)
         for h in range(len(shown)):
             sigma = keypoint_sigma(keypoints, sequence.intrinsics, h)
             shown[h] = sigma <= KEYPOINT_SIGMA / SURE

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax import evaluation, graph, simulation
+from bodyslam_jax import diagnostics, evaluation, graph, simulation
 from bodyslam_jax.body import BodyModel, load_body_model, local_joints
 from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
@@ -111,7 +111,7 @@ def simulate_case(
         )
     body = load_body_model(config.body_model)
     simulated = simulation.simulate(sequence, body)
-    measured = simulation.as_sequence(simulated)
+    measured = diagnostics.reconcile(simulation.as_sequence(simulated), body)
     name = f"{simulated.name}-{fingerprint(sequence)}"
     kept = Cache(None if cache is None else cache / name)
     cameras, bodies = before_joint(measured, body, config, kept)

@@ -41,6 +41,7 @@ from bodyslam_jax.diagnostics.agreement.oddities import warn_of_oddities
 from bodyslam_jax.diagnostics.agreement.renumbering import settle_times
 from bodyslam_jax.diagnostics.agreement.resolution import undone
 from bodyslam_jax.diagnostics.agreement.timing import best_timing
+from bodyslam_jax.people import correct_left_right
 from bodyslam_jax.types import Sequence
 
 _log = logging.getLogger(__name__)
@@ -70,6 +71,9 @@ Warn = Callable[[str], None]
 def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
     """The sequence with its parts in agreement; unchanged if they agree already.
 
+    Limbs whose left and right a detector exchanged in some frames have their names
+    again, so that all that follows has the same keypoints.
+
     Uses keypoints, bodies and camera, not the images. New warnings name what was undone
     and what is unusual.
 
@@ -86,6 +90,10 @@ def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
         settled = _settle(sequence, body, new_warnings.append)
     except ValueError as error:
         raise InputError(f"{sequence.name}: {error}") from None
+    if settled.keypoints is not None:
+        keypoints, exchanged = correct_left_right(settled.keypoints, settled.fps)
+        if exchanged.any():
+            settled = dataclasses.replace(settled, keypoints=keypoints)
     if not new_warnings:
         return settled
     new = [text for text in new_warnings if text not in sequence.warnings]
