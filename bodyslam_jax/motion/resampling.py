@@ -63,6 +63,21 @@ class Clock(eqx.Module):
             same=self.same,
         )
 
+    def from_frame(self, start: int) -> "Clock":
+        """For the sequence from a frame on. A tick before that frame lies at it."""
+        tick = np.asarray(self.tick)[start:]
+        first = 0 if start == 0 else int(tick[0])
+        frame = np.asarray(self.frame)[first:] - start
+        before = frame < 0
+        return Clock(
+            frame=jnp.asarray(np.maximum(frame, 0)),
+            between=jnp.asarray(np.where(before, 0, np.asarray(self.between)[first:])),
+            tick=jnp.asarray(tick - first),
+            beyond=jnp.asarray(np.asarray(self.beyond)[start:]),
+            steps=jnp.asarray(np.asarray(self.steps)[start:]),
+            same=self.same,
+        )
+
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
     """Lays the model's ticks, `fps` a second, over a video's timestamps (s)."""
