@@ -24,18 +24,24 @@ COUPLED = tuple(range(16))
 
 
 class Linear(g.FrameFactor):
-    """Sums of everything that is added up: `r = (A x - z) / σ`."""
+    """Sums of everything that is added up: `r = (A x - z) / σ`; with postures of two
+    frames, without of three."""
 
     mixture: Float[Array, "d n"]
     measured: Float[Array, "h t d"]
     sigma: Float[Array, "h t"]
+    posed: bool = eqx.field(static=True, default=False)
     padding = {"sigma": jnp.inf}
-    keys = (
-        *(("camera", lag) for lag in range(3)),
-        *(("root", lag) for lag in range(3)),
-        *(("pose", lag) for lag in range(2)),
-        *(("scale", 0), ("shape", 0), ("intrinsics", 0), ("drift", 0)),
-    )
+
+    @property
+    def keys(self):
+        names = ("camera", "root", *(("pose",) if self.posed else ()))
+        common = ("scale", "shape", "intrinsics", "drift")
+        lags = range(2 if self.posed else 3)
+        return (
+            *((name, lag) for name in names for lag in lags),
+            *((name, 0) for name in common),
+        )
 
     @property
     def limbs(self):
@@ -44,21 +50,22 @@ class Linear(g.FrameFactor):
     def frame_residual(self, data, window, shared):
         measured, sigma = data
         parts = [f.camera[:3, 3] for f in window] + [f.root[:3, 3] for f in window]
-        parts += [f.pose[: len(COUPLED), 0] for f in window[:2]]
+        if self.posed:
+            parts += [f.pose[: len(COUPLED), 0] for f in window]
         parts += [shared.scale[None], shared.shape, shared.intrinsics, shared["drift"]]
         return (self.mixture @ jnp.concatenate(parts) - measured) / sigma
 
 
 class Hangs(g.FrameFactor):
-    """A person's axis is along gravity, a variable: `r = (C_WC C_CH e_y - g) / σ`."""
+    """A person's axis is along gravity, a variable: `r = (C_WH^T g - e_y) / σ`."""
 
     sigma: Float[Array, "h t"]
     padding = {"sigma": jnp.inf}
     keys = (("camera", 0), ("root", 0), ("gravity", 0))
 
     def frame_residual(self, data, window, shared):
-        axis = window[0].camera[:3, :3] @ window[0].root[:3, 1]
-        return (axis - shared["gravity"]) / data[0]
+        C_WH = window[0].camera[:3, :3] @ window[0].root[:3, :3]
+        return (C_WH.T @ shared["gravity"] - jnp.array([0.0, 1, 0])) / data[0]
 
 
 def linear(people=2, frames=40):
@@ -68,13 +75,22 @@ def linear(people=2, frames=40):
     state = dataclasses.replace(
         state, poses=state.poses.at[..., 1:].set(0.0), globals=jnp.array([0.3, -0.2])
     )
-    count = 18 + 2 * len(COUPLED) + 1 + 10 + 4 + 2
+    count = 1 + 10 + 4 + 2
+    posed, other = count + 12 + 2 * len(COUPLED), count + 18
     sigma = np.full((people, frames), 0.5)
     sigma[:, :2] = np.inf
     normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
     there = jnp.ones((people, frames), bool)
     factors = [
-        Linear(0.3 * normal(45, count), normal(people, frames, 45), jnp.asarray(sigma)),
+        *(
+            Linear(
+                mixture=0.3 * normal(30, size),
+                measured=normal(people, frames, 30),
+                sigma=jnp.asarray(sigma),
+                posed=size == posed,
+            )
+            for size in (posed, other)
+        ),
         g.BodyPosePrior(
             rotation=state.poses + jnp.zeros(3).at[0].set(0.1),
             sigma=jnp.full((people, frames, 23), 0.2),
@@ -102,10 +118,10 @@ def solution(problem, state, **options):
     return bs.solve(problem, state, schedule=TIGHT, **options).state
 
 
-def farthest(state, other):
-    """The largest coordinate of the step from one state to another, by group."""
-    step = vars(state.local(other))
-    return {k: float(jnp.abs(x).max()) for k, x in step.items() if x.size}
+def farthest(problem, state, other):
+    """The largest free coordinate of the step from one state to another, by group."""
+    step = only_free(problem, state.local(other))
+    return {k: float(jnp.abs(x).max()) for k, x in vars(step).items() if x.size}
 
 
 def remaining(state, left, frames):
@@ -129,20 +145,18 @@ def only_free(problem, step):
 def test_a_linear_problem_has_the_solution_of_the_whole(people):
     problem, state = linear(people)
     if not people:
-        problem = dataclasses.replace(problem, factors=problem.factors[3:])
+        problem = dataclasses.replace(problem, factors=problem.factors[4:])
         steady = jnp.full((40, 2), 0.5).at[:2].set(jnp.inf)
         problem = problem.with_factors(scenes.CameraSmoothness(sigma=steady))
     batch = solution(problem, state, damping=0.0)
-    assert farthest(state, batch)["cameras"] > 1e-3
+    assert farthest(problem, state, batch)["cameras"] > 1e-3
     # Twice: the first prior goes into the second.
     once = marginalise(problem, state, 10)
     twice = marginalise(once.problem, once.state, 20)
     for left, frames in ((once, 10), (twice, 20)):
         found = solution(left.problem, left.state, damping=0.0)
         expected = remaining(batch, left, frames)
-        step = only_free(left.problem, found.local(expected))
-        for name, value in vars(step).items():
-            np.testing.assert_allclose(value, 0, atol=1e-9, err_msg=name)
+        assert max(farthest(left.problem, found, expected).values()) < 1e-9
 
 
 CASES = [
@@ -217,15 +231,18 @@ def test_what_is_left_is_solved_where_the_whole_is(options, same):
     left = marginalise(problem, batch, 10)
     expected = remaining(batch, left, 10)
     away = scenes.perturb(np.random.default_rng(0), left.problem, expected, size=0.003)
-    found = farthest(solution(left.problem, away), expected)
+    found = farthest(left.problem, solution(left.problem, away), expected)
     assert found["cameras"] < same
     assert found.get("roots", 0) < same
     assert found.get("scale", 0) < same
+    none = solution(g.disable(left.problem, g.MarginalPrior), away)
+    assert farthest(left.problem, none, expected)["cameras"] > 1e3 * same
 
 
 @pytest.mark.slow
 def test_linearised_near_the_solution_the_prior_leads_close_to_it():
-    problem, _, state = make(frames=20, landmarks=120, length=6)
+    # Without noise: what Gauss-Newton leaves out is in proportion to residuals.
+    problem, _, state = make(frames=20, landmarks=120, length=6, noise=0.0)
     plain = [dataclasses.replace(f, loss=g.Squared()) for f in problem.factors]
     problem = dataclasses.replace(problem, factors=tuple(plain))
     batch = solution(problem, state)
@@ -235,12 +252,10 @@ def test_linearised_near_the_solution_the_prior_leads_close_to_it():
         left = marginalise(problem, off, 10)
         expected = remaining(batch, left, 10)
         found = solution(left.problem, left.state)
-        away.append(farthest(found, expected)["cameras"])
+        away.append(farthest(left.problem, found, expected)["cameras"])
     # What is lost is of second order.
     assert away[0] < 1e-3
     assert away[1] < 0.02 * away[0]
-    none = solution(g.disable(left.problem, g.MarginalPrior), left.state)
-    assert farthest(none, expected)["cameras"] > 10 * away[0]
 
 
 def similar(state, turn=(0.4, -0.7, 0.2), shift=(3.0, -1.0, 2.0), ratio=2.5):
@@ -335,7 +350,7 @@ def test_solves_in_single_precision_and_within_jit():
     arrays, static = eqx.partition(left.problem, eqx.is_array)
     away = scenes.perturb(np.random.default_rng(0), left.problem, left.state, 0.003)
     found = traced_solve(traced, arrays, static, away)
-    assert farthest(found, left.state)["cameras"] < 1e-6
+    assert farthest(left.problem, found, left.state)["cameras"] < 1e-6
     low = lambda x: x.astype(np.float32) if eqx.is_inexact_array(x) else x
     single, start = jax.tree.map(low, (problem, batch))
     left = marginalise(single, start, 10)
@@ -344,7 +359,7 @@ def test_solves_in_single_precision_and_within_jit():
     found = bs.solve(left.problem, away).state
     assert found.cameras.dtype == jnp.float32
     expected = jax.tree.map(low, remaining(batch, left, 10))
-    assert farthest(found, expected)["cameras"] < 2e-3
+    assert farthest(left.problem, found, expected)["cameras"] < 2e-3
 
 
 def traced_solve(traced, arrays, static, state):

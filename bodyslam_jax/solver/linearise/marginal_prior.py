@@ -11,8 +11,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import CHUNK, MarginalPrior, Problem, State
 from bodyslam_jax.graph.factors.marginal_prior import coordinates
 from bodyslam_jax.solver.apart import groups_of, split_poses
@@ -27,15 +28,11 @@ def linearise_marginal_prior(
     first = prior.first_frames(state)
     zero = first.zero_step()
     free = coordinates(prior.first_frames(mask_of(problem)), prior.reach)
-
-    def moved(step):
-        there = prior.moved(first.retract(_step_of(prior, zero, step)))
-        return there, there
-
-    by_step, there = jax.jacfwd(moved, has_aux=True)(jnp.zeros_like(free))
-    jacobian = (prior.root @ by_step) * free
+    index = indices(prior, sizes)
+    there = prior.moved(first)
     residual = prior.root @ there + prior.offset
     sums.costs.append(0.5 * jnp.sum(prior.loss.rho(residual @ residual)))
+    jacobian = _jacobian(prior, first, there, index) * free
     gram, slope = jacobian.T @ jacobian, residual @ jacobian
 
     down = _step_of(prior, zero, slope)
@@ -49,7 +46,6 @@ def linearise_marginal_prior(
     if "poses" in sizes.variables:
         for name, part in split_poses(longer(down.poses, 1), sizes.joints).items():
             sums.add_gradient(name, part)
-    index = indices(prior, sizes)
     at = index.globals
     sums.globals = sums.globals + gram[at[:, None], at]
     sums.globals_gradient = sums.globals_gradient + slope[at]
@@ -66,6 +62,30 @@ def linearise_marginal_prior(
     order = np.concatenate(parts)
     matrix = jnp.pad(gram, (0, 1))[order[:, None], order].astype(sizes.dtype)
     return PriorBlocks(matrix, index.people.shape[1], prior.reach)
+
+
+def _jacobian(
+    prior: MarginalPrior, first: State, there: Float[Array, " n"], index: "Indices"
+) -> Float[Array, "n n"]:
+    """Of the residual, by the prior's coordinates at a state; `there` is `x ⊖ x̂`."""
+    # Cameras move together; what else turns does so by itself.
+    nobody = {"roots": first.roots[:0], "poses": first.poses[:0]}
+    nobody |= {"shapes": first.shapes[:0]}
+    estimate = dataclasses.replace(prior.estimate, **nobody)
+    map_alone = dataclasses.replace(prior, estimate=estimate)
+    alone = dataclasses.replace(first, **nobody)
+    zero = alone.zero_step()
+
+    def moved(step):
+        return map_alone.moved(alone.retract(_step_of(map_alone, zero, step)))
+
+    at = index.alone
+    by_step = jax.jacfwd(moved)(jnp.zeros(len(at), there.dtype))
+    jacobian = prior.root.at[:, at].set(prior.root[:, at] @ by_step)
+    turns = index.turns
+    by_turn = so3.inverse_right_jacobian(there[turns])
+    rows = jnp.einsum("nka,kab->nkb", prior.root[:, turns], by_turn)
+    return jacobian.at[:, turns].set(rows)
 
 
 def diagonal_of_prior(
@@ -96,6 +116,10 @@ class Indices:
     postures: Int[np.ndarray, "h 69"]
     cameras: Int[np.ndarray, " c6"]
     globals: Int[np.ndarray, " g"]
+    alone: Int[np.ndarray, " m"]
+    """Scale, all intrinsics, all named globals, and cameras."""
+    turns: Int[np.ndarray, "k 3"]
+    """Rotations of people."""
 
 
 def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
@@ -105,7 +129,7 @@ def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
     start = np.cumsum([0, 1, i, g, 10 * h, 6 * prior.frames, 6 * prior.reach * h])
     named = start[2] + np.arange(sizes.named)
     intrinsics = start[1] + np.arange(sizes.intrinsics)
-    shapes = start[3] + np.arange(10 * h)
+    shapes, cameras = start[3] + np.arange(10 * h), np.arange(6 * prior.frames)
     roots = start[5] + np.arange(6 * prior.reach * h).reshape(h, 6 * prior.reach)
     postures = start[6] + np.arange(69 * h).reshape(h, 69)
     joints = sizes.joints if "poses" in sizes.variables else ()
@@ -113,8 +137,10 @@ def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
     return Indices(
         people=np.concatenate([postures[:, coupled], roots], axis=1),
         postures=postures,
-        cameras=start[4] + np.arange(6 * prior.frames),
+        cameras=start[4] + cameras,
         globals=np.concatenate([[0], intrinsics, named, shapes]),
+        alone=np.concatenate([np.arange(start[3]), start[4] + cameras]),
+        turns=np.concatenate([roots.reshape(-1, 6)[:, :3], postures.reshape(-1, 3)]),
     )
 
 
