@@ -15,7 +15,7 @@ from problems import dense, make, structured_step
 import bodyslam_jax as bs
 import bodyslam_jax.graph as g
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.solver import Stage, marginalise
+from bodyslam_jax.solver import Stage, marginalise, marginals
 from bodyslam_jax.solver.padding import pad
 
 TIGHT = (Stage(max_steps=60, rtol=1e-15, atol=1e-15),)
@@ -205,6 +205,48 @@ def test_prior_and_rest_have_the_normal_equations_of_the_whole(options):
     np.testing.assert_allclose(ravel_pytree(cut)[0], best, atol=1e-8 * abs(best).max())
 
 
+@pytest.mark.parametrize(
+    "people", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["map", "person"]
+)
+@pytest.mark.parametrize("gauge", [True, False], ids=["held", "free"])
+def test_steps_far_from_the_first_estimates_are_those_of_the_prior_s_cost(
+    people, gauge
+):
+    problem, _, state = make(frames=20, people=people)
+    given = problem if gauge else without_gauge(problem)
+    left = marginalise(given, state, 10)
+    assert bool(left.problem.factors[-1].invariant.all()) == (not gauge)
+    rng = np.random.default_rng(0)
+    away = scenes.perturb(rng, left.problem, left.state, size=0.2)
+    jacobian, residual = dense(left.problem, away)
+    part = jacobian.T @ jacobian
+    extra = np.where(np.diag(part) > 0, 1e-3 * np.diag(part), 1.0)
+    best = np.linalg.solve(part + np.diag(extra), -jacobian.T @ residual)
+    step = structured_step(*pad(left.problem, away), jnp.asarray(1e-3))
+    found, _ = ravel_pytree(remaining_step(step, left.state))
+    np.testing.assert_allclose(found, best, atol=1e-8 * abs(best).max())
+
+
+def test_predictions_that_look_back_beyond_the_past_stay_as_they_are():
+    """Also in a factor that has no weight in the past."""
+    problem, _, state = make(frames=20, people=1)
+    left = marginalise(problem, state, 10)
+    valid = jnp.ones((1, 20), bool).at[:, :15].set(False)
+    predicted = {
+        "translation": jnp.full((1, 20, 3), 7.0),
+        "leg": jnp.ones((1, 1, 1)),
+        "rotation": jnp.zeros((1, 20, 3)),
+        "body_pose": jnp.zeros((1, 20, 23, 3)),
+        "valid": valid,
+    }
+    of_motion = lambda p: p.factors[2].factor
+    assert isinstance(of_motion(left.problem), g.HumanMotion)
+    found = of_motion(left.problem.with_prediction(predicted)).translation
+    before = of_motion(left.problem).translation
+    np.testing.assert_array_equal(found[:, :15], before[:, :15])
+    np.testing.assert_array_equal(found[:, 15:], 7.0)
+
+
 def remaining_step(step, state):
     t, l = len(state.cameras), len(state.landmarks)
     return dataclasses.replace(
@@ -256,6 +298,33 @@ def test_linearised_near_the_solution_the_prior_leads_close_to_it():
     # What is lost is of second order.
     assert away[0] < 1e-3
     assert away[1] < 0.02 * away[0]
+
+
+@pytest.mark.slow
+def test_what_is_left_is_as_uncertain_as_in_the_whole():
+    problem, _, state = make(frames=20, landmarks=60, people=1)
+    # What keypoints bend is in covariances, and not in the prior.
+    kinds = g.Reprojection, g.ShapePrior, g.HumanMotion, g.BodyPosePrior
+    posed = g.RootPositionPrior(
+        position=state.roots[..., :3, 3],
+        sigma=jnp.full((1, 20, 2), 0.05),
+        correlation=g.ar1_correlation(jnp.ones((1, 20), bool), 0.9),
+    )
+    turned = g.RootOrientation(
+        orientation=state.roots[..., :3, :3],
+        sigma=jnp.full((1, 20), 0.2),
+        correlation=jnp.zeros((1, 20)),
+    )
+    kept = [f for f in problem.factors if isinstance(f, kinds)]
+    problem = g.make_problem([*kept, posed, turned], state)
+    left = marginalise(problem, state, 10)
+    whole = marginals(problem, state)
+    part = marginals(left.problem, left.state)
+    known = {"rtol": 1e-4, "atol": 1e-6}
+    np.testing.assert_allclose(part.scale, whole.scale, **known)
+    np.testing.assert_allclose(part.cameras[10:], whole.cameras[10:], **known)
+    np.testing.assert_allclose(part.people[:, 10:], whole.people[:, 10:], **known)
+    np.testing.assert_allclose(part.shapes, whole.shapes, **known)
 
 
 def similar(state, turn=(0.4, -0.7, 0.2), shift=(3.0, -1.0, 2.0), ratio=2.5):

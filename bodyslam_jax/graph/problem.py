@@ -143,10 +143,13 @@ class Problem(eqx.Module):
             "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
             "rotation": found.rotation,
             "body_pose": found.body_pose,
+            "valid": found.valid,
         }
 
     def with_prediction(self, prediction: Any) -> "Problem":
-        """The same problem with a prediction (`predict`) in its factors."""
+        """The same problem with a prediction (`predict`) in its factors; where it says
+        that it is not valid, as the sequence does not hold its window, they keep what
+        they have."""
         if prediction is None:
             return self
         factors = tuple(_with_prediction(f, prediction) for f in self.factors)
@@ -263,13 +266,21 @@ def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
     if isinstance(factor, HumanMotion) and "translation" in prediction:
         unit = 1 if factor.body is None else prediction["leg"]
         translation = prediction["translation"] / unit
-        return eqx.tree_at(lambda f: f.translation, factor, translation)
+        return _predicted(factor, "translation", translation, prediction)
     if isinstance(factor, RelativeOrientation) and "rotation" in prediction:
-        return eqx.tree_at(lambda f: f.rotation, factor, prediction["rotation"])
+        return _predicted(factor, "rotation", prediction["rotation"], prediction)
     predicted_pose = isinstance(factor, BodyPosePrior) and factor.predicted
     if predicted_pose and "body_pose" in prediction:
-        return eqx.tree_at(lambda f: f.rotation, factor, prediction["body_pose"])
+        return _predicted(factor, "rotation", prediction["body_pose"], prediction)
     return factor
+
+
+def _predicted(factor: Factor, name: str, value: Array, prediction: Any) -> Factor:
+    known = getattr(factor, name)
+    valid = prediction.get("valid", jnp.ones(known.shape[:2], bool))
+    valid = valid.reshape(*valid.shape, *(1,) * (known.ndim - valid.ndim))
+    kept = jnp.where(valid, value, known)
+    return eqx.tree_at(lambda f: getattr(f, name), factor, kept)
 
 
 def limbs_of(factors: Sequence[Factor]) -> Limbs:

@@ -64,16 +64,16 @@ class Clock(eqx.Module):
         )
 
     def from_frame(self, start: int) -> "Clock":
-        """For the sequence from a frame on. A tick before that frame lies at it."""
-        tick = np.asarray(self.tick)[start:]
-        first = 0 if start == 0 else int(tick[0])
-        frame = np.asarray(self.frame)[first:] - start
-        before = frame < 0
+        """For the sequence from a frame on, with the ticks from that frame on; frames
+        before the first of them lie at it."""
+        tick, beyond = np.asarray(self.tick)[start:], np.asarray(self.beyond)[start:]
+        first = int(tick[0] + (beyond[0] > 1e-9))
+        before = tick < first
         return Clock(
-            frame=jnp.asarray(np.maximum(frame, 0)),
-            between=jnp.asarray(np.where(before, 0, np.asarray(self.between)[first:])),
-            tick=jnp.asarray(tick - first),
-            beyond=jnp.asarray(np.asarray(self.beyond)[start:]),
+            frame=jnp.asarray(np.asarray(self.frame)[first:] - start),
+            between=jnp.asarray(np.asarray(self.between)[first:]),
+            tick=jnp.asarray(np.where(before, 0, tick - first)),
+            beyond=jnp.asarray(np.where(before, 0.0, beyond)),
             steps=jnp.asarray(np.asarray(self.steps)[start:]),
             same=self.same,
         )
