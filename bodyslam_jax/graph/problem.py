@@ -56,7 +56,8 @@ class MotionPredictor(eqx.Module):
 
     predict: Callable[..., Any] = eqx.field(static=True)
     """`predict(model, body, orientation, body_pose, shape, present)` of one person,
-    with `translation`, `rotation`, `body_pose` in its result."""
+    with `translation`, `rotation`, `body_pose` in its result, and `valid` where it does
+    not predict all steps."""
     model: Any
     body: Any
     present: Bool[Array, "h t"]
@@ -143,7 +144,7 @@ class Problem(eqx.Module):
             "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
             "rotation": found.rotation,
             "body_pose": found.body_pose,
-            "valid": found.valid,
+            "valid": getattr(found, "valid", None),
         }
 
     def with_prediction(self, prediction: Any) -> "Problem":
@@ -276,11 +277,11 @@ def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
 
 
 def _predicted(factor: Factor, name: str, value: Array, prediction: Any) -> Factor:
-    known = getattr(factor, name)
-    valid = prediction.get("valid", jnp.ones(known.shape[:2], bool))
-    valid = valid.reshape(*valid.shape, *(1,) * (known.ndim - valid.ndim))
-    kept = jnp.where(valid, value, known)
-    return eqx.tree_at(lambda f: getattr(f, name), factor, kept)
+    valid, known = prediction.get("valid"), getattr(factor, name)
+    if valid is not None:
+        valid = valid.reshape(*valid.shape, *(1,) * (known.ndim - valid.ndim))
+        value = jnp.where(valid, value, known)
+    return eqx.tree_at(lambda f: getattr(f, name), factor, value)
 
 
 def limbs_of(factors: Sequence[Factor]) -> Limbs:
