@@ -327,6 +327,23 @@ def test_what_is_left_is_as_uncertain_as_in_the_whole():
     np.testing.assert_allclose(part.shapes, whole.shapes, **known)
 
 
+@pytest.mark.slow
+def test_a_simulated_clip_is_solved_in_two_windows_as_it_is_whole():
+    """With the factors and the motion model of a run."""
+    problem, state = bs.build(bs.simulate_case("M2", frames=40))
+    well = (Stage(max_steps=60, rtol=1e-9),)
+    batch = bs.solve(problem, state, schedule=well).state
+    left = marginalise(problem, batch, 10)
+    found = bs.solve(left.problem, left.state, schedule=well).state
+    away = farthest(left.problem, found, remaining(batch, left, 10))
+    assert away["scale"] < 1e-5
+    assert max(away["cameras"], away["roots"]) < 1e-4
+    left = marginalise(left.problem, found, 20)
+    found = bs.solve(left.problem, left.state, schedule=well).state
+    assert float(found.scale) == pytest.approx(float(batch.scale), rel=2e-3)
+    assert jnp.abs(found.roots[:, 10:] - batch.roots[:, 20:]).max() < 5e-3
+
+
 def similar(state, turn=(0.4, -0.7, 0.2), shift=(3.0, -1.0, 2.0), ratio=2.5):
     """The same scene elsewhere, turned, in another unit."""
     C, shift = so3.exp(jnp.asarray(turn)), jnp.asarray(shift)
