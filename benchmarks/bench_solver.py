@@ -12,6 +12,7 @@
     python benchmarks/bench_solver.py scales --frames 300
     python benchmarks/bench_solver.py growth
     python benchmarks/bench_solver.py calibration --frames 20 --repeats 60
+    python benchmarks/bench_solver.py marginalise --frames 60
 
 Compilation is outside the clock and given by itself; all solvers' results are judged by
 one cost function. With `--cache` a second run tells what loading the program takes in
@@ -36,7 +37,7 @@ from solver_clock import timed
 from solver_scene import make
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.solver import Stage, solve, vmap_over_devices
+from bodyslam_jax.solver import Stage, marginalise, solve, vmap_over_devices
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import cast, sizes_of
 from bodyslam_jax.solver.elimination.person import eliminate_people
@@ -139,6 +140,35 @@ def growth(sizes, steps, mixed):
         subprocess.run([*command, *options], check=True)
 
 
+def first_chunk(frames, repeats):
+    """Time to make a prior of the first ten frames, of cameras alone and with a person,
+    and of a step on what is left, with the prior and without."""
+    for people in (0, 1):
+        problem, truth, _ = make(frames, people)
+        run = functools.partial(marginalise, problem, truth, g.CHUNK)
+        left, first, (wall, cpu) = timed(run, repeats)
+        prior = left.problem.factors[-1]
+        print(
+            f"{frames} frames, {people} people: {int((prior.root != 0).any(0).sum())} "
+            f"coordinates stay, {wall:.3f} s (processor {cpu:.3f}), compile "
+            f"{first[0] - wall:.1f} s (processor {first[1] - cpu:.1f})",
+            flush=True,
+        )
+        schedule = (Stage(max_steps=6, rtol=0.0),)
+        for name, rest in (
+            ("with it", left.problem),
+            ("without", problem),
+        ):
+            state = left.state if name == "with it" else truth
+            one = functools.partial(solve, rest, state, schedule=schedule)
+            found, _, (wall, cpu) = timed(one, repeats)
+            count = int(found.num_steps[0])
+            print(
+                f"  {name}: {wall / count:.4f} s a step (processor {cpu / count:.4f})",
+                flush=True,
+            )
+
+
 def one(frames, steps, mixed):
     problem, _, start = make(frames, 1)
     peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -157,7 +187,8 @@ def one(frames, steps, mixed):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    subjects = "landmarks joint breakdown peers baselines scales growth one calibration"
+    subjects = "landmarks joint breakdown peers baselines scales growth one"
+    subjects += " calibration marginalise"
     parser.add_argument("what", choices=subjects.split())
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 300, 1000])
     parser.add_argument("--float32", action="store_true")
@@ -224,6 +255,7 @@ def main():
             n, args.rtol, args.baselines, args.peer_python, args.peer_steps
         ),
         "scales": lambda n: scales(n, args.rtol, args.repeats),
+        "marginalise": lambda n: first_chunk(n, args.repeats),
         "one": lambda n: one(n, args.steps, args.mixed),
     }
     for frames in args.frames:

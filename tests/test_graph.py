@@ -40,6 +40,16 @@ def test_retraction_of_a_rotation_composes_and_does_not_jump(angle):
     check_grads(retract, (step,), order=1)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.5])
+def test_local_is_the_step_that_retraction_takes(size, rng):
+    state = scenes.truth(rng, frames=4, people=2, landmarks=3)
+    flat, unravel = ravel_pytree(state.zero_step())
+    step = unravel(jnp.asarray(size * rng.standard_normal(flat.shape)))
+    there_and_back = jax.jit(lambda state, step: state.local(state.retract(step)))
+    found, _ = ravel_pytree(there_and_back(state, step))
+    np.testing.assert_allclose(found, ravel_pytree(step)[0], atol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "loss",
@@ -185,6 +195,7 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
         x for x in vars(g).values() if isinstance(x, type) and issubclass(x, g.Factor)
     }
     classes = {x for x in classes if not inspect.isabstract(x)}
+    classes.remove(g.MarginalPrior)  # tests/test_marginalisation.py
     assert {type(factor) for factor in factors} >= classes, "a class without a test"
     step = jax.tree.map(
         lambda x: jnp.asarray(rng.standard_normal(x.shape)), state.zero_step()

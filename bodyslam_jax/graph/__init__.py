@@ -32,6 +32,7 @@ from bodyslam_jax.graph.factors.keypoint_reprojection import (
     KeypointReprojection as KeypointReprojection,
 )
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior as LandmarkPrior
+from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior as MarginalPrior
 from bodyslam_jax.graph.factors.relative_orientation import (
     RelativeOrientation as RelativeOrientation,
 )
@@ -67,6 +68,7 @@ from bodyslam_jax.graph.pelvis_displacement import displacement as displacement
 from bodyslam_jax.graph.problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph.problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph.problem import Problem as Problem
+from bodyslam_jax.graph.problem import layout_of as layout_of
 from bodyslam_jax.graph.problem import limbs_of as limbs_of
 from bodyslam_jax.graph.problem import make_problem as make_problem
 from bodyslam_jax.graph.state import State as State

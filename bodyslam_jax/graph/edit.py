@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.intrinsics_prior import AbstractIntrinsicsFactor
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
@@ -37,6 +38,8 @@ def _missing(factor: Factor, problem: Problem) -> Factor:
         values = {"sigma": jnp.inf}
     elif isinstance(factor, LandmarkPrior):
         values = {"whitening": 0.0}
+    elif isinstance(factor, MarginalPrior):
+        values = {"root": 0.0, "offset": 0.0}
     elif isinstance(factor, AbstractIntrinsicsFactor) and hasattr(factor, "sigma"):
         values = {"sigma": jnp.inf}
     elif isinstance(factor, FrameFactor) and factor.padding:

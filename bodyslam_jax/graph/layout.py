@@ -100,17 +100,22 @@ def make_layout(
     limbs: Limbs = (JOINTS,),
     *,
     common_sizes: bool = True,
+    front: int = 0,
 ) -> Layout:
     """Groups `m` observations of landmarks. Indices are not checked.
 
     Without `common_sizes`, or if there is none that holds the problem, its tables are
     as large as it needs.
+
+    `front` is the number of chunks that a `MarginalPrior` couples, the first ones. With
+    it the order is that of time, and no landmark is lasting.
     """
     for size in sizes.SIZES if common_sizes else ():
-        found = _in_size(size, num_frames, num_landmarks, frame, landmark, limbs)
+        given = size, num_frames, num_landmarks, frame, landmark, limbs, front
+        found = _in_size(*given)
         if found is not None:
             return found
-    given = num_frames, num_landmarks, frame, landmark, num_people, limbs
+    given = num_frames, num_landmarks, frame, landmark, num_people, limbs, front
     return _of_own_size(*given)
 
 
@@ -121,6 +126,7 @@ def _in_size(
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
     limbs: Limbs,
+    front: int,
 ) -> Layout | None:
     """The layout of a problem in tables of a given size; `None` if it does not fit."""
     count = -(-num_frames // CHUNK)
@@ -134,12 +140,12 @@ def _in_size(
     layout = Layout(
         buckets=(),
         num_chunks=size.chunks,
-        bandwidth=2,
+        bandwidth=max(front, 2),
         limbs=limbs,
         num_landmarks=size.landmarks,
         num_observations=size.observations,
         used=jnp.asarray(count, jnp.int32),
-        used_bandwidth=jnp.asarray(2, jnp.int32),
+        used_bandwidth=jnp.asarray(max(front, 2), jnp.int32),
     )
     if len(frame) == 0:
         return layout
@@ -162,8 +168,8 @@ def _in_size(
     return dataclasses.replace(
         layout,
         buckets=tuple(buckets),
-        bandwidth=max(size.widths[-1], 2),
-        used_bandwidth=jnp.asarray(max(span.max(), 2), jnp.int32),
+        bandwidth=max(size.widths[-1], front, 2),
+        used_bandwidth=jnp.asarray(max(span.max(), front, 2), jnp.int32),
     )
 
 
@@ -174,6 +180,7 @@ def _of_own_size(
     landmark: Int[np.ndarray, " m"],
     num_people: int,
     limbs: Limbs,
+    front: int,
 ) -> Layout:
     """The layout of a problem whose sizes are its own, rounded up. So are those of
     many frames or landmarks, or of long tracks, which fit in no common size."""
@@ -181,14 +188,16 @@ def _of_own_size(
     num_chunks = round_up(count, parts=8)
     room = round_up(num_landmarks + 1), round_up(len(frame) + 1)
     if len(frame) == 0:
-        return Layout((), num_chunks, 2, None, 1, limbs, *room)
+        return Layout((), num_chunks, max(front, 2), None, 1, limbs, *room)
     own = num_people * PERSON
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
     # In any order, a landmark's span is at least the number of chunks that observe it.
     least = np.bincount(pairs // count, minlength=num_landmarks)
     lasting = choose_long_tracks(least, num_chunks, own, 1, _SIZE)
     rest = pairs[~np.isin(pairs // count, lasting)]
-    order, reach = order_chunks(*divmod(rest, count), count, num_people)
+    order, reach = None, 1
+    if not front:
+        order, reach = order_chunks(*divmod(rest, count), count, num_people)
     if order is not None:
         # Padding comes last, and nothing couples it with the rest.
         order = np.append(order, np.arange(count, num_chunks))
@@ -196,6 +205,8 @@ def _of_own_size(
         frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
     start, span = _spans(num_landmarks, frame, landmark)
     lasting = choose_long_tracks(span, num_chunks, own, reach, _SIZE)
+    if front:
+        lasting = lasting[:0]
     soon = span > 0
     soon[lasting] = False
     widths = _choose_widths(span[soon], num_chunks)
@@ -218,7 +229,7 @@ def _of_own_size(
     if order is not None:
         order = jnp.asarray(order, jnp.int32)
         reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
-    bandwidth = max(widths[-1], reach + 1)
+    bandwidth = max(widths[-1], reach + 1, front)
     return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs, *room)
 
 

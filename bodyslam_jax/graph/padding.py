@@ -106,6 +106,11 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
     """
     lead = state.roots.shape[:2] if factor.of_people else state.cameras.shape[:1]
     axis = len(lead) - 1
+    if isinstance(factor, Masked):
+        inner = pad_factor(factor.factor, state, frames)
+        inner = inner.factor if isinstance(inner, Masked) else inner
+        present = extend(factor.present, axis, frames, False)
+        return Masked(factor=inner, present=present)
     fill = factor.padding or {}
     padded = factor
     for name in factor.time_fields:

@@ -17,6 +17,7 @@ from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.globals import (
@@ -29,6 +30,7 @@ from bodyslam_jax.graph.globals import (
 )
 from bodyslam_jax.graph.layout import Layout, make_layout
 from bodyslam_jax.graph.memory import check_memory
+from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
 from bodyslam_jax.graph.sizes import is_dense
 from bodyslam_jax.graph.state import State, Step, gauge
@@ -54,7 +56,8 @@ class MotionPredictor(eqx.Module):
 
     predict: Callable[..., Any] = eqx.field(static=True)
     """`predict(model, body, orientation, body_pose, shape, present)` of one person,
-    with `translation`, `rotation`, `body_pose` in its result."""
+    with `translation`, `rotation`, `body_pose` in its result, and `valid` where it does
+    not predict all steps."""
     model: Any
     body: Any
     present: Bool[Array, "h t"]
@@ -67,6 +70,13 @@ class MotionPredictor(eqx.Module):
         stretch = lambda x: x.lengthened(frames) if of_clock(x) else x
         model = jax.tree.map(stretch, self.model, is_leaf=of_clock)
         return dataclasses.replace(self, model=model, present=present)
+
+    def from_frame(self, start: int) -> "MotionPredictor":
+        """The same for the sequence from a frame on."""
+        of_clock = lambda x: isinstance(x, Clock)
+        cut = lambda x: x.from_frame(start) if of_clock(x) else x
+        model = jax.tree.map(cut, self.model, is_leaf=of_clock)
+        return dataclasses.replace(self, model=model, present=self.present[:, start:])
 
     def __call__(self, state: State) -> Any:
         """Predictions of all people; leading axes `h t`."""
@@ -134,10 +144,13 @@ class Problem(eqx.Module):
             "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
             "rotation": found.rotation,
             "body_pose": found.body_pose,
+            "valid": getattr(found, "valid", None),
         }
 
     def with_prediction(self, prediction: Any) -> "Problem":
-        """The same problem with a prediction (`predict`) in its factors."""
+        """The same problem with a prediction (`predict`) in its factors; where it says
+        that it is not valid, as the sequence does not hold its window, they keep what
+        they have."""
         if prediction is None:
             return self
         factors = tuple(_with_prediction(f, prediction) for f in self.factors)
@@ -233,8 +246,9 @@ class Problem(eqx.Module):
                 check_padding(factor, sample)
         everything = (*self.factors, *factors)
         layout = dataclasses.replace(self.layout, limbs=limbs_of(everything))
-        if any(isinstance(f, Reprojection | LandmarkPrior) for f in factors):
-            layout = _layout_of(everything, sizes, None)
+        laid = Reprojection | LandmarkPrior | MarginalPrior
+        if any(isinstance(f, laid) for f in factors):
+            layout = layout_of(everything, sizes, None)
             check_memory(layout, sample)
         free, variables = self.free, self.variables
         if "scale" in _variables_of(factors) - _variables_of(self.factors):
@@ -247,16 +261,27 @@ class Problem(eqx.Module):
 
 def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
     """The factor with its predicted measurements replaced, if it has any."""
+    if isinstance(factor, Masked):
+        inner = _with_prediction(factor.factor, prediction)
+        return eqx.tree_at(lambda f: f.factor, factor, inner)
     if isinstance(factor, HumanMotion) and "translation" in prediction:
         unit = 1 if factor.body is None else prediction["leg"]
         translation = prediction["translation"] / unit
-        return eqx.tree_at(lambda f: f.translation, factor, translation)
+        return _predicted(factor, "translation", translation, prediction)
     if isinstance(factor, RelativeOrientation) and "rotation" in prediction:
-        return eqx.tree_at(lambda f: f.rotation, factor, prediction["rotation"])
+        return _predicted(factor, "rotation", prediction["rotation"], prediction)
     predicted_pose = isinstance(factor, BodyPosePrior) and factor.predicted
     if predicted_pose and "body_pose" in prediction:
-        return eqx.tree_at(lambda f: f.rotation, factor, prediction["body_pose"])
+        return _predicted(factor, "rotation", prediction["body_pose"], prediction)
     return factor
+
+
+def _predicted(factor: Factor, name: str, value: Array, prediction: Any) -> Factor:
+    valid, known = prediction.get("valid"), getattr(factor, name)
+    if valid is not None:
+        valid = valid.reshape(*valid.shape, *(1,) * (known.ndim - valid.ndim))
+        value = jnp.where(valid, value, known)
+    return eqx.tree_at(lambda f: getattr(f, name), factor, value)
 
 
 def limbs_of(factors: Sequence[Factor]) -> Limbs:
@@ -267,11 +292,12 @@ def limbs_of(factors: Sequence[Factor]) -> Limbs:
     """
     found: list[set[int]] = []
     for factor in factors:
-        if not isinstance(factor, FrameFactor) or factor.per_joint:
-            continue
-        if not any(name == "pose" for name, _ in factor.keys):
-            continue
-        for joints in map(set, factor.limbs):
+        if isinstance(factor, FrameFactor):
+            sees = any(name == "pose" for name, _ in factor.keys)
+            limbs = factor.limbs if sees and not factor.per_joint else ()
+        else:
+            limbs = factor.limbs if isinstance(factor, MarginalPrior) else ()
+        for joints in map(set, limbs):
             near = [limb for limb in found if limb & joints]
             found = [limb for limb in found if not limb & joints]
             found += [joints.union(*near)] if joints else []
@@ -324,7 +350,7 @@ def make_problem(
     if free is not None:
         check_shapes(free, "free", dict(sizes))
         check_mask(free)
-    layout = _layout_of(factors, sizes, common_sizes)
+    layout = layout_of(factors, sizes, common_sizes)
     check_memory(layout, state)
     mask: Step
     if free is None:
@@ -349,19 +375,27 @@ def make_problem(
 
 
 def _variables_of(factors: Sequence[Factor]) -> set[str]:
-    """Names of the variables (as in `Key`) that any `FrameFactor` depends on."""
+    """Names of the variables (as in `Key`) that any `FrameFactor` depends on; the scale
+    of a prior that people are in, too."""
     over_frames = [f for f in factors if isinstance(f, FrameFactor)]
-    return {name for factor in over_frames for name, _ in factor.touched}
+    known = {name for factor in over_frames for name, _ in factor.touched}
+    priors = [f for f in factors if isinstance(f, MarginalPrior)]
+    of_people = any(len(prior.estimate.roots) for prior in priors)
+    return known | ({"scale"} if of_people else set())
 
 
-def _layout_of(
+def layout_of(
     factors: Sequence[Factor], sizes: Sizes, common_sizes: bool | None
 ) -> Layout:
     """The layout of landmark observations in dense blocks, see `graph/layout.py`.
 
-    **Raises:** `ValueError` for two `Reprojection`, and for priors of landmarks without
-    an observation.
+    **Raises:** `ValueError` for two `Reprojection` or `MarginalPrior`, and for priors
+    of landmarks without an observation.
     """
+    priors = [f for f in factors if isinstance(f, MarginalPrior)]
+    if len(priors) > 1:
+        raise ValueError(f"factors: {len(priors)} `MarginalPrior`, expected one.")
+    front = -(-priors[0].frames // CHUNK) if priors else 0
     tracks = [f for f in factors if isinstance(f, Reprojection)]
     if len(tracks) > 1:
         raise ValueError(
@@ -376,7 +410,7 @@ def _layout_of(
     if common_sizes is None:
         common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
     given = sizes["t"], sizes["l"], frame, landmark, sizes["h"], limbs
-    return make_layout(*given, common_sizes=common_sizes)
+    return make_layout(*given, common_sizes=common_sizes, front=front)
 
 
 def _sample_state(free: Step) -> State:

@@ -84,6 +84,23 @@ class State(eqx.Module):
             globals=self.globals + step.globals,
         )
 
+    def local(self, other: "State") -> Step:
+        """The step that leads to `other`: the inverse of `retract`. Rotations by less
+        than half a turn."""
+        poses = jnp.concatenate([self.cameras[None], self.roots])
+        others = jnp.concatenate([other.cameras[None], other.roots])
+        steps = local_pose(poses, others)
+        return Step(
+            scale=other.scale - self.scale,
+            cameras=steps[0],
+            roots=steps[1:],
+            poses=so3.between(self.poses, other.poses),
+            shapes=other.shapes - self.shapes,
+            landmarks=other.landmarks - self.landmarks,
+            intrinsics=other.intrinsics - self.intrinsics,
+            globals=other.globals - self.globals,
+        )
+
     def zero_step(self) -> Step:
         """The zero step."""
         return Step(
@@ -116,6 +133,14 @@ def retract_pose(
         axis=-1,
     )
     return jnp.concatenate([top, pose[..., 3:, :]], axis=-2)
+
+
+def local_pose(
+    pose: Float[Array, "*b 4 4"], other: Float[Array, "*b 4 4"]
+) -> Float[Array, "*b 6"]:
+    """The step that leads from one pose to another: the inverse of `retract_pose`."""
+    turn = so3.log(so3.inverse(pose[..., :3, :3]) @ other[..., :3, :3])
+    return jnp.concatenate([turn, other[..., :3, 3] - pose[..., :3, 3]], axis=-1)
 
 
 def retract_rotation(

@@ -20,6 +20,7 @@ from bodyslam_jax.graph.factors.camera_prior import CameraPrior
 from bodyslam_jax.graph.factors.ground_contact import GroundContact
 from bodyslam_jax.graph.factors.keypoint_reprojection import KeypointReprojection
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
+from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.factors.root_orientation import RootOrientation
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
@@ -74,8 +75,8 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
     **Raises:** `ValueError` that says where, what was found and what was expected.
     """
     name = type(factor).__name__
-    of_landmarks = isinstance(factor, Reprojection | LandmarkPrior)
-    if not of_landmarks and not isinstance(factor, FrameFactor):
+    known = FrameFactor | Reprojection | LandmarkPrior | MarginalPrior
+    if not isinstance(factor, known):
         raise ValueError(f"factors: {name} is neither of landmarks nor over frames.")
     sizes = dict(sizes)
     check_loss(factor.loss, f"{name}.loss")
@@ -99,6 +100,8 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
     check_correlation(factor, name)
     if isinstance(factor, Reprojection):
         _check_tracks(factor, sizes)
+    if isinstance(factor, MarginalPrior):
+        _check_marginal(factor, sizes)
     if isinstance(factor, RootOrientation):
         measured = _measured(factor.sigma[..., None])
         _check_rotations(factor.orientation, f"{name}.orientation", measured)
@@ -268,6 +271,21 @@ def _check_range(where, index, limit):
         raise ValueError(
             f"{where}: indices {index.min()} to {index.max()}, expected 0 to "
             f"{limit - 1}."
+        )
+
+
+def _check_marginal(factor, sizes):
+    found = check_state(factor.estimate)
+    for axis in "hig":
+        if found[axis] != sizes[axis]:
+            raise ValueError(
+                f"MarginalPrior.estimate: {found[axis]} along `{axis}`, expected "
+                f"{sizes[axis]} as in the state."
+            )
+    if found["t"] > sizes["t"]:
+        raise ValueError(
+            f"MarginalPrior: couples {found['t']} frames, expected at most the "
+            f"{sizes['t']} of the state."
         )
 
 

@@ -63,6 +63,21 @@ class Clock(eqx.Module):
             same=self.same,
         )
 
+    def from_frame(self, start: int) -> "Clock":
+        """For the sequence from a frame on, with the ticks from that frame on; frames
+        before the first of them lie at it."""
+        tick, beyond = np.asarray(self.tick)[start:], np.asarray(self.beyond)[start:]
+        first = int(tick[0] + (beyond[0] > 1e-9))
+        before = tick < first
+        return Clock(
+            frame=jnp.asarray(np.asarray(self.frame)[first:] - start),
+            between=jnp.asarray(np.asarray(self.between)[first:]),
+            tick=jnp.asarray(np.where(before, 0, tick - first)),
+            beyond=jnp.asarray(np.where(before, 0.0, beyond)),
+            steps=jnp.asarray(np.asarray(self.steps)[start:]),
+            same=self.same,
+        )
+
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
     """Lays the model's ticks, `fps` a second, over a video's timestamps (s)."""

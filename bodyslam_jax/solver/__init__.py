@@ -6,7 +6,7 @@ from bodyslam_jax.solver.convergence_trace import clock as clock
 from bodyslam_jax.solver.convergence_trace import trace as trace
 from bodyslam_jax.solver.covariance import Marginals as Marginals
 from bodyslam_jax.solver.covariance import marginals as marginals
-from bodyslam_jax.solver.marginalisation import MarginalPrior as MarginalPrior
+from bodyslam_jax.solver.marginalisation import Remainder as Remainder
 from bodyslam_jax.solver.marginalisation import marginalise as marginalise
 from bodyslam_jax.solver.observability import observability as observability
 from bodyslam_jax.solver.schedule import PAPER_SCHEDULE as PAPER_SCHEDULE

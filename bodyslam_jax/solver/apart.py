@@ -64,6 +64,26 @@ def solve_apart(
 ) -> Float[Array, "h t _"]:
     """Steps of these joints: a block-tridiagonal system for each, of 3 x 3 blocks, all
     joints at once."""
+    gradient = lin.gradient["apart"]
+    link, pivot, known = eliminate_apart(lin, damping)
+
+    def backward(pull, frame):
+        pivot, known, link = frame
+        moved = _along(_inverse(pivot), known - pull)
+        return _along(_turned(link), moved), moved
+
+    given = pivot, known, link
+    _, moved = jax.lax.scan(backward, jnp.zeros_like(known[0]), given, reverse=True)
+    return jnp.moveaxis(moved, 0, 1).reshape(gradient.shape)
+
+
+def eliminate_apart(
+    lin: Linearisation, damping: Float[Array, "h t _"]
+) -> tuple[
+    Float[Array, "t h j 3 3"], Float[Array, "t h j 3 3"], Float[Array, "t h j 3"]
+]:
+    """Coupling of each frame with the one before; and what all before leave of each
+    frame's own block and right-hand side."""
     gradient, own = lin.gradient["apart"], lin.blocks["apart", "apart", 0]
     shape = own.shape[:-1]
     eye = jnp.eye(3, dtype=own.dtype)
@@ -71,27 +91,23 @@ def solve_apart(
     # Of each frame with the one before.
     link = lin.blocks.get(("apart", "apart", 1), jnp.zeros_like(own))
     right = -gradient.reshape(shape)
-    turned = lambda x: x.swapaxes(-1, -2)
 
     def forward(before, frame):
         inverse, known = before
         own, link, right = frame
         gain = _times(link, inverse)
-        inverse = _inverse(own - _times(gain, turned(link)))
+        pivot = own - _times(gain, _turned(link))
         known = right - _along(gain, known)
-        return (inverse, known), (inverse, known)
-
-    def backward(pull, frame):
-        inverse, known, link = frame
-        moved = _along(inverse, known - pull)
-        return _along(turned(link), moved), moved
+        return (_inverse(pivot), known), (pivot, known)
 
     own, link, right = (jnp.moveaxis(x, 1, 0) for x in (own, link, right))
     none = jnp.zeros_like(own[0]), jnp.zeros_like(right[0])
-    _, (inverse, known) = jax.lax.scan(forward, none, (own, link, right))
-    given = inverse, known, link
-    _, moved = jax.lax.scan(backward, none[1], given, reverse=True)
-    return jnp.moveaxis(moved, 0, 1).reshape(gradient.shape)
+    _, (pivot, known) = jax.lax.scan(forward, none, (own, link, right))
+    return link, pivot, known
+
+
+def _turned(x: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    return x.swapaxes(-1, -2)
 
 
 def _times(a: Float[Array, "*b 3 3"], b: Float[Array, "*b 3 3"]) -> Array:

@@ -16,7 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import (
+    Factor,
     FrameFactor,
+    MarginalPrior,
     Problem,
     Squared,
     State,
@@ -87,12 +89,17 @@ def is_quadratic(problem: Problem) -> bool:
     return all(isinstance(f.loss, Squared) for f in _factors_of_scale(problem))
 
 
-def _factors_of_scale(problem: Problem) -> list[FrameFactor]:
-    over_frames = [f for f in problem.factors if isinstance(f, FrameFactor)]
-    return [factor for factor in over_frames if ("scale", 0) in factor.keys]
+def _factors_of_scale(problem: Problem) -> list[Factor]:
+    return [factor for factor in problem.factors if _sees_scale(factor)]
 
 
-def _model(factors: list[FrameFactor], state: State, scale: Float[Array, ""]) -> _Model:
+def _sees_scale(factor: Factor) -> bool:
+    if isinstance(factor, FrameFactor):
+        return ("scale", 0) in factor.keys
+    return isinstance(factor, MarginalPrior)
+
+
+def _model(factors: list[Factor], state: State, scale: Float[Array, ""]) -> _Model:
     def residuals(s):
         there = dataclasses.replace(state, scale=s)
         return [residual_of(factor, there) for factor in factors]

@@ -80,6 +80,17 @@ class LandmarkBlocks(eqx.Module):
     gradient: Float[Array, "n 3 g"]
 
 
+class PriorBlocks(eqx.Module):
+    """`J^T J` of a `MarginalPrior`: of people in the first chunk, cameras of the first
+    chunks, and globals."""
+
+    matrix: Float[Array, "d d"]
+    person: int = eqx.field(static=True)
+    """Coordinates of a person: the last posture, then the last roots."""
+    reach: int = eqx.field(static=True)
+    """Number of these roots."""
+
+
 class Linearisation(eqx.Module):
     """Blocks of `J^T J` and of the gradient `J^T r` at a state, and its cost."""
 
@@ -93,6 +104,8 @@ class Linearisation(eqx.Module):
     landmarks: tuple[LandmarkBlocks, ...]
     costs: Float[Array, " k"]
     """Of each factor."""
+    prior: PriorBlocks | None = None
+    """Its globals' own block is in `globals`."""
 
 
 def cast(tree, dtype: np.dtype):

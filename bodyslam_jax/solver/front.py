@@ -90,6 +90,8 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
             cross |= other == "camera" or lag != 0
         if first in ("pose", "root") and other in ("root", "camera"):
             reach = max(reach, abs(lag))
+    if lin.prior is not None:
+        reach = max(reach, lin.prior.reach)
     limbs = sizes.widths if "pose" in lin.gradient else ()
     return Window(limbs, cross, reach, sizes.own_globals)
 

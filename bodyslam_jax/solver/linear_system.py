@@ -37,8 +37,9 @@ from bodyslam_jax.solver.elimination.schur import (
     substitute_landmarks,
 )
 from bodyslam_jax.solver.front import Window, window_of
+from bodyslam_jax.solver.linearise.marginal_prior import diagonal_of_prior
 from bodyslam_jax.solver.long_tracks import move_lasting
-from bodyslam_jax.solver.reduced_system import assemble
+from bodyslam_jax.solver.reduced_system import Chunks, add_marginal_prior, assemble
 
 
 class Eliminated(eqx.Module):
@@ -62,6 +63,10 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
     root = jnp.zeros((sizes.people, t, 6), dtype)
     if ("root", "root", 0) in lin.blocks:
         root = diagonal(lin.blocks["root", "root", 0])
+    of_prior = None
+    if lin.prior is not None:
+        of_prior = [x.astype(dtype) for x in diagonal_of_prior(lin.prior, sizes, t)]
+        camera, root = camera + of_prior[0], root + of_prior[1]
     result = {
         "globals": diagonal(lin.globals),
         "camera": camera,
@@ -73,6 +78,8 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
     }
     if "pose" in lin.gradient:
         result["pose"] = _pose_diagonal(lin)
+        if of_prior is not None:
+            result["pose"] = result["pose"] + of_prior[2]
     if "apart" in lin.gradient:
         result["apart"] = apart_diagonal(lin)
     return result
@@ -111,6 +118,15 @@ def eliminate(
 ) -> Eliminated:
     """Factorises the damped normal equations, in the precision of `sizes`."""
     lin, damping = cast((lin, damping), sizes.dtype)
+    chunks, window, people = reduce_to_chunks(problem, lin, sizes, damping)
+    factor = factorise(chunks, sizes, problem.layout)
+    return Eliminated(damping, window, people, factor)
+
+
+def reduce_to_chunks(
+    problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
+) -> tuple[Chunks, Window, People | None]:
+    """The system of chunks that landmarks, inner postures and inner roots leave."""
     reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
     window = window_of(lin, sizes)
     people = None
@@ -119,7 +135,9 @@ def eliminate(
     kept = None if people is None else people.kept
     layout = problem.layout
     chunks = assemble(lin, sizes, reduced, kept, window, damping, layout.order)
-    return Eliminated(damping, window, people, factorise(chunks, sizes, layout))
+    if lin.prior is not None:
+        chunks = add_marginal_prior(chunks, lin.prior, sizes, window)
+    return chunks, window, people
 
 
 @eqx.filter_jit

@@ -1,263 +1,543 @@
-"""The oldest frames of a problem as a Gaussian prior on what is left of it.
+"""The first chunks of a problem as a prior on what is left of it.
 
 The measurements are split: `old` are those of the first frames and of all landmarks
 that these frames observe, `rest` are the others. With the normal equations `H δ = -g`
-of `old` at a state, E the variables of the oldest frames and landmarks, and R all
-others that `old` depends on,
+of `old` at a state, E the variables that only `old` depends on, and R all others that
+it depends on,
 
-    Λ = H_RR - H_RE H_EE^-1 H_ER,    η = g_R - H_RE H_EE^-1 g_E,
+    Λ = H_RR - H_RE H_EE^-1 H_ER,    η = g_R - H_RE H_EE^-1 g_E.
 
-and `½ δ_R^T Λ δ_R + η^T δ_R` is, up to a constant, the least cost of `old` over E: to
-second order, and exactly where residuals are linear and losses squared. `H_EE^-1` is
-the solver's own elimination with R held constant, one right-hand side for each
-coordinate in R; so any factor that the solver takes may be in `old`. A fixed-lag
-smoother that adds this prior to `rest` loses nothing but the relinearisation of E
-(Sibley, Matthies, Sukhatme, Sliding window filter with application to planetary
-landing, 2010).
+The elimination of a step (`linear_system.py`) has both when it has come to the last
+chunk of the first frames: landmarks, postures and roots are gone, chunks before it too,
+and what is not yet factorised is Λ, with the right-hand side -η. R are the last posture
+and the last roots of that chunk, its last cameras and those of the next chunks that
+observe old landmarks, and the globals. One elimination, whatever the size of R.
 
-R has the cameras, roots and poses of the last old frames that factors of later frames
-reach back to, the cameras that observe old landmarks, and scale, shapes, intrinsics.
+With `Λ = W^T W` and `W^T b = η`, from the eigenvectors of Λ in units of its diagonal,
+`½ |W δ + b|²` is, up to a constant, the least cost of `old` over E: to second order,
+and exactly where residuals are linear and losses squared (Sibley, Matthies, Sukhatme,
+Sliding window filter with application to planetary landing, 2010). `MarginalPrior` has
+it as a factor of the remaining state.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from bodyslam_jax.geometry.lengths import padded_rows
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import (
+    CHUNK,
     Factor,
     FrameFactor,
     LandmarkPrior,
+    MarginalPrior,
     Problem,
     Reprojection,
     State,
-    Step,
+    layout_of,
+    make_layout,
+    residual_of,
 )
 from bodyslam_jax.graph.padding import Masked
-from bodyslam_jax.solver.blocks import mask_of
+from bodyslam_jax.solver.apart import eliminate_apart, groups_of
+from bodyslam_jax.solver.block_cholesky import Factor as Factorised
+from bodyslam_jax.solver.block_cholesky import factorise
+from bodyslam_jax.solver.blocks import CAMERAS, Sizes, mask_of, sizes_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
-from bodyslam_jax.solver.implicit import diagonal_of, normal_solver
-from bodyslam_jax.solver.levenberg_marquardt import lifted
+from bodyslam_jax.solver.front import Window
+from bodyslam_jax.solver.linear_system import damped, diagonals, reduce_to_chunks
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.linearise.marginal_prior import indices
+from bodyslam_jax.solver.loops import row_of
 from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.solve import check_start
 
-_REFINEMENTS = 2
-"""Of each solution by `H_EE^-1`, which is hardly damped: to rounding."""
+_LITTLE = 64
+"""Damping of what is eliminated, in units of rounding: pivots of points without
+parallax stay positive, and what they add is below rounding."""
+_SAME = {"float64": 1e-6, "float32": 1e-2}
+"""Change of residuals, in standard deviations, that rounding may make where the map is
+moved as a whole."""
+_TURN = (0.3, -0.2, 0.4)
+"""rad. Any large one will do, and so will any shift and any ratio."""
+_SHIFT = (0.7, -0.4, 0.5)
+_RATIO = 1.3
 
 
-_GRADIENT, _NONE = -1, -2
-"""In place of the number of a coordinate."""
+class Remainder(NamedTuple):
+    """What `marginalise` leaves."""
+
+    problem: Problem
+    """The last of its factors is the `MarginalPrior`."""
+    state: State
+    landmarks: Int[np.ndarray, " l"]
+    """Which of the landmarks are left, as they were numbered."""
 
 
-class MarginalPrior(eqx.Module):
-    """`½ δ^T Λ δ + η^T δ` for a step δ from the state where it was linearised."""
+def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
+    """The problem without the measurements of its first `frames` frames, which a prior
+    stands for.
 
-    information: Float[Array, "n n"]
-    """Λ"""
-    slope: Float[Array, " n"]
-    """η"""
-    coordinates: Int[Array, " n"]
-    """Where R stands in a flattened `Step` of the problem (`ravel_pytree`)."""
+    `frames` is a multiple of `graph.CHUNK`, ten frames. The last ten of them stay, as
+    the past that later frames reach back to, and that a motion model looks back on:
+    their last cameras, roots and the last posture are in the prior, all else in them is
+    held. Landmarks that the first frames observe go with all their observations. The
+    prior is one more factor: it may be marginalised again, with the ten frames it is
+    of, and put into other problems whose first frames these are.
 
-    def cost(self, step: Step) -> Float[Array, ""]:
-        """The cost of a step, less that of none: zero for the zero step."""
-        moved = ravel_pytree(step)[0][self.coordinates]
-        return moved @ (self.slope + 0.5 * self.information @ moved)
+    Predictions of the motion model are those at `state`, and stay so in the prior.
+    Robust losses keep the weights that they have there, and derivatives are taken there
+    for good.
 
+    Not for use within `jit`: how many coordinates stay depends on the tracks.
 
-def marginalise(
-    problem: Problem, state: State, frames: int
-) -> tuple[MarginalPrior, Problem]:
-    """The prior that the first `frames` frames leave, and the problem without them.
-
-    The problem that is left has the same shapes: its old measurements have no weight,
-    and the variables that were marginalised are held constant. Predictions of the
-    motion model are those at `state`, and stay so in the prior.
-
-    Not for use within `jit`: the number of coordinates depends on the tracks. Takes one
-    elimination of the old frames for each of them.
-
-    **Raises:** `ValueError` if `frames` is not between 1 and the number of frames less
-    1, or if `state` does not fit the problem, as `solve` does.
+    **Raises:** `ValueError` if `frames` is no multiple of ten, or not between 10 and
+    the number of frames less 1; if `state` does not fit the problem, as `solve` does;
+    or if a factor reaches back ten frames or more.
     """
     check_start(problem, state)
-    count = len(state.cameras)
-    if not 0 < frames < count:
-        raise ValueError(f"frames: {frames}, expected 1 to {count - 1}.")
+    total = len(state.cameras)
+    if frames % CHUNK or not 0 < frames < total:
+        raise ValueError(
+            f"frames: {frames}, expected a multiple of {CHUNK} from {CHUNK} to "
+            f"{total - 1}."
+        )
     problem = problem.refresh(state)
-    observed = _observed_landmarks(problem, frames)
-    old, rest = (_split(problem, frames, observed, kept) for kept in (True, False))
-    gone = _marginalised(problem, frames, observed)
-    padded, start = pad(old, state)
-    eliminated = eqx.tree_at(lambda p: p.free, old, gone)
-    eliminated, _ = pad(eliminated, state)
-    touched = _touched(padded, start, mask_of(eliminated))
-    place = np.flatnonzero(ravel_pytree(touched)[0])
-    columns = np.full(padded_rows(len(place) + 1), _NONE)
-    columns[: len(place) + 1] = *place, _GRADIENT
-    rows = _program()(padded, eliminated, start, jnp.asarray(columns))
-    reduced = rows[: len(place) + 1, place]
-    information, slope = reduced[:-1], reduced[-1]
-    left = jax.tree.map(lambda free, old: free * (1 - old), mask_of(rest), gone)
-    prior = MarginalPrior(
-        information=(information + information.T) / 2,
-        slope=slope,
-        coordinates=jnp.asarray(np.flatnonzero(_of_size(touched, state))),
+    observed, last = _observed_landmarks(problem, frames)
+    first = frames // CHUNK - 1
+    old, start = _old(problem, state, frames, observed, last)
+    count = -(-len(start.cameras) // CHUNK) - first
+    padded = pad(old, start)
+    found = _program()(*padded, jnp.asarray(first, jnp.int32), count)
+    invariant = _invariant(*padded)
+    rest = _rest(problem, state, frames, observed, found.window.reach)
+    prior = _prior(problem, old, rest.state, found, count, invariant)
+    left = (*rest.problem.factors, prior)
+    shape = {name: len(x) for name, x in (("t", rest.state.cameras),)}
+    shape |= {"l": len(rest.landmarks), "h": len(state.roots)}
+    whole = dataclasses.replace(
+        rest.problem, factors=left, layout=layout_of(left, shape, None)
     )
-    return prior, eqx.tree_at(lambda p: p.free, rest, left)
+    return rest._replace(problem=whole)
 
 
-def _of_size(step: Step, state: State) -> np.ndarray:
-    """A padded step cut to the sizes of a state, flattened."""
-    t, l = len(state.cameras), len(state.landmarks)
-    cut = dataclasses.replace(
-        step,
-        cameras=step.cameras[:t],
-        roots=step.roots[:, :t],
-        poses=step.poses[:, :t],
-        landmarks=step.landmarks[:l],
-    )
-    return np.asarray(ravel_pytree(cut)[0])
+# The measurements of the first frames, and the others.
 
 
-def _observed_landmarks(problem: Problem, frames: int) -> Bool[np.ndarray, " l"]:
-    """Landmarks with an observation in the first frames."""
+def _observed_landmarks(
+    problem: Problem, frames: int
+) -> tuple[Bool[np.ndarray, " l"], int]:
+    """Landmarks with an observation in the first frames, and the number of frames up to
+    the last that what is marginalised depends on."""
     observed = np.zeros(len(problem.free.landmarks), bool)
+    last = frames
     for factor in problem.factors:
         if isinstance(factor, Reprojection):
-            early = np.asarray(factor.frame) < frames
-            early &= np.isfinite(np.asarray(factor.sigma))
-            observed[np.asarray(factor.landmark)[early]] = True
-    return observed
+            frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
+            counts = np.isfinite(np.asarray(factor.sigma))
+            observed[landmark[(frame < frames) & counts]] = True
+            here = observed[landmark] & counts
+            last = max(last, 1 + frame.max(initial=0, where=here))
+        if isinstance(factor, MarginalPrior):
+            last = max(last, factor.frames)
+    return observed, int(last)
 
 
-def _split(
-    problem: Problem, frames: int, observed: Bool[np.ndarray, " l"], old: bool
-) -> Problem:
-    """The problem with the old measurements alone, or with the others alone.
+def _reach(problem: Problem) -> int:
+    """Frames that factors reach back."""
+    lags = [f.num_lags - 1 for f in problem.factors if isinstance(f, FrameFactor)]
+    reach = max(lags, default=0)
+    if reach >= CHUNK:
+        raise ValueError(
+            f"problem.factors: one reaches back {reach} frames, expected at most "
+            f"{CHUNK - 1}."
+        )
+    return reach
 
-    Measurements of scale, shapes or intrinsics alone are none of the old ones.
-    """
-    early = np.arange(len(problem.free.cameras)) < frames
-    chosen = [f for f in problem.factors if not (old and _is_once(f))]
-    people = len(problem.free.roots)
-    factors = tuple(_part(f, early, observed, people, old) for f in chosen)
-    return dataclasses.replace(problem, factors=factors)
+
+def _old(
+    problem: Problem,
+    state: State,
+    frames: int,
+    observed: Bool[np.ndarray, " l"],
+    last: int,
+) -> tuple[Problem, State]:
+    """The measurements that go, with the frames and landmarks that they depend on."""
+    present = np.arange(last) < frames
+    chosen = [f for f in problem.factors if not _is_once(f)]
+    factors = tuple(_part(f, 0, last, present, observed) for f in chosen)
+    tracks = next((f for f in factors if isinstance(f, Reprojection)), None)
+    none = np.zeros(0, int)
+    before = [f.frames for f in factors if isinstance(f, MarginalPrior)]
+    layout = make_layout(
+        last,
+        int(observed.sum()),
+        none if tracks is None else np.asarray(tracks.frame),
+        none if tracks is None else np.asarray(tracks.landmark),
+        len(state.roots),
+        problem.layout.limbs,
+        front=-(-max(before, default=1) // CHUNK),
+    )
+    old = dataclasses.replace(
+        problem,
+        factors=factors,
+        free=_cut(problem.free, 0, last, observed),
+        motion=None,
+        layout=layout,
+    )
+    return old, _cut(state, 0, last, observed)
+
+
+def _rest(
+    problem: Problem,
+    state: State,
+    frames: int,
+    observed: Bool[np.ndarray, " l"],
+    roots: int,
+) -> Remainder:
+    """The measurements that stay, without the prior and the layout for it."""
+    start, stop = frames - CHUNK, len(state.cameras)
+    present = np.arange(start, stop) >= frames
+    factors = tuple(
+        _part(f, start, stop, present, ~observed)
+        for f in problem.factors
+        if not isinstance(f, MarginalPrior)
+    )
+    free = _cut(problem.free, start, stop, ~observed)
+    cameras = _reach(problem)
+    free = dataclasses.replace(
+        free,
+        cameras=free.cameras.at[: CHUNK - cameras].set(0.0),
+        roots=free.roots.at[:, : CHUNK - roots].set(0.0),
+        poses=free.poses.at[:, : CHUNK - 1].set(0.0),
+    )
+    motion = None if problem.motion is None else problem.motion.from_frame(start)
+    left = dataclasses.replace(problem, factors=factors, free=free, motion=motion)
+    there = _cut(state, start, stop, ~observed)
+    return Remainder(left, there, np.flatnonzero(~observed))
 
 
 def _is_once(factor: Factor) -> bool:
     return isinstance(factor, FrameFactor) and factor.once
 
 
+def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> Any:
+    """A state, or a mask, of some frames and landmarks."""
+    return dataclasses.replace(
+        x,
+        cameras=x.cameras[start:stop],
+        roots=x.roots[:, start:stop],
+        poses=x.poses[:, start:stop],
+        landmarks=x.landmarks[np.flatnonzero(landmarks)],
+    )
+
+
 def _part(
     factor: Factor,
-    early: Bool[np.ndarray, " t"],
-    observed: Bool[np.ndarray, " l"],
-    people: int,
-    old: bool,
+    start: int,
+    stop: int,
+    present: Bool[np.ndarray, " t"],
+    landmarks: Bool[np.ndarray, " l"],
 ) -> Factor:
+    """The measurements of some landmarks, or of the frames that are `present` among
+    those from `start` to `stop`."""
     if isinstance(factor, Reprojection):
-        kept = jnp.asarray(observed == old)[factor.landmark]
-        return _filled(factor, "sigma", kept, jnp.inf)
+        frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
+        rows = np.flatnonzero(landmarks[landmark] & (frame >= start) & (frame < stop))
+        number = np.cumsum(landmarks) - 1
+        return Reprojection(
+            frame=jnp.asarray(frame[rows] - start, factor.frame.dtype),
+            landmark=jnp.asarray(number[landmark[rows]], factor.landmark.dtype),
+            pixel=factor.pixel[rows],
+            sigma=factor.sigma[rows],
+            loss=factor.loss,
+        )
     if isinstance(factor, LandmarkPrior):
-        return _filled(factor, "whitening", jnp.asarray(observed == old), 0.0)
-    if isinstance(factor, FrameFactor) and not factor.once:
-        kept = jnp.asarray(early == old)
-        if not factor.padding or factor.num_lags > 1:
-            # A row may weigh the residual of the row before it, whose measurement
-            # must therefore stay.
-            shape = (people, len(kept)) if factor.of_people else kept.shape
-            return Masked(factor=factor, present=jnp.broadcast_to(kept, shape))
-        axis = 1 if factor.of_people else 0
-        for name, value in factor.padding.items():
-            factor = _filled(factor, name, kept, value, axis)
+        kept = np.flatnonzero(landmarks)
+        return LandmarkPrior(
+            factor.position[kept], factor.whitening[kept], loss=factor.loss
+        )
+    if not isinstance(factor, FrameFactor) or factor.once:
         return factor
+    return _in_frames(_frames(factor, start, stop), present)
+
+
+def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
+    """The factor of a sequence of these frames."""
+    axis = 1 if factor.of_people else 0
+    if isinstance(factor, Masked):
+        inner = _frames(factor.factor, start, stop)
+        return Masked(factor=inner, present=factor.present[..., start:stop])
+    lead = None
+    cut = lambda x: x[(slice(None),) * axis + (slice(start, stop),)]
+    for name in factor.time_fields:
+        value = getattr(factor, name)
+        lead = value.shape[: axis + 1]
+        factor = eqx.tree_at(lambda f, n=name: getattr(f, n), factor, cut(value))
+    if lead and any(jnp.ndim(x) for x in jax.tree.leaves(factor.loss)):
+        of_frames = lambda x: cut(x) if jnp.shape(x)[: axis + 1] == lead else x
+        loss = jax.tree.map(of_frames, factor.loss)
+        factor = eqx.tree_at(lambda f: f.loss, factor, loss)
     return factor
 
 
-def _filled(factor, name, kept, value, axis=0):
-    """The factor with `value` where an array is not kept along an axis."""
-    array = getattr(factor, name)
-    shape = [1] * array.ndim
-    shape[axis] = len(kept)
-    filled = jnp.where(kept.reshape(shape), array, jnp.asarray(value, array.dtype))
-    return eqx.tree_at(lambda f: getattr(f, name), factor, filled)
+def _in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFactor:
+    """The factor with the residuals of these frames alone."""
+    kept = jnp.asarray(present)
+    if isinstance(factor, Masked):
+        return Masked(factor=factor.factor, present=factor.present & kept)
+    if not factor.padding or factor.num_lags > 1:
+        # A row may weigh the residual of the row before it, whose measurement must
+        # therefore stay.
+        values = getattr(factor, factor.time_fields[0])
+        lead = values.shape[: 2 if factor.of_people else 1]
+        return Masked(factor=factor, present=jnp.broadcast_to(kept, lead))
+    axis = 1 if factor.of_people else 0
+    for name, fill in factor.padding.items():
+        array = getattr(factor, name)
+        shape = [len(kept) if a == axis else 1 for a in range(array.ndim)]
+        empty = jnp.asarray(fill, array.dtype)
+        filled = jnp.where(kept.reshape(shape), array, empty)
+        factor = eqx.tree_at(lambda f, n=name: getattr(f, n), factor, filled)
+    return factor
 
 
-def _marginalised(
-    problem: Problem, frames: int, observed: Bool[np.ndarray, " l"]
-) -> Step:
-    """1 for the free coordinates in E."""
-    lags = [f.num_lags - 1 for f in problem.factors if isinstance(f, FrameFactor)]
-    mask = mask_of(problem)
-    early = np.arange(len(mask.cameras)) < frames - max(lags, default=0)
-    early, seen = (jnp.asarray(x, mask.cameras.dtype) for x in (early, observed))
-    none = jax.tree.map(jnp.zeros_like, mask)
-    return dataclasses.replace(
-        none,
-        cameras=mask.cameras * early[:, None],
-        roots=mask.roots * early[:, None],
-        poses=mask.poses * early[:, None, None],
-        landmarks=mask.landmarks * seen[:, None],
-    )
+# What elimination leaves.
 
 
-@eqx.filter_jit
-def _touched(problem: Problem, state: State, gone: Step) -> Step:
-    """1 for the coordinates in R: free, measured, and not in E."""
-    pairs = mask_of(problem), diagonal_of(problem, state), gone
-    return jax.tree.map(
-        lambda free, d, e: jnp.where((d > 0) & (e == 0), free, 0.0), *pairs
-    )
+class _Trailing(eqx.Module):
+    """Λ and η of the last chunk of people that goes, of `count` chunks of cameras from
+    it on, and of globals."""
+
+    matrix: Float[Array, "n n"]
+    slope: Float[Array, " n"]
+    apart: Float[Array, "h j 3 3"] | None
+    """Λ of the joints that are chains by themselves."""
+    apart_slope: Float[Array, "h j 3"] | None
+    window: Window
 
 
 @functools.cache
-def _program() -> Callable[..., Array]:
-    return compiled(_reduced)
+def _program() -> Callable[..., _Trailing]:
+    return compiled(_trailing)
 
 
 @in_full_precision
-def _reduced(
-    problem: Problem, eliminated: Problem, state: State, columns: Int[Array, " n"]
-) -> Float[Array, "n m"]:
-    """Rows of `H - H_E H_EE^-1 H_E^T` for some coordinates, and the gradient's."""
-    gone = mask_of(eliminated)
-    free = mask_of(problem)
-    masked = functools.partial(jax.tree.map, jnp.multiply)
+def _trailing(
+    problem: Problem, state: State, first: Int[Array, ""], count: int
+) -> _Trailing:
+    """`first` is the number of chunks before the last one that goes."""
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state)
+    dtype = state.scale.dtype
+    little = jnp.asarray(_LITTLE * jnp.finfo(dtype).eps, dtype)
+    damping = damped(diagonals(lin, sizes), little)
+    chunks, window, _ = reduce_to_chunks(problem, lin, sizes, damping)
+    layout = dataclasses.replace(problem.layout, used=first)
+    factor = factorise(chunks, sizes, layout)
+    matrix = _unfactorised(chunks, factor, sizes, first, count)
+    after = first * CHUNK
+    rows = lambda x, axis, start, size: jax.lax.dynamic_slice_in_dim(
+        x, after + start, size, axis
+    )
+    kept = [rows(damping["camera"], 0, 0, count * CHUNK).reshape(-1)]
+    if sizes.people:
+        last = CHUNK - window.reach
+        own = [rows(damping["root"], 1, last, window.reach).reshape(sizes.people, -1)]
+        if window.pose:
+            own.insert(0, rows(damping["pose"], 1, CHUNK - 1, 1)[:, 0])
+        kept.insert(0, jnp.concatenate(own, axis=1).reshape(-1))
+    added = jnp.concatenate([*kept, damping["globals"]])
+    # What stays is not damped.
+    apart = apart_slope = None
+    if "apart" in damping:
+        _, pivot, known = eliminate_apart(lin, damping["apart"])
+        at = after + CHUNK - 1
+        more = row_of(damping["apart"], at, 1).reshape(known.shape[1:])
+        eye = jnp.eye(3, dtype=dtype)
+        apart = row_of(pivot, at) - more[..., None] * eye
+        apart_slope = -row_of(known, at)
+    return _Trailing(
+        matrix[:-1, :-1] - jnp.diag(added),
+        -matrix[:-1, -1],
+        apart,
+        apart_slope,
+        window,
+    )
 
-    def residual(step):
-        return lifted(state.retract(masked(free, step)), problem)
 
-    found, along = jax.linearize(residual, state.zero_step())
-    transpose = jax.linear_transpose(along, state.zero_step())
-    product = lambda step: transpose(along(step))[0]
-    solve = normal_solver(eliminated, state)
-
-    def refined(_, given):
-        image, moved = given
-        wrong = jax.tree.map(jnp.subtract, image, product(moved))
-        more = masked(gone, solve(masked(gone, wrong)))
-        return image, jax.tree.map(jnp.add, moved, more)
-
-    flat, unravel = ravel_pytree(state.zero_step())
-    gradient = transpose(found)[0]
-
-    def without_gone(k):
-        """A column of H, or the gradient, less what E explains of it."""
-        unit = flat.at[k].set(jnp.where(k >= 0, 1.0, 0.0))
-        image = jax.tree.map(
-            lambda column, slope: jnp.where(k == _GRADIENT, slope, column),
-            *(product(unravel(unit)), gradient),
+def _unfactorised(
+    chunks: Chunks,
+    factor: Factorised,
+    sizes: Sizes,
+    first: Int[Array, ""],
+    count: int,
+) -> Float[Array, "n n"]:
+    """What is left of people of chunk `first`, of cameras of `count` chunks, and of the
+    globals with the right-hand side, once the chunks before it are factorised."""
+    _, r, q = chunks.coupling.shape
+    head, tail = q - CAMERAS, sizes.arrow + 1
+    after = (r - head - tail) // CAMERAS
+    end = head + count * CAMERAS
+    size = end + tail
+    whole = jnp.zeros((size, size), chunks.pivot.dtype)
+    cameras = lambda i: np.arange(head + i * CAMERAS, head + (i + 1) * CAMERAS)
+    globals_ = np.arange(end, size)
+    tail_rows = np.arange(r - tail, r)
+    for i in range(count):
+        pivot, coupling = (
+            row_of(x, first + i) for x in (chunks.pivot, chunks.coupling)
         )
-        start = image, state.zero_step()
-        _, moved = jax.lax.fori_loop(0, _REFINEMENTS + 1, refined, start)
-        return ravel_pytree(jax.tree.map(jnp.subtract, image, product(moved)))[0]
+        # Of people only those of the first: no old measurement sees the others.
+        mine = np.arange(q) if i == 0 else np.arange(head, q)
+        place = np.arange(q) if i == 0 else cameras(i)
+        later = np.arange(end - cameras(i)[-1] - 1)[: after * CAMERAS]
+        rows = np.concatenate([head + later, tail_rows])
+        below = np.concatenate([cameras(i)[-1] + 1 + later, globals_])
+        part = coupling[rows[:, None], mine]
+        whole = whole.at[place[:, None], place].add(pivot[mine[:, None], mine])
+        whole = whole.at[below[:, None], place].add(part)
+        whole = whole.at[place[:, None], below].add(part.T)
+    for back in range(1, after + 1):
+        known = first >= back
+        side = row_of(factor.side, jnp.maximum(first - back, 0))
+        side = jnp.where(known, side, 0.0)
+        people = side[:head] if back == 1 else jnp.zeros_like(side[:head])
+        seen = side[head + (back - 1) * CAMERAS : -tail][: count * CAMERAS]
+        seen = jnp.pad(seen, ((0, count * CAMERAS - len(seen)), (0, 0)))
+        rows = jnp.concatenate([people, seen, side[-tail:]])
+        whole = whole - rows @ rows.T
+    return whole.at[end:, end:].set(factor.corner)
 
-    return jax.lax.map(without_gone, columns)
+
+# The prior.
+
+
+def _prior(
+    problem: Problem,
+    old: Problem,
+    left: State,
+    found: _Trailing,
+    count: int,
+    invariant: Bool[np.ndarray, " 3"],
+) -> MarginalPrior:
+    """The factor of the remaining state that has this Λ and η."""
+    frames = min(count * CHUNK, len(left.cameras))
+    none = np.zeros(len(left.landmarks), bool)
+    estimate = _cut(left, 0, frames, none)
+    size = 1 + len(left.intrinsics) + len(left.globals) + left.shapes.size
+    size += 6 * frames + len(left.roots) * (6 * found.window.reach + 69)
+    dtype = left.scale.dtype
+    prior = MarginalPrior(
+        root=jnp.zeros((size, size), dtype),
+        offset=jnp.zeros(size, dtype),
+        estimate=estimate,
+        anchor=jnp.zeros(frames, dtype),
+        invariant=jnp.asarray(invariant, dtype),
+        reach=found.window.reach,
+        joints=problem.layout.joints,
+    )
+    index = indices(prior, sizes_of(old, left))
+    matrix, slope = np.zeros((size, size)), np.zeros(size)
+    own, cut = index.people.size, CAMERAS * count - 6 * frames
+    end = len(found.slope) - len(index.globals)
+    kept = np.r_[: end - cut, end : len(found.slope)]
+    place = np.concatenate([index.people.reshape(-1), index.cameras, index.globals])
+    assert own + 6 * frames == end - cut
+    matrix[np.ix_(place, place)] = np.asarray(found.matrix)[np.ix_(kept, kept)]
+    slope[place] = np.asarray(found.slope)[kept]
+    if found.apart is not None:
+        joints = np.array(groups_of(problem.layout.joints)["apart"])
+        rows = index.postures.reshape(-1, 23, 3)[:, joints]
+        matrix[rows[..., :, None], rows[..., None, :]] = np.asarray(found.apart)
+        slope[rows] = np.asarray(found.apart_slope)
+    gone = index.cameras[: 6 * (CHUNK - _reach(problem))]
+    matrix, slope = _without(matrix, slope, gone, np.finfo(dtype).eps)
+    root, offset = _square_root(matrix, slope, np.finfo(dtype).eps)
+    diagonal = np.diag(matrix)[index.cameras].reshape(-1, 6)
+    anchor = (diagonal[:, 3:] > 0).any(axis=1)
+    return dataclasses.replace(
+        prior,
+        root=jnp.asarray(root, dtype),
+        offset=jnp.asarray(offset, dtype),
+        anchor=jnp.asarray(anchor, dtype),
+    )
+
+
+def _without(matrix, slope, gone, eps):
+    """Less some coordinates, which get rows of 0."""
+    gone = gone[np.diag(matrix)[gone] > 0]
+    unit = 1 / np.sqrt(np.diag(matrix)[gone])
+    own = unit[:, None] * matrix[np.ix_(gone, gone)] * unit
+    own += _LITTLE * eps * np.eye(len(gone))
+    side = unit[:, None] * matrix[gone]
+    gain = np.linalg.solve(own, side).T
+    matrix = matrix - gain @ side
+    slope = slope - gain @ (unit * slope[gone])
+    matrix[gone], matrix[:, gone], slope[gone] = 0.0, 0.0, 0.0
+    return (matrix + matrix.T) / 2, slope
+
+
+def _square_root(matrix, slope, eps):
+    """`W` with `W^T W` the matrix, and `b` with `W^T b` the slope, where the matrix is
+    not 0 to rounding."""
+    diagonal = np.maximum(np.diag(matrix), 0.0)
+    unit = np.where(diagonal > 0, np.sqrt(diagonal), 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    known = values > len(values) * eps * max(values[-1], 0.0)
+    size = np.sqrt(np.where(known, values, 0.0))
+    root = size[:, None] * vectors.T * unit
+    offset = np.where(known, vectors.T @ (slope / unit), 0.0)
+    return root, offset / np.where(known, size, 1.0)
+
+
+def _invariant(problem: Problem, state: State) -> Bool[np.ndarray, " 3"]:
+    """Whether the measurements depend neither on where the map is, nor on how it is
+    turned, nor on its unit; held coordinates do not move with it."""
+    change, size = (np.asarray(x) for x in _changes(problem, state))
+    free = change <= _SAME[state.scale.dtype.name] * (1 + size)
+    return free & free[0]
+
+
+@eqx.filter_jit
+def _changes(problem: Problem, state: State) -> tuple[Float[Array, " 3"], Array]:
+    """The largest change of a residual, and the largest residual."""
+    mask = mask_of(problem)
+
+    def residuals(moved: State) -> Array:
+        step = jax.tree.map(jnp.multiply, mask, state.local(moved))
+        there = state.retract(step)
+        parts = [residual_of(f, there).reshape(-1) for f in problem.factors]
+        return jnp.concatenate(parts)
+
+    dtype = state.scale.dtype
+    shift, turn = jnp.asarray(_SHIFT, dtype), so3.exp(jnp.asarray(_TURN, dtype))
+    centre = state.cameras[:, :3, 3]
+
+    def placed(rotation, r):
+        top = jnp.concatenate([rotation, r[..., None]], axis=-1)
+        return jnp.concatenate([top, state.cameras[:, 3:]], axis=1)
+
+    C = state.cameras[:, :3, :3]
+    ways = [
+        (placed(C, centre + shift), state.landmarks + shift, state.scale),
+        (placed(turn @ C, centre @ turn.T), state.landmarks @ turn.T, state.scale),
+        (placed(C, _RATIO * centre), _RATIO * state.landmarks, state.scale / _RATIO),
+    ]
+    before = residuals(state)
+    change = []
+    for cameras, landmarks, scale in ways:
+        moved = dataclasses.replace(
+            state, cameras=cameras, landmarks=landmarks, scale=scale
+        )
+        change.append(jnp.max(jnp.abs(residuals(moved) - before), initial=0.0))
+    return jnp.stack(change), jnp.max(jnp.abs(before), initial=0.0)

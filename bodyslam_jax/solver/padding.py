@@ -15,6 +15,7 @@ import numpy as np
 from bodyslam_jax.graph import (
     CHUNK,
     LandmarkPrior,
+    MarginalPrior,
     Problem,
     Reprojection,
     State,
@@ -91,4 +92,6 @@ def _pad_factor(factor, state, frames, landmarks, observations):
             sigma=extend(factor.sigma, 0, rows, jnp.inf),
             loss=factor.loss,
         )
+    if isinstance(factor, MarginalPrior):
+        return factor
     return pad_factor(factor, state, frames)

@@ -11,12 +11,14 @@ is up to `reach` places away, either way.
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver.blocks import (
     CAMERAS,
     Linearisation,
+    PriorBlocks,
     Sizes,
     own_to_global,
     shifted,
@@ -103,6 +105,38 @@ def assemble(
         coupling = [band + _in_place(after, order, sizes.reach, band.shape[1])]
     coupling = jnp.concatenate([*coupling, _stack([[*tails, tail]])], axis=1)
     return Chunks(_stack(lines), coupling, corner)
+
+
+def add_marginal_prior(
+    chunks: Chunks, prior: PriorBlocks, sizes: Sizes, window: Window
+) -> Chunks:
+    """The system of chunks with the prior's blocks; chunks in the order of time."""
+    matrix, pivot, coupling = prior.matrix, chunks.pivot, chunks.coupling
+    own, head = sizes.people * prior.person, sizes.people * window.person
+    count = (len(matrix) - own - sizes.globals) // CAMERAS
+    person = np.arange(prior.person)
+    # Roots are the last ones, in a window that may have more.
+    roots = person >= prior.person - 6 * prior.reach
+    person = person + roots * 6 * (window.reach - prior.reach)
+    people = np.arange(sizes.people)[:, None] * window.person + person
+    cameras = head + np.arange(CAMERAS)
+    tail = coupling.shape[1] - sizes.arrow - 1 + np.arange(sizes.globals)
+    of_globals = np.arange(len(matrix) - sizes.globals, len(matrix))
+    for i in range(count):
+        start = own + i * CAMERAS
+        here = np.arange(start, start + CAMERAS)
+        place = cameras
+        if i == 0:
+            here = np.concatenate([np.arange(own), here])
+            place = np.concatenate([people.reshape(-1), cameras])
+        later = np.arange(start + CAMERAS, own + count * CAMERAS)
+        rows = np.concatenate([sizes.reach * head + later - later[:1].sum(), tail])
+        below = np.concatenate([later, of_globals])
+        pivot = pivot.at[i, place[:, None], place].add(matrix[here[:, None], here])
+        coupling = coupling.at[i, rows[:, None], place].add(
+            matrix[below[:, None], here]
+        )
+    return Chunks(pivot, coupling, chunks.corner)
 
 
 def _in_place(

@@ -12,6 +12,7 @@ import numpy as np
 from bodyslam_jax.graph import (
     FrameFactor,
     LandmarkPrior,
+    MarginalPrior,
     Problem,
     Reprojection,
     State,
@@ -19,6 +20,7 @@ from bodyslam_jax.graph import (
 from bodyslam_jax.solver.blocks import Linearisation, Observations, Sums, sizes_of
 from bodyslam_jax.solver.linearise.frame import linearise_frames
 from bodyslam_jax.solver.linearise.landmark import add_prior, linearise_landmarks
+from bodyslam_jax.solver.linearise.marginal_prior import linearise_marginal_prior
 
 
 @eqx.filter_jit
@@ -33,13 +35,15 @@ def linearise(
     Blocks are kept in `dtype`, gradients and costs in the state's own.
     """
     sums = Sums(sizes_of(problem, state, dtype), state)
-    landmarks, priors = (), []
+    landmarks, priors, marginal = (), [], None
     for factor in problem.factors:
         if isinstance(factor, Reprojection):
             landmarks = linearise_landmarks(problem, factor, observations, state, sums)
         elif isinstance(factor, LandmarkPrior):
             priors.append(factor)
             sums.costs.append(factor.cost(state))
+        elif isinstance(factor, MarginalPrior):
+            marginal = linearise_marginal_prior(problem, factor, state, sums)
         elif isinstance(factor, FrameFactor):
             linearise_frames(problem, factor, state, sums)
     for prior in priors:
@@ -52,4 +56,5 @@ def linearise(
         sums.globals_gradient,
         landmarks,
         jnp.stack(sums.costs),
+        marginal,
     )
