@@ -3,8 +3,8 @@
 They are weak evidence. On 180 rendered side views the depth of limbs has errors of 3 to
 9 cm (1 σ) and a bias of up to 10 cm, correlated over about 0.15 s; the order of knees
 or ankles 10 cm apart in depth was correct in all of 267 pairs, and no body was turned
-round. They do not enter the fit, whose starts they used to choose among: 31 sequences
-and seven people in real clips are fitted alike without them.
+round. They do not enter the fit. Its starts were chosen with them; of eleven rendered
+sequences these were the same without them to 0.1 mm.
 """
 
 import dataclasses
