@@ -47,7 +47,8 @@ def literals(text: str) -> list[Literal]:
     commented = {k + 1 for k, line in enumerate(lines) if "#" in line}
     documented = _documented(tree)
     found = []
-    for node, name in _numbers(tree, "module"):
+    place = lambda one: (one[0].lineno, one[0].col_offset)
+    for node, name in sorted(_numbers(tree, "module"), key=place):
         line = node.lineno
         known = line in commented or line - 1 in commented or line in documented
         found.append(Literal(line, name, node.value, known))
