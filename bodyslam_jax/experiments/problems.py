@@ -18,7 +18,11 @@ def rebuild(
 ) -> graph.Problem:
     """A problem of other `factors`, with the predictor of this one."""
     return graph.make_problem(
-        factors, state, motion=problem.motion, free=free or problem.free
+        factors,
+        state,
+        motion=problem.motion,
+        free=free or problem.free,
+        named=problem.globals,
     )
 
 
