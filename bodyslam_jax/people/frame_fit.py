@@ -1,9 +1,8 @@
-"""Fits of single frames, from the lifted posture.
+"""Fits of single frames to keypoints, from the lifted posture.
 
-Before, every frame was fitted from eight headings with typical postures, too, and one
-of the ends was chosen. Bodies are the same from what the lifting network (`lift`) says
-alone: results of six rendered sequences to 0.1 mm of PA-MPJPE, of six simulated ones to
-0.2, joints of seven people in real clips who walk, dance and sit to 0.3 degrees (mean).
+Each starts at what the lifting network (`lift`) says, placed by the keypoints, and is
+the start of the fit of all frames (`fit`). Other headings and typical postures end at
+the same bodies (`benchmarks/keypoints.md`).
 """
 
 from typing import Any
