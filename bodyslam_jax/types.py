@@ -48,9 +48,6 @@ class Keypoints:
     """px; 0 where the keypoint is missing."""
     confidence: Float[np.ndarray, "h t 25"]
     """0 where the keypoint is missing; else positive. The scale is the detector's."""
-    depth: Float[np.ndarray, "h t 25"] | None = None
-    """Depth in the camera relative to the middle of the hips, m, positive away from
-    the camera, as regressed by a network; 0 where it is missing."""
     definition: str = "unknown"
     """What the detector calls a hip or a knee: a name in
     `body.KEYPOINT_DEFINITIONS`."""

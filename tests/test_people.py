@@ -136,6 +136,18 @@ def test_fit_is_present_where_there_are_keypoints_or_a_short_gap(fitted):
     np.testing.assert_array_equal(fitted.present[1], wanted)
 
 
+def test_whom_a_detector_only_guesses_is_absent(seen, body):
+    """Somebody who leaves the image: all keypoints go on, with little confidence."""
+    confidence = seen.confidence[:1].copy()
+    confidence[:, 40:] *= 0.3
+    leaving = dataclasses.replace(seen, uv=seen.uv[:1], confidence=confidence)
+    found = people.fit_bodies(leaving, CAMERA, body, FPS)
+    np.testing.assert_array_equal(found.present[0], np.arange(FRAMES) < 40)
+    # The scale of confidences is the detector's.
+    unsure = dataclasses.replace(leaving, confidence=0.3 * seen.confidence[:1])
+    assert people.fit_bodies(unsure, CAMERA, body, FPS).present[0].all()
+
+
 def test_fit_has_one_shape_and_no_backward_knees(fitted):
     assert np.ptp(fitted.shapes, axis=1).max() == 0
     assert np.abs(fitted.shapes).max() < 2

@@ -246,19 +246,6 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
 
 
-def test_depths_are_those_of_the_person_and_their_ray(scene, found):
-    whole = with_people(scene[1], found)
-    keypoints = people.with_depths(whole.keypoints, found, whole.intrinsics)
-    said = found.relative[:, [10, 13]].any(axis=-1)
-    assert said.mean() > 0.8
-    np.testing.assert_array_equal(keypoints.depth[0][:, [10, 13]] != 0, said)
-    # Seen far to the left of the axis, what is to a person's right is before them.
-    params = np.array([1.0, 1.0, 1e4, *whole.intrinsics.params[3:]])
-    camera = dataclasses.replace(whole.intrinsics, params=params)
-    turned = people.with_depths(whole.keypoints, found, camera).depth[0]
-    np.testing.assert_allclose(turned[:, 10], found.relative[:, 10, 0], atol=0.1)
-
-
 def test_feet_of_somebody_else_are_left_out():
     points = np.column_stack([np.zeros((17, 2)), np.full(17, 0.9)])
     square = blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))

@@ -8,7 +8,6 @@ from bodyslam_jax.people.clean_regressed import BodyNoise as BodyNoise
 from bodyslam_jax.people.clean_regressed import body_noise as body_noise
 from bodyslam_jax.people.clean_regressed import prepare_bodies as prepare_bodies
 from bodyslam_jax.people.definitions import as_body_keypoints as as_body_keypoints
-from bodyslam_jax.people.depths import with_depths as with_depths
 from bodyslam_jax.people.detect import detect_people as detect_people
 from bodyslam_jax.people.find import find_people_tracked as find_people_tracked
 from bodyslam_jax.people.fit import fit_bodies as fit_bodies

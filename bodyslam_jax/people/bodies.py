@@ -27,12 +27,10 @@ def estimate_bodies(
     (others,) = np.nonzero(without_bodies(sequence))
     if keypoints is None or not len(others):
         return found
-    depth = None if keypoints.depth is None else keypoints.depth[others]
     remaining = dataclasses.replace(
         keypoints,
         uv=keypoints.uv[others],
         confidence=keypoints.confidence[others],
-        depth=depth,
     )
     fitted = fit_bodies(remaining, camera, body, fps, settings)
     for name in ("present", "poses", "shapes", "trans"):
@@ -59,12 +57,10 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
         raise InputError(f"person: found {beyond[0]}, but {sequence.name} has {found}.")
     index = list(dict.fromkeys(people))
     if keypoints is not None:
-        depth = None if keypoints.depth is None else keypoints.depth[index]
         keypoints = dataclasses.replace(
             keypoints,
             uv=keypoints.uv[index],
             confidence=keypoints.confidence[index],
-            depth=depth,
         )
     if bodies is not None:
         bodies = dataclasses.replace(

@@ -22,7 +22,6 @@ from bodyslam_jax.people.found import (
     Found,
     as_body25,
     find_feet,
-    find_relative,
 )
 from bodyslam_jax.people.linking import link, remarks
 from bodyslam_jax.people.movenet import SURE, Region, sure_points
@@ -112,7 +111,6 @@ class _Finder:
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
         """By tracklet and frame: heel and big toe of both sides (4, 3)."""
-        self.relative: dict[tuple[int, int], np.ndarray] = {}
         self.others: list[tuple[int, np.ndarray]] = []
         self.masks: list[np.ndarray] = []
 
@@ -156,17 +154,15 @@ class _Finder:
             for piece in pieces
             for frame in piece.frames
         }
-        unknown = np.zeros((25, 3))
-        alone = lambda k, points: (k, -1, as_body25(points, None), unknown)
-        rows: list[tuple[int, int, np.ndarray, np.ndarray]] = [
+        alone = lambda k, points: (k, -1, as_body25(points, None))
+        rows: list[tuple[int, int, np.ndarray]] = [
             alone(*other) for other in self.others
         ]
         for tracklet in self.tracker.tracklets:
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
                 key = tracklet.number, frame
                 body = as_body25(points, self.feet.get(key))
-                relative = self.relative.get(key, unknown)
-                rows.append((frame, who.get(key, -1), body, relative))
+                rows.append((frame, who.get(key, -1), body))
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
         warnings = remarks(people, self.fps, self.association.max_gap)
@@ -189,7 +185,6 @@ class _Finder:
             np.array([row[0] for row in rows], int),
             np.array([row[2] for row in rows]).reshape(-1, 25, 3),
             np.array([row[1] for row in rows], int),
-            np.array([row[3] for row in rows]).reshape(-1, 25, 3),
             np.stack(self.masks),
             tuple(warnings),
         )
@@ -253,7 +248,6 @@ class _Finder:
         if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
             return
         self.feet[number, k] = find_feet(pose, points, apart)
-        self.relative[number, k] = find_relative(pose)
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 

@@ -24,9 +24,9 @@ from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.frame_fit import fit_frames
 from bodyslam_jax.people.keypoint_errors import (
     CORRELATION_TIME,
-    MIN_KEYPOINTS,
     ROBUST_SCALE,
     find_present,
+    has_enough,
     in_pixels,
     keypoint_sigma,
     pixels_per_metre,
@@ -145,7 +145,8 @@ def _fit_person(
     uv, sigma = uv[fitted], sigma[fitted]
     lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
-    start, cuts = _start(scene, uv, sigma_px, lifted, fps)
+    usable = np.flatnonzero(has_enough(sigma))
+    start, cuts = _start(scene, uv, sigma_px, usable, lifted, fps)
 
     focal = float(scene.intrinsics[0])
     depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
@@ -197,15 +198,14 @@ def _start(
     scene: Scene,
     uv: np.ndarray,
     sigma_px: np.ndarray,
+    usable: np.ndarray,
     lifted: Lifted,
     fps: float,
 ) -> tuple[Fit, np.ndarray]:
-    """Fits of every few frames, interpolated to all frames.
+    """Fits of every few of the `usable` frames, interpolated to all frames.
 
     **Returns:** the fits, and the frames at which the trajectory is cut.
     """
-    enough = np.sum(np.isfinite(sigma_px), axis=1) >= MIN_KEYPOINTS
-    usable = np.flatnonzero(enough)
     stride = max(1, round(_START_INTERVAL * fps))
     chosen = np.unique(
         [usable[np.argmin(np.abs(usable - k))] for k in range(0, len(uv), stride)]

@@ -27,11 +27,6 @@ at the place of the other wrist: on ten rendered sequences the error was 2.5 tim
 of a certain wrist at a confidence of 0.8, and 7 times at 0.5. Errors of other joints
 are about inverse to their confidence."""
 
-_LANDMARK = np.array(
-    [0, -1, 12, 14, 16, 11, 13, 15, -1, 24, 26, 28, 23, 25, 27] + [-1] * 10
-)
-"""BlazePose's landmark of each of BODY_25, of those that are joints."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Found:
@@ -43,9 +38,6 @@ class Found:
     person: Int[np.ndarray, " n"]
     """Number of the person, the most visible first; -1 for people who are only
     masked."""
-    relative: Float[np.ndarray, "n 25 3"]
-    """Places about the middle of the hips, m, as if on the optical axis (x right, y
-    down, z forward), from BlazePose; 0 where unknown."""
     silhouettes: UInt8[np.ndarray, "t y x8"]
     """Masks of people at every `step`-th pixel, eight to a byte."""
     warnings: tuple[str, ...]
@@ -63,11 +55,6 @@ class Found:
     def detected(self) -> DetectedPeople:
         """All detections, to be masked in the images."""
         return DetectedPeople(self.frame, self.points, self.silhouettes)
-
-
-def find_relative(pose: blazepose.Pose) -> Float[np.ndarray, "25 3"]:
-    """BlazePose's landmarks in metres, in BODY_25's order; 0 for those it has not."""
-    return np.where((_LANDMARK >= 0)[:, None], pose.world[_LANDMARK], 0.0)
 
 
 def find_feet(

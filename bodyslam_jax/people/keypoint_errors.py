@@ -15,7 +15,9 @@ DETECTOR_FLOOR = 1.0
 
 
 MIN_KEYPOINTS = 6
-"""Keypoints that a frame must have for its body to be fitted."""
+"""Sure keypoints whose information a frame must have for its body to be fitted. Of a
+person who leaves the image a detector goes on to guess all keypoints, with little
+confidence, on the arm or leg that is left (`benchmarks/video.md`)."""
 CORRELATION_TIME = 0.15
 """Time for which errors of a keypoint stay the same, s: frames within it count once."""
 ROBUST_SCALE = 4.0
@@ -40,11 +42,20 @@ def keypoint_sigma(
     )
 
 
+def has_enough(sigma: Float[np.ndarray, "t 25"]) -> Bool[np.ndarray, " t"]:
+    """Frames whose keypoints have as much information as `MIN_KEYPOINTS` sure ones.
+
+    A keypoint counts by its precision `σ⁻²`, `sigma` (m) being that of
+    `keypoint_sigma`, over its precision at full confidence.
+    """
+    return np.sum((KEYPOINT_SIGMA / sigma) ** 2, axis=1) >= MIN_KEYPOINTS
+
+
 def find_present(
     sigma: Float[np.ndarray, "t 25"], fps: float, settings: PeopleFit
 ) -> Bool[np.ndarray, " t"]:
     """Frames with keypoints enough, and short gaps between them."""
-    enough = np.sum(np.isfinite(sigma), axis=1) >= MIN_KEYPOINTS
+    enough = has_enough(sigma)
     present = enough.copy()
     valid = np.flatnonzero(enough)
     for a, b in zip(valid[:-1], valid[1:]):

@@ -112,7 +112,7 @@ def _detect_and_track(
         key = fingerprint(sequence, config.detection, config.association)
         found = cache.stage("detection", key, people.Found, compute)
     points, person = found.by_frame(sequence.num_frames)
-    sequence = io.with_detections(
+    return io.with_detections(
         with_warnings(sequence, found.warnings),
         points,
         config.association,
@@ -120,10 +120,6 @@ def _detect_and_track(
         detected=found.detected(),
         definition="movenet-blazepose",
     )
-    if sequence.keypoints is None:
-        return sequence
-    keypoints = people.with_depths(sequence.keypoints, found, sequence.intrinsics)
-    return dataclasses.replace(sequence, keypoints=keypoints)
 
 
 def estimate_bodies(sequence: Sequence, body: BodyModel, config: Config) -> Bodies:
