@@ -303,6 +303,35 @@ class ScaleStart:
 
 
 @dataclasses.dataclass(frozen=True)
+class OwnVariable:
+    """A variable that a user added to the joint problem, at its optimum."""
+
+    name: str
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    """Standard deviation of each coordinate; NaN if it was not computed."""
+    given: tuple[float, ...]
+    """The mean of its prior."""
+    given_sigma: tuple[float, ...]
+    """The standard deviation of its prior; `inf` without one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnFactor:
+    """How a factor that a user added to the joint problem fits its optimum."""
+
+    name: str
+    """Of its class, numbered from the second factor of a class on."""
+    residuals: int
+    """Number of whitened residuals that are not missing."""
+    cost: float
+    """Its share of the negative log-likelihood."""
+    rms: float
+    """Root mean square of its whitened residuals, those of a robust loss weighed by it:
+    1 where its sigmas are right."""
+
+
+@dataclasses.dataclass(frozen=True)
 class JointEstimate:
     """The optimum of the factor graph: cameras, people, landmarks and scale."""
 
@@ -344,6 +373,9 @@ class JointEstimate:
     """Stature that was given, its standard deviation, the stature had it not been
     given, and the standard deviation of that, m; NaN for people of whom none was given.
     `None` where none was, or uncertainty was not computed."""
+    own_variables: tuple[OwnVariable, ...] = ()
+    own_factors: tuple[OwnFactor, ...] = ()
+    """Terms that a user added (`run(..., factors=, variables=)`)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -146,6 +146,20 @@ def test_a_focal_length_that_was_guessed_is_stated(tmp_path, body):
     assert "Focal length:" not in card({"guessed": False, "focal_px": 500.0})
 
 
+def test_terms_of_ones_own_are_in_the_report(tmp_path, body):
+    late = {"value": [0.44], "sigma": [0.1], "given": [0.0], "given_sigma": [0.5]}
+    frame = {k: [0.25, v] for k, v in zip(late, (7.5, None, 0.0, None), strict=True)}
+    own = {
+        "variables": {"late": late, "frame": frame},
+        "factors": {"Gps": {"residuals": 120, "cost": 44.5, "rms": 0.86}},
+    }
+    result = dataclasses.replace(_walk(), summary={"own": own})
+    text = _text(_write(tmp_path, result, body))
+    for words in ("Terms of your own", "late 0.44 0.1", "frame[1] 7.5", "Gps 120"):
+        assert words in text, words
+    assert "None" not in text
+
+
 def test_the_report_gives_the_difference_of_cues_that_contradict(tmp_path, body):
     scale = {"value": 2.0, "sigma": 0.6, "from_motion": [1.0, 0.1]}
     text = lambda scale: _text(

@@ -15,7 +15,12 @@ from bodyslam_jax.body import load_body_model, rest_joints
 from bodyslam_jax.config import Config, Known, Measured, Simulation
 from bodyslam_jax.diagnostics import Gait
 from bodyslam_jax.diagnostics.accuracy import accuracy, guess_warning
-from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
+from bodyslam_jax.diagnostics.facts import (
+    Fact,
+    contradictions,
+    given_facts,
+    misfits_of_own_factors,
+)
 from bodyslam_jax.diagnostics.statistics import stature
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.geometry.levelling import level
@@ -25,6 +30,7 @@ from bodyslam_jax.pipeline import sfm_stage
 from bodyslam_jax.types import (
     Bodies,
     Intrinsics,
+    OwnFactor,
     Result,
     ScaleStart,
     Sequence,
@@ -196,6 +202,15 @@ def compared(known=Known(), up=LEVEL, gait=None, start=None, lens=LENS, **of_cam
     facts = given_facts(known, sequence, cameras, joint, up, [gait], 0.0)
     warnings, reasons = contradictions(facts)
     return {fact.name for fact in facts}, warnings, [r.name for r in reasons]
+
+
+@pytest.mark.parametrize("rms, warned, doubted", [(1.2, 0, 0), (2.5, 1, 0), (7, 0, 1)])
+def test_a_factor_that_does_not_fit_is_told(rms, warned, doubted):
+    own = OwnFactor("Tape", residuals=3, cost=1.5 * rms**2, rms=float(rms))
+    joint = dataclasses.replace(walker_input()[3], own_factors=(own,))
+    lines, reasons = misfits_of_own_factors(joint)
+    assert (len(lines), len(reasons)) == (warned, doubted)
+    assert all("Tape" in reason.message for reason in reasons)
 
 
 def test_nothing_given_is_compared_with_nothing():

@@ -501,3 +501,57 @@ def test_solvers_are_selected_by_name(built, solver):
 def test_dense_solvers_refuse_large_problems_with_their_size(built, solver):
     with pytest.raises(ValueError, match=f"{solver} is for small problems.*found .*40"):
         bs.solve(*built, solver=solver)
+
+
+class LateClock(bs.FrameFactor):
+    """Positions of the camera by a clock that is late, m and frames."""
+
+    position: Float[Array, "t 3"]
+    sigma: Float[Array, " t"]
+    keys = (("camera", 0), ("camera", 1), ("scale", 0), ("late", 0))
+    map_units = {}
+
+    def frame_residual(self, data, window, shared):
+        position, sigma = data
+        now, before = window[0].camera[:3, 3], window[1].camera[:3, 3]
+        centre = now - shared["late"][0] * (now - before)
+        return (shared.scale * centre - position) / sigma
+
+
+@pytest.mark.slow
+def test_run_takes_factors_and_variables(case):
+    """A sensor that is right decides; one of another unit makes the result doubtful."""
+    T_WC = np.asarray(case.truth.T_WC)
+    path = (np.linalg.inv(T_WC[0]) @ T_WC)[:, :3, 3]
+    path = path - 0.5 * np.diff(path, axis=0, prepend=path[:1])
+    variables = {"late": bs.Variable(0.0, sigma=1.0)}
+
+    def found(unit):
+        sensor = LateClock(jnp.asarray(unit * path), jnp.full(FRAMES, 0.005))
+        return bs.run(
+            case.sequence,
+            case.config,
+            factors=lambda start: [sensor] if len(start.cameras) == FRAMES else [],
+            variables=variables,
+        )
+
+    result = found(1.0)
+    own = result.summary["own"]
+    late = own["variables"]["late"]
+    assert abs(result.scale / case.map_scale - 1) < 0.01
+    assert result.summary["scale"]["sigma"] < 0.01 * result.scale
+    assert abs(late["value"][0] - 0.5) < 3 * late["sigma"][0] + 0.1
+    assert late["given_sigma"] == [1.0]
+    assert own["factors"]["LateClock"]["rms"] < 2
+    assert "own_factor" not in [reason["name"] for reason in result.summary["reasons"]]
+    wrong = found(3.3).summary
+    assert wrong["own"]["factors"]["LateClock"]["rms"] > 3
+    assert wrong["status"] == "doubtful"
+    assert "own_factor" in [reason["name"] for reason in wrong["reasons"]]
+
+
+@pytest.mark.slow
+def test_run_names_a_variable_that_is_missing(case):
+    sensor = LateClock(jnp.zeros((FRAMES, 3)), jnp.full(FRAMES, 0.01))
+    with pytest.raises(ValueError, match="factors: .*'late'"):
+        bs.run(case.sequence, case.config, factors=[sensor])

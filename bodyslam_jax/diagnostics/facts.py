@@ -124,6 +124,32 @@ def contradictions(facts: Many[Fact]) -> tuple[list[str], list[Reason]]:
     return warnings, reasons
 
 
+def misfits_of_own_factors(joint: JointEstimate) -> tuple[list[str], list[Reason]]:
+    """Warnings of a user's own factors whose residuals are beyond two standard
+    deviations (rms), and reasons to doubt the result for those beyond three."""
+    warnings, reasons = [], []
+    for factor in joint.own_factors:
+        message = (
+            f"the residuals of the factor {factor.name} are {factor.rms:.1f} of its "
+            f"standard deviations (rms of {factor.residuals})."
+        )
+        if factor.rms > DOUBTED:
+            reasons.append(
+                Reason(
+                    name="own_factor",
+                    message=message,
+                    expected="about 1",
+                    advice="check its measurements, their units and frame, and its "
+                    "sigmas; everything else contradicts it",
+                    figure=factor.rms,
+                    unit="standard deviations",
+                )
+            )
+        elif factor.rms > WARNED:
+            warnings.append(message)
+    return warnings, reasons
+
+
 def given_facts(
     known: Known,
     sequence: Sequence,

@@ -12,7 +12,12 @@ from bodyslam_jax.diagnostics import measurability
 from bodyslam_jax.diagnostics.accuracy import Accuracy, accuracy, guess_warning
 from bodyslam_jax.diagnostics.checks import Reason, Status, status_of
 from bodyslam_jax.diagnostics.completeness import incomplete, scale_undetermined
-from bodyslam_jax.diagnostics.facts import Fact, contradictions, given_facts
+from bodyslam_jax.diagnostics.facts import (
+    Fact,
+    contradictions,
+    given_facts,
+    misfits_of_own_factors,
+)
 from bodyslam_jax.diagnostics.gait import Gait, gait
 from bodyslam_jax.diagnostics.ground_scale import ground_scale
 from bodyslam_jax.diagnostics.measured import measured
@@ -140,6 +145,9 @@ def assess(
     )
     lines, contradicted = contradictions(of_given)
     warnings += lines
+    lines, misfits = misfits_of_own_factors(joint)
+    warnings += lines
+    of_world += tuple(misfits)
     people, contradicted = with_more_doubts(
         people, [*contradicted, *_resized(body, joint)]
     )

@@ -65,6 +65,7 @@ _WHOLE = {
     "given_gravity": "People and ground contradict the gravity that was given.",
     "given_static": "The camera was said to stand still, but the background moves.",
     "given_path": "People's sizes contradict the camera's path that was given.",
+    "own_factor": "Everything else contradicts a factor that was added.",
     "input_contradicts_itself": "The files that were given contradict each other.",
     "scale_sigma": "All sizes and distances are hardly known.",
     "scale_cues_apart": (

@@ -306,6 +306,7 @@ def _details(
     contents = {
         "People": people_table(result, summary, people, body),
         "What was given, and what is found without it": _given(summary),
+        "Terms of your own": _own(summary),
         "Scale": lengths(result, scale) + _scale_table(result, scale),
         "Camera intrinsics (px)": focal_length(summary.get("intrinsics") or {})
         + table(["parameter", "value"], lens),
@@ -319,6 +320,28 @@ def _details(
     parts = [folded(title, text) for title, text in contents.items() if text]
     errors = error_tables(summary.get("errors") or {})
     return f"{errors}<section><h2>For experts</h2>{''.join(parts)}</section>"
+
+
+def _own(summary: Mapping[str, Any]) -> str:
+    """Variables and factors that the joint problem was given from Python."""
+    own = summary.get("own") or {}
+    variables = [
+        (name if len(row["value"]) == 1 else f"{name}[{i}]", *numbers)
+        for name, row in (own.get("variables") or {}).items()
+        for i, numbers in enumerate(
+            zip(row["value"], row["sigma"], row["given"], row["given_sigma"])
+        )
+    ]
+    factors = [
+        (name, *(row.get(key) for key in ("residuals", "cost", "rms")))
+        for name, row in (own.get("factors") or {}).items()
+    ]
+    found = ""
+    if variables:
+        found += table(["variable", "value", "±", "prior", "±"], variables)
+    if factors:
+        found += table(["factor", "residuals", "cost", "rms, in sigmas"], factors)
+    return found
 
 
 def _given(summary: Mapping[str, Any]) -> str:

@@ -11,7 +11,14 @@ from bodyslam_jax.diagnostics.accuracy import Accuracy, PersonAccuracy
 from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
 from bodyslam_jax.diagnostics.verdict import Verdict
 from bodyslam_jax.geometry.gravity import Upright
-from bodyslam_jax.types import JointEstimate, Result, ScaleStart, Sequence, SfmResult
+from bodyslam_jax.types import (
+    JointEstimate,
+    OwnVariable,
+    Result,
+    ScaleStart,
+    Sequence,
+    SfmResult,
+)
 
 
 def summarise(
@@ -52,6 +59,14 @@ def summarise(
         "lengths": _lengths(verdict.accuracy),
         # What the user gave, and the estimates without it.
         "given": [fact.to_dict() for fact in verdict.given],
+        "own": {
+            # Terms that `run` was given from Python.
+            "variables": {v.name: _own_variable(v) for v in joint.own_variables},
+            "factors": {
+                f.name: {"residuals": f.residuals, "cost": f.cost, "rms": f.rms}
+                for f in joint.own_factors
+            },
+        },
         "people": [
             _person(person, known)
             for person, known in zip(
@@ -83,6 +98,16 @@ def describe(sequence: Sequence) -> dict[str, Any]:
         "frames": sequence.num_frames,
         "width": sequence.intrinsics.width,
         "height": sequence.intrinsics.height,
+    }
+
+
+def _own_variable(variable: OwnVariable) -> dict[str, Any]:
+    known = lambda x: [v if np.isfinite(v) else None for v in x]
+    return {
+        "value": list(variable.value),
+        "sigma": known(variable.sigma),
+        "given": list(variable.given),
+        "given_sigma": known(variable.given_sigma),
     }
 
 

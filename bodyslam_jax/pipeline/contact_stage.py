@@ -94,7 +94,7 @@ def hold_standing_feet(
             return stand_on_plane(factor, best, probability, sequence.fps)
         return factor
 
-    held = ("scale", "cameras", "landmarks", "intrinsics", "shapes")
+    held = ("scale", "cameras", "landmarks", "intrinsics", "shapes", "globals")
     problem = dataclasses.replace(
         alone,
         factors=tuple(weighed(factor) for factor in alone.factors),

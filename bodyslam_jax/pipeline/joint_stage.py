@@ -20,6 +20,7 @@ from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
+from bodyslam_jax.pipeline.own_terms import OwnTerms
 from bodyslam_jax.pipeline.people_floor import people_on_floor
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
@@ -36,6 +37,8 @@ class Uncertainty:
     """Quantities that the measurements do not determine, a line each."""
     statures: Float[np.ndarray, "h 4"] | None = None
     """As in `JointEstimate`."""
+    marginals: solver.Marginals | None = None
+    """Marginal covariances; `None` where they were not computed."""
 
 
 def estimate(
@@ -45,15 +48,20 @@ def estimate(
     body: BodyModel,
     config: Config,
     edges: Edges | None = None,
+    own: OwnTerms = OwnTerms(),
 ) -> JointEstimate:
-    """The paper's graph: two steps, then the optimum of everything.
+    """The paper's graph: two steps, then the optimum of everything; with a user's `own`
+    terms.
 
-    **Raises:** as `prepare`, unless a detector looked at all images and found nobody.
+    **Raises:** as `prepare`, unless a detector looked at all images and found nobody;
+    `InputError` where an own term does not fit.
     """
     searched = sequence.detected is not None and sequence.keypoints is None
     if searched and cameras.kind != "moving" and not len(bodies.present):
         return empty_estimate(cameras)
     prepared = prepare(sequence, cameras, bodies, body, config, edges=edges)
+    alone = prepared.problem
+    prepared = own.added_to(prepared)
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
     stages = (*prepared.stages, stage)
     if is_uneven(prepared.problem):
@@ -73,7 +81,8 @@ def estimate(
     best = solution.state
     uncertainty = estimate_uncertainty(sequence, cameras, prepared, best, body, config)
     standing = hold_standing_feet(prepared, best, sequence, cameras, body, config)
-    return of_state(
+    variables, factors = own.found(alone, prepared.problem, best, uncertainty.marginals)
+    estimate = of_state(
         standing.state,
         prepared,
         uncertainty,
@@ -81,6 +90,7 @@ def estimate(
         (*stages, *standing.stages),
         standing.probability,
     )
+    return dataclasses.replace(estimate, own_variables=variables, own_factors=factors)
 
 
 def of_state(
@@ -148,7 +158,9 @@ def estimate_uncertainty(
     scale_sigma = covariance_sigma(
         float(variance), moving=prepared.moving, metric=bool(metric)
     )
-    return Uncertainty(scale_sigma, np.asarray(shapes), tuple(unobserved), statures)
+    return Uncertainty(
+        scale_sigma, np.asarray(shapes), tuple(unobserved), statures, marginals
+    )
 
 
 def _statures(

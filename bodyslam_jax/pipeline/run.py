@@ -4,10 +4,11 @@ Each stage's result is kept in a `Cache` under a fingerprint of all that it depe
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
-from bodyslam_jax import diagnostics, motion, people, sfm
+from bodyslam_jax import diagnostics, graph, motion, people, sfm
 from bodyslam_jax.body import BodyModel, load_body_model, rest_joints
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
@@ -16,6 +17,7 @@ from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.own_terms import Factors, OwnTerms
 from bodyslam_jax.pipeline.people_stage import with_warnings
 from bodyslam_jax.pipeline.progress import Counter, Stopwatch
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
@@ -34,20 +36,33 @@ _FEWEST_FRAMES = 3
 
 
 def run(
-    sequence: Sequence, config: Config = Config(), *, cache: Cache = Cache(None)
+    sequence: Sequence,
+    config: Config = Config(),
+    *,
+    cache: Cache = Cache(None),
+    factors: Factors = (),
+    variables: Mapping[str, graph.Variable] | None = None,
 ) -> Result:
     """Estimates cameras, people and map in metres; `cache` keeps finished stages.
 
+    Args:
+        factors: a user's own, which the joint problem has beside all others; or a
+            function that makes them of the state in which the joint solve begins.
+        variables: named globals that `factors` depend on, with their priors.
+            `summary["own"]` has their values and sigmas, and how each factor fits; a
+            factor that the optimum contradicts makes the result doubtful.
+
     **Raises:** `InputError`, in one line, if the sequence holds nothing that cameras or
-    people can be estimated from.
+    people can be estimated from, or a factor does not fit the problem.
     """
     gender = sequence.bodies.gender if sequence.bodies else None
     config, warnings = with_compatible_body(config, gender)
-    return run_stages(with_warnings(sequence, warnings), config, cache)[0]
+    own = OwnTerms(factors, variables or {})
+    return run_stages(with_warnings(sequence, warnings), config, cache, own)[0]
 
 
 def run_stages(
-    sequence: Sequence, config: Config, cache: Cache
+    sequence: Sequence, config: Config, cache: Cache, own: OwnTerms = OwnTerms()
 ) -> tuple[Result, SfmResult, Sequence]:
     """`run`, the cameras before the joint estimate, and the input as it was used: with
     the people who were found, in the order of the result, and without zoom.
@@ -73,12 +88,10 @@ def run_stages(
         with watch("edges"):
             edges = find_edges(everybody, cameras, cache=cache)
     with watch("joint"):
-        joint = cache.stage(
-            "joint",
-            key,
-            JointEstimate,
-            lambda: joint_stage.estimate(refined, cameras, bodies, body, config, edges),
-        )
+        given = refined, cameras, bodies, body, config, edges, own
+        compute = lambda: joint_stage.estimate(*given)
+        # Code that a factor brings has no fingerprint.
+        joint = compute() if own else cache.stage("joint", key, JointEstimate, compute)
     if cameras.kind == "moving":
         with watch("edges"):
             edges = find_edges(everybody, cameras, joint, cache)
