@@ -1,6 +1,8 @@
 """Evaluating many pairs of different lengths: padded, and compiled once."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -109,3 +111,20 @@ def test_another_length_is_not_compiled_again():
 def test_no_pair_is_refused():
     with pytest.raises(ValueError, match="No pair"):
         bs.stack_pairs([])
+
+
+def test_trajectories_are_stacked_as_they_are(pairs, stacked):
+    """As those of states of a problem, which nobody has to associate."""
+    again = bs.stack_pairs([evaluation.associate(*pair) for pair in pairs])
+    jax.tree.map(np.testing.assert_array_equal, again, stacked)
+    longer, shorter = (evaluation.associate(*pair)[0] for pair in (pairs[1], pairs[0]))
+    with pytest.raises(ValueError, match="expected the same"):
+        bs.stack_pairs([(longer, shorter)])
+
+
+def test_the_page_of_metrics_has_every_key(stacked):
+    one = jax.tree.map(lambda x: x[1], stacked)
+    keys = set(jax.eval_shape(evaluation.evaluate_trajectories, *one).values)
+    page = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert set(re.findall("`([a-z0-9_]+)`", " ".join(rows))) == keys

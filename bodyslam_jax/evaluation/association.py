@@ -69,16 +69,19 @@ _evaluate = eqx.filter_jit(evaluate_trajectories)
 
 
 def stack_pairs(
-    pairs: Iterable[tuple[Result, Result]], body: BodyModel | None = None
+    pairs: Iterable[tuple[Result, Result] | tuple[Trajectories, Trajectories]],
+    body: BodyModel | None = None,
 ) -> tuple[Trajectories, Trajectories]:
-    """Estimates and truths of pairs (result, truth), associated, padded and stacked.
+    """Estimates and truths of pairs, associated, padded and stacked.
 
     Pairs with fewer frames or people than others get masked ones; errors of people whom
-    a pair lacks are NaN.
+    a pair lacks are NaN. `Trajectories` are compared frame by frame and person by
+    person as they are, such as `case.trajectories(state)` and `case.truth`.
 
-    **Raises:** `InputError` if there is no pair, and as `associate`.
+    **Raises:** `InputError` if there is no pair, if two `Trajectories` have not the
+    same frames and people, and as `associate`.
     """
-    associated = [associate(result, truth, body) for result, truth in pairs]
+    associated = [_associated(*pair, body) for pair in pairs]
     if not associated:
         raise InputError("No pair of a result and a truth to stack.")
     frames = bucket(max(len(truth.camera_valid) for _, truth in associated))
@@ -90,6 +93,24 @@ def stack_pairs(
     # Stacked on the host: nothing is compiled for a number of pairs.
     stack = lambda *x: jnp.asarray(np.stack([np.asarray(one) for one in x]))
     return jax.tree.map(stack, *estimates), jax.tree.map(stack, *truths)
+
+
+def _associated(
+    estimate: Result | Trajectories,
+    truth: Result | Trajectories,
+    body: BodyModel | None,
+) -> tuple[Trajectories, Trajectories]:
+    if isinstance(estimate, Result) and isinstance(truth, Result):
+        return associate(estimate, truth, body)
+    if not isinstance(estimate, Trajectories) or not isinstance(truth, Trajectories):
+        found = f"{type(estimate).__name__} and {type(truth).__name__}"
+        raise InputError(f"pairs: {found}, expected two `Result` or `Trajectories`.")
+    if estimate.present.shape != truth.present.shape:
+        raise InputError(
+            f"pairs: {estimate.present.shape} and {truth.present.shape} people and "
+            "frames, expected the same."
+        )
+    return estimate, truth
 
 
 def associate(
