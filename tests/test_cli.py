@@ -210,6 +210,22 @@ def test_doctor_reports(monkeypatch, capsys):
     assert code == 0
     for word in ("jax", "BRISK", "body model", "motion model", "devices"):
         assert word in out
+    last = out.splitlines()[-1].split(None, 1)
+    assert last == ["verdict", "ready: `bodyslam demo`, `bodyslam run VIDEO`"]
+
+
+@pytest.mark.parametrize(
+    "name, finding, words",
+    [
+        ("optimistix", "not installed", "install again: optimistix"),
+        ("body in use", "none: No neutral body model found", "no run works"),
+        ("body in use", "smpl, but the motion model was trained", "another body"),
+        ("video writer VP90", "absent", "no overlay.webm"),
+    ],
+)
+def test_the_last_line_of_doctor_says_what_does_not_work(name, finding, words):
+    rows = dict(environment.report()) | {name: finding}
+    assert words in environment.verdict(list(rows.items()))
 
 
 def _body_in_use():

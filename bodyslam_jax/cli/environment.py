@@ -10,12 +10,15 @@ _PACKAGES = (
     "bodyslam-jax jax jaxlib equinox optimistix lineax jaxlie jaxopt optax numpy scipy "
     "opencv-python-headless onnxruntime trimesh matplotlib tyro"
 ).split()
+NOT_INSTALLED = "not installed"
 _CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
 
 
 def doctor() -> None:
-    """Prints versions, devices, codecs, networks and body models of this machine."""
+    """Prints versions, devices, codecs, networks and body models of this machine, and
+    what of `bodyslam` works with them."""
     rows = report()
+    rows.append(("verdict", verdict(rows)))
     width = max(len(name) for name, _ in rows)
     for name, finding in rows:
         print(f"{name:<{width}}  {finding}")
@@ -28,11 +31,31 @@ def report() -> list[tuple[str, str]]:
     return rows + _devices() + _opencv() + _networks() + _models()
 
 
+def verdict(rows: list[tuple[str, str]]) -> str:
+    """What works on a machine of which `report` says `rows`, and what does not."""
+    found = dict(rows)
+    missing = [name for name in _PACKAGES if found[name] == NOT_INSTALLED]
+    if missing:
+        return f"install again: {', '.join(missing)} is not there"
+    if found["body in use"].startswith("none"):
+        return "no run works: the body model is missing, see `body in use`"
+    faults = [
+        f"{name} ({text}): `run --detect none` with keypoints of your own works"
+        for name, text in rows
+        if name.startswith("network") and not text.startswith("runs")
+    ]
+    if found["video writer VP90"] != "present":
+        faults.append("no VP9 writer: runs have no overlay.webm")
+    if ", but " in found["body in use"]:
+        faults.append("the motion model is of another body: see `body in use`")
+    return "; ".join(faults) or "ready: `bodyslam demo`, `bodyslam run VIDEO`"
+
+
 def _version(name: str) -> str:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+        return NOT_INSTALLED
 
 
 def _devices() -> list[tuple[str, str]]:
