@@ -1,5 +1,6 @@
 """What is exported for other programs, read back."""
 
+import csv
 import dataclasses
 import importlib
 import json
@@ -21,6 +22,7 @@ from bodyslam_jax import evaluation, export, io
 from bodyslam_jax.body import JOINT_NAMES, joints, load_body_model, vertices
 from bodyslam_jax.cli.export import Formats
 from bodyslam_jax.export import formats
+from bodyslam_jax.export.formats import csv as isb
 from bodyslam_jax.export.formats.bvh import MIXAMO_NAMES
 from bodyslam_jax.io.camera.calibration import read_camera
 from bodyslam_jax.io.camera.path import read_camera_path
@@ -229,6 +231,63 @@ def test_each_person_has_a_file(tmp_path, result, body):
         == {"person_0.bvh", "person_1.bvh", "camera.tum"}
         == {p.name for p in found}
     )
+
+
+def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
+    sigma = np.full(result.joints.shape[:3], 0.03)
+    known = dataclasses.replace(result, joint_sigma=sigma)
+    (path,) = export.export(known, tmp_path / "a.csv", body=body, person=1)
+    rows = list(csv.DictReader(path.open()))
+    assert len(rows) == len(result.timestamps)
+    k = int(np.flatnonzero(result.present[1])[2])
+    row = rows[k]
+    found = [float(row[f"left_knee_{axis}_m"]) for axis in "xyz"]
+    np.testing.assert_allclose(found, result.joints[1, k, 4], rtol=1e-4, atol=1e-6)
+    assert float(row["left_knee_sigma_m"]) == 0.03
+    assert float(row["time_s"]) == pytest.approx(result.timestamps[k], abs=1e-6)
+    absent = np.flatnonzero(~result.present[1])
+    assert len(absent) and all(rows[k]["pelvis_x_m"] == "" for k in absent)
+
+
+def test_angles_of_joints_have_the_signs_of_the_field():
+    """A leg that swings forward, outwards and turns in; knees, ankles and elbows bend."""
+
+    def turned(joint, about, degrees):
+        turns = np.tile(np.eye(3), (1, 24, 1, 1))
+        turns[0, joint] = Rotation.from_euler(about, degrees, True).as_matrix()
+        return turns
+
+    straight = np.zeros((1, 24, 3))
+    straight[0, 12] = [0, 1, 0]  # the neck over the pelvis
+    straight[0, [18, 20], 0] = [0.3, 0.55]  # the left arm, stretched to its side
+    up = np.array([0.0, 1, 0])
+    angle = lambda turns, name: float(isb.angles(turns, straight, up)[name][0])
+    # SMPL's axes: x left, y up, z forward. About -x the leg below the hip goes forward.
+    assert angle(turned(1, "x", -30), "left_hip_flexion_deg") == pytest.approx(30)
+    assert angle(turned(2, "x", -30), "right_hip_flexion_deg") == pytest.approx(30)
+    assert angle(turned(5, "x", 40), "right_knee_flexion_deg") == pytest.approx(40)
+    assert angle(turned(7, "x", -10), "left_ankle_dorsiflexion_deg") == pytest.approx(
+        10
+    )
+    for side, joint, sign in (("left", 1, 1), ("right", 2, -1)):
+        # About z a left leg (on the side of +x) goes outwards.
+        out, inwards = turned(joint, "z", sign * 20), turned(joint, "y", -sign * 15)
+        assert angle(out, f"{side}_hip_adduction_deg") == pytest.approx(-20)
+        assert angle(inwards, f"{side}_hip_internal_rotation_deg") == pytest.approx(15)
+    none = np.tile(np.eye(3), (1, 24, 1, 1))
+    assert angle(none, "left_shoulder_elevation_deg") == pytest.approx(90)
+    assert angle(none, "left_elbow_flexion_deg") == pytest.approx(0)
+    assert angle(none, "trunk_lean_deg") == pytest.approx(0)
+
+
+def test_speeds_are_those_of_a_line():
+    times = np.arange(5) / 25
+    joints = np.zeros((5, 24, 3))
+    joints[..., 0], joints[:, 0, 1] = 1.5 * times[:, None], 7 * times
+    present = np.array([True, True, True, True, False])
+    found = isb.speeds(joints, present, times, np.array([0.0, 1, 0]))
+    np.testing.assert_allclose(found["pelvis_speed_m_s"][1:3], 1.5)
+    assert np.isnan(found["left_wrist_speed_m_s"][[0, 3, 4]]).all()
 
 
 def test_trc_holds_the_joints(tmp_path, result, body):

@@ -15,6 +15,7 @@ Formats = Literal[
     "kitti",
     "trc",
     "c3d",
+    "csv",
     "usd",
     "rerun",
 ]
@@ -38,8 +39,8 @@ def export(
         to: One or more formats; without it what the suffix of `--out` says, else glb.
             glb: bodies, camera, map and ground, animated (Blender, engines). bvh:
             skeleton for retargeting. amass: SMPL poses. colmap, nerfstudio: cameras and
-            map. tum, kitti: camera path. trc, c3d: joints as markers. usd, rerun: need
-            extras of the same name. docs/export.md has axes, units and skeletons.
+            map. tum, kitti: camera path. trc, c3d: joints as markers. csv: joints,
+            angles, speeds. usd, rerun: need extras of the same name. docs/export.md has axes, units and skeletons.
         out: File, or folder for several formats; without it the run's `export` folder.
         up: Axis that points up; the run's own is y. GLB is y up in any case.
         person: Numbers of the people to write; without it everybody.

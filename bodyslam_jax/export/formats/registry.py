@@ -141,6 +141,17 @@ FORMATS: dict[str, Format] = {
             "person_{}.c3d",
         ),
         Format(
+            "csv",
+            ".csv",
+            "one person's joints with sigmas, joint angles, speeds",
+            "y or z up; segments x forward, y up, z right (ISB)",
+            "m, degrees, m/s, s",
+            _OWN_TIMES,
+            _SMPL,
+            "spreadsheets, pandas, R, MATLAB",
+            "person_{}.csv",
+        ),
+        Format(
             "usd",
             ".usdc",
             "skinned animated bodies, animated camera, map, ground",
