@@ -235,6 +235,7 @@ def test_each_person_has_a_file(tmp_path, result, body):
 
 def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
     sigma = np.full(result.joints.shape[:3], 0.03)
+    sigma[0] = 0.5  # somebody else's
     known = dataclasses.replace(result, joint_sigma=sigma)
     (path,) = export.export(known, tmp_path / "a.csv", body=body, person=1)
     rows = list(csv.DictReader(path.open()))
@@ -250,7 +251,7 @@ def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
 
 
 def test_angles_of_joints_have_the_signs_of_the_field():
-    """A leg that swings forward, outwards and turns in; knees, ankles and elbows bend."""
+    """A leg swings forward, outwards and turns in; knees, ankles and elbows bend."""
 
     def turned(joint, about, degrees):
         turns = np.tile(np.eye(3), (1, 24, 1, 1))

@@ -40,7 +40,8 @@ def export(
             glb: bodies, camera, map and ground, animated (Blender, engines). bvh:
             skeleton for retargeting. amass: SMPL poses. colmap, nerfstudio: cameras and
             map. tum, kitti: camera path. trc, c3d: joints as markers. csv: joints,
-            angles, speeds. usd, rerun: need extras of the same name. docs/export.md has axes, units and skeletons.
+            angles, speeds. usd, rerun: need extras of the same name. docs/export.md has
+            axes, units and skeletons.
         out: File, or folder for several formats; without it the run's `export` folder.
         up: Axis that points up; the run's own is y. GLB is y up in any case.
         person: Numbers of the people to write; without it everybody.

@@ -31,14 +31,14 @@ _ARM = {"shoulder": 16, "elbow": 18, "wrist": 20}
 
 def write(path: Path, scene: Scene) -> None:
     """A row a frame of the only person of a scene; absent frames are empty."""
-    result, person = scene.result, scene.people[0]
+    result = scene.result
     joints, present = result.joints[0], result.present[0]
     columns = {}
     for k, name in enumerate(JOINT_NAMES):
         for axis in range(3):
             columns[f"{name}_{'xyz'[axis]}_m"] = joints[:, k, axis]
         if result.joint_sigma is not None:
-            columns[f"{name}_sigma_m"] = result.joint_sigma[person, :, k]
+            columns[f"{name}_sigma_m"] = result.joint_sigma[0, :, k]
     turns = so3.exp(result.poses[0].reshape(len(joints), 24, 3))
     vertical = np.eye(3)[1 if scene.up == "y" else 2]
     columns |= angles(turns, joints, vertical)

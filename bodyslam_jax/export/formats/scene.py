@@ -151,6 +151,8 @@ def make_scene(
         )
     fields = ("poses", "trans", "betas", "joints", "present")
     few = dataclasses.replace(result, **{n: getattr(result, n)[chosen] for n in fields})
+    if result.joint_sigma is not None:
+        few = dataclasses.replace(few, joint_sigma=result.joint_sigma[chosen])
     evaluation.check_body(few, body)
     if up == "z":
         few = turned(few, body, Y_TO_Z)
@@ -229,6 +231,7 @@ def at_constant_rate(scene: Scene) -> Scene:
         trans=each(r.trans).reshape(h, num, 3),
         joints=each(r.joints).reshape(h, num, 24, 3),
         present=there,
+        joint_sigma=None,
     )
     return dataclasses.replace(scene, result=found)
 
