@@ -238,7 +238,7 @@ def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
     sigma[0] = 0.5  # somebody else's
     known = dataclasses.replace(result, joint_sigma=sigma)
     (path,) = export.export(known, tmp_path / "a.csv", body=body, person=1)
-    rows = list(csv.DictReader(path.open()))
+    rows = list(csv.DictReader(path.read_text().splitlines()))
     assert len(rows) == len(result.timestamps)
     k = int(np.flatnonzero(result.present[1])[2])
     row = rows[k]

@@ -14,7 +14,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.registry import FORMATS, Format
-from bodyslam_jax.export.formats.scene import Scene, Up, make_scene
+from bodyslam_jax.export.formats.scene import Scene, Up, make_scene, of_people
 from bodyslam_jax.io import atomic
 from bodyslam_jax.types import Result
 
@@ -159,13 +159,8 @@ def _parts(format: Format, base: Path, scene: Scene) -> list[tuple[Path, Scene]]
         raise InputError(f"--to {format.name}: nobody is in this run, expected people.")
     found = []
     for k, number in enumerate(scene.people):
-        fields = ("poses", "trans", "betas", "joints", "present")
-        one = {n: getattr(scene.result, n)[k : k + 1] for n in fields}
-        part = dataclasses.replace(
-            scene,
-            result=dataclasses.replace(scene.result, **one),
-            people=(number,),
-        )
+        one = of_people(scene.result, slice(k, k + 1))
+        part = dataclasses.replace(scene, result=one, people=(number,))
         if "{}" in base.name:
             target = base.with_name(base.name.format(number))
         elif len(scene.people) == 1:

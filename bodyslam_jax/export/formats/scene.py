@@ -149,10 +149,7 @@ def make_scene(
         raise InputError(
             f"--person {' '.join(missing)}: not in this run, expected {known}."
         )
-    fields = ("poses", "trans", "betas", "joints", "present")
-    few = dataclasses.replace(result, **{n: getattr(result, n)[chosen] for n in fields})
-    if result.joint_sigma is not None:
-        few = dataclasses.replace(few, joint_sigma=result.joint_sigma[chosen])
+    few = of_people(result, chosen)
     evaluation.check_body(few, body)
     if up == "z":
         few = turned(few, body, Y_TO_Z)
@@ -168,6 +165,16 @@ def make_scene(
         (int(width), int(height)),
         observations,
         video,
+    )
+
+
+def of_people(result: Result, people: Any) -> Result:
+    """The result with these people only: an index of arrays."""
+    fields = ["poses", "trans", "betas", "joints", "present"]
+    if result.joint_sigma is not None:
+        fields.append("joint_sigma")
+    return dataclasses.replace(
+        result, **{n: getattr(result, n)[people] for n in fields}
     )
 
 
