@@ -252,7 +252,9 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
         layout = problem.layout
         soon = tuple(dataclasses.replace(b, lasting=False) for b in layout.buckets)
         without = dataclasses.replace(layout, buckets=soon)
-        counted, others = (memory.memory_needed(x, state) for x in (layout, without))
+        counted, others = (
+            memory.memory_needed(x, state, 69) for x in (layout, without)
+        )
         return np.array([kept.size * kept.dtype.itemsize, counted - others])
 
     kept, counted = bytes_of(FAR) - bytes_of(0)

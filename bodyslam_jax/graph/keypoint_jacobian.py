@@ -21,34 +21,6 @@ from bodyslam_jax.body import (
 )
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS, ancestors
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import JOINTS
-from bodyslam_jax.graph.tracing import is_traced
-
-
-def turning_joints(
-    body: BodyModel, layout: str, points: tuple[int, ...] | None = None
-) -> tuple[int, ...]:
-    """Joints below the pelvis, from 0, whose rotations move these keypoints (or all).
-
-    Hands move no keypoint of BODY_25, for example. All joints, if the body has pose
-    blend shapes or is traced.
-    """
-    if is_traced(body) or body.pose_dirs.shape[-1]:
-        return JOINTS
-    names = KEYPOINT_NAMES[layout]
-    picks, weight = np.asarray(body.picks), np.asarray(body.skin_weight)
-    on = np.asarray(body.skin_joint)
-    moved = np.zeros(24, bool)
-    above = ancestors() > 0
-    for name in names if points is None else [names[i] for i in points]:
-        if name in SURFACE_POINTS:
-            vertex = picks[SURFACE_POINTS.index(name)]
-            moved |= above[:, on[vertex][weight[vertex] != 0]].any(axis=1)
-        else:
-            joint = KEYPOINT_JOINT[name]
-            at_joint = np.arange(24) == joint
-            moved |= above[:, joint] & (~at_joint | (name in DETECTOR_BIAS))
-    return tuple(np.flatnonzero(moved[1:]).tolist())
 
 
 class Carried(NamedTuple):
@@ -75,10 +47,13 @@ def carried_by_joints(
     shape: Float[Array, " 10"],
     layout: str,
     bias: float | Float[Array, ""],
+    points: tuple[int, ...] | None = None,
 ) -> Carried:
-    """Rotations and positions of joints, and keypoints relative to them."""
+    """Rotations and positions of joints, and keypoints relative to them: all of the
+    layout's, or those with these numbers."""
     dtype = R.dtype
     names = KEYPOINT_NAMES[layout]
+    names = names if points is None else tuple(names[i] for i in points)
     skinned = np.array([name in SURFACE_POINTS for name in names])
     pick = np.array(
         [SURFACE_POINTS.index(n) if n in SURFACE_POINTS else 0 for n in names]
@@ -136,12 +111,13 @@ def keypoint_jacobian(
     shape: Float[Array, " 10"],
     layout: str,
     bias: float | Float[Array, ""],
+    points: tuple[int, ...] | None = None,
 ) -> tuple[Float[Array, "k 3"], Float[Array, "3 k 69"], Float[Array, "k 3 10"]]:
     """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
-    by shape."""
+    by shape; of all keypoints, or of those with these numbers."""
     dtype = pose.dtype
     R = so3.exp(pose)
-    found = carried_by_joints(body, R, shape, layout, bias)
+    found = carried_by_joints(body, R, shape, layout, bias, points)
     G, x, share = found.G, found.x, found.share
     count = share.shape[1]
     features = body.pose_dirs.shape[-1]

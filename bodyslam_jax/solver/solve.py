@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
+from bodyslam_jax.graph import VARIABLES, Problem, State, check_state
 from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
@@ -65,8 +65,7 @@ def solve(
 
     **Raises:** `ValueError` if `state` does not have the sizes and the precision the
     problem was made for, is not finite, or has poses that are not rigid, if there is no
-    factor, or no stage that takes a step, if `damping` is negative, if factors put in
-    later see joints together that those it was made with did not, or if a baseline is
+    factor, or no stage that takes a step, if `damping` is negative, or if a baseline is
     to mix precisions. Failure to converge is a `status`, and so is what is not finite
     within `jit`.
     """
@@ -77,7 +76,6 @@ def solve(
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
         baselines.check_size(solver, problem, state)
         return _solve_baseline(problem, state, solver, schedule)
-    check_limbs(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
@@ -95,17 +93,6 @@ def check_start(problem: Problem, state: State, damping: float = 0.0) -> None:
     if not problem.factors:
         raise ValueError("problem.factors: found none, expected one or more.")
     check_state(state, problem.free)
-
-
-def check_limbs(problem: Problem) -> None:
-    """Refuses factors that were put in later, where the layout does not hold them."""
-    known = [set(limb) for limb in problem.layout.limbs]
-    more = [x for x in limbs_of(problem.factors) if not any(set(x) <= y for y in known)]
-    if more and not is_traced(problem):
-        raise ValueError(
-            f"problem.factors: they see joints {list(more[0])} together, which those "
-            "that the problem was made with did not; make it anew with `make_problem`."
-        )
 
 
 def method_of(

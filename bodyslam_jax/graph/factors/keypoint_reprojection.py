@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body import KEYPOINT_NAMES, BodyModel, local_keypoints
+from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.graph.factor import FrameFactor, Limbs
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
-from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
+from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph.losses import Loss, squared_norm
 from bodyslam_jax.graph.state import State
 
@@ -39,13 +39,6 @@ class KeypointReprojection(FrameFactor):
     layout: str = eqx.field(static=True, default="body25")
     padding = {"sigma": jnp.inf}
     keys = (("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0))
-
-    @property
-    def limbs(self) -> Limbs:
-        count = len(KEYPOINT_NAMES[self.layout])
-        return tuple(
-            turning_joints(self.body, self.layout, (point,)) for point in range(count)
-        )
 
     def residual(self, state: State) -> Float[Array, "h t j 2"]:
         shape = state.shapes[:, None]

@@ -152,7 +152,7 @@ def substitute_people(
     steps: Float[Array, "h n p"],
     cameras: Float[Array, "t 6"],
     own_globals: Float[Array, "h g"],
-) -> tuple[Float[Array, "h t 6"], Float[Array, "h t c"] | None]:
+) -> tuple[Float[Array, "h t 6"], Float[Array, "h t p"] | None]:
     """Steps of all roots and postures, from what each person keeps of the chunks, from
     those of cameras and of the person's globals."""
     h, n = sizes.people, sizes.chunks
@@ -184,6 +184,6 @@ def substitute_people(
     together = group_size(h * n)
     cut = lambda x: x.reshape(h * n // together, together, *x.shape[2:])
     given = people.postures, border, steps[..., :pose]
-    group = lambda given: substitute_postures(window, *given)
+    group = lambda given: substitute_postures(*given)
     poses = jax.lax.map(group, jax.tree.map(cut, given))
     return roots.reshape(h, -1, 6), poses.reshape(h, -1, pose)
