@@ -299,7 +299,7 @@ def make_problem(
     free: Step | None = None,
     common_sizes: bool | None = None,
     named: Named = (),
-    basis: Float[Array | np.ndarray, "69 k"] | None = None,
+    basis: Float[Array | np.ndarray, "m k"] | None = None,
 ) -> Problem:
     """Checks factors against a first state, fixes the gauge, and lays out the blocks.
 

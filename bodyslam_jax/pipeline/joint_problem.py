@@ -413,16 +413,13 @@ def _make_problem(
     a floor."""
     if free is not None and any(isinstance(f, graph.GroundContact) for f in factors):
         free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
-    import os
-
-    kk = int(os.environ.get("KK", 40))
     problem = graph.make_problem(
         factors,
         state,
         motion=predictor,
         free=free,
         common_sizes=True,
-        basis=people.posture_basis(kk) if kk and len(state.roots) else None,
+        basis=people.posture_basis() if len(state.roots) else None,
     )
     if free is not None and people_on_floor(problem) is None:
         constant = graph.set_constant(problem.free, "scale")

@@ -152,7 +152,7 @@ def substitute_people(
     steps: Float[Array, "h n p"],
     cameras: Float[Array, "t 6"],
     own_globals: Float[Array, "h g"],
-) -> tuple[Float[Array, "h t 6"], Float[Array, "h t p"] | None]:
+) -> tuple[Float[Array, "h t 6"], Float[Array, "h t c"] | None]:
     """Steps of all roots and postures, from what each person keeps of the chunks, from
     those of cameras and of the person's globals."""
     h, n = sizes.people, sizes.chunks
