@@ -105,6 +105,12 @@ def carried_by_joints(
     )
 
 
+def placed(found: Carried) -> Float[Array, "24 k 3"]:
+    """The share of each joint in each keypoint, m, in H; keypoints are their sums."""
+    turned = times(found.lever, found.G.swapaxes(-1, -2))
+    return found.share[..., None] * found.x[:, None] + turned
+
+
 def keypoint_jacobian(
     body: BodyModel,
     pose: Float[Array, "23 3"],
@@ -122,13 +128,13 @@ def keypoint_jacobian(
     count = share.shape[1]
     features = body.pose_dirs.shape[-1]
     path = jnp.asarray(ancestors()[1:], dtype)
-    placed = share[..., None] * x[:, None] + times(found.lever, G.swapaxes(-1, -2))
-    position = jnp.sum(placed, axis=0)
+    parts = placed(found)
+    position = jnp.sum(parts, axis=0)
     moved = G.swapaxes(0, 1).reshape(3, 72) @ found.lever_by_shape.reshape(72, -1)
     by_shape = (share.T @ found.x_by_shape.reshape(24, 30)).reshape(-1, 3, 10)
     by_shape = by_shape + moved.reshape(3, -1, 10).swapaxes(0, 1)
     # First moment of the points below a joint, about that joint.
-    moment = (path @ placed.reshape(24, -1)).reshape(23, -1, 3)
+    moment = (path @ parts.reshape(24, -1)).reshape(23, -1, 3)
     moment = moment - (path @ share)[..., None] * x[1:, None]
     # One column for each axis of each joint, 69 in a row.
     wide = jnp.broadcast_to(moment[:, :, :, None], (*moment.shape, 3))
