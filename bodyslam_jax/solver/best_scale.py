@@ -49,7 +49,8 @@ class _Model(NamedTuple):
 class _Search(NamedTuple):
     """Where the search for s stands."""
 
-    count: Int[Array, ""]
+    looked: Int[Array, ""]
+    """How many were looked at."""
     scale: Float[Array, ""]
     """The next to be looked at."""
     last: Float[Array, ""]
@@ -85,10 +86,10 @@ def best_scale(
 
     def goes_on(search: _Search):
         small = jnp.abs(search.step) <= 4 * eps * jnp.abs(search.last)
-        return (search.count < known + _STEPS) & ((search.count < known) | ~small)
+        return (search.looked < known + _STEPS) & ((search.looked < known) | ~small)
 
     def once(search: _Search):
-        count, scale = search.count, search.scale
+        count, scale = search.looked, search.scale
         there = _model(sees, state, scale)
         first = count == 0
         around = jnp.where(first, scale + there.plain, search.around)
