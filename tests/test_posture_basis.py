@@ -133,6 +133,7 @@ def test_derivatives_of_a_solution_are_those_in_the_basis():
 
     def size(shift):
         factor = problem.factors[at]
+        assert isinstance(factor, g.KeypointReprojection)
         moved = dataclasses.replace(factor, pixel=factor.pixel + shift)
         factors = (*problem.factors[:at], moved, *problem.factors[at + 1 :])
         other = dataclasses.replace(problem, factors=factors)
