@@ -44,10 +44,6 @@ class StillFeet(g.FrameFactor):
         ("shape", 0),
     )
 
-    @property
-    def limbs(self) -> g.Limbs:
-        return tuple(g.turning_joints(self.body, "body25", (k,)) for k in self.points)
-
     def data(self):
         return self.sigma
 

@@ -158,7 +158,8 @@ def _structured_step(problem, state, damping):
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
     extra = damped(diagonals(lin, sizes), damping)
-    return solve_step(problem, state, lin, sizes, eliminate(problem, lin, sizes, extra))
+    whole = eliminate(problem, lin, sizes, extra)
+    return solve_step(problem, state, lin, sizes, whole).step
 
 
 structured_step = compiled(_structured_step)

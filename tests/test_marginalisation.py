@@ -43,10 +43,6 @@ class Linear(g.FrameFactor):
             *((name, 0) for name in common),
         )
 
-    @property
-    def limbs(self):
-        return (COUPLED,)
-
     def frame_residual(self, data, window, shared):
         measured, sigma = data
         parts = [f.camera[:3, 3] for f in window] + [f.root[:3, 3] for f in window]

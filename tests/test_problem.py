@@ -219,11 +219,11 @@ def test_a_problem_too_large_for_memory_reports_how_many_frames_fit(monkeypatch)
 
     def people_of(frames):
         rng = np.random.default_rng(0)
-        return scenes.truth(rng, frames, 20, 0)
+        return scenes.truth(rng, frames, 6, 0)
 
-    monkeypatch.setattr(memory, "memory", lambda: 2**27)
+    monkeypatch.setattr(memory, "memory", lambda: 2**30)
     with pytest.raises(
-        ValueError, match=r"need about 0\.\d GiB, found 0\.1 GiB"
+        ValueError, match=r"need about \d\.\d GiB, found 1\.0 GiB"
     ) as error:
         g.make_problem([], people_of(400))
     (fit,) = re.findall(r"about (\d+) frames fit", str(error.value))
@@ -252,7 +252,9 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
         layout = problem.layout
         soon = tuple(dataclasses.replace(b, lasting=False) for b in layout.buckets)
         without = dataclasses.replace(layout, buckets=soon)
-        counted, others = (memory.memory_needed(x, state) for x in (layout, without))
+        counted, others = (
+            memory.memory_needed(x, state, 69) for x in (layout, without)
+        )
         return np.array([kept.size * kept.dtype.itemsize, counted - others])
 
     kept, counted = bytes_of(FAR) - bytes_of(0)

@@ -6,11 +6,9 @@ from bodyslam_jax.graph.check_factor import check_factor as check_factor
 from bodyslam_jax.graph.edit import disable as disable
 from bodyslam_jax.graph.edit import rescaled as rescaled
 from bodyslam_jax.graph.edit import set_constant as set_constant
-from bodyslam_jax.graph.factor import JOINTS as JOINTS
 from bodyslam_jax.graph.factor import Factor as Factor
 from bodyslam_jax.graph.factor import Frame as Frame
 from bodyslam_jax.graph.factor import FrameFactor as FrameFactor
-from bodyslam_jax.graph.factor import Limbs as Limbs
 from bodyslam_jax.graph.factor import Shared as Shared
 from bodyslam_jax.graph.factor import residual_of as residual_of
 from bodyslam_jax.graph.factors.angular_acceleration_prior import (
@@ -50,7 +48,6 @@ from bodyslam_jax.graph.factors.stature import Stature as Stature
 from bodyslam_jax.graph.factors.upright_prior import UprightPrior as UprightPrior
 from bodyslam_jax.graph.globals import GlobalPrior as GlobalPrior
 from bodyslam_jax.graph.globals import Variable as Variable
-from bodyslam_jax.graph.keypoint_jacobian import turning_joints as turning_joints
 from bodyslam_jax.graph.layout import Layout as Layout
 from bodyslam_jax.graph.layout import make_layout as make_layout
 from bodyslam_jax.graph.losses import BlakeZisserman as BlakeZisserman
@@ -69,8 +66,8 @@ from bodyslam_jax.graph.problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph.problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph.problem import Problem as Problem
 from bodyslam_jax.graph.problem import layout_of as layout_of
-from bodyslam_jax.graph.problem import limbs_of as limbs_of
 from bodyslam_jax.graph.problem import make_problem as make_problem
+from bodyslam_jax.graph.state import TURNS as TURNS
 from bodyslam_jax.graph.state import State as State
 from bodyslam_jax.graph.state import Step as Step
 from bodyslam_jax.graph.state import gauge as gauge

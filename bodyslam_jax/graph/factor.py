@@ -20,12 +20,6 @@ from bodyslam_jax.graph.annotations import fields_with_axes
 from bodyslam_jax.graph.losses import Loss, Squared, squared_norm
 from bodyslam_jax.graph.state import State
 
-JOINTS = tuple(range(23))
-"""All joints below the pelvis, as `State.poses` counts them."""
-
-Limbs = tuple[tuple[int, ...], ...]
-"""Groups of joints."""
-
 Key = tuple[str, int]
 """A variable and how many frames back: `("camera", 1)` is the previous camera."""
 
@@ -254,11 +248,6 @@ class FrameFactor(Factor):
     ) -> tuple[Float[Array, "*b d"], dict[Key, Float[Array, "*b d n"]]] | None:
         """The same for all frames at once, leading axes `h t` (or `t`)."""
         return None
-
-    @property
-    def limbs(self) -> Limbs:
-        """Joints of the touched poses on which one row of the residual may depend."""
-        return (JOINTS,)
 
     @property
     def num_lags(self) -> int:

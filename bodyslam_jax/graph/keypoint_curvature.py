@@ -12,13 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import ancestors
-from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.keypoint_jacobian import (
-    carried_by_joints,
-    times,
-)
+from bodyslam_jax.graph.keypoint_jacobian import Carried, times
 
 _UPPER = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
 """1 where the joint of a coordinate (row) is an ancestor of that of the other, 1/2
@@ -26,24 +21,18 @@ where both belong to one joint."""
 
 
 def keypoint_curvature(
-    body: BodyModel,
-    pose: Float[Array, "23 3"],
-    shape: Float[Array, " 10"],
-    layout: str,
-    bias: float | Float[Array, ""],
+    found: Carried,
     pull: Float[Array, "k 3"],
 ) -> tuple[Float[Array, "72 72"], Float[Array, "72 10"]]:
     """Second derivatives of `Σ_k pull_k · p_k` by rotations twice, and by rotations and
     shape.
 
-    Points (m) and `pull`, the gradient of the cost by them, are in H. Rotations (rad)
-    are `Exp` on the right: of the whole body about the pelvis, then of each joint.
-    Points are linear in shape. Pose blend shapes are neglected.
+    Points (`carried_by_joints`, m) and `pull`, the gradient of the cost by them, are in
+    H. Rotations (rad) are `Exp` on the right: of the whole body about the pelvis, then
+    of each joint. Points are linear in shape. Pose blend shapes are neglected.
     """
-    R = so3.exp(pose)
-    found = carried_by_joints(body, R, shape, layout, bias)
     G, x = found.G, found.x
-    path = jnp.asarray(ancestors(), pose.dtype)
+    path = jnp.asarray(ancestors(), x.dtype)
     below = lambda y: (path @ y.reshape(24, -1)).reshape(y.shape)
     own = found.share @ pull
     all_own = below(own)

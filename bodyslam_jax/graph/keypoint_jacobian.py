@@ -21,34 +21,6 @@ from bodyslam_jax.body import (
 )
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS, ancestors
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import JOINTS
-from bodyslam_jax.graph.tracing import is_traced
-
-
-def turning_joints(
-    body: BodyModel, layout: str, points: tuple[int, ...] | None = None
-) -> tuple[int, ...]:
-    """Joints below the pelvis, from 0, whose rotations move these keypoints (or all).
-
-    Hands move no keypoint of BODY_25, for example. All joints, if the body has pose
-    blend shapes or is traced.
-    """
-    if is_traced(body) or body.pose_dirs.shape[-1]:
-        return JOINTS
-    names = KEYPOINT_NAMES[layout]
-    picks, weight = np.asarray(body.picks), np.asarray(body.skin_weight)
-    on = np.asarray(body.skin_joint)
-    moved = np.zeros(24, bool)
-    above = ancestors() > 0
-    for name in names if points is None else [names[i] for i in points]:
-        if name in SURFACE_POINTS:
-            vertex = picks[SURFACE_POINTS.index(name)]
-            moved |= above[:, on[vertex][weight[vertex] != 0]].any(axis=1)
-        else:
-            joint = KEYPOINT_JOINT[name]
-            at_joint = np.arange(24) == joint
-            moved |= above[:, joint] & (~at_joint | (name in DETECTOR_BIAS))
-    return tuple(np.flatnonzero(moved[1:]).tolist())
 
 
 class Carried(NamedTuple):
@@ -75,10 +47,13 @@ def carried_by_joints(
     shape: Float[Array, " 10"],
     layout: str,
     bias: float | Float[Array, ""],
+    points: tuple[int, ...] | None = None,
 ) -> Carried:
-    """Rotations and positions of joints, and keypoints relative to them."""
+    """Rotations and positions of joints, and keypoints relative to them: all of the
+    layout's, or those with these numbers."""
     dtype = R.dtype
     names = KEYPOINT_NAMES[layout]
+    names = names if points is None else tuple(names[i] for i in points)
     skinned = np.array([name in SURFACE_POINTS for name in names])
     pick = np.array(
         [SURFACE_POINTS.index(n) if n in SURFACE_POINTS else 0 for n in names]
@@ -130,29 +105,36 @@ def carried_by_joints(
     )
 
 
+def placed(found: Carried) -> Float[Array, "24 k 3"]:
+    """The share of each joint in each keypoint, m, in H; keypoints are their sums."""
+    turned = times(found.lever, found.G.swapaxes(-1, -2))
+    return found.share[..., None] * found.x[:, None] + turned
+
+
 def keypoint_jacobian(
     body: BodyModel,
     pose: Float[Array, "23 3"],
     shape: Float[Array, " 10"],
     layout: str,
     bias: float | Float[Array, ""],
+    points: tuple[int, ...] | None = None,
 ) -> tuple[Float[Array, "k 3"], Float[Array, "3 k 69"], Float[Array, "k 3 10"]]:
     """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
-    by shape."""
+    by shape; of all keypoints, or of those with these numbers."""
     dtype = pose.dtype
     R = so3.exp(pose)
-    found = carried_by_joints(body, R, shape, layout, bias)
+    found = carried_by_joints(body, R, shape, layout, bias, points)
     G, x, share = found.G, found.x, found.share
     count = share.shape[1]
     features = body.pose_dirs.shape[-1]
     path = jnp.asarray(ancestors()[1:], dtype)
-    placed = share[..., None] * x[:, None] + times(found.lever, G.swapaxes(-1, -2))
-    position = jnp.sum(placed, axis=0)
+    parts = placed(found)
+    position = jnp.sum(parts, axis=0)
     moved = G.swapaxes(0, 1).reshape(3, 72) @ found.lever_by_shape.reshape(72, -1)
     by_shape = (share.T @ found.x_by_shape.reshape(24, 30)).reshape(-1, 3, 10)
     by_shape = by_shape + moved.reshape(3, -1, 10).swapaxes(0, 1)
     # First moment of the points below a joint, about that joint.
-    moment = (path @ placed.reshape(24, -1)).reshape(23, -1, 3)
+    moment = (path @ parts.reshape(24, -1)).reshape(23, -1, 3)
     moment = moment - (path @ share)[..., None] * x[1:, None]
     # One column for each axis of each joint, 69 in a row.
     wide = jnp.broadcast_to(moment[:, :, :, None], (*moment.shape, 3))

@@ -19,7 +19,6 @@ from jaxtyping import Array, Int
 
 from bodyslam_jax.geometry.lengths import round_up
 from bodyslam_jax.graph import sizes
-from bodyslam_jax.graph.factor import JOINTS, Limbs
 from bodyslam_jax.graph.long_tracks import choose_long_tracks
 from bodyslam_jax.graph.ordering import CHUNK, PERSON, order_chunks
 
@@ -59,9 +58,6 @@ class Layout(eqx.Module):
     """The chunk at each position of the elimination order; `None` for that of time."""
     reach: int = eqx.field(static=True, default=1)
     """Largest distance, in that order, of chunks adjacent in time."""
-    limbs: Limbs = eqx.field(static=True, default=(JOINTS,))
-    """Joints that factors see together, as those of one leg; narrow limbs first. Of
-    joints in none, such as hands that no keypoint sees, each is a chain by itself."""
     num_landmarks: int = eqx.field(static=True, default=1)
     """Number of landmarks, rounded up: one more at least, for empty entries."""
     num_observations: int = eqx.field(static=True, default=1)
@@ -81,11 +77,6 @@ class Layout(eqx.Module):
         )
 
     @property
-    def joints(self) -> tuple[int, ...]:
-        """All joints that are in a limb, limb after limb."""
-        return sum(self.limbs, ())
-
-    @property
     def lasting(self) -> int:
         """Number of landmarks, with padding, that are eliminated with the globals."""
         return sum(b.landmark.size for b in self.buckets if b.lasting)
@@ -97,7 +88,6 @@ def make_layout(
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
     num_people: int = 0,
-    limbs: Limbs = (JOINTS,),
     *,
     common_sizes: bool = True,
     front: int = 0,
@@ -111,11 +101,11 @@ def make_layout(
     it the order is that of time, and no landmark is lasting.
     """
     for size in sizes.SIZES if common_sizes else ():
-        given = size, num_frames, num_landmarks, frame, landmark, limbs, front
+        given = size, num_frames, num_landmarks, frame, landmark, front
         found = _in_size(*given)
         if found is not None:
             return found
-    given = num_frames, num_landmarks, frame, landmark, num_people, limbs, front
+    given = num_frames, num_landmarks, frame, landmark, num_people, front
     return _of_own_size(*given)
 
 
@@ -125,7 +115,6 @@ def _in_size(
     num_landmarks: int,
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
-    limbs: Limbs,
     front: int,
 ) -> Layout | None:
     """The layout of a problem in tables of a given size; `None` if it does not fit."""
@@ -141,7 +130,6 @@ def _in_size(
         buckets=(),
         num_chunks=size.chunks,
         bandwidth=max(front, 2),
-        limbs=limbs,
         num_landmarks=size.landmarks,
         num_observations=size.observations,
         used=jnp.asarray(count, jnp.int32),
@@ -179,7 +167,6 @@ def _of_own_size(
     frame: Int[np.ndarray, " m"],
     landmark: Int[np.ndarray, " m"],
     num_people: int,
-    limbs: Limbs,
     front: int,
 ) -> Layout:
     """The layout of a problem whose sizes are its own, rounded up. So are those of
@@ -188,7 +175,7 @@ def _of_own_size(
     num_chunks = round_up(count, parts=8)
     room = round_up(num_landmarks + 1), round_up(len(frame) + 1)
     if len(frame) == 0:
-        return Layout((), num_chunks, max(front, 2), None, 1, limbs, *room)
+        return Layout((), num_chunks, max(front, 2), None, 1, *room)
     own = num_people * PERSON
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
     # In any order, a landmark's span is at least the number of chunks that observe it.
@@ -230,7 +217,7 @@ def _of_own_size(
         order = jnp.asarray(order, jnp.int32)
         reach = min(next((w for w in _WIDTHS if reach <= w), reach), num_chunks - 1)
     bandwidth = max(widths[-1], reach + 1, front)
-    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, limbs, *room)
+    return Layout(tuple(buckets), num_chunks, bandwidth, order, reach, *room)
 
 
 def _spans(num_landmarks, frame, landmark):

@@ -27,11 +27,10 @@ def memory() -> int:
     return min(found)
 
 
-def memory_needed(layout: Layout, state: State) -> int:
-    """Bytes of the solver's tables, about."""
+def memory_needed(layout: Layout, state: State, pose: int) -> int:
+    """Bytes of the solver's tables, about; `pose` coordinates of a posture."""
     item = state.scale.dtype.itemsize
     people = len(state.roots)
-    pose = 3 * len(layout.joints)
     person = pose + 12  # what remains of a chunk: a posture and two roots
     front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
     front += 3 * layout.lasting
@@ -43,12 +42,12 @@ def memory_needed(layout: Layout, state: State) -> int:
     return item * (chunk * layout.num_chunks + tables)
 
 
-def check_memory(layout: Layout, state: State) -> None:
+def check_memory(layout: Layout, state: State, pose: int) -> None:
     """Refuses a problem that does not fit; memory grows linearly with frames.
 
     **Raises:** `InputError` with the number of frames that fit.
     """
-    need, have = memory_needed(layout, state), memory()
+    need, have = memory_needed(layout, state, pose), memory()
     if need > have:
         most = int(layout.num_chunks * CHUNK * have / need)
         fit = max((x for x in LENGTHS if x <= most), default=most)

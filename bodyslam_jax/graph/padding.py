@@ -61,10 +61,6 @@ class Masked(FrameFactor):
     def keys(self):
         return self.factor.keys
 
-    @property
-    def limbs(self):
-        return self.factor.limbs
-
     def rescaled(self, factor):
         return dataclasses.replace(self, factor=self.factor.rescaled(factor))
 

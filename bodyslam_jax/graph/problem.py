@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.graph.factor import Factor, FrameFactor, Limbs
+from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
 from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
@@ -33,10 +33,11 @@ from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
 from bodyslam_jax.graph.sizes import is_dense
-from bodyslam_jax.graph.state import State, Step, gauge
+from bodyslam_jax.graph.state import TURNS, State, Step, gauge
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
     Sizes,
+    check_basis,
     check_measurements,
     check_prior,
     check_shapes,
@@ -98,6 +99,10 @@ class Problem(eqx.Module):
     the other groups are not formed."""
     globals: Named = eqx.field(static=True, default=())
     """Names and sizes of the variables in `State.globals`."""
+    basis: Float[Array, "69 k"] | None = None
+    """Orthonormal columns: the turns of the 23 joints (rad, each in its own frame) that
+    a step may give a posture. What they do not span of a posture stays as it is in the
+    first state. `None` for all turns."""
 
     def cost(self, state: State, *, held: bool = False) -> Float[Array, ""]:
         """Negative log-likelihood, up to a constant.
@@ -245,11 +250,12 @@ class Problem(eqx.Module):
             if isinstance(factor, FrameFactor):
                 check_padding(factor, sample)
         everything = (*self.factors, *factors)
-        layout = dataclasses.replace(self.layout, limbs=limbs_of(everything))
+        layout = self.layout
         laid = Reprojection | LandmarkPrior | MarginalPrior
         if any(isinstance(f, laid) for f in factors):
             layout = layout_of(everything, sizes, None)
-            check_memory(layout, sample)
+            width = TURNS if self.basis is None else self.basis.shape[1]
+            check_memory(layout, sample, width)
         free, variables = self.free, self.variables
         if "scale" in _variables_of(factors) - _variables_of(self.factors):
             free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
@@ -284,26 +290,6 @@ def _predicted(factor: Factor, name: str, value: Array, prediction: Any) -> Fact
     return eqx.tree_at(lambda f: getattr(f, name), factor, value)
 
 
-def limbs_of(factors: Sequence[Factor]) -> Limbs:
-    """Groups of joints (limbs) that factors couple within a frame, smallest first.
-
-    Overlapping groups of different factors are merged. A joint that is coupled only to
-    itself in other frames (such as hands without keypoints) is in no limb.
-    """
-    found: list[set[int]] = []
-    for factor in factors:
-        if isinstance(factor, FrameFactor):
-            sees = any(name == "pose" for name, _ in factor.keys)
-            limbs = factor.limbs if sees and not factor.per_joint else ()
-        else:
-            limbs = factor.limbs if isinstance(factor, MarginalPrior) else ()
-        for joints in map(set, limbs):
-            near = [limb for limb in found if limb & joints]
-            found = [limb for limb in found if not limb & joints]
-            found += [joints.union(*near)] if joints else []
-    return tuple(sorted((tuple(sorted(x)) for x in found), key=lambda x: (len(x), x)))
-
-
 def make_problem(
     factors: Sequence[Factor],
     state: State,
@@ -313,6 +299,7 @@ def make_problem(
     free: Step | None = None,
     common_sizes: bool | None = None,
     named: Named = (),
+    basis: Float[Array | np.ndarray, "m k"] | None = None,
 ) -> Problem:
     """Checks factors against a first state, fixes the gauge, and lays out the blocks.
 
@@ -327,6 +314,10 @@ def make_problem(
 
     `named` has the names and sizes of `state.globals`; `Problem.with_variables` adds
     named globals to a problem with their priors.
+
+    `basis` has the turns of joints that steps may give a posture, as orthonormal
+    columns, such as `people.posture_basis()`: what it does not span stays as in the
+    first state. By default it is all turns, which takes longer to compile and to solve.
 
     **Raises:** `ValueError` if shapes or dtypes of arrays do not fit, a value is not
     finite or not valid (a pose that is not rigid, sigma 0, a correlation of 1, a weight
@@ -351,7 +342,7 @@ def make_problem(
         check_shapes(free, "free", dict(sizes))
         check_mask(free)
     layout = layout_of(factors, sizes, common_sizes)
-    check_memory(layout, state)
+    check_memory(layout, state, TURNS if basis is None else basis.shape[1])
     mask: Step
     if free is None:
         ones = jax.tree.map(jnp.ones_like, state.zero_step())
@@ -371,7 +362,9 @@ def make_problem(
     moves = lambda x: is_traced(x) or bool(np.any(np.asarray(x)))
     movable = jax.tree.map(moves, mask)
     variables = tuple(name for name in VARIABLES if getattr(movable, name))
-    return Problem(factors, mask, motion, layout, variables, named)
+    if basis is not None:
+        basis = check_basis(basis, state.scale.dtype)
+    return Problem(factors, mask, motion, layout, variables, named, basis)
 
 
 def _variables_of(factors: Sequence[Factor]) -> set[str]:
@@ -406,10 +399,9 @@ def layout_of(
     for factor in factors:
         if isinstance(factor, LandmarkPrior):
             check_prior(factor, landmark)
-    limbs = limbs_of(factors)
     if common_sizes is None:
         common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
-    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"], limbs
+    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"]
     return make_layout(*given, common_sizes=common_sizes, front=front)
 
 

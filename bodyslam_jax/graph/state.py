@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 
+TURNS = 69
+"""Turns of the 23 joints of a posture, three each."""
 _MOVED = 0.01
 """rad, m and so on: standard deviation of a step to a state close by."""
 

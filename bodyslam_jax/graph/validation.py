@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.graph.annotations import array_annotations
@@ -25,7 +25,7 @@ from bodyslam_jax.graph.factors.reprojection import Reprojection
 from bodyslam_jax.graph.factors.root_orientation import RootOrientation
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
 from bodyslam_jax.graph.factors.upright_prior import UprightPrior
-from bodyslam_jax.graph.state import State, Step
+from bodyslam_jax.graph.state import TURNS, State, Step
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation_weights import (
     check_correlation,
@@ -303,3 +303,24 @@ def _check_tracks(factor, sizes):
             f"Reprojection: landmark {l} is observed twice in frame {f} "
             f"({len(twice)} such observations), expected once at most."
         )
+
+
+def check_basis(basis: Array | np.ndarray, dtype: np.dtype) -> Array:
+    """The basis of postures in the precision of a state.
+
+    **Raises:** `ValueError` unless it has 69 rows and orthonormal columns.
+    """
+    if is_traced(basis):
+        return jnp.asarray(basis, dtype)
+    found = np.asarray(basis, float)
+    if found.ndim != 2 or found.shape[0] != TURNS or not found.shape[1]:
+        raise ValueError(
+            f"basis: found shape {found.shape}, expected ({TURNS}, k) with k from 1."
+        )
+    off = np.max(np.abs(found.T @ found - np.eye(found.shape[1])))
+    if not off < 1e-4:
+        raise ValueError(
+            f"basis: its columns are not orthonormal (off by {off:.2g}); `numpy.linalg."
+            "qr` makes them so."
+        )
+    return jnp.asarray(found, dtype)

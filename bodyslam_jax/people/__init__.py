@@ -18,6 +18,7 @@ from bodyslam_jax.people.networks import network_status as network_status
 from bodyslam_jax.people.person_state import PersonState as PersonState
 from bodyslam_jax.people.person_state import bodies_from_roots as bodies_from_roots
 from bodyslam_jax.people.person_state import roots_from_bodies as roots_from_bodies
+from bodyslam_jax.people.posture_prior import posture_basis as posture_basis
 from bodyslam_jax.people.shown import joints_of as joints_of
 from bodyslam_jax.people.shown import legs_shown as legs_shown
 from bodyslam_jax.people.shown import shown_keypoints as shown_keypoints

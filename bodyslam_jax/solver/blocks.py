@@ -1,11 +1,8 @@
 """The blocks of the normal equations, and how many of them there are.
 
 Names of blocks: `("pose", "root", d)` couples the pose of frame k with the root of
-frame k - d; `joint` is a pose whose joints do not interact, `apart` one of joints that
-nothing else touches, and `alone` a camera without a person.
+frame k - d; `alone` is a camera without a person.
 """
-
-import itertools
 
 import equinox as eqx
 import jax
@@ -13,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph import CHUNK, Limbs, Problem, State, Step
+from bodyslam_jax.graph import CHUNK, Problem, State, Step
+from bodyslam_jax.solver.posture import posture_width
 
 CAMERAS = 6 * CHUNK
 """Coordinates of a chunk's cameras."""
@@ -34,20 +32,10 @@ class Sizes(eqx.Module):
     variables: tuple[str, ...] = eqx.field(static=True)
     lasting: int = eqx.field(static=True)
     """Landmarks that are eliminated last."""
-    limbs: Limbs = eqx.field(static=True)
-    """Of `Layout`: their joints' turns are the group `pose`."""
+    posture: int = eqx.field(static=True)
+    """Coordinates of a posture (`posture.py`)."""
     dtype: np.dtype = eqx.field(static=True)
     """Of blocks and factors: the state's, or a lower one (see `solve`)."""
-
-    @property
-    def joints(self) -> tuple[int, ...]:
-        return sum(self.limbs, ())
-
-    @property
-    def widths(self) -> tuple[tuple[int, int], ...]:
-        """How many limbs have how many coordinates, narrow ones first."""
-        of_width = itertools.groupby(self.limbs, len)
-        return tuple((len(list(same)), 3 * count) for count, same in of_width)
 
     @property
     def common(self) -> int:
@@ -96,8 +84,6 @@ class Linearisation(eqx.Module):
 
     blocks: dict[tuple[str, str, int], Array]
     """Per person (but for cameras alone) and frame."""
-    limbs: dict[int, list[Float[Array, "h t _l _p _p"]]]
-    """Postures with those so many frames before: limbs with themselves, by width."""
     gradient: dict[str, Array]
     globals: Float[Array, "g g"]
     globals_gradient: Float[Array, " g"]
@@ -134,7 +120,6 @@ class Sums:
     def __init__(self, sizes: Sizes, state: State):
         self.sizes = sizes
         self.blocks: dict[tuple[str, str, int], Array] = {}
-        self.limbs: dict[int, list[Array]] = {}
         self.gradient: dict[str, Array] = {}
         self.costs: list[Array] = []
         dtype = state.scale.dtype
@@ -145,13 +130,6 @@ class Sums:
         value = value.astype(self.sizes.dtype)
         known = self.blocks.get(key)
         self.blocks[key] = value if known is None else known + value
-
-    def add_limbs(self, lag: int, values: list[Array]) -> None:
-        values = cast(values, self.sizes.dtype)
-        known = self.limbs.get(lag)
-        self.limbs[lag] = (
-            values if known is None else jax.tree.map(jnp.add, known, values)
-        )
 
     def add_gradient(self, name: str, value: Array) -> None:
         known = self.gradient.get(name)
@@ -184,7 +162,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
         named=size("globals", state.globals),
         variables=problem.variables,
         lasting=problem.layout.lasting,
-        limbs=problem.layout.limbs,
+        posture=posture_width(problem),
         dtype=state.scale.dtype if dtype is None else dtype,
     )
 

@@ -29,19 +29,13 @@ Pairs = dict[tuple[str, str], Array]
 class Window(eqx.Module):
     """Static sizes of the groups."""
 
-    limbs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    """How many limbs have how many coordinates, narrow ones first; none where postures
-    are not among the variables."""
+    pose: int = eqx.field(static=True)
+    """Coordinates of a posture; none where postures are not among the variables."""
     cross: bool = eqx.field(static=True)
     """Whether postures couple with cameras, or with roots of other frames."""
     reach: int = eqx.field(static=True)
     """Frames back that terms of roots and cameras reach."""
     own_globals: int = eqx.field(static=True)
-
-    @property
-    def pose(self) -> int:
-        """Coordinates of a posture."""
-        return sum(count * width for count, width in self.limbs)
 
     @property
     def widths(self) -> dict[str, int]:
@@ -77,9 +71,8 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
     **Raises:** `ValueError` if a factor couples frames that lie too far apart.
     """
     cross, reach = False, 0
-    postures = [("pose", "pose", lag) for lag in lin.limbs]
-    for first, other, lag in [*lin.blocks, *postures]:
-        limit = 1 if first in ("pose", "joint", "apart") else CHUNK - 1
+    for first, other, lag in lin.blocks:
+        limit = 1 if first == "pose" else CHUNK - 1
         if abs(lag) > limit:
             raise ValueError(
                 f"a factor couples {first} and {other} {abs(lag)} frames apart; the "
@@ -92,8 +85,8 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
             reach = max(reach, abs(lag))
     if lin.prior is not None:
         reach = max(reach, lin.prior.reach)
-    limbs = sizes.widths if "pose" in lin.gradient else ()
-    return Window(limbs, cross, reach, sizes.own_globals)
+    pose = sizes.posture if "pose" in lin.gradient else 0
+    return Window(pose, cross, reach, sizes.own_globals)
 
 
 def _block(pairs: Pairs, row: str, column: str) -> Array | None:

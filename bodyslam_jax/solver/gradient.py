@@ -7,20 +7,19 @@ that no factor has.
 import equinox as eqx
 import jax.numpy as jnp
 
-from bodyslam_jax.graph import Problem, Step
-from bodyslam_jax.solver.apart import split_poses
+from bodyslam_jax.graph import Problem
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, globals_of
+from bodyslam_jax.solver.linear_system import Move
 
 
 def with_gradient(
-    problem: Problem, lin: Linearisation, sizes: Sizes, step: Step
+    problem: Problem, lin: Linearisation, sizes: Sizes, move: Move
 ) -> Linearisation:
-    """The same blocks of `J^T J`, with the gradient `step`."""
-    poses = split_poses(step.poses, problem.layout.joints)
-    gradient = {}
+    """The same blocks of `J^T J`, with the gradient `move`."""
+    step, gradient = move.step, {}
     for name, known in lin.gradient.items():
-        if name in poses:
-            gradient[name] = poses[name]
+        if name == "pose":
+            gradient[name] = move.postures
         elif name == "root":
             gradient[name] = step.roots
         else:

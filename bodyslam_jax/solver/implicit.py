@@ -17,18 +17,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
 from bodyslam_jax.graph.tracing import is_alone, is_traced
-from bodyslam_jax.solver.apart import join_poses
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import mask_of, sizes_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.gmres import gmres
 from bodyslam_jax.solver.gradient import with_gradient
-from bodyslam_jax.solver.linear_system import damped, diagonals, eliminate, solve_step
+from bodyslam_jax.solver.linear_system import (
+    Move,
+    damped,
+    diagonals,
+    eliminate,
+    solve_step,
+)
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
+from bodyslam_jax.solver.posture import from_turns, to_turns
 
 _LITTLE = {"float64": 1e-9, "float32": 1e-5}
 """Damping of the preconditioner."""
@@ -56,16 +63,17 @@ def _cotangent_of_problem(problem, state, cotangent):
     problem = _without_single_views(problem)
     zero = state.zero_step()
     diagonal = diagonal_of(problem, state)
-    mask = jax.tree.map(
-        lambda m, d: jnp.where(d > 0, m, 0.0), mask_of(problem), diagonal
-    )
+    masks = coordinates_of(problem, mask_of(problem))
+    if problem.basis is not None:
+        masks["poses"] = jnp.ones_like(diagonal["poses"])
+    mask = jax.tree.map(lambda m, d: jnp.where(d > 0, m, 0.0), masks, diagonal)
     # Standard deviations: in metres and radians, points that nobody sees well would
     # decide alone when the rest is good enough.
     unit = jax.tree.map(lambda d: jax.lax.rsqrt(jnp.where(d > 0, d, 1.0)), diagonal)
-    masked = lambda step: jax.tree.map(lambda m, s: m * s, mask, step)
+    masked = lambda x: jax.tree.map(lambda m, s: m * s, mask, x)
     _, pull = jax.vjp(state.retract, zero)
     (right,) = pull(cotangent)
-    right = masked(right)
+    right = masked(coordinates_of(problem, right))
     arrays, static = eqx.partition(problem, eqx.is_inexact_array)
 
     def gradient(step, arrays):
@@ -87,17 +95,18 @@ def _cotangent_of_problem(problem, state, cotangent):
     scale, _ = ravel_pytree(unit)
 
     def left_of(scaled, share):
-        step = unravel(scaled * scale)
-        product, _ = transpose(masked(step))
+        x = unravel(scaled * scale)
+        product, _ = transpose(step_of(problem, masked(x)))
         # A held coordinate is its own equation.
         image = jax.tree.map(
             lambda b, m, p, x: share * b - jnp.where(m > 0, m * p, x),
-            *(right, mask, product, step),
+            *(right, mask, coordinates_of(problem, product), x),
         )
         return ravel_pytree(precondition(image))[0] / scale
 
     adjoint = unravel(scale * gmres(left_of, flat, _RTOL[flat.dtype.name]))
-    _, result = transpose(jax.tree.map(jnp.negative, masked(adjoint)))
+    adjoint = step_of(problem, masked(adjoint))
+    _, result = transpose(jax.tree.map(jnp.negative, adjoint))
     return result
 
 
@@ -123,7 +132,22 @@ def _without_single_views(problem: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
 
 
-def diagonal_of(problem: Problem, state: State) -> Step:
+Coordinates = dict[str, Array]
+"""What a step has, by name; postures in the coordinates that the solver moves
+(`posture.py`)."""
+
+
+def coordinates_of(problem: Problem, slope: Step) -> Coordinates:
+    """A gradient by coordinates from one by steps."""
+    return {**vars(slope), "poses": from_turns(problem, slope.poses)}
+
+
+def step_of(problem: Problem, x: Coordinates) -> Step:
+    """The step that has these coordinates."""
+    return Step(**{**x, "poses": to_turns(problem, x["poses"])})
+
+
+def diagonal_of(problem: Problem, state: State) -> Coordinates:
     """The diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
@@ -134,12 +158,12 @@ def diagonal_of(problem: Problem, state: State) -> Step:
     for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
         moved = jnp.moveaxis(own, 1, 2)
         landmarks = landmarks.at[bucket.landmark].set(moved, mode="drop")
-    known = {name: diagonal[name] for name in ("pose", "apart") if name in diagonal}
-    return Step(
+    none = jnp.zeros((*zero.poses.shape[:2], sizes.posture), state.scale.dtype)
+    return dict(
         scale=diagonal["globals"][0],
         cameras=diagonal["camera"],
         roots=diagonal["root"],
-        poses=join_poses(known, sizes.joints, zero.poses),
+        poses=diagonal.get("pose", none),
         shapes=diagonal["globals"][sizes.common :].reshape(zero.shapes.shape),
         landmarks=landmarks,
         intrinsics=diagonal["globals"][1 : 1 + count] if count else zero.intrinsics,
@@ -149,7 +173,9 @@ def diagonal_of(problem: Problem, state: State) -> Step:
     )
 
 
-def normal_solver(problem: Problem, state: State) -> Callable[[Step], Step]:
+def normal_solver(
+    problem: Problem, state: State
+) -> Callable[[Coordinates], Coordinates]:
     """`v -> (J^T J)^-1 v`, hardly damped, by the solver's own elimination."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
@@ -157,9 +183,12 @@ def normal_solver(problem: Problem, state: State) -> Callable[[Step], Step]:
     little = jnp.asarray(_LITTLE[state.scale.dtype.name], state.scale.dtype)
     damping = damped(diagonals(lin, sizes), little)
 
-    def apply(right: Step) -> Step:
-        there = with_gradient(problem, lin, sizes, jax.tree.map(jnp.negative, right))
+    def apply(right: Coordinates) -> Coordinates:
+        down = jax.tree.map(jnp.negative, right)
+        move = Move(step_of(problem, down), down["poses"])
+        there = with_gradient(problem, lin, sizes, move)
         eliminated = eliminate(problem, there, sizes, damping)
-        return solve_step(problem, state, there, sizes, eliminated)
+        found = solve_step(problem, state, there, sizes, eliminated)
+        return {**vars(found.step), "poses": found.postures}
 
     return apply

@@ -11,6 +11,7 @@ The stages of a schedule are phases of one loop, and differ by a mask: what they
 compiled once, and so is what covariances need of the last linearisation.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, residual_of, robustify
-from bodyslam_jax.solver.best_scale import at_best_scale
+from bodyslam_jax.solver.best_scale import WORTH, best_scale, is_quadratic
 from bodyslam_jax.solver.blocks import Linearisation, sizes_of
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
@@ -88,10 +89,11 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             nu=jnp.asarray(2.0, dtype),
             cost=jnp.asarray(jnp.inf, dtype),
             first_cost=jnp.asarray(jnp.inf, dtype),
+            better_scale=jnp.asarray(jnp.nan, dtype),
             steps=jnp.zeros(s, int),
             share=jnp.zeros((), dtype),
             bent=jnp.array(True),
-            finished=(stage == s) & ~self.keep,
+            finished=jnp.array(False),
             result=optx.RESULTS.successful,
             history=History(
                 jnp.zeros((s, n + 1), dtype),
@@ -112,14 +114,20 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         dtype = y.scale.dtype
         last = state.stage == len(self.limit)
         at = jnp.minimum(state.stage, len(self.limit) - 1)
-        args = _held(args, self.free[at])
+        whole, args = args, _held(args, self.free[at])
         sizes = sizes_of(args, y, self.dtype)
 
         begins = (state.steps[at] == 0) & ~last
-        lin, prediction, y, gained = jax.lax.cond(
+        lin, prediction, y, best_scale, gained = jax.lax.cond(
             state.stale,
-            lambda _: _linearise_anew(args, state.observations, y, self.dtype, begins),
-            lambda _: (state.final.lin, state.prediction, y, jnp.zeros_like(y.scale)),
+            lambda _: _linearise_anew(
+                *(args, state.observations, y, self.dtype, begins),
+                last & (whole.free.scale > 0) & (not is_quadratic(whole)),
+            ),
+            lambda _: (
+                *(state.final.lin, state.prediction, y),
+                *(y.scale, jnp.zeros_like(y.scale)),
+            ),
             None,
         )
         problem: Problem = args.with_prediction(prediction)
@@ -127,8 +135,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         curvature = curvature_if(share > 0, problem, lin, y, sizes)
         bent = add_second_order(lin, curvature, share)
         known = jnp.sum(lin.costs)
-        trial = attempt(
-            problem, y, bent, sizes, state.damping, state.landmark_damping, last
+        trial = _attempt_if(
+            ~last | self.keep,
+            *(problem, y, bent, sizes, state.damping, state.landmark_damping, last),
         )
         accept, before = trial.accepted, jnp.sum(trial.terms)
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
@@ -165,9 +174,17 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         share = jnp.where(self.damping > 0, share, 0.0)  # Gauss-Newton knows none
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
+        # Where the last stage ended, the motion is predicted anew.
+        ended = jnp.max(jnp.where(state.steps > 0, jnp.arange(len(steps)), -1))
+        ended = jnp.where(last & (ended >= 0), ended, len(steps))
+        end = lambda rows, value: rows.at[ended, state.steps[ended]].set(
+            value, mode="drop"
+        )
+        moved = ((self.free[:, VARIABLES.index("scale")] > 0) & (steps > 0)).any()
+        is_better = last & moved & (gained > WORTH)
         history = History(
-            put(put(old.cost, i, known), i + 1, cost),
-            put(put(old.terms, i, lin.costs), i + 1, terms),
+            end(put(put(old.cost, i, known), i + 1, cost), known),
+            end(put(put(old.terms, i, lin.costs), i + 1, terms), lin.costs),
             put(old.damping, i, trial.damping),
             put(old.step, i, jnp.sqrt(trial.length)),
             put(old.accepted, i, accept | found),
@@ -184,12 +201,15 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             nu=jnp.where(accept | over, 2.0, 2 * state.nu).astype(dtype),
             cost=cost,
             first_cost=jnp.where(
-                jnp.sum(state.steps) == 0, known + gained, state.first_cost
+                jnp.sum(state.steps) == 0,
+                known + jnp.where(begins, gained, 0.0),
+                state.first_cost,
             ),
+            better_scale=jnp.where(is_better, best_scale, state.better_scale),
             steps=steps,
             share=jnp.where(over, 0.0, share).astype(dtype),
             bent=state.bent & ~last,
-            finished=(last & sound) | ((following == len(self.limit)) & ~self.keep),
+            finished=last & (sound | ~self.keep),
             result=optx.RESULTS.where(last, state.result, result),
             history=history,
         )
@@ -202,7 +222,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return state.finished, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        names = ("history", "cost", "first_cost", "steps", "final")
+        names = ("history", "cost", "first_cost", "better_scale", "steps", "final")
         return y, aux, {name: getattr(state, name) for name in names}
 
 
@@ -224,10 +244,19 @@ def _is_done(
     return trial.finite & ((trial.predicted <= floor) | (small & undisturbed))
 
 
+def _attempt_if(needed: Bool[Array, ""], *given: Any) -> Trial:
+    """`attempt`, or no step where only the cost is asked for."""
+    problem, state, lin, *_ = given
+    some = lambda _: attempt(*given)
+    like = eqx.filter_eval_shape(some, None)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    none = blank._replace(state=state, terms=lin.costs)
+    return jax.lax.cond(needed, some, lambda _: none, None)
+
+
 def _first(problem, observations, state, dtype):
-    lin, prediction, *_ = _linearise_anew(
-        problem, observations, state, dtype, jnp.array(False)
-    )
+    no = jnp.array(False)
+    lin, prediction, *_ = _linearise_anew(problem, observations, state, dtype, no, no)
     sizes = sizes_of(problem, state, dtype)
     extra = damped(diagonals(lin, sizes), jnp.ones_like(state.scale))
     return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
@@ -239,18 +268,21 @@ def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
     return Final(lin, eliminated.factor, None if people is None else people.roots)
 
 
-def _linearise_anew(problem, observations, state, dtype, begins):
+def _linearise_anew(problem, observations, state, dtype, begins, ends):
     """The equations with the motion predicted anew, and the state that they are at:
-    where a stage `begins`, that of the best scale; and what that gained."""
+    where a stage `begins`, that of the best scale; the best scale, where a stage begins
+    or all of them have come to their `ends`; and what it gained or would gain."""
     seen = problem.predict(state)
     problem = problem.with_prediction(seen)
-    state, gained = jax.lax.cond(
-        begins,
-        lambda s: at_best_scale(problem, s),
-        lambda s: (s, jnp.zeros_like(s.scale)),
+    best, gained = jax.lax.cond(
+        begins | ends,
+        lambda s: best_scale(problem, s, ends | (problem.free.scale > 0)),
+        lambda s: (s.scale, jnp.zeros_like(s.scale)),
         state,
     )
-    return linearise(problem, observations, state, dtype), seen, state, gained
+    scale = jnp.where(begins, best, state.scale)
+    state = dataclasses.replace(state, scale=scale)
+    return linearise(problem, observations, state, dtype), seen, state, best, gained
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:

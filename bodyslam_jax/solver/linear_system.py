@@ -6,18 +6,14 @@ and back. A coordinate that no measurement sees has a zero row, gets 1 on its di
 and stays where it is.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, Step
-from bodyslam_jax.solver.apart import (
-    apart_diagonal,
-    join_poses,
-    solve_apart,
-    split_poses,
-)
 from bodyslam_jax.solver.block_cholesky import Factor, back_substitute, factorise
 from bodyslam_jax.solver.blocks import (
     CAMERAS,
@@ -39,6 +35,7 @@ from bodyslam_jax.solver.elimination.schur import (
 from bodyslam_jax.solver.front import Window, window_of
 from bodyslam_jax.solver.linearise.marginal_prior import diagonal_of_prior
 from bodyslam_jax.solver.long_tracks import move_lasting
+from bodyslam_jax.solver.posture import to_turns
 from bodyslam_jax.solver.reduced_system import Chunks, add_marginal_prior, assemble
 
 
@@ -77,24 +74,11 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
         ),
     }
     if "pose" in lin.gradient:
-        result["pose"] = _pose_diagonal(lin)
-        if of_prior is not None:
-            result["pose"] = result["pose"] + of_prior[2]
-    if "apart" in lin.gradient:
-        result["apart"] = apart_diagonal(lin)
+        pose = jnp.zeros_like(lin.gradient["pose"])
+        if ("pose", "pose", 0) in lin.blocks:
+            pose = diagonal(lin.blocks["pose", "pose", 0])
+        result["pose"] = pose if of_prior is None else pose + of_prior[2]
     return result
-
-
-def _pose_diagonal(lin: Linearisation) -> Float[Array, "h t c"]:
-    total = jnp.zeros_like(lin.gradient["pose"])
-    flat = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).reshape(*x.shape[:2], -1)
-    if 0 in lin.limbs:
-        found = [flat(x) for x in lin.limbs[0]]
-        total = total + jnp.concatenate(found, axis=-1).astype(total.dtype)
-    joint = lin.blocks.get(("joint", "joint", 0))
-    if joint is not None:
-        total = total + flat(joint).astype(total.dtype)
-    return total
 
 
 UNSEEN = 1e-12
@@ -140,6 +124,13 @@ def reduce_to_chunks(
     return chunks, window, people
 
 
+class Move(NamedTuple):
+    """A step, and the coordinates of its postures (`posture.py`)."""
+
+    step: Step
+    postures: Float[Array, "h t p"]
+
+
 @eqx.filter_jit
 def solve_step(
     problem: Problem,
@@ -147,7 +138,7 @@ def solve_step(
     lin: Linearisation,
     sizes: Sizes,
     eliminated: Eliminated,
-) -> Step:
+) -> Move:
     """The step that solves the factorised equations, in the state's own precision."""
     h, n = sizes.people, sizes.chunks
     lin, zero = cast((lin, state.zero_step()), sizes.dtype)
@@ -158,17 +149,15 @@ def solve_step(
     if problem.layout.order is not None:
         steps = steps[jnp.argsort(problem.layout.order)]
     cameras = of_cameras(steps)
-    roots, poses = zero.roots, zero.poses
+    roots = zero.roots
+    postures = jnp.zeros((h, len(zero.cameras), sizes.posture), sizes.dtype)
     if eliminated.people is not None:
         steps = steps[:, :head].reshape(n, h, -1).swapaxes(0, 1)
         own = jnp.stack([common[own_to_global(sizes, p)] for p in range(h)])
         roots, moved = substitute_people(
             eliminated.people, sizes, eliminated.window, steps, cameras, own
         )
-        found = {} if moved is None else {"pose": moved}
-        if "apart" in lin.gradient:
-            found["apart"] = solve_apart(lin, eliminated.damping["apart"])
-        poses = join_poses(found, sizes.joints, poses)
+        postures = postures if moved is None else moved
     i = sizes.intrinsics
     intrinsics = common[1 : 1 + i] if i else zero.intrinsics
     landmarks = substitute_landmarks(
@@ -183,33 +172,34 @@ def solve_step(
         scale=common[0],
         cameras=cameras,
         roots=roots,
-        poses=poses,
+        poses=to_turns(problem, postures),
         shapes=common[sizes.common : sizes.globals].reshape(h, 10),
         landmarks=landmarks,
         intrinsics=intrinsics,
         globals=common[1 + i : sizes.common] if sizes.named else zero.globals,
     )
-    return cast(step, state.scale.dtype)
+    return cast(Move(step, postures), state.scale.dtype)
 
 
 def quadratic(
-    problem: Problem, diagonal: dict, sizes: Sizes, step: Step
+    problem: Problem, diagonal: dict, sizes: Sizes, move: Move
 ) -> Float[Array, ""]:
     """`δ^T diag(H) δ`"""
+    step = move.step
     total = jnp.sum(diagonal["camera"] * step.cameras**2)
     total = total + jnp.sum(diagonal["root"] * step.roots**2)
     total = total + jnp.sum(diagonal["globals"] * globals_of(step, sizes) ** 2)
-    for name, moved in split_poses(step.poses, problem.layout.joints).items():
-        if name in diagonal:
-            total = total + jnp.sum(diagonal[name] * moved**2)
+    if "pose" in diagonal:
+        total = total + jnp.sum(diagonal["pose"] * move.postures**2)
     for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
         moved = step.landmarks[bucket.landmark]
         total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
     return total
 
 
-def slope_along(problem, lin, sizes, step):
+def slope_along(problem: Problem, lin: Linearisation, sizes: Sizes, move: Move):
     """`g^T δ`"""
+    step = move.step
     total = jnp.sum(lin.globals_gradient * globals_of(step, sizes))
     gradient = lin.gradient
     if "camera_alone" in gradient:
@@ -218,9 +208,8 @@ def slope_along(problem, lin, sizes, step):
         total = total + jnp.sum(gradient["camera"] * step.cameras)
     if "root" in gradient:
         total = total + jnp.sum(gradient["root"] * step.roots)
-    for name, moved in split_poses(step.poses, problem.layout.joints).items():
-        if name in gradient:
-            total = total + jnp.sum(gradient[name] * moved)
+    if "pose" in gradient:
+        total = total + jnp.sum(gradient["pose"] * move.postures)
     for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
         moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
         total = total + jnp.sum(table.gradient * moved)

@@ -41,7 +41,8 @@ class Loop(eqx.Module):
     """The state of `StructuredLevenbergMarquardt` between two iterations."""
 
     stage: Int[Array, ""]
-    """That runs now; the number of stages while the last factorisation is made."""
+    """That runs now; the number of stages in the last rounds, which tell the cost, and
+    factorise for covariances."""
     prediction: Any
     observations: Observations | None
     final: Final
@@ -55,6 +56,8 @@ class Loop(eqx.Module):
     nu: Float[Array, ""]
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]
+    better_scale: Float[Array, ""]
+    """Another s with a lower cost where the solve ended; NaN if none is known."""
     steps: Int[Array, " s"]
     share: Float[Array, ""]
     """Of what keypoints bend (`_curvature`), in the next step."""

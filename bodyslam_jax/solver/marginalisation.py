@@ -46,7 +46,6 @@ from bodyslam_jax.graph import (
     residual_of,
 )
 from bodyslam_jax.graph.padding import Masked
-from bodyslam_jax.solver.apart import eliminate_apart, groups_of
 from bodyslam_jax.solver.block_cholesky import Factor as Factorised
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes, mask_of, sizes_of
@@ -58,6 +57,7 @@ from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.linearise.marginal_prior import indices
 from bodyslam_jax.solver.loops import row_of
 from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.posture import basis_of
 from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.solve import check_start
 
@@ -120,7 +120,9 @@ def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
     found = _program()(*padded, jnp.asarray(first, jnp.int32), count)
     invariant = _invariant(*padded)
     rest = _rest(problem, state, frames, observed, found.window.reach)
-    prior = _prior(problem, old, rest.state, found, count, invariant)
+    free = np.asarray(problem.free.poses[:, frames - 1]).reshape(-1, 69, 1)
+    postures = free * np.asarray(basis_of(problem, state.scale.dtype))
+    prior = _prior(problem, old, rest.state, found, count, invariant, postures)
     left = (*rest.problem.factors, prior)
     shape = {name: len(x) for name, x in (("t", rest.state.cameras),)}
     shape |= {"l": len(rest.landmarks), "h": len(state.roots)}
@@ -184,7 +186,6 @@ def _old(
         none if tracks is None else np.asarray(tracks.frame),
         none if tracks is None else np.asarray(tracks.landmark),
         len(state.roots),
-        problem.layout.limbs,
         front=-(-max(before, default=1) // CHUNK),
     )
     old = dataclasses.replace(
@@ -320,9 +321,6 @@ class _Trailing(eqx.Module):
 
     matrix: Float[Array, "n n"]
     slope: Float[Array, " n"]
-    apart: Float[Array, "h j 3 3"] | None
-    """Λ of the joints that are chains by themselves."""
-    apart_slope: Float[Array, "h j 3"] | None
     window: Window
 
 
@@ -358,19 +356,9 @@ def _trailing(
         kept.insert(0, jnp.concatenate(own, axis=1).reshape(-1))
     added = jnp.concatenate([*kept, damping["globals"]])
     # What stays is not damped.
-    apart = apart_slope = None
-    if "apart" in damping:
-        _, pivot, known = eliminate_apart(lin, damping["apart"])
-        at = after + CHUNK - 1
-        more = row_of(damping["apart"], at, 1).reshape(known.shape[1:])
-        eye = jnp.eye(3, dtype=dtype)
-        apart = row_of(pivot, at) - more[..., None] * eye
-        apart_slope = -row_of(known, at)
     return _Trailing(
         matrix[:-1, :-1] - jnp.diag(added),
         -matrix[:-1, -1],
-        apart,
-        apart_slope,
         window,
     )
 
@@ -429,8 +417,10 @@ def _prior(
     found: _Trailing,
     count: int,
     invariant: Bool[np.ndarray, " 3"],
+    postures: Float[np.ndarray, "h 69 p"],
 ) -> MarginalPrior:
-    """The factor of the remaining state that has this Λ and η."""
+    """The factor of the remaining state that has this Λ and η; `postures` are turns by
+    the coordinates of the last postures."""
     frames = min(count * CHUNK, len(left.cameras))
     none = np.zeros(len(left.landmarks), bool)
     estimate = _cut(left, 0, frames, none)
@@ -444,22 +434,25 @@ def _prior(
         anchor=jnp.zeros(frames, dtype),
         invariant=jnp.asarray(invariant, dtype),
         reach=found.window.reach,
-        joints=problem.layout.joints,
     )
     index = indices(prior, sizes_of(old, left))
-    matrix, slope = np.zeros((size, size)), np.zeros(size)
-    own, cut = index.people.size, CAMERAS * count - 6 * frames
+    cut = CAMERAS * count - 6 * frames
     end = len(found.slope) - len(index.globals)
     kept = np.r_[: end - cut, end : len(found.slope)]
-    place = np.concatenate([index.people.reshape(-1), index.cameras, index.globals])
-    assert own + 6 * frames == end - cut
-    matrix[np.ix_(place, place)] = np.asarray(found.matrix)[np.ix_(kept, kept)]
-    slope[place] = np.asarray(found.slope)[kept]
-    if found.apart is not None:
-        joints = np.array(groups_of(problem.layout.joints)["apart"])
-        rows = index.postures.reshape(-1, 23, 3)[:, joints]
-        matrix[rows[..., :, None], rows[..., None, :]] = np.asarray(found.apart)
-        slope[rows] = np.asarray(found.apart_slope)
+    rest = np.concatenate([index.cameras, index.globals])
+    # The prior is of turns: what the basis does not span of them it does not see.
+    place = np.zeros((len(kept), size))
+    width = found.window.person
+    for h, turns in enumerate(postures):
+        rows = slice(h * width, (h + 1) * width)
+        if found.window.pose:
+            place[rows][: found.window.pose, index.postures[h]] = np.linalg.pinv(turns)
+        place[rows][found.window.pose :, index.roots[h]] = np.eye(
+            6 * found.window.reach
+        )
+    place[len(kept) - len(rest) :, rest] = np.eye(len(rest))
+    matrix = place.T @ np.asarray(found.matrix)[np.ix_(kept, kept)] @ place
+    slope = place.T @ np.asarray(found.slope)[kept]
     gone = index.cameras[: 6 * (CHUNK - _reach(problem))]
     matrix, slope = _without(matrix, slope, gone, np.finfo(dtype).eps)
     root, offset = _square_root(matrix, slope, np.finfo(dtype).eps)

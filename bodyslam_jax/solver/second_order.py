@@ -20,10 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.graph import KeypointReprojection, Problem, State
-from bodyslam_jax.solver.apart import pick
+from bodyslam_jax.graph import TURNS, KeypointReprojection, Problem, State
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, cast, mask_of
-from bodyslam_jax.solver.elimination.limbs import diagonal
+from bodyslam_jax.solver.posture import to_coordinates
 
 _LITTLE = 1e-3
 """Share of the cost: after a step that gains no more, curvature comes in."""
@@ -35,8 +34,6 @@ class Curvature(eqx.Module):
     """What keypoints add to some of the blocks of `J^T J`."""
 
     blocks: dict[tuple[str, str, int], Array]
-    limbs: list[Float[Array, "h t _l _p _p"]]
-    """Of postures with themselves, as `Linearisation` has them."""
 
 
 def next_share(
@@ -82,10 +79,10 @@ def curvature_of(
         if isinstance(factor, KeypointReprojection)
     ]
     if not each:
-        return Curvature({}, [])
+        return Curvature({})
     found = jax.tree.map(lambda *x: sum(x[1:], x[0]), *each)
     blocks = {key: found.blocks[key] for key in lin.blocks if key in found.blocks}
-    return Curvature(blocks, found.limbs if 0 in lin.limbs else [])
+    return Curvature(blocks)
 
 
 def add_second_order(
@@ -98,34 +95,31 @@ def add_second_order(
         key: add(block, curvature.blocks[key]) if key in curvature.blocks else block
         for key, block in lin.blocks.items()
     }
-    limbs = dict(lin.limbs)
-    if curvature.limbs:
-        limbs[0] = [
-            add(x, more) for x, more in zip(limbs[0], curvature.limbs, strict=True)
-        ]
-    return dataclasses.replace(lin, blocks=blocks, limbs=limbs)
+    return dataclasses.replace(lin, blocks=blocks)
 
 
 def _blocks_of(factor, problem, state, sizes):
     turns, by_shape = factor.curvature(state)
     free = mask_of(problem)
-    poses = free.poses.reshape(*free.poses.shape[:2], 69)
+    poses = free.poses.reshape(*free.poses.shape[:2], TURNS)
     turning = jnp.concatenate([free.roots[..., :3], poses], axis=-1)
     turns = turns * turning[..., :, None] * turning[..., None, :]
     by_shape = by_shape * turning[..., None] * free.shapes[:, None, None]
-    limbs = lambda x, axis: pick(x, sizes.joints, axis=axis, width=3)
-    pose, root = limbs(turns[..., 3:, :], 2), turns[..., :3, :3]
+    by_posture = lambda x: to_coordinates(problem, x.swapaxes(-1, -2))
+    root, pose = turns[..., :3, :3], turns[..., 3:, 3:]
+    with_root = by_posture(turns[..., 3:, :3]).swapaxes(-1, -2)
     blocks = {
         ("root", "root", 0): jnp.pad(root, (*_NONE, (0, 3), (0, 3))),
-        ("pose", "root", 0): jnp.pad(pose[..., :3], (*_NONE, (0, 0), (0, 3))),
+        ("pose", "root", 0): jnp.pad(with_root, (*_NONE, (0, 0), (0, 3))),
+        ("pose", "pose", 0): by_posture(by_posture(pose)),
     }
     if "shapes" in problem.variables:
         before = (sizes.common, 0)
         wide = lambda x, rows: jnp.pad(x, (*_NONE, (0, rows), before))
         blocks["root", "globals", 0] = wide(by_shape[..., :3, :], 3)
-        blocks["pose", "globals", 0] = wide(limbs(by_shape[..., 3:, :], 2), 0)
-    own = diagonal(sizes.widths, limbs(pose[..., 3:], 3))
-    return Curvature(*cast((blocks, own), sizes.dtype))
+        of_postures = by_posture(by_shape[..., 3:, :]).swapaxes(-1, -2)
+        blocks["pose", "globals", 0] = wide(of_postures, 0)
+    return Curvature(cast(blocks, sizes.dtype))
 
 
 _NONE = ((0, 0), (0, 0))

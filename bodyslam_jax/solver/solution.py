@@ -76,6 +76,7 @@ def outcome(start, best, result, stats) -> tuple[Solution, Final]:
         histories=histories,
         num_steps=counts,
         first_cost=stats["first_cost"],
+        better_scale=stats["better_scale"],
     )
     return solution, stats["final"]
 

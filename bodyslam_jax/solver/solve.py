@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from bodyslam_jax.graph import VARIABLES, Problem, State, check_state, limbs_of
+from bodyslam_jax.graph import VARIABLES, Problem, State, check_state
 from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
-from bodyslam_jax.solver.best_scale import WORTH, at_best_scale, is_quadratic
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.implicit import cotangent_of_problem
 from bodyslam_jax.solver.levenberg_marquardt import (
@@ -66,8 +65,7 @@ def solve(
 
     **Raises:** `ValueError` if `state` does not have the sizes and the precision the
     problem was made for, is not finite, or has poses that are not rigid, if there is no
-    factor, or no stage that takes a step, if `damping` is negative, if factors put in
-    later see joints together that those it was made with did not, or if a baseline is
+    factor, or no stage that takes a step, if `damping` is negative, or if a baseline is
     to mix precisions. Failure to converge is a `status`, and so is what is not finite
     within `jit`.
     """
@@ -78,7 +76,6 @@ def solve(
             raise ValueError(f"mixed_precision: {solver} has one precision only.")
         baselines.check_size(solver, problem, state)
         return _solve_baseline(problem, state, solver, schedule)
-    check_limbs(problem)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
     given = padded, start, schedule, damping, mixed_precision
     solution = _differentiable(*given, is_alone())
@@ -96,17 +93,6 @@ def check_start(problem: Problem, state: State, damping: float = 0.0) -> None:
     if not problem.factors:
         raise ValueError("problem.factors: found none, expected one or more.")
     check_state(state, problem.free)
-
-
-def check_limbs(problem: Problem) -> None:
-    """Refuses factors that were put in later, where the layout does not hold them."""
-    known = [set(limb) for limb in problem.layout.limbs]
-    more = [x for x in limbs_of(problem.factors) if not any(set(x) <= y for y in known)]
-    if more and not is_traced(problem):
-        raise ValueError(
-            f"problem.factors: they see joints {list(more[0])} together, which those "
-            "that the problem was made with did not; make it anew with `make_problem`."
-        )
 
 
 def method_of(
@@ -161,44 +147,7 @@ def _run(problem, state, method):
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )
-    stats = _with_last_cost(problem, found.value, found.stats)
-    solution, final = outcome(state, found.value, found.result, stats)
-    return _with_better_scale(problem, solution, method), final
-
-
-def _with_last_cost(problem: Problem, state: State, stats: dict[str, Any]) -> Any:
-    """What the loop recorded, with the cost where it ended as `Problem.cost` has it:
-    with the motion predicted there, not at the state before its last step."""
-    terms = jnp.stack(list(problem.cost_by_term(state).values()))
-    steps, history = stats["steps"], stats["history"]
-    ran = jnp.where(steps[: len(history.cost)] > 0, jnp.arange(len(history.cost)), -1)
-    stage = jnp.max(ran)
-    at = jnp.where(stage < 0, -1, stage), steps[stage]
-    put = lambda rows, value: rows.at[at].set(
-        jnp.where(stage < 0, rows[at], value), mode="drop"
-    )
-    cost = jnp.where(stage < 0, stats["cost"], jnp.sum(terms))
-    history = dataclasses.replace(
-        history, cost=put(history.cost, cost), terms=put(history.terms, terms)
-    )
-    return {**stats, "cost": cost, "history": history}
-
-
-def _with_better_scale(
-    problem: Problem, solution: Solution, method: StructuredLevenbergMarquardt
-) -> Solution:
-    """The solution with another s that is better, where a stage has moved s and robust
-    losses may have several best ones."""
-    if is_quadratic(problem):
-        none = jnp.full_like(solution.cost, jnp.nan)
-        return dataclasses.replace(solution, better_scale=none)
-    now = problem.refresh(solution.state)
-    moved, gain = at_best_scale(now, solution.state)
-    steps = jnp.stack(solution.num_steps)
-    frees = method.free[:, VARIABLES.index("scale")]
-    known = (gain > WORTH) & ((frees > 0) & (steps > 0)).any()
-    other = jnp.where(known, moved.scale, jnp.nan)
-    return dataclasses.replace(solution, better_scale=other)
+    return outcome(state, found.value, found.result, found.stats)
 
 
 @eqx.filter_custom_vjp

@@ -96,7 +96,7 @@ def attempt(
     move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
     slope = jnp.where(finite, slope, 0.0)
     there, rejected, share, terms, gain = search(
-        problem, state, move, slope, predicted, lin.costs
+        problem, state, move.step, slope, predicted, lin.costs
     )
     decrease = jnp.sum(lin.costs) - jnp.sum(terms)
     accepted = finite & (predicted > 0) & (decrease > GAIN * share * predicted)

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor
+from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.pelvis_displacement import previous_frame
+from bodyslam_jax.graph.state import State
 
 
 class AngularAccelerationPrior(FrameFactor):
@@ -26,3 +28,38 @@ class AngularAccelerationPrior(FrameFactor):
         (sigma,) = data
         now, before, first = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
         return (so3.log(before.T @ now) - so3.log(first.T @ before)) / sigma
+
+    def residual(self, state: State) -> Float[Array, "h t 3"]:
+        return self._change(self._turns(state)[0]) / self.sigma[..., None]
+
+    def jacobians(self, state):
+        turn, C_HC = self._turns(state)
+        # By a turn of C_k on its right, and of C_{k-1} on its right.
+        now = so3.inverse_right_jacobian(turn)
+        before = -so3.inverse_right_jacobian(-turn)
+        by_root = now, before - previous_frame(now), -previous_frame(before)
+        parts: dict[Key, Array] = {}
+        for lag, by_turn in enumerate(by_root):
+            by_turn = by_turn / self.sigma[..., None, None]
+            # C_WC Exp(ω) C_CH = C_WH Exp(C_HC ω).
+            of_camera = by_turn @ _shifted_back(C_HC, lag)
+            for name, part in (("root", by_turn), ("camera", of_camera)):
+                none = jnp.zeros_like(part)
+                parts[name, lag] = jnp.concatenate([part, none], axis=-1)
+        return self._change(turn) / self.sigma[..., None], parts
+
+    def _turns(self, state: State) -> tuple[Float[Array, "h t 3"], Array]:
+        """`Log(C_{k-1}^T C_k)`, and C_HC of each frame."""
+        C_CH = state.roots[..., :3, :3]
+        C_WH = state.cameras[:, :3, :3] @ C_CH
+        return so3.log(so3.inverse(previous_frame(C_WH)) @ C_WH), so3.inverse(C_CH)
+
+    def _change(self, turn: Float[Array, "h t 3"]) -> Float[Array, "h t 3"]:
+        return turn - previous_frame(turn)
+
+
+def _shifted_back(x: Array, lag: int) -> Array:
+    """`previous_frame`, so many times."""
+    for _ in range(lag):
+        x = previous_frame(x)
+    return x

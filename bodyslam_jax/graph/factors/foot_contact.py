@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
-from bodyslam_jax.graph.factor import Frame, FrameFactor, Key, Limbs
-from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
+from bodyslam_jax.graph.factor import Frame, FrameFactor, Key
+from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
 
@@ -48,11 +48,6 @@ class FootContact(FrameFactor):
     padding = {"sigma": jnp.inf}
     map_units = {"scale": -1}
     keys = tuple((name, lag) for name in ("camera", "root", "pose") for lag in range(2))
-
-    @property
-    def limbs(self) -> Limbs:
-        points = BODY25_TOES_AND_HEELS
-        return tuple(turning_joints(self.body, "body25", (k,)) for k in points)
 
     def frame_residual(self, data, window, shared):
         shape, scale, sigma = data
@@ -81,8 +76,9 @@ class FootContact(FrameFactor):
 
     def _with_derivatives(self, pose, camera, root, shape, scale):
         """The points q of one frame, m, and their derivatives by its variables."""
-        p_H, by_pose, _ = keypoint_jacobian(self.body, pose, shape, "body25", 0.0)
-        p_H, by_pose = p_H[_FEET], by_pose[:, _FEET]
+        p_H, by_pose, _ = keypoint_jacobian(
+            self.body, pose, shape, "body25", 0.0, BODY25_TOES_AND_HEELS
+        )
         C_WC, r_WC = camera[:3, :3], camera[:3, 3]
         C_CH, r_CH = root[:3, :3], root[:3, 3]
         C_WH = C_WC @ C_CH

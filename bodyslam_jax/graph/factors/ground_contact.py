@@ -16,11 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel, local_keypoints
-from bodyslam_jax.graph.factor import FrameFactor, Key, Limbs
-from bodyslam_jax.graph.keypoint_jacobian import (
-    keypoint_jacobian,
-    turning_joints,
-)
+from bodyslam_jax.graph.factor import FrameFactor, Key
+from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.state import State
 
@@ -48,19 +45,15 @@ class GroundContact(FrameFactor):
     map_units = {"offset": 1}
     keys = (("camera", 0), ("root", 0), ("pose", 0), ("scale", 0), ("shape", 0))
 
-    @property
-    def limbs(self) -> Limbs:
-        return (turning_joints(self.body, "body25", HEELS_AND_TOES),)
-
     def frame_residual(self, data, window, shared):
         (offset, sigma), (frame,) = data, window
         return (self._lowest(frame, shared, offset) - SOLE)[None] / sigma
 
     def jacobian(self, data, window, shared):
         (offset, sigma), (frame,) = data, window
-        points = keypoint_jacobian(self.body, frame.pose, shared.shape, "body25", 0.0)
-        feet = np.array(HEELS_AND_TOES)
-        p_H, by_pose, by_shape = points[0][feet], points[1][:, feet], points[2][feet]
+        p_H, by_pose, by_shape = keypoint_jacobian(
+            self.body, frame.pose, shared.shape, "body25", 0.0, HEELS_AND_TOES
+        )
         height, up_C = self._heights(p_H, frame, shared, offset)
         share = jax.nn.softmax(-height / _SOFTNESS)
         up_H = frame.root[:3, :3].T @ up_C

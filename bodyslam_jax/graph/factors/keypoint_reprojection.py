@@ -16,11 +16,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body import KEYPOINT_NAMES, BodyModel, local_keypoints
+from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.graph.factor import FrameFactor, Limbs
+from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
-from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian, turning_joints
+from bodyslam_jax.graph.keypoint_jacobian import (
+    carried_by_joints,
+    keypoint_jacobian,
+    placed,
+)
 from bodyslam_jax.graph.losses import Loss, squared_norm
 from bodyslam_jax.graph.state import State
 
@@ -39,13 +44,6 @@ class KeypointReprojection(FrameFactor):
     layout: str = eqx.field(static=True, default="body25")
     padding = {"sigma": jnp.inf}
     keys = (("root", 0), ("pose", 0), ("shape", 0), ("intrinsics", 0))
-
-    @property
-    def limbs(self) -> Limbs:
-        count = len(KEYPOINT_NAMES[self.layout])
-        return tuple(
-            turning_joints(self.body, self.layout, (point,)) for point in range(count)
-        )
 
     def residual(self, state: State) -> Float[Array, "h t j 2"]:
         shape = state.shapes[:, None]
@@ -102,14 +100,17 @@ class KeypointReprojection(FrameFactor):
 
         def one(data, window, shared, loss):
             (pixel, sigma), (frame,) = data, window
-            given = self.body, frame.pose, shared.shape, self.layout, self.bias
-            C_CH = frame.root[:3, :3]
-            p_C = keypoint_jacobian(*given)[0] @ C_CH.T + frame.root[:3, 3]
+            R, C_CH = so3.exp(frame.pose), frame.root[:3, :3]
+            found = carried_by_joints(
+                self.body, R, shared.shape, self.layout, self.bias
+            )
+            p_H = jnp.sum(placed(found), axis=0)
+            p_C = p_H @ C_CH.T + frame.root[:3, 3]
             residual, pull = jax.vjp(
                 lambda p: (project(shared.intrinsics, p) - pixel) / sigma[:, None], p_C
             )
             weight = loss.weight(squared_norm(residual))[:, None]
             (by_C,) = pull(weight * residual)
-            return keypoint_curvature(*given, by_C @ C_CH)
+            return keypoint_curvature(found, by_C @ C_CH)
 
         return self.map_frames(one, state, losses)

@@ -26,7 +26,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import Factor, Limbs
+from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.state import State, Step
@@ -59,9 +59,6 @@ class MarginalPrior(Factor):
     unit; the last two only with the first."""
     reach: int = eqx.field(static=True)
     """Number of roots."""
-    joints: tuple[int, ...] = eqx.field(static=True)
-    """Those of a posture that are coupled with others; the rest are so with
-    themselves."""
     loss: Loss = Squared()
     map_units = {}
 
@@ -69,12 +66,6 @@ class MarginalPrior(Factor):
     def frames(self) -> int:
         """How many frames it looks at, the first ones."""
         return len(self.estimate.cameras)
-
-    @property
-    def limbs(self) -> Limbs:
-        """Coupled joints, none with another: postures are eliminated last (of their
-        chunk)."""
-        return tuple((joint,) for joint in self.joints)
 
     def residual(self, state: State) -> Float[Array, " n"]:
         return self.root @ self.moved(self.first_frames(state)) + self.offset

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.factor import FrameFactor
+from bodyslam_jax.graph.factor import FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.pelvis_displacement import previous_frame
+from bodyslam_jax.graph.state import State
 from bodyslam_jax.graph.whitening import innovation
 
 
@@ -38,3 +40,30 @@ class RootOrientation(FrameFactor):
         error = so3.log(measured.T @ window[0].root[:3, :3])
         before = so3.log(previous.T @ window[1].root[:3, :3])
         return innovation(error, before, correlation) / sigma
+
+    def residual(self, state: State) -> Float[Array, "h t 3"]:
+        error = self._error(state)
+        now, earlier = self._coefficients
+        return now * error + earlier * previous_frame(error)
+
+    def jacobians(self, state):
+        error = self._error(state)
+        now, earlier = self._coefficients
+        by_turn = so3.inverse_right_jacobian(error)
+        by_root = jnp.concatenate([by_turn, jnp.zeros_like(by_turn)], axis=-1)
+        parts: dict[Key, Array] = {
+            ("root", 0): now[..., None] * by_root,
+            ("root", 1): earlier[..., None] * previous_frame(by_root),
+        }
+        return now * error + earlier * previous_frame(error), parts
+
+    def _error(self, state: State) -> Float[Array, "h t 3"]:
+        return so3.log(so3.inverse(self.orientation) @ state.roots[..., :3, :3])
+
+    @property
+    def _coefficients(self):
+        """Of this frame's and the last error in the residual."""
+        rho = self.correlation[..., None]
+        # Division by sigma comes last: inf * 0 would make the derivative by ρ NaN.
+        now = 1 / jnp.sqrt(1 - rho**2) / self.sigma[..., None]
+        return now, -rho * now

@@ -184,6 +184,6 @@ def substitute_people(
     together = group_size(h * n)
     cut = lambda x: x.reshape(h * n // together, together, *x.shape[2:])
     given = people.postures, border, steps[..., :pose]
-    group = lambda given: substitute_postures(window, *given)
+    group = lambda given: substitute_postures(*given)
     poses = jax.lax.map(group, jax.tree.map(cut, given))
     return roots.reshape(h, -1, 6), poses.reshape(h, -1, pose)

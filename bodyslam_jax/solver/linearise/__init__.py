@@ -50,7 +50,6 @@ def linearise(
         landmarks = add_prior(problem, prior, state, landmarks)
     return Linearisation(
         sums.blocks,
-        sums.limbs,
         sums.gradient,
         sums.globals,
         sums.globals_gradient,

@@ -12,14 +12,14 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import (
+    TURNS,
     FrameFactor,
     Problem,
     State,
     squared_norm,
 )
-from bodyslam_jax.solver.apart import groups_of, pick, split_poses
 from bodyslam_jax.solver.blocks import Sums, shifted
-from bodyslam_jax.solver.elimination.limbs import diagonal, squares
+from bodyslam_jax.solver.posture import basis_of, to_coordinates
 
 _RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
 _GROUP = {
@@ -43,7 +43,6 @@ def linearise_frames(
     if not keys:
         sums.costs.append(factor.cost(state))
         return
-    joint = factor.per_joint
     residual, parts = _derivatives(factor, keys, state, sums)
     s = squared_norm(residual)
     sums.costs.append(0.5 * jnp.sum(factor.loss.rho(s)))
@@ -51,19 +50,22 @@ def linearise_frames(
     if not factor.of_people:
         residual, root_weight = residual[None], root_weight[None]
         parts = {touch: part[None] for touch, part in parts.items()}
-    # One more axis for the joints that do not interact; the rows of a frame in one.
-    lead = residual.shape[: 3 if joint else 2]
+    # The rows of a frame in one axis.
+    lead = residual.shape[:2]
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
-    # Postures first: their limbs do not touch each other (`_add_products`).
     local = sorted((t for t in keys if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
     columns = []
     for name, lag in local:
-        free = _free_of(problem, name, lag, joint)
+        free = _free_of(problem, name, lag)
         part = parts[name, lag]
-        if name == "pose" and not joint:
-            part, free = (pick(x, sums.sizes.joints, width=3) for x in (part, free))
-        columns.append(rows(part, part.shape[-1]) * free[..., None, :])
+        if name != "pose":
+            columns.append(rows(part, 6) * free[..., None, :])
+        elif factor.per_joint:
+            columns.append(_of_joints(problem, rows, part, free))
+        else:
+            part = rows(part, TURNS) * free[..., None, :]
+            columns.append(to_coordinates(problem, part))
     common = [name for name in _COMMON if (name, 0) in keys]
     if common:
         widths = _common_widths(sums.sizes)
@@ -75,6 +77,14 @@ def linearise_frames(
                 columns.append(jnp.zeros((*weight.shape[:-1], widths[name]), s.dtype))
     columns.append(rows(residual, 1))
     _add_products(sums, local, bool(common), columns, weight, factor)
+
+
+def _of_joints(problem, rows, part, free):
+    """By coordinates of postures, where row j depends on joint j alone."""
+    part = part.reshape(*part.shape[:3], -1, 3) * free.reshape(*part.shape[:3], 1, 3)
+    basis = basis_of(problem, part.dtype).reshape(23, 3, -1)
+    wide = jnp.einsum("htjda,jak->htjdk", part, basis)
+    return rows(wide, basis.shape[-1])
 
 
 def _derivatives(factor, keys, state, sums):
@@ -128,15 +138,12 @@ def _common_widths(sizes):
 
 
 def _add_products(sums, local, has_common, columns, weight, factor):
-    joint, of_people = factor.per_joint, factor.of_people
+    of_people = factor.of_people
     ends = [sum(c.shape[-1] for c in columns[: i + 1]) for i in range(len(columns))]
     parts = [slice(e - c.shape[-1], e) for e, c in zip(ends, columns, strict=True)]
     whole = jnp.concatenate(columns, axis=-1) * weight
     jac = whole.astype(sums.sizes.dtype)
-    # Of one posture with itself, which has most coordinates, limbs are worked on alone.
-    alone = not joint and [name for name, _ in local].count("pose") == 1
-    skip = ends[0] if alone else 0
-    gram = _products(jac[..., skip:], jac)
+    gram = _products(jac, jac)
     if jac.dtype == whole.dtype:
         slope = gram[..., -1, :]
     else:
@@ -144,43 +151,23 @@ def _add_products(sums, local, has_common, columns, weight, factor):
     # A term of frame k about frame k - lag.
     shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
-    turned = lambda x: x.swapaxes(-1, -2)
-    beyond = lambda part: slice(part.start - skip, part.stop - skip)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
     for i, (name, lag) in enumerate(local):
         own = shift(slope[..., parts[i]], lag)
-        if joint:
-            for group, part in split_poses(own, sums.sizes.joints).items():
-                sums.add_gradient(group, part)
-        else:
-            sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
+        sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
         for j, (other, other_lag) in enumerate(local):
             here, there = (_RANK[name], lag), (_RANK[other], other_lag)
             if here > there:
                 continue
-            if alone and i == j == 0:
-                limbs = squares(sums.sizes.widths, jac[..., :skip])
-                sums.add_limbs(0, [shift(x, lag) for x in limbs])
-                continue
-            block = shift(turned(gram[..., beyond(parts[j]), parts[i]]), lag)
-            if joint:
-                # Joints that do not interact here stay so: 3 x 3 each.
-                for group, joints in groups_of(sums.sizes.joints).items():
-                    group = "joint" if group == "pose" else group
-                    part = pick(block, joints, 2)
-                    sums.add((group, group, other_lag - lag), part)
-                continue
+            block = shift(gram[..., parts[i], parts[j]], lag)
             key = (name, other) if of_people else ("alone", "alone")
-            if key == ("pose", "pose"):
-                sums.add_limbs(other_lag - lag, diagonal(sums.sizes.widths, block))
-            else:
-                sums.add((*key, other_lag - lag), squeeze(block))
+            sums.add((*key, other_lag - lag), squeeze(block))
         if has_common:
-            block = shift(turned(gram[..., beyond(spread), parts[i]]), lag)
+            block = shift(gram[..., parts[i], spread], lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if has_common:
         n = sums.sizes.own_globals if of_people else sums.sizes.common
-        total = jnp.sum(gram[..., beyond(spread), spread], axis=1).astype(whole.dtype)
+        total = jnp.sum(gram[..., spread, spread], axis=1).astype(whole.dtype)
         down = jnp.sum(slope[..., spread], axis=1)
         for person in range(total.shape[0]):
             sums.add_globals(
@@ -228,15 +215,14 @@ def _move_shared(shared, name, step):
     return dataclasses.replace(shared, **{name: changed})
 
 
-def _free_of(problem, name, lag, joint):
+def _free_of(problem, name, lag):
     """Mask of a variable `lag` frames back; people share the cameras'."""
     if name == "camera":
         free = problem.free.cameras[None]
     elif name == "root":
         free = problem.free.roots
     else:
-        free = problem.free.poses
-        free = free if joint else free.reshape(*free.shape[:2], 69)
+        free = problem.free.poses.reshape(*problem.free.poses.shape[:2], TURNS)
     if lag:
         free = jnp.concatenate([free[:, :lag], free[:, :-lag]], axis=1)
     return free

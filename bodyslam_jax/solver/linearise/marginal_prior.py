@@ -2,8 +2,7 @@
 
 All that it couples is in the reduced system of chunks (`reduced_system.py`): the last
 postures and roots of the first chunk, cameras, globals. So it stays one matrix until
-that system is put together. Joints that are chains by themselves have blocks of their
-own in it, and globals go to theirs at once.
+that system is put together; globals go to theirs at once.
 """
 
 import dataclasses
@@ -16,14 +15,14 @@ from jaxtyping import Array, Float, Int
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import CHUNK, MarginalPrior, Problem, State
 from bodyslam_jax.graph.factors.marginal_prior import coordinates
-from bodyslam_jax.solver.apart import groups_of, split_poses
 from bodyslam_jax.solver.blocks import PriorBlocks, Sizes, Sums, mask_of
+from bodyslam_jax.solver.posture import from_turns, to_coordinates
 
 
 def linearise_marginal_prior(
     problem: Problem, prior: MarginalPrior, state: State, sums: Sums
 ) -> PriorBlocks:
-    """Its dense matrix; gradients, globals and joints by themselves go to `sums`."""
+    """Its dense matrix; gradients and globals go to `sums`."""
     sizes = sums.sizes
     first = prior.first_frames(state)
     zero = first.zero_step()
@@ -33,7 +32,7 @@ def linearise_marginal_prior(
     residual = prior.root @ there + prior.offset
     sums.costs.append(0.5 * jnp.sum(prior.loss.rho(residual @ residual)))
     jacobian = _jacobian(prior, first, there, index) * free
-    gram, slope = jacobian.T @ jacobian, residual @ jacobian
+    slope = residual @ jacobian
 
     down = _step_of(prior, zero, slope)
     after = len(state.cameras) - prior.frames
@@ -44,24 +43,23 @@ def linearise_marginal_prior(
     if "roots" in sizes.variables:
         sums.add_gradient("root", longer(down.roots, 1))
     if "poses" in sizes.variables:
-        for name, part in split_poses(longer(down.poses, 1), sizes.joints).items():
-            sums.add_gradient(name, part)
+        sums.add_gradient("pose", from_turns(problem, longer(down.poses, 1)))
     at = index.globals
-    sums.globals = sums.globals + gram[at[:, None], at]
+    by_globals = jacobian[:, at]
+    sums.globals = sums.globals + by_globals.T @ by_globals
     sums.globals_gradient = sums.globals_gradient + slope[at]
-    if "poses" in sizes.variables and (apart := groups_of(sizes.joints).get("apart")):
-        frames, joints = len(state.cameras), len(apart)
-        rows = index.postures.reshape(-1, 23, 3)[:, np.array(apart)]
-        block = gram[rows[..., :, None], rows[..., None, :]]
-        whole = jnp.zeros((sizes.people, frames, joints, 3, 3), gram.dtype)
-        sums.add(("apart", "apart", 0), whole.at[:, CHUNK - 1].set(block))
-    # Cameras of frames up to the end of the last chunk that are not in the prior: a row
-    # of zeros behind all others.
-    missing = np.full(-prior.frames % CHUNK * 6, len(gram))
-    parts = index.people.reshape(-1), index.cameras, missing, index.globals
-    order = np.concatenate(parts)
-    matrix = jnp.pad(gram, (0, 1))[order[:, None], order].astype(sizes.dtype)
-    return PriorBlocks(matrix, index.people.shape[1], prior.reach)
+    by_people = jacobian[:, index.roots]
+    if "poses" in sizes.variables:
+        postures = to_coordinates(problem, jacobian[:, index.postures])
+        by_people = jnp.concatenate([postures, by_people], axis=-1)
+    # Cameras of frames up to the end of the last chunk that are not in the prior have
+    # zeros.
+    missing = jnp.zeros((len(jacobian), -prior.frames % CHUNK * 6), jacobian.dtype)
+    flat = by_people.reshape(len(jacobian), -1)
+    parts = flat, jacobian[:, index.cameras], missing, by_globals
+    columns = jnp.concatenate(parts, axis=1)
+    matrix = (columns.T @ columns).astype(sizes.dtype)
+    return PriorBlocks(matrix, by_people.shape[-1], prior.reach)
 
 
 def _jacobian(
@@ -111,8 +109,7 @@ def diagonal_of_prior(
 class Indices:
     """Where the solver's variables stand in a prior's coordinates."""
 
-    people: Int[np.ndarray, "h p"]
-    """Coupled joints of the posture, in the solver's order, then roots."""
+    roots: Int[np.ndarray, "h r"]
     postures: Int[np.ndarray, "h 69"]
     cameras: Int[np.ndarray, " c6"]
     globals: Int[np.ndarray, " g"]
@@ -132,10 +129,8 @@ def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
     shapes, cameras = start[3] + np.arange(10 * h), np.arange(6 * prior.frames)
     roots = start[5] + np.arange(6 * prior.reach * h).reshape(h, 6 * prior.reach)
     postures = start[6] + np.arange(69 * h).reshape(h, 69)
-    joints = sizes.joints if "poses" in sizes.variables else ()
-    coupled = 3 * np.repeat(np.array(joints, int), 3) + np.tile([0, 1, 2], len(joints))
     return Indices(
-        people=np.concatenate([postures[:, coupled], roots], axis=1),
+        roots=roots,
         postures=postures,
         cameras=start[4] + cameras,
         globals=np.concatenate([[0], intrinsics, named, shapes]),
