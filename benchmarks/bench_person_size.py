@@ -63,7 +63,7 @@ def errors(simulated, weights):
     problem = graph.make_problem(factors, state, free=free)
     held = graph.set_constant(problem.free, "scale", "cameras", "intrinsics")
     problem = dataclasses.replace(problem, free=held)
-    solution, _ = solve_stage(problem, state, config, "bodies only")
+    solution, _ = solve_stage(problem, state, config, "people")
     shape = solution.state.shapes[0]
     leg = lambda shape: motion.leg_length(body, jnp.asarray(shape))
     by_shape = np.asarray(jax.grad(lambda shape: jnp.log(leg(shape)))(shape))

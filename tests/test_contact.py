@@ -223,7 +223,6 @@ def test_standing_feet_stop_sliding_and_nothing_else_changes():
         case.bodies,
         case.body,
         case.config,
-        body_only_solve=False,
     )
     start = prepared.state
     found = hold_standing_feet(
@@ -256,7 +255,7 @@ def test_the_joint_problem_and_that_of_standing_feet_are_one_program(monkeypatch
         return SimpleNamespace(state=state), {}
 
     monkeypatch.setattr(contact_stage, "solve_stage", record)
-    prepared = joint_problem.prepare(*arguments, body_only_solve=False)
+    prepared = joint_problem.prepare(*arguments)
     rest = case.sequence, case.cameras, case.body, case.config
     hold_standing_feet(prepared, prepared.state, *rest)
     (problem,) = solved
@@ -265,6 +264,6 @@ def test_the_joint_problem_and_that_of_standing_feet_are_one_program(monkeypatch
     assert eqx.tree_equal(ours, joint)
     (contact,) = [f for f in problem.factors if isinstance(f, g.FootContact)]
     assert np.isfinite(contact.sigma).any()
-    bare = joint_problem.prepare(*arguments, body_only_solve=False, feet=False)
+    bare = joint_problem.prepare(*arguments, feet=False)
     with pytest.raises(ValueError, match="no FootContact"):
         hold_standing_feet(bare, bare.state, *rest)

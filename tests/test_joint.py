@@ -58,12 +58,9 @@ def _cameras() -> SfmResult:
 
 @pytest.fixture
 def unsolved(monkeypatch):
-    """`prepare` without the body-only solve, and with no valid prediction."""
+    """`prepare` with no valid prediction."""
     invalid = _prediction(jnp.zeros(3), jnp.zeros(T, bool))
     monkeypatch.setattr(joint_problem, "predict", lambda *_: invalid)
-    monkeypatch.setattr(
-        joint_problem, "solve_body_only", lambda _, state, __: (state, {})
-    )
 
 
 @pytest.mark.slow
@@ -100,7 +97,7 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
         load_body_model(dtype=jnp.float64),
         dataclasses.replace(Config(), weights=weights),
     )
-    assert errors == [share] * 3  # body-only solve, first scale, joint problem
+    assert errors == [share] * 2  # first scale, joint problem
     assert float(prepared.state.scale) == pytest.approx(2)
 
 
@@ -131,12 +128,12 @@ def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     )
     cue = {}
     assert prepare().warnings == ()
-    assert calls == [("term", []), ("scale", []), ("term", [])]
+    assert calls == [("scale", []), ("term", [])]
     calls.clear()
     cue = {"ground": 3.0, "ground_error": 0.1}
     (line,) = prepare().warnings
     assert "person 0 moves at 1.2 m/s" in line
-    assert calls == [("term", []), ("scale", []), ("scale", [0]), ("term", [0])]
+    assert calls == [("scale", []), ("scale", [0]), ("term", [0])]
 
 
 def test_only_keypoints_tell_the_place_better_than_a_regressor_does():

@@ -24,7 +24,7 @@ def test_the_papers_schedule_has_its_numbers_of_first_order_steps():
     ("config", "steps"), [(Config(), [20, 50]), (Config.paper(), [200, 100])]
 )
 def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
-    """All of them for the joint problem, the last of them for the body-only solve."""
+    """All of them for the joint problem, the last of them for standing feet."""
     state = scenes.truth(np.random.default_rng(0), frames=2, people=0, landmarks=0)
     problem = graph.make_problem((), state)
     calls = []
@@ -37,7 +37,7 @@ def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
     monkeypatch.setattr(solver, "solve", solve)
     _, entry = solve_stage(problem, state, config, "joint")
     assert entry["iterations"] == 7 and entry["status"] == "converged"
-    solve_stage(problem, state, config, "bodies only")
+    solve_stage(problem, state, config, "standing feet")
     assert calls == [(config.solver, steps), (config.solver, steps[-1:])]
 
 

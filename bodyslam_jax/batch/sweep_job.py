@@ -101,7 +101,7 @@ _solve_all = solver.vmap_over_devices(_solve_one, (None, None, None, 0, 0))
 
 
 def _prepared(job: SweepJob) -> tuple[Clip, SfmResult, BodyModel, Prepared]:
-    """The joint problem after the body-only solve, as in `pipeline.run`."""
+    """The joint problem as in `pipeline.run`."""
     source, config = job.source, job.config
     clip = io.read_sequence(
         source.path,

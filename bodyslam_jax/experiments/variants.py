@@ -71,7 +71,7 @@ def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
 
 
 def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
-    """β held at the regressor's value, not at that of the body-only solve."""
+    """β held at the regressor's value."""
     (prior,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
     valid = jnp.isfinite(prior.sigma)
     count = valid.sum(axis=1, dtype=prior.shape.dtype)

@@ -85,10 +85,7 @@ def with_wander(
     contact: graph.GroundContact, state: graph.State, fps: float
 ) -> graph.GroundContact:
     """The factor with a larger error where feet rise and sink over the ground in the
-    course of the sequence (`geometry.local_ground.wander`).
-
-    `state` is that after the body-only solve: bodies of a regressor wander too.
-    """
+    course of the sequence (`geometry.local_ground.wander`)."""
     sigma = np.asarray(contact.sigma)
     used = np.isfinite(sigma)
     every = scales(contact, state)

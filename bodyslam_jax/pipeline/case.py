@@ -55,7 +55,7 @@ class Case:
         return float(np.sqrt(((centre - centre.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
     def prepare(self, config: Config | None = None) -> Prepared:
-        """The joint problem and its start after the body-only solve, as in `run`, with
+        """The joint problem and its start, as in `run`, with
         other settings than the case's if they are given."""
         return prepare(
             self.sequence, self.cameras, self.bodies, self.body, config or self.config

@@ -27,7 +27,6 @@ from bodyslam_jax.pipeline.people_floor import (
     people_on_floor,
     without_floor,
 )
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
@@ -54,8 +53,6 @@ class Prepared:
     roots: PersonState
     moving: bool
     """Whether the camera moves, so that its path has a scale to be estimated."""
-    stages: tuple[dict, ...]
-    """Report entries of the solves made on the way."""
     warnings: tuple[str, ...] = ()
     """Lines for the report."""
     passengers: tuple[int, ...] = ()
@@ -93,19 +90,15 @@ def prepare(
     body: BodyModel,
     config: Config,
     *,
-    body_only_solve: bool = True,
     feet: bool = True,
     edges: Edges | None = None,
 ) -> Prepared:
-    """The body-only solve, the first scale in closed form, then the whole graph.
+    """The first scale in closed form, then the whole graph; nothing is solved.
 
-    Without `body_only_solve` nothing is solved: people start as their bodies are given.
-    With `feet` the problem has the factor of standing feet, without weight, which
-    `contact_stage.hold_standing_feet` replaces. `edges` are straight edges in the world
-    of a camera that does not move, which tell how the floor lies there.
-
-    Body poses are fitted to keypoints before the motion model reads them: a regressor's
-    errors in orientation bias the displacements that are predicted from it.
+    People start as their bodies are given. With `feet` the problem has the factor of
+    standing feet, without weight, which `contact_stage.hold_standing_feet` replaces.
+    `edges` are straight edges in the world of a camera that does not move, which tell
+    how the floor lies there.
 
     **Raises:** `InputError` if there is neither a moving camera nor a person.
     """
@@ -128,7 +121,7 @@ def prepare(
     if cameras.kind in _TRIPODS and anybody and weights.ground_sigma is not None:
         floor = without_floor(body, roots.present)
         factors.append(floor)
-    start, passengers, stages, prediction = ScaleStart(), {}, (), None
+    start, passengers, prediction = ScaleStart(), {}, None
     if anybody:
         prediction = predict(predictor, state)
         people_factors, contact = _people_factors(
@@ -143,22 +136,6 @@ def prepare(
         present = roots.present & cameras.registered
         standing = present & crowd.legs_shown
         steps = initialisation.steps_shown(prediction, crowd.legs_shown, sequence.fps)
-        motion_factors = functools.partial(
-            _motion_factors,
-            shared_error=_shared_error(crowd.fitted, config),
-            fps=sequence.fps,
-            body=body,
-            config=config,
-        )
-        if body_only_solve:
-            start_factors = motion_factors(steps, state, passengers)
-            problem = make([*factors, *start_factors], state)
-            state, stage = solve_body_only(problem, state, config)
-            stages = (stage,)
-            prediction = predict(predictor, state)
-            steps = initialisation.steps_shown(
-                prediction, crowd.legs_shown, sequence.fps
-            )
         if floor is not None:
             found = on_floor(
                 state,
@@ -182,7 +159,15 @@ def prepare(
         start, passengers = _start_of_scale(
             sequence, cameras, crowd, state, steps, contact, present, config
         )
-        factors += motion_factors(steps, state, passengers)
+        factors += _motion_factors(
+            steps,
+            state,
+            passengers,
+            shared_error=_shared_error(crowd.fitted, config),
+            fps=sequence.fps,
+            body=body,
+            config=config,
+        )
     elif moving and np.isfinite(cameras.path_scale):
         start = ScaleStart(
             path=cameras.path_scale, path_error=PATH_SIGMA * cameras.path_scale
@@ -206,35 +191,11 @@ def prepare(
         start,
         roots,
         moving,
-        stages,
         warnings,
         tuple(passengers),
         crowd,
         crowd.legs_shown if anybody else None,
     )
-
-
-def solve_body_only(
-    problem: graph.Problem, state: graph.State, config: Config
-) -> tuple[graph.State, dict]:
-    """The body-only solve: people in the camera frame, all else held constant.
-
-    The problem keeps its factors and shapes, so that it shares the compiled program of
-    the joint problem; factors that tie people to the world are disabled.
-    """
-    alone = graph.disable(
-        problem,
-        graph.Reprojection,
-        graph.HumanMotion,
-        graph.RelativeOrientation,
-        graph.RootSmoothness,
-        graph.GroundContact,
-        graph.FootContact,
-    )
-    rest = ("scale", "cameras", "landmarks", "intrinsics")
-    alone = dataclasses.replace(alone, free=graph.set_constant(alone.free, *rest))
-    solution, stage = solve_stage(alone, state, config, "bodies only")
-    return solution.state, stage
 
 
 def _starting_people(

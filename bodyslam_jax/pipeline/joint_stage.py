@@ -63,7 +63,7 @@ def estimate(
     alone = prepared.problem
     prepared = own.added_to(prepared)
     solution, stage = solve_stage(prepared.problem, prepared.state, config, "joint")
-    stages = (*prepared.stages, stage)
+    stages = (stage,)
     if is_uneven(prepared.problem):
         prepared = with_ground_of(
             solution.state,

@@ -51,9 +51,7 @@ def build(
         cameras, bodies = before_joint(source, body, config)
         sequence = people.select_people(source, config.person)
         sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
-    prepared = prepare(
-        sequence, cameras, bodies, body, config, body_only_solve=False, feet=False
-    )
+    prepared = prepare(sequence, cameras, bodies, body, config, feet=False)
     return hold_groups(prepared.problem, hold), prepared.state
 
 
