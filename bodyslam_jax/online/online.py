@@ -17,20 +17,29 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from bodyslam_jax import solver
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.io.camera.calibration import guess_camera, with_focal
-from bodyslam_jax.online.estimate import Estimate, PersonEstimate, World, placed
-from bodyslam_jax.online.record import Record, Seen, result_of
+from bodyslam_jax.io.camera.calibration import guess_camera, project_points, with_focal
+from bodyslam_jax.online.estimate import (
+    Estimate,
+    PersonEstimate,
+    World,
+    joints_of,
+    placed,
+)
+from bodyslam_jax.online.invented import invented
+from bodyslam_jax.online.record import Record, Seen, parts_of
 from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window
 from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.live import LivePeople
+from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
 from bodyslam_jax.sfm.person_mask import draw_person
-from bodyslam_jax.types import Intrinsics, Result
+from bodyslam_jax.types import Intrinsics, Result, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +118,7 @@ class Online:
         self.found = LivePeople(fps, config.detection, config.association)
         self.counts, self.record = _Counts(), Record()
         self.latest: Estimate | None = None
-        self.started = False
+        self.started = self.prepared = False
         self.done = False
         self.filters: dict[int, PersonFilter] = {}
         self.last_seen: dict[int, float] = {}
@@ -120,6 +129,46 @@ class Online:
         """Of the map."""
         self.video: Path | None = None
         """The file that the frames are of, for the result's pictures."""
+        self.picks: list[int] = []
+        """Which of its frames they are."""
+        self.inputs: tuple[Sequence, SfmResult]
+        """What the result was made of, after `finish`."""
+
+    def prepare(self, size: tuple[int, int] | None = None) -> None:
+        """Compiles all programs, or takes them from JAX's cache, on an invented scene:
+        no frame waits for it then. The first `update` does it if nobody has.
+
+        **Arguments:** `size`: width and height of the images (px), from which the
+        intrinsics are guessed if none were given.
+
+        **Raises:** `InputError` if neither is known.
+        """
+        if self.prepared:
+            return
+        if self.intrinsics is None:
+            if size is None:
+                raise InputError("prepare: found neither intrinsics nor a size.")
+            self.intrinsics = self._guess(*size)
+        if self.config.people and self.config.detect != "none":
+            self.found.open()
+        frames, points = invented(self.intrinsics, self.body, self.step)
+        scratch = Window(*self._of_window())
+        scratch.advance(frames[: FRAMES - CHUNK])
+        scratch.advance(frames[FRAMES - CHUNK :])
+        solver.marginals(scratch.problem, scratch.state)
+        one = PersonFilter(self.intrinsics, self.body, self.fps, self.config.people_fit)
+        for k in range(2):
+            body = one.update(k / self.fps, points, np.zeros(10))
+        assert body is not None
+        given = np.eye(4), body.T_CH, body.body_pose, np.zeros(10), self.body, None
+        placed(0, *given)
+        joints_of(self.body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
+        self.prepared = True
+
+    def _of_window(self) -> tuple:
+        assert self.intrinsics is not None
+        rest = self.config, 1 / self.step, self.places
+        return self.intrinsics, self.body, *rest
 
     # Every frame.
 
@@ -187,17 +236,43 @@ class Online:
             self.pool.shutdown()
         self.record.pixel_sigma = self.window.pixel_sigma
         assert self.intrinsics is not None
-        return result_of(
+        measured, cameras, joint = parts_of(
             self.record,
             self.intrinsics,
-            self.body,
-            self.config,
             self.name,
             1 / self.step,
             (*self.warnings, *self._told()),
-            {k: round(v, 2) for k, v in self.seconds.items()},
-            self.video,
         )
+        if self.video is not None:
+            picks = np.array(self.picks, int)
+            measured = dataclasses.replace(measured, frames=self.video, picks=picks)
+        self.inputs = measured, cameras
+        seconds = {k: round(v, 2) for k, v in self.seconds.items()}
+        given = self.config, self.body, cameras, joint, seconds
+        return assemble(measured, *given)
+
+    def warn(self, note: str) -> None:
+        """Adds a line to the notes of all further estimates and of the result."""
+        self.warnings[note] = None
+
+    @property
+    def points(self) -> Float[np.ndarray, "n 2"]:
+        """Points that are followed in the last image, px."""
+        return self.follower.uv if self.started else np.zeros((0, 2))
+
+    def drawn(
+        self, estimate: Estimate
+    ) -> list[tuple[int, Float[np.ndarray, "24 2"], Float[np.ndarray, "24 3"]]]:
+        """Number, joints in the image (px) and joints in the world (m) of the people
+        of an estimate."""
+        assert self.intrinsics is not None
+        found = []
+        for one in estimate.people:
+            T_CW = np.linalg.inv(estimate.T_WC)
+            p_C = one.joints @ T_CW[:3, :3].T + T_CW[:3, 3]
+            p_C[:, 2] = np.maximum(p_C[:, 2], 0.05)
+            found.append((one.person, project_points(self.intrinsics, p_C), one.joints))
+        return found
 
     # Parts of a frame.
 
@@ -207,9 +282,8 @@ class Online:
                 raise InputError("intrinsics: found none, nor an image to guess from.")
             self.intrinsics = self._guess(image.shape[1], image.shape[0])
         self.follower = PointFollower(self.intrinsics, self.config.tracking.num_points)
-        self.window = Window(
-            self.intrinsics, self.body, self.config, 1 / self.step, self.places
-        )
+        self.prepare()
+        self.window = Window(*self._of_window())
         self._begin_map()
         self.started = True
 

@@ -6,22 +6,17 @@ image is kept. Half a kilobyte a frame, one more for each person.
 """
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
-from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.window import SCALE_WALK, Solved
-from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.types import (
     Intrinsics,
     JointEstimate,
     Keypoints,
-    Result,
     ScaleStart,
     Sequence,
     SfmResult,
@@ -134,23 +129,15 @@ def smoothed_scales(
     return frame, found, float(sigma[-1])
 
 
-def result_of(
+def parts_of(
     record: Record,
     intrinsics: Intrinsics,
-    body: BodyModel,
-    config: Config,
     name: str,
     fps: float,
     warnings: tuple[str, ...],
-    seconds: dict[str, float],
-    frames: Path | None = None,
-) -> Result:
-    """The result of all frames, as an offline run has it.
-
-    Args:
-        fps: of the frames of the window.
-        frames: the video, if it is a file.
-    """
+) -> tuple[Sequence, SfmResult, JointEstimate]:
+    """All frames as the stages of an offline run hand them on: what was measured, the
+    cameras, and the estimate; `fps` is that of the frames of the window."""
     path = _path(record, fps)
     told = record.scales[max(record.scales)] if record.scales else []
     _, scales, sigma = smoothed_scales(told, fps)
@@ -169,7 +156,7 @@ def result_of(
     ).reshape(-1, 3)
     measured = Sequence(
         name=name,
-        frames=frames,
+        frames=None,
         timestamps=np.array([f.time for f in record.frames]) - record.frames[0].time,
         intrinsics=intrinsics,
         keypoints=_keypoints(record, persons),
@@ -211,7 +198,7 @@ def result_of(
         stages=(),
         contacts=contacts,
     )
-    return assemble(measured, config, body, sfm, joint, seconds)
+    return measured, sfm, joint
 
 
 def _path(record: Record, fps: float) -> _Path:

@@ -1,4 +1,4 @@
-"""The fixed-lag window: the offline graph over the last frames, and a prior of the rest.
+"""The fixed-lag window: the graph over the last frames, and a prior of the rest.
 
 `FRAMES` frames in chunks of ten. The first chunk is the past, whose measurements are in
 the prior; the others are measured. All arrays have one size, so that the solver's
@@ -23,7 +23,6 @@ from bodyslam_jax import graph, initialisation, people, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.scale_uncertainty import inflate_fitted_shapes
-from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
@@ -193,7 +192,8 @@ class Window:
         clock = _Clock()
         for start in range(0, len(frames), CHUNK):
             if self.count == FRAMES - CHUNK:
-                if self.first + 2 * CHUNK > self.solved_until:
+                fresh = self.first + 2 * CHUNK > self.solved_until
+                if fresh or len(self.state.cameras) < PRIOR + CHUNK:
                     self._solve(clock)
                 self._move_on()
                 clock("marginalise")

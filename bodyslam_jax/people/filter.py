@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.people.costs import Fit, Lifted, Scene, linearise
+from bodyslam_jax.people.costs import Fit, Scene, linearise
 from bodyslam_jax.people.fit import make_scene
 from bodyslam_jax.people.frame_fit import first_fit
 from bodyslam_jax.people.keypoint_errors import (

@@ -230,7 +230,7 @@ def _rest(
 
 
 def _from(start: int, shape: tuple[int, ...], axis: int) -> np.ndarray:
-    """1 from an index of an axis on, else 0; it broadcasts to an array of this shape."""
+    """1 from an index of an axis on, else 0; broadcasts to an array of this shape."""
     along = [n if a == axis else 1 for a, n in enumerate(shape)]
     return (np.arange(shape[axis]) >= start).astype(float).reshape(along)
 
