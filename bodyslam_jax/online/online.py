@@ -31,7 +31,7 @@ from bodyslam_jax.online.estimate import (
     placed,
 )
 from bodyslam_jax.online.invented import invented
-from bodyslam_jax.online.record import Record, Seen, parts_of
+from bodyslam_jax.online.record import Record, Seen, between, parts_of
 from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window
 from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.live import LivePeople
@@ -56,6 +56,8 @@ _LOST = 2.0
 """s after which a lost camera that sees points begins a new map."""
 _PENDING = 5 * CHUNK
 """Most frames that wait for the window; of older ones only the time is kept."""
+_BRIDGED = 2
+"""Most frames of the window in a row that are taken for located without an image."""
 _GONE = 0.5
 """s without keypoints after which a person is not in the estimate."""
 _OF_FRONT = 8 * FRAMES
@@ -433,6 +435,14 @@ class Online:
             self.warnings[note] = None
             self.first_time += (gap - FRAMES) * self.step
             slot -= gap - FRAMES
+        if 0 < slot - self.next_slot <= _BRIDGED and T_WC is not None:
+            # Frames that the source, or a slow machine, left out.
+            ends = np.array([self.next_slot - 1, slot])
+            poses = np.array([self.front[self.next_slot - 1], here])
+            for k in range(self.next_slot, slot):
+                pose = between(ends, poses, np.array([k]))[0]
+                missing = self._empty(k, pose)
+                self._put(dataclasses.replace(missing, located=True))
         while self.next_slot < slot:
             self._put(self._empty(self.next_slot, here))
         if slot == self.next_slot:

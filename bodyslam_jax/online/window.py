@@ -76,6 +76,7 @@ class Measured:
     T_WC: Float[np.ndarray, "4 4"]
     """Map units; a guess where not `located`."""
     located: bool
+    """Also of a frame without an image, between others: its ids are empty."""
     ids: Int[np.ndarray, " n"]
     """Of the tracks."""
     uv: Float[np.ndarray, "n 2"]
@@ -235,7 +236,7 @@ class Window:
         for k, frame in enumerate(frames, start=at):
             self.cameras[k:] = frame.T_WC
             self.located[k] = frame.located
-            self.free[k] = float(frame.located)
+            self.free[k] = float(frame.located and len(frame.ids) > 0)
             self.seen[k] = self._landmarks_of(k, frame) if frame.located else _NOTHING
             self.known[:, k:] = False
             self.uv[:, k:], self.confidence[:, k:] = 0.0, 0.0
@@ -251,7 +252,8 @@ class Window:
     def _fix_gauge(self) -> None:
         """The first camera is held, and one coordinate of the farthest of the first
         window: the unit of the map."""
-        here = CHUNK + np.flatnonzero(self.located[CHUNK:])
+        shown = np.array([len(ids) > 0 for ids, _ in self.seen])
+        here = CHUNK + np.flatnonzero(shown[CHUNK:])
         if not len(here):
             return
         self.free[here] = 1.0
@@ -403,8 +405,7 @@ class Window:
         if self.prior is None:
             joints = sum(graph.limbs_of(factors), ())
             self.prior = priors.no_prior(state, PRIOR, 2, joints)
-        known = np.isfinite(np.asarray(moved.whitening)).all() and told.any()
-        metric = np.isfinite(self.scale_sigma) or bool(known)
+        metric = np.isfinite(self.scale_sigma) or bool((told > 0).any())
         free = state.zero_step()
         ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
         past = np.arange(FRAMES) >= CHUNK - self.prior.reach
@@ -598,6 +599,7 @@ class Window:
         self, problem: graph.Problem, state: graph.State, told: np.ndarray
     ) -> None:
         self.cameras = np.array(state.cameras)
+        self._bridge()
         self.cameras[CHUNK + self.count :] = self.cameras[CHUNK + self.count - 1]
         present = np.asarray(problem.motion.present) | np.asarray(
             problem.free.poses
@@ -611,6 +613,22 @@ class Window:
         self._measure_pixels(problem.factors[0], np.asarray(state.landmarks))
         self.problem, self.state = problem, state
         self.told = told
+
+    def _bridge(self) -> None:
+        """Puts cameras without an image between those around them."""
+        rows = np.arange(CHUNK, CHUNK + self.count)
+        shown = np.array([len(self.seen[k][0]) > 0 for k in rows], bool)
+        solved = rows[shown]
+        missing = rows[~shown & self.located[rows]]
+        missing = missing[(missing > solved.min(initial=FRAMES))]
+        missing = missing[(missing < solved.max(initial=0))]
+        for k in missing:
+            a, b = solved[solved < k][-1], solved[solved > k][0]
+            share = np.array([(k - a) / (b - a)])
+            A, B = self.cameras[a], self.cameras[b]
+            turn = so3.interpolate(A[None, :3, :3], B[None, :3, :3], share)[0]
+            self.cameras[k, :3, :3] = turn
+            self.cameras[k, :3, 3] = A[:3, 3] + share[0] * (B - A)[:3, 3]
 
     def _measure_pixels(
         self, tracks: graph.Reprojection, places: Float[np.ndarray, "l 3"]
