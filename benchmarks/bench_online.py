@@ -194,7 +194,7 @@ def frames_of(sequence: Sequence) -> Iterator[Given]:
     """The frames of a sequence, one after another."""
     images = None if sequence.frames is None else io.frames(sequence)
     found, tracks = sequence.keypoints, sequence.tracks
-    ends = order = None
+    ends = order = np.zeros(0, int)
     if tracks is not None:
         order = np.argsort(tracks.frame, kind="stable")
         wanted = np.arange(sequence.num_frames + 1)

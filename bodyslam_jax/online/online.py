@@ -31,8 +31,8 @@ from bodyslam_jax.online.estimate import (
     placed,
 )
 from bodyslam_jax.online.invented import invented
-from bodyslam_jax.online.record import Record, Seen, between, parts_of
-from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window
+from bodyslam_jax.online.record import Record, Seen, parts_of
+from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window, between
 from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.live import LivePeople
 from bodyslam_jax.pipeline.run import assemble
@@ -159,9 +159,9 @@ class Online:
         scratch.advance(frames[FRAMES - CHUNK :])
         solver.marginals(scratch.problem, scratch.state)
         one = PersonFilter(self.intrinsics, self.body, self.fps, self.config.people_fit)
-        for k in range(2):
-            body = one.update(k / self.fps, points, np.zeros(10))
-        assert body is not None
+        one.update(0.0, points, np.zeros(10))
+        one.update(1 / self.fps, points, np.zeros(10))
+        body = one.body()
         given = np.eye(4), body.T_CH, body.body_pose, np.zeros(10), self.body, None
         placed(0, *given)
         joints_of(self.body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
@@ -519,10 +519,12 @@ class Online:
         for person, (T_CH, pose) in sorted(bodies.items()):
             given = T_CH, pose, self._shape(person), self.body
             people.append(placed(person, T_WC, *given, self.contacts.get(person)))
-        solved = self.solved
-        known = solved is not None and np.isfinite(solved.scale_sigma)
+        nan = float("nan")
+        scale = sigma = nan
+        if self.solved is not None and np.isfinite(self.solved.scale_sigma):
+            scale, sigma = self.solved.scale, self.solved.scale_sigma
         notes = list(self.warnings)
-        if not known:
+        if np.isnan(sigma):
             notes.append("scale unknown: nobody has told it yet")
         return Estimate(
             frame=self.counts.frames - 1,
@@ -530,8 +532,8 @@ class Online:
             T_WC=T_WC,
             located=status == "tracking",
             people=tuple(people),
-            scale=solved.scale if known else float("nan"),
-            scale_sigma=solved.scale_sigma if known else float("nan"),
+            scale=scale,
+            scale_sigma=sigma,
             status=status,
             notes=tuple(notes),
             latency=0.0,

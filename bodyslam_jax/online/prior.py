@@ -146,8 +146,14 @@ def _places(estimate: graph.State, reach: int) -> _Places:
     head = 1 + len(estimate.intrinsics) + len(estimate.globals) + 10 * people
     cameras = 6 * len(estimate.cameras)
     tail = people * (6 * reach + POSTURE)
-    parts = np.split(np.arange(head + cameras + tail), [head, head + cameras])
-    return _Places(*parts, people, reach)
+    ends = np.cumsum([head, cameras, tail])
+    return _Places(
+        np.arange(ends[0]),
+        np.arange(ends[0], ends[1]),
+        np.arange(ends[1], ends[2]),
+        people,
+        reach,
+    )
 
 
 def _first_frames(state: graph.State, frames: int) -> graph.State:

@@ -8,11 +8,11 @@ image is kept. Half a kilobyte a frame, one more for each person.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.online.window import SCALE_WALK, Solved
+from bodyslam_jax.online.window import SCALE_WALK, Solved, between
 from bodyslam_jax.types import (
     Intrinsics,
     JointEstimate,
@@ -228,23 +228,6 @@ def _path(record: Record, fps: float) -> _Path:
     return _Path(poses, scale_at)
 
 
-def between(
-    known: Real[np.ndarray, " n"],
-    T: Float[np.ndarray, "n 4 4"],
-    wanted: Real[np.ndarray, " m"],
-) -> Float[np.ndarray, "m 4 4"]:
-    """Poses at other times, interpolated; beyond the ends the first and the last."""
-    found = np.tile(np.eye(4), (len(wanted), 1, 1))
-    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
-    before = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, None)
-    gap = np.maximum(known[after] - known[before], 1e-9)
-    share = np.clip((wanted - known[before]) / gap, 0.0, 1.0)
-    a, b = T[before], T[after]
-    found[:, :3, 3] = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    found[:, :3, :3] = so3.interpolate(a[:, :3, :3], b[:, :3, :3], share)
-    return found
-
-
 def _cameras(
     record: Record, path: _Path
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
@@ -318,7 +301,7 @@ def _people(
                 continue
             T_WH = between(np.arange(len(ends)), np.array(ends), np.array([share]))[0]
             turns = so3.exp(np.array([thetas[0], thetas[-1]]))
-            found = so3.interpolate(*turns, np.full(23, share))
+            found = so3.interpolate(turns[0], turns[1], np.full(23, share))
             roots[h, t] = np.linalg.inv(T_WC[t]) @ T_WH
             poses[h, t], present[h, t] = so3.log(found), True
             contacts[h, t] = stands[0] + share * (stands[-1] - stands[0])

@@ -17,16 +17,17 @@ import time
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 
 from bodyslam_jax import graph, initialisation, people, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.scale_uncertainty import inflate_fitted_shapes
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.motion import leg_length
+from bodyslam_jax.motion import Prediction, leg_length
 from bodyslam_jax.online import prior as priors
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
@@ -128,7 +129,7 @@ class Window:
         fps: float,
         places: int,
     ) -> None:
-        """**Args:** `fps` of the window's frames; `places` for people."""
+        """**Arguments:** `fps` of the window's frames; `places` for people."""
         self.intrinsics, self.body, self.config = intrinsics, body, config
         self.fps, self.places = fps, places
         self.count = 0
@@ -408,8 +409,8 @@ class Window:
         metric = np.isfinite(self.scale_sigma) or bool((told > 0).any())
         free = state.zero_step()
         ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
-        past = np.arange(FRAMES) >= CHUNK - self.prior.reach
-        last = np.arange(FRAMES) >= CHUNK - 1
+        past = np.asarray(np.arange(FRAMES) >= CHUNK - self.prior.reach)
+        last = np.asarray(np.arange(FRAMES) >= CHUNK - 1)
         filled = np.arange(FRAMES) < CHUNK + self.count
         there = roots.present & filled
         free = dataclasses.replace(
@@ -418,7 +419,7 @@ class Window:
             cameras=jnp.asarray(self.free * past[:, None]),
             roots=ones(free.roots, (there & past)[..., None]),
             poses=ones(free.poses, (there & last)[..., None, None]),
-            shapes=ones(free.shapes, there.any(axis=1)[:, None]),
+            shapes=ones(free.shapes, np.asarray(there.any(axis=1))[:, None]),
             landmarks=jnp.ones_like(state.landmarks),
         )
         problem = graph.make_problem(
@@ -447,7 +448,7 @@ class Window:
         pixel = 1 / K[0, 0]
         places = np.array([self.where.get(i, _NOWHERE) for i in known.tolist()])
         places = places.reshape(-1, 3)
-        fresh = np.isnan(places).any(axis=1)
+        fresh = np.asarray(np.isnan(places).any(axis=1))
         if fresh.any():
             found = triangulate(R_CW, centre, xy, row, len(known), pixel)
             places = np.where(fresh[:, None], found, places)
@@ -458,7 +459,7 @@ class Window:
             p_C[:, :2] / np.where(front, depth, 1.0)[:, None] - xy, axis=1
         )
         limit = _OUTLIER * self.pixel_sigma * pixel
-        off = np.bincount(row, ~front | (away > limit), len(known)) / seen
+        off = np.bincount(row, np.logical_or(~front, away > limit), len(known)) / seen
         good = (seen >= _LEAST_SEEN) & (off < 0.5)
         good &= widest_angle(centre, row, places) > _LEAST_ANGLE
         for i in known[~good]:
@@ -520,7 +521,7 @@ class Window:
         state: graph.State,
         roots: PersonState,
         legs: np.ndarray,
-        steps: object,
+        steps: Prediction,
         measured: np.ndarray,
     ) -> tuple[graph.GroundContact, graph.State]:
         """The factor of people on the ground of the map, and the state with a first
@@ -601,16 +602,17 @@ class Window:
         self.cameras = np.array(state.cameras)
         self._bridge()
         self.cameras[CHUNK + self.count :] = self.cameras[CHUNK + self.count - 1]
-        present = np.asarray(problem.motion.present) | np.asarray(
-            problem.free.poses
-        ).any(axis=(2, 3))
+        present = np.array(np.asarray(problem.free.poses).any(axis=(2, 3)))
+        present[:, :CHUNK] |= self.known[:, :CHUNK]
         self.roots, self.poses = np.array(state.roots), np.array(state.poses)
         self.known |= present & (np.arange(FRAMES) < CHUNK + self.count)
         self.shapes = np.array(state.shapes)
         self.scale = float(state.scale)
         for i, place in zip(self.in_graph.tolist(), np.asarray(state.landmarks)):
             self.where[i] = place
-        self._measure_pixels(problem.factors[0], np.asarray(state.landmarks))
+        tracks = problem.factors[0]
+        assert isinstance(tracks, graph.Reprojection)
+        self._measure_pixels(tracks, np.asarray(state.landmarks))
         self.problem, self.state = problem, state
         self.told = told
 
@@ -622,13 +624,8 @@ class Window:
         missing = rows[~shown & self.located[rows]]
         missing = missing[(missing > solved.min(initial=FRAMES))]
         missing = missing[(missing < solved.max(initial=0))]
-        for k in missing:
-            a, b = solved[solved < k][-1], solved[solved > k][0]
-            share = np.array([(k - a) / (b - a)])
-            A, B = self.cameras[a], self.cameras[b]
-            turn = so3.interpolate(A[None, :3, :3], B[None, :3, :3], share)[0]
-            self.cameras[k, :3, :3] = turn
-            self.cameras[k, :3, 3] = A[:3, 3] + share[0] * (B - A)[:3, 3]
+        if len(missing):
+            self.cameras[missing] = between(solved, self.cameras[solved], missing)
 
     def _measure_pixels(
         self, tracks: graph.Reprojection, places: Float[np.ndarray, "l 3"]
@@ -666,9 +663,7 @@ class Window:
         if self.told.size:
             self.steps_told += self.told[:, CHUNK : 2 * CHUNK].sum(axis=1)
             self.told = self.told[:, CHUNK:]
-        ground = next(f for f in problem.factors if _is_ground(f))
-        ground = getattr(ground, "factor", ground)
-        sigma = np.asarray(ground.sigma)[:, CHUNK : 2 * CHUNK]
+        sigma = np.asarray(_ground_of(problem).sigma)[:, CHUNK : 2 * CHUNK]
         self.ground_told += float(np.isfinite(sigma).sum())
         gone = np.concatenate([s[0] for s in self.seen[CHUNK : 2 * CHUNK]])
         gone = np.unique(gone)
@@ -739,6 +734,23 @@ class Window:
         )
 
 
+def between(
+    known: Real[np.ndarray, " n"],
+    T: Float[np.ndarray, "n 4 4"],
+    wanted: Real[np.ndarray, " m"],
+) -> Float[np.ndarray, "m 4 4"]:
+    """Poses at other times, interpolated; beyond the ends the first and the last."""
+    found = np.tile(np.eye(4), (len(wanted), 1, 1))
+    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    before = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, None)
+    gap = np.maximum(known[after] - known[before], 1e-9)
+    share = np.clip((wanted - known[before]) / gap, 0.0, 1.0)
+    a, b = T[before], T[after]
+    found[:, :3, 3] = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+    found[:, :3, :3] = so3.interpolate(a[:, :3, :3], b[:, :3, :3], share)
+    return found
+
+
 @eqx.filter_jit
 def _prediction(predictor: graph.MotionPredictor, state: graph.State) -> object:
     """As `Problem.predict`."""
@@ -773,8 +785,12 @@ def _most(good: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
     return kept & good
 
 
-def _is_ground(factor: object) -> bool:
-    return isinstance(getattr(factor, "factor", factor), graph.GroundContact)
+def _ground_of(problem: graph.Problem) -> graph.GroundContact:
+    for factor in problem.factors:
+        inner = getattr(factor, "factor", factor)
+        if isinstance(inner, graph.GroundContact):
+            return inner
+    raise AssertionError("a window has a factor of the ground")
 
 
 class _Clock:

@@ -29,7 +29,7 @@ from bodyslam_jax.people.keypoint_errors import (
     keypoint_sigma,
     pixels_per_metre,
 )
-from bodyslam_jax.people.lift import REACH, SPACING, lift, load_lifter
+from bodyslam_jax.people.lift import REACH, SPACING, Lifter, lift, load_lifter
 from bodyslam_jax.people.skeleton import NUM_SHAPE
 from bodyslam_jax.types import Intrinsics, Keypoints
 
@@ -120,7 +120,7 @@ class PersonFilter:
         )
         first = self.belief is None
         gap = self.fps**-1 if first else time - self.time
-        belief = _blank(self.scene) if first else self.belief
+        belief = self.belief or _blank(self.scene)
         self.belief = _updated(
             self.scene,
             load_lifter(),
@@ -159,7 +159,8 @@ class PersonFilter:
         times = np.array([r[0] for r in self.recent])
         wanted = time - SPACING * np.arange(_HISTORY - 1, -1, -1)
         near = np.abs(times[None] - wanted[:, None]).argmin(axis=1)
-        return tuple(np.stack([self.recent[k][i] for k in near]) for i in (1, 2))
+        uv, sigma = (np.stack([self.recent[k][i] for k in near]) for i in (1, 2))
+        return uv, sigma
 
 
 def _blank(scene: Scene) -> Belief:
@@ -181,7 +182,7 @@ def _decode(scene: Scene, latent: Float[Array, " k"]) -> Float[Array, "23 3"]:
 @eqx.filter_jit
 def _updated(
     scene: Scene,
-    lifter: eqx.Module,
+    lifter: Lifter,
     belief: Belief,
     first: Array,
     gap: Float[Array, ""],

@@ -11,6 +11,7 @@ from collections import deque
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
 
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.features import epipolar_inliers, match, spread
@@ -32,7 +33,9 @@ _STILL = 3.0
 """Median motion over these frames, px, below which the test says nothing."""
 _PLACES = 60
 """Keyframes that are remembered: two minutes at one in two seconds."""
-_FEATURES = 500
+_FEATURES = 1000
+_NEAR = 3.0
+"""Distance of a corner that describes a point, px."""
 _MATCHES = 20
 """Matches by which a place is recognised."""
 _DARK = 8.0
@@ -65,7 +68,7 @@ class PointFollower:
         self.previous: np.ndarray | None = None
         self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_GAP + 1)
         self.next_id = 0
-        self.orb = cv2.ORB_create(_FEATURES)
+        self.orb = cv2.ORB.create(_FEATURES)
         self.places: deque[Place] = deque(maxlen=_PLACES)
 
     def advance(
@@ -97,17 +100,18 @@ class PointFollower:
         known = np.array([i in points for i in self.ids.tolist()], bool)
         if known.sum() < _MATCHES or self.previous is None:
             return
-        ids, uv = self.ids[known], self.uv[known]
-        marks = [
-            cv2.KeyPoint(float(x), float(y), 31.0, class_id=row)
-            for row, (x, y) in enumerate(uv)
-        ]
-        kept, descriptors = self.orb.compute(self.previous, marks)
-        if len(kept) < _MATCHES:
+        marks, descriptors = self.orb.detectAndCompute(self.previous, None)
+        if descriptors is None:
             return
-        rows = [mark.class_id for mark in kept]
-        where = np.array([points[i] for i in ids[rows].tolist()])
-        self.places.append(Place(descriptors, where))
+        # Described are ORB's own corners, turned as it sees them, next to known points.
+        ids, uv = self.ids[known], self.uv[known]
+        corners = np.array([mark.pt for mark in marks])
+        away, near = KDTree(uv).query(corners, distance_upper_bound=_NEAR)
+        rows = np.flatnonzero(np.isfinite(away))
+        if len(rows) < _MATCHES:
+            return
+        where = np.array([points[i] for i in ids[near[rows]].tolist()])
+        self.places.append(Place(descriptors[rows], where))
 
     def recognise(
         self, gray: UInt8[np.ndarray, "y x"]
@@ -146,8 +150,8 @@ class PointFollower:
         moved = np.linalg.norm(self.uv[now] - uv[then], axis=1)
         if not len(now) or np.median(moved) < _STILL:
             return
-        xy = [rays(x, self.K, self.distortion) for x in (uv[then], self.uv[now])]
-        inlier = epipolar_inliers(*xy, _EPIPOLAR / self.K[0, 0])
+        a, b = (rays(x, self.K, self.distortion) for x in (uv[then], self.uv[now]))
+        inlier = epipolar_inliers(a, b, _EPIPOLAR / self.K[0, 0])
         kept = np.ones(len(self.ids), bool)
         kept[now[~inlier]] = False
         self._keep(kept)
@@ -155,7 +159,7 @@ class PointFollower:
     def _inside(self, uv: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         width, height = self.size
         low, high = _BORDER, np.array([width, height]) - _BORDER
-        ok = ((uv >= low) & (uv < high)).all(axis=1)
+        ok = np.array(np.logical_and(uv >= low, uv < high).all(axis=1))
         if mask is not None:
             at = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int)
             ok &= mask[at[:, 1], at[:, 0]] == 0

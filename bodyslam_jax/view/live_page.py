@@ -34,7 +34,7 @@ _POINT = (90, 230, 120)
 
 
 @dataclasses.dataclass
-class _Path:
+class Path:
     """A growing path, thinned."""
 
     points: list[list[float]] = dataclasses.field(default_factory=list)
@@ -56,7 +56,7 @@ class LivePage:
     def __init__(self, port: int = 0) -> None:
         """**Raises:** `InputError` if the port is taken."""
         self.picture, self.state = b"", b"{}"
-        self.paths: dict[str, _Path] = {}
+        self.paths: dict[str, Path] = {}
         self.server: PageServer = local_server(functools.partial(_Handler, self), port)
         self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
         self.thread.start()
@@ -83,9 +83,9 @@ class LivePage:
         ok, encoded = cv2.imencode(
             ".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
         )
-        self.paths.setdefault("camera", _Path()).add(T_WC[:3, 3])
+        self.paths.setdefault("camera", Path()).add(T_WC[:3, 3])
         for person, _, joints in people:
-            self.paths.setdefault(str(person), _Path()).add(joints[0])
+            self.paths.setdefault(str(person), Path()).add(joints[0])
         rounded = lambda x: np.round(np.asarray(x, float), 3).tolist()
         state = {
             "paths": {name: path.points for name, path in self.paths.items()},
