@@ -33,7 +33,7 @@ from bodyslam_jax.online.estimate import (
 from bodyslam_jax.online.invented import invented
 from bodyslam_jax.online.record import Record, Seen, parts_of
 from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window, between
-from bodyslam_jax.people.filter import PersonFilter
+from bodyslam_jax.people.filter import Body, PersonFilter
 from bodyslam_jax.people.live import LivePeople
 from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.sfm.live_map import LiveMap
@@ -62,6 +62,9 @@ _GONE = 0.5
 """s without keypoints after which a person is not in the estimate."""
 _OF_FRONT = 8 * FRAMES
 """Frames of the window whose first poses are remembered until it has solved them."""
+_TWO_MAPS = (
+    "the camera was lost and a new map began: the way between the two maps is not known"
+)
 _POINTS_AGAIN = 100
 """Points that a camera begins with where it was lost."""
 
@@ -245,6 +248,8 @@ class Online:
             1 / self.step,
             (*self.warnings, *self._told()),
         )
+        if _TWO_MAPS in self.warnings:
+            measured = dataclasses.replace(measured, contradictions=(_TWO_MAPS,))
         if self.video is not None:
             picks = np.array(self.picks, int)
             measured = dataclasses.replace(measured, frames=self.video, picks=picks)
@@ -396,11 +401,7 @@ class Online:
 
     def _new_map(self) -> None:
         """Ends a map that the camera is lost in, and waits for another one."""
-        note = (
-            "the camera was lost and a new map began: the way between the two maps is "
-            "not known"
-        )
-        self.warnings[note] = None
+        self.warnings[_TWO_MAPS] = None
         self._collect(wait=True)
         self._end_map()
         self.window.restart()
@@ -596,6 +597,10 @@ class Online:
             if person is not None and solved.present[h].any():
                 last = int(np.flatnonzero(solved.present[h])[-1])
                 self.contacts[person] = solved.contacts[h, last]
+                if person in self.filters:
+                    body = Body(solved.roots[h, last], solved.poses[h, last])
+                    at = float(solved.times[last])
+                    self.filters[person].anchor(at, body, self._shape(person))
         self.solved = solved
 
     def _end_map(self) -> None:

@@ -143,7 +143,7 @@ def parts_of(
     _, scales, sigma = smoothed_scales(told, fps)
     scale = float(scales[-1])
     T_WC, located = _cameras(record, path)
-    persons = sorted(record.shapes)
+    persons = sorted({p for slot in record.slots.values() for p in slot.people})
     roots, poses, present, contacts = _people(record, path, persons, T_WC)
     cameras = T_WC.copy()
     cameras[:, :3, 3] /= scale

@@ -62,6 +62,8 @@ _SIGMA = 0.7
 SCALE_WALK = 0.005
 """Relative standard deviation by which the unit of the map changes in a second: what a
 monocular map drifts by on simulated tracks (`benchmarks/online.md`)."""
+_AWAY = 10
+"""Frames without keypoints after which a person's place is free for somebody else."""
 _LEAST_STEPS = 15
 """Predicted steps from which s is estimated: about a second."""
 _GROUND_COUNTS = 10.0
@@ -242,7 +244,7 @@ class Window:
             self.known[:, k:] = False
             self.uv[:, k:], self.confidence[:, k:] = 0.0, 0.0
             for person, points in frame.people.items():
-                h = self._place_of(person)
+                h = self._place_of(person, k)
                 if h is not None:
                     self.uv[h, k] = points[:, :2]
                     self.confidence[h, k] = points[:, 2]
@@ -283,14 +285,16 @@ class Window:
             rows.append(landmark)
         return np.array(rows, int), np.asarray(frame.uv[chosen], float)
 
-    def _place_of(self, person: int) -> int | None:
-        """The person's place; a new one gets that of somebody who is gone."""
+    def _place_of(self, person: int, k: int) -> int | None:
+        """The person's place from frame `k` on; a new one gets that of somebody who was
+        not seen for a while."""
         if person in self.people:
             return self.people.index(person)
+        recent = slice(max(0, k - _AWAY), k)
         gone = [
             h
             for h, other in enumerate(self.people)
-            if other is None or not (self.confidence[h] > 0).any()
+            if other is None or not (self.confidence[h, recent] > 0).any()
         ]
         if not gone:
             return None
@@ -300,6 +304,8 @@ class Window:
         self.began[h] = -1
         self.steps_told[h] = 0.0
         self.known[h] = False
+        self.uv[h], self.confidence[h] = 0.0, 0.0
+        self.roots[h], self.poses[h] = np.eye(4), 0.0
         self.shapes[h] = self.book.get(person, (np.zeros(10), None))[0]
         return h
 

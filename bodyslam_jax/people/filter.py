@@ -47,6 +47,14 @@ _CAUSAL = 1.5
 """Factor on the lifted posture's standard deviations: the network expects half a second
 that is still to come, and sees the last frame stand still instead."""
 _HISTORY = 2 * REACH + 1
+_LEAST_GAP = 1e-3
+"""s between two updates."""
+_REMEMBERED = 3.0
+"""s for which keypoints are remembered, for a filter that begins anew."""
+_ANCHORED = np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.08])
+"""Uncertainty of a root from a window's newest frames, rad and m."""
+_ANCHORED_POSTURE = 0.4
+"""The same of a posture, in standard deviations of the prior's components."""
 
 
 class Belief(eqx.Module):
@@ -98,8 +106,44 @@ class PersonFilter:
         `None` with fewer keypoints than a first frame must have."""
         uv, sigma = self._measured(points)
         self.recent.append((time, uv, sigma))
-        while time - self.recent[0][0] > (REACH + 1) * SPACING:
+        while time - self.recent[0][0] > _REMEMBERED:
             self.recent.popleft()
+        return self._step(time, uv, sigma, shape)
+
+    def anchor(self, time: float, body: Body, shape: Float[np.ndarray, " 10"]) -> None:
+        """Begins anew at an earlier time, with a body that all measurements around it
+        told, and goes through the keypoints since then once more, at the lifting
+        network's rate."""
+        if self.belief is None or time < self.recent[0][0] - SPACING:
+            return
+        dtype = self.scene.intrinsics.dtype
+        prior = self.scene.prior
+        angles = body.body_pose[:21].reshape(63) - np.asarray(prior.mean)
+        latent = np.linalg.lstsq(np.asarray(prior.basis), angles, rcond=None)[0]
+        fit = Fit(
+            jnp.asarray(body.T_CH[:3, :3], dtype),
+            jnp.asarray(body.T_CH[:3, 3], dtype),
+            jnp.asarray(latent, dtype),
+        )
+        sigma = np.concatenate([_ANCHORED, np.full(len(latent), _ANCHORED_POSTURE)])
+        self.belief = dataclasses.replace(
+            self.belief, fit=fit, covariance=jnp.asarray(np.diag(sigma**2), dtype)
+        )
+        newest = self.recent[-1][0]
+        self.time = time
+        for at, uv, known in list(self.recent):
+            if at - self.time >= SPACING - 1e-6 or (
+                at == newest and at - self.time > _LEAST_GAP
+            ):
+                self._step(at, uv, known, shape)
+
+    def _step(
+        self,
+        time: float,
+        uv: Float[np.ndarray, "25 2"],
+        sigma: Float[np.ndarray, " 25"],
+        shape: Float[np.ndarray, " 10"],
+    ) -> Body | None:
         enough = np.isfinite(sigma).sum() >= MIN_KEYPOINTS
         if self.belief is None and not enough:
             return None
@@ -119,7 +163,7 @@ class PersonFilter:
             *(number(x) for x in (uv, pixels, full)),
         )
         first = self.belief is None
-        gap = self.fps**-1 if first else time - self.time
+        gap = 1 / self.fps if first else max(time - self.time, _LEAST_GAP)
         belief = self.belief or _blank(self.scene)
         self.belief = _updated(
             self.scene,
@@ -132,6 +176,10 @@ class PersonFilter:
             *given,
         )
         self.time = time
+        if not np.isfinite(np.asarray(self.belief.covariance)).all():
+            # Keypoints of no body; the next frame begins anew.
+            self.belief = None
+            return None
         return self.body()
 
     def body(self) -> Body:
@@ -156,7 +204,7 @@ class PersonFilter:
         self, time: float
     ) -> tuple[Float[np.ndarray, "w 25 2"], Float[np.ndarray, "w 25"]]:
         """Keypoints of the last second, `SPACING` apart, the newest last."""
-        times = np.array([r[0] for r in self.recent])
+        times = np.array([r[0] for r in self.recent if r[0] <= time])
         wanted = time - SPACING * np.arange(_HISTORY - 1, -1, -1)
         near = np.abs(times[None] - wanted[:, None]).argmin(axis=1)
         uv, sigma = (np.stack([self.recent[k][i] for k in near]) for i in (1, 2))

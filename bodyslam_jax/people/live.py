@@ -33,6 +33,8 @@ _LASTS = 0.2
 """s: shorter tracks are nobody."""
 _SAME_CLOTHES = 0.6 * OTHER_CLOTHES
 """Difference of colours below which somebody who returns is the same person."""
+_SOON = 5.0
+"""s after which somebody whose clothes are not seen is somebody else."""
 _KEPT = 45
 """Detections of a track that are remembered."""
 _COCO = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
@@ -165,14 +167,24 @@ class LivePeople:
         if len(track.frames) < max(2, round(_LASTS * self.fps)):
             return None
         look, person = track.look, len(self.persons)
-        alive = {t.number for t in self.tracker.alive(self.frame)}
         away = [
             (difference(known.look, look), other)
             for other, known in self.persons.items()
-            if known.track not in alive
+            if self._last(other) < track.frames[0]
         ]
+        # Without an image, who comes soon after only one person went is that one.
+        lately = [
+            (0.0, other)
+            for d, other in away
+            if np.isnan(d) and self.frame - self._last(other) <= _SOON * self.fps
+        ]
+        away = lately if len(lately) == 1 else away
         away = [(d, other) for d, other in away if d < _SAME_CLOTHES]
         if away:
             person = min(away)[1]
         self.persons[person] = _Person(number, look)
         return person
+
+    def _last(self, person: int) -> int:
+        """The frame in which a person was seen last."""
+        return self.tracker.tracklets[self.persons[person].track].frames[-1]
