@@ -47,8 +47,8 @@ COMMANDS = {
     "demo": _command(demo, "out from_pixels preset settings device overlay open"),
     "live": _command(
         live,
-        """source out camera page port open preset settings detect device height focal
-        fov gravity fps""",
+        """source out camera page port open preset settings detect device focal fov
+        gravity fps""",
     ),
     "batch": _command(
         batch,

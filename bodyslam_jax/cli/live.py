@@ -53,7 +53,8 @@ def live(
         preset: `paper` selects the paper's weights and motion network.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.
-        config: Settings of every stage.
+        config: Settings of every stage; what is known of a whole video (--start,
+            --end, --height, --camera-path, --static-camera, --person) is refused.
     """
     from bodyslam_jax import export
     from bodyslam_jax.cli.folders import free_folder
@@ -62,6 +63,7 @@ def live(
     from bodyslam_jax.online import Online
     from bodyslam_jax.online.folder import write_folder
 
+    _check(config)
     capture = Capture(source, config.fps)
     try:
         intrinsics = None if camera is None else read_camera(camera, capture.size)[0]
@@ -92,6 +94,19 @@ def live(
         result = online.finish()
         write_folder(online, result, out)
     return finish(result, out)
+
+
+def _check(config: Config) -> None:
+    """Refuses what is known of a whole video only.
+
+    **Raises:** `InputError` that names the option.
+    """
+    from bodyslam_jax.config.errors import InputError
+
+    for name in ("start", "end", "camera_path", "static_camera", "person", "height"):
+        if getattr(config, name) not in (None, False, ()):
+            option = "--" + name.replace("_", "-")
+            raise InputError(f"{option}: `live` does not use it; use `bodyslam run`.")
 
 
 def _page(wanted: bool, port: int, open: bool) -> Any:

@@ -106,7 +106,8 @@ class PointFollower:
         # Described are ORB's own corners, turned as it sees them, next to known points.
         ids, uv = self.ids[known], self.uv[known]
         corners = np.array([mark.pt for mark in marks])
-        away, near = KDTree(uv).query(corners, distance_upper_bound=_NEAR)
+        found = KDTree(uv).query(corners, distance_upper_bound=_NEAR)
+        away, near = (np.asarray(x) for x in found)
         rows = np.flatnonzero(np.isfinite(away))
         if len(rows) < _MATCHES:
             return
