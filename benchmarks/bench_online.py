@@ -141,12 +141,9 @@ def memory(given: Any) -> Iterator[dict]:
     begun = time.process_time()
     last: Estimate | None = None
     for k in range(given.frames):
-        row, turn = loop[k % len(loop)], k // (len(loop) // 2)
-        ids, uv = row.points
-        # A point that is seen again in the other direction is another track.
-        last = online.update(
-            None, k / sequence.fps, row.keypoints, points=(ids + 100_000 * turn, uv)
-        )
+        row = loop[k % len(loop)]
+        given = row.keypoints
+        last = online.update(None, k / sequence.fps, given, points=row.points)
         if k % 300 == 299:
             now = time.process_time()
             yield {

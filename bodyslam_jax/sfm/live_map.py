@@ -38,6 +38,11 @@ _KEYFRAMES = 12
 """Keyframes from which points are triangulated."""
 _ANGLE = np.radians(1.0)
 """Parallax of a new point."""
+_ENOUGH, _LEAST_ANGLE = 0.5, 0.2
+"""Share of known points from which new ones need all of that parallax, and the least
+share of it."""
+_OFF = 0.25
+"""Share of views that a new point may not fit: tracks have outliers."""
 _ROTATED = 2.0
 """px: median distance from a pure turn up to which two views have no parallax."""
 
@@ -235,10 +240,13 @@ class LiveMap:
         front = p_C[:, 2] > 1e-6
         depth = np.where(front, p_C[:, 2], 1.0)
         away = np.linalg.norm(p_C[:, :2] / depth[:, None] - seen, axis=1)
-        worst = np.zeros(len(track))
-        np.maximum.at(worst, row, np.where(front, away, np.inf))
-        good = (count >= 2) & (worst < self.threshold)
-        good &= widest_angle(centre, row, places) > _ANGLE
+        fits = front & (away < self.threshold)
+        off = np.bincount(row, ~fits, len(track)) / count
+        # Where the camera mostly turns, points of little parallax are better than none.
+        share = (len(ids) - len(new)) / (_ENOUGH * len(ids))
+        angle = _ANGLE * np.clip(share, _LEAST_ANGLE, 1.0)
+        good = (count >= 2) & (off < _OFF)
+        good &= widest_angle(centre, row, places) > angle
         for i, x in zip(track[good].tolist(), places[good]):
             self.points[i] = x
 
