@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.io import read_sequence as read_sequence
     from bodyslam_jax.motion import MotionModel as MotionModel
     from bodyslam_jax.motion import load_motion_model as load_motion_model
+    from bodyslam_jax.online import Online as Online
     from bodyslam_jax.pipeline import run as run
     from bodyslam_jax.pipeline.case import simulate_case as simulate_case
     from bodyslam_jax.pipeline.problem_builder import build as build
@@ -46,6 +47,7 @@ _HOME = {
     "Config": "config",
     "FrameFactor": "graph",
     "MotionModel": "motion",
+    "Online": "online",
     "Problem": "graph",
     "Result": "types",
     "Sequence": "types",

@@ -106,7 +106,10 @@ def test_every_option_is_one_that_is_parsed(name):
             "run x --people-fit.no-walking-knees",
             "--people-fit.no-walking-knees no longer exists: knees are as measured.",
         ),
-        ("evaluate a b --start 3", "it is an option of bodyslam run, demo, batch, sw"),
+        (
+            "evaluate a b --start 3",
+            "it is an option of bodyslam run, demo, live, batch, sw",
+        ),
         ("run x --nosuch", "`bodyslam run --help-all` lists all."),
     ],
 )

@@ -15,6 +15,7 @@ from bodyslam_jax.cli.datasets import emdb, rich, threedpw, tum_amass
 from bodyslam_jax.cli.environment import doctor
 from bodyslam_jax.cli.estimate import demo, evaluate, run
 from bodyslam_jax.cli.export import export
+from bodyslam_jax.cli.live import live
 from bodyslam_jax.cli.make import experiment, simulate, train_motion
 from bodyslam_jax.cli.view import view
 
@@ -44,6 +45,11 @@ COMMANDS = {
         end person open""",
     ),
     "demo": _command(demo, "out from_pixels preset settings device overlay open"),
+    "live": _command(
+        live,
+        """source out camera page port open preset settings detect device focal fov
+        gravity fps""",
+    ),
     "batch": _command(
         batch,
         """inputs out shard engine workers retries ray_address slurm_minutes slurm

@@ -3,6 +3,7 @@
 import itertools
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from bodyslam_jax.types import Sequence
@@ -16,10 +17,18 @@ def default_folder(sequence: Sequence) -> Path:
 
     An unfinished run of the same input is continued.
     """
-    name = sequence.name or "run"
+    is_ours = lambda folder: _is_unfinished(folder, sequence)
+    return free_folder(sequence.name or "run", is_ours)
+
+
+def free_folder(
+    name: str, is_ours: Callable[[Path], bool] = lambda folder: False
+) -> Path:
+    """`runs/NAME`, or the first of `runs/NAME-2` and so on that is not there, or
+    `is_ours`."""
     for number in itertools.count(1):
         folder = _ROOT / (name if number == 1 else f"{name}-{number}")
-        if not folder.exists() or _is_unfinished(folder, sequence):
+        if not folder.exists() or is_ours(folder):
             return folder
     raise AssertionError("unreachable")
 

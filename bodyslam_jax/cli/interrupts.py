@@ -63,6 +63,33 @@ def deferred() -> Iterator[None]:
         handler(signal.SIGINT, None)
 
 
+@contextlib.contextmanager
+def as_event() -> Iterator[threading.Event]:
+    """The first Ctrl-C in the block sets an event and nothing else; the next one is
+    handled as outside of it."""
+    event = threading.Event()
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler):  # ignored, as by `nohup`
+        yield event
+        return
+    wakeup = signal.set_wakeup_fd(-1)
+
+    def restore() -> None:
+        signal.signal(signal.SIGINT, handler)
+        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
+
+    def first(*_: object) -> None:
+        event.set()
+        restore()
+
+    signal.signal(signal.SIGINT, first)
+    try:
+        yield event
+    finally:
+        if not event.is_set():
+            restore()
+
+
 def leave() -> NoReturn:
     """Ends the process without Python's own shutdown, which waits for threads that
     compile."""

@@ -10,6 +10,7 @@ length's.
 
 import logging
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.ndimage import median_filter
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.lengths import padded_length
+from bodyslam_jax.geometry.lengths import lengthened, padded_length
 from bodyslam_jax.people.costs import Fit, Lifted, Scene
 from bodyslam_jax.people.frame_fit import fit_frames
 from bodyslam_jax.people.keypoint_errors import (
@@ -96,11 +97,22 @@ def fit_bodies(
         roots.present[h] = present
         roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
         roots.T_CH[h, fitted, :3, 3] = chain.fit.position
-        roots.body_pose[h, fitted] = scene.prior.decode(chain.fit.latent)
+        roots.body_pose[h, fitted] = _decoded(scene.prior, np.asarray(chain.fit.latent))
         roots.T_CH[h, ~present] = np.eye(4)
         roots.body_pose[h, ~present] = 0.0
         roots.shape[h] = chain.shape[:10]
     return bodies_from_roots(roots, body)
+
+
+def _decoded(
+    prior: PosturePrior, latent: Float[np.ndarray, "t k"]
+) -> Float[np.ndarray, "t 23 3"]:
+    """`PosturePrior.decode`, compiled for few lengths."""
+    longer = lengthened(latent, padded_length(len(latent)))
+    return np.asarray(_decode(prior, longer))[: len(latent)]
+
+
+_decode = eqx.filter_jit(lambda prior, latent: prior.decode(latent))
 
 
 def make_scene(
@@ -155,11 +167,14 @@ def _fit_person(
     dtype = scene.intrinsics.dtype
     length = padded_length(len(uv)) - len(uv)
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
-    last = lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], length, axis=0)])
+    # By NumPy: JAX would compile small programs for each length.
+    last = lambda a: jnp.asarray(
+        np.concatenate([a, np.repeat(np.asarray(a)[-1:], length, axis=0)])
+    )
     # Errors of the lifted postures are correlated in time too; padding has none.
     alike = max(1.0, settings.lift_correlation * fps) ** 0.5
     wider = np.where(np.arange(len(uv) + length) < len(uv), alike, np.inf)
-    lifted = jax.tree.map(lambda a: last(jnp.asarray(a, dtype)), lifted)
+    lifted = jax.tree.map(lambda a: last(np.asarray(a, dtype)), lifted)
     evidence = np.sum(np.isfinite(sigma).any(1)) / frames_alike
     problem = ChainProblem(
         scene,
@@ -172,7 +187,8 @@ def _fit_person(
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
     chain, value = solve_chain(problem, chain, _MOST_STEPS)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
-    return fitted, Chain(jax.tree.map(lambda a: a[: len(uv)], chain.fit), chain.shape)
+    fit = jax.tree.map(lambda a: np.asarray(a)[: len(uv)], chain.fit)
+    return fitted, Chain(fit, chain.shape)
 
 
 def guess_postures(
@@ -191,7 +207,7 @@ def guess_postures(
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
     lifted, usable = lift(load_lifter(), scene.intrinsics, *numbers)
     lifted = lifted.widened(jnp.where(usable & trusted, 1.0, jnp.inf).astype(dtype))
-    return jax.tree.map(lambda a: np.asarray(a[: len(uv)]), lifted)
+    return jax.tree.map(lambda a: np.asarray(a)[: len(uv)], lifted)
 
 
 def _start(

@@ -47,7 +47,7 @@ def _descend(
     lifted: Lifted,
 ) -> Fit:
     """Levenberg--Marquardt from each of `m` guesses, all the same number of steps."""
-    fits = jax.vmap(_first, in_axes=(None, 0, 0, 0))(scene, uv, sigma, lifted)
+    fits = jax.vmap(first_fit, in_axes=(None, 0, 0, 0))(scene, uv, sigma, lifted)
     shape = jnp.zeros(NUM_SHAPE, uv.dtype)
     size = 6 + fits.latent.shape[-1]
     prior = jnp.concatenate([jnp.zeros(6, uv.dtype), jnp.ones(size - 6, uv.dtype)])
@@ -85,7 +85,7 @@ def _descend(
     return jax.lax.fori_loop(0, steps + 1, step, carry)[0]
 
 
-def _first(
+def first_fit(
     scene: Scene,
     uv: Float[Array, "25 2"],
     sigma: Float[Array, " 25"],

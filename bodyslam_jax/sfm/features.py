@@ -103,7 +103,7 @@ def epipolar_inliers(
 
 
 def match(
-    a: UInt8[np.ndarray, "n 64"], b: UInt8[np.ndarray, "m 64"], *, ratio: float = 0.8
+    a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"], *, ratio: float = 0.8
 ) -> np.ndarray:
     """Mutual nearest descriptors (k, 2) whose second-best is clearly worse."""
     if len(a) < 2 or len(b) < 2:

@@ -215,16 +215,25 @@ def _rest(
     )
     free = _cut(problem.free, start, stop, ~observed)
     cameras = _reach(problem)
+    until = lambda x, axis, count: jnp.asarray(
+        np.asarray(x) * _from(count, np.shape(x), axis)
+    )
     free = dataclasses.replace(
         free,
-        cameras=free.cameras.at[: CHUNK - cameras].set(0.0),
-        roots=free.roots.at[:, : CHUNK - roots].set(0.0),
-        poses=free.poses.at[:, : CHUNK - 1].set(0.0),
+        cameras=until(free.cameras, 0, CHUNK - cameras),
+        roots=until(free.roots, 1, CHUNK - roots),
+        poses=until(free.poses, 1, CHUNK - 1),
     )
     motion = None if problem.motion is None else problem.motion.from_frame(start)
     left = dataclasses.replace(problem, factors=factors, free=free, motion=motion)
     there = _cut(state, start, stop, ~observed)
     return Remainder(left, there, np.flatnonzero(~observed))
+
+
+def _from(start: int, shape: tuple[int, ...], axis: int) -> np.ndarray:
+    """1 from an index of an axis on, else 0; broadcasts to an array of this shape."""
+    along = [n if a == axis else 1 for a, n in enumerate(shape)]
+    return (np.arange(shape[axis]) >= start).astype(float).reshape(along)
 
 
 def _is_once(factor: Factor) -> bool:
@@ -235,11 +244,16 @@ def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> An
     """A state, or a mask, of some frames and landmarks."""
     return dataclasses.replace(
         x,
-        cameras=x.cameras[start:stop],
-        roots=x.roots[:, start:stop],
-        poses=x.poses[:, start:stop],
-        landmarks=x.landmarks[np.flatnonzero(landmarks)],
+        cameras=_rows(x.cameras, slice(start, stop)),
+        roots=_rows(x.roots, (slice(None), slice(start, stop))),
+        poses=_rows(x.poses, (slice(None), slice(start, stop))),
+        landmarks=_rows(x.landmarks, np.flatnonzero(landmarks)),
     )
+
+
+def _rows(x: Array, at: Any) -> Array:
+    """`x[at]` by NumPy: JAX would compile a program for each shape."""
+    return jnp.asarray(np.asarray(x)[at])
 
 
 def _part(
@@ -258,18 +272,17 @@ def _part(
         return Reprojection(
             frame=jnp.asarray(frame[rows] - start, factor.frame.dtype),
             landmark=jnp.asarray(number[landmark[rows]], factor.landmark.dtype),
-            pixel=factor.pixel[rows],
-            sigma=factor.sigma[rows],
+            pixel=_rows(factor.pixel, rows),
+            sigma=_rows(factor.sigma, rows),
             loss=factor.loss,
         )
     if isinstance(factor, LandmarkPrior):
         kept = np.flatnonzero(landmarks)
-        return LandmarkPrior(
-            factor.position[kept], factor.whitening[kept], loss=factor.loss
-        )
+        of_kept = (_rows(x, kept) for x in (factor.position, factor.whitening))
+        return LandmarkPrior(*of_kept, loss=factor.loss)
     if not isinstance(factor, FrameFactor) or factor.once:
         return factor
-    return _in_frames(_frames(factor, start, stop), present)
+    return in_frames(_frames(factor, start, stop), present)
 
 
 def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
@@ -277,9 +290,10 @@ def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
     axis = 1 if factor.of_people else 0
     if isinstance(factor, Masked):
         inner = _frames(factor.factor, start, stop)
-        return Masked(factor=inner, present=factor.present[..., start:stop])
+        present = _rows(factor.present, (..., slice(start, stop)))
+        return Masked(factor=inner, present=present)
     lead = None
-    cut = lambda x: x[(slice(None),) * axis + (slice(start, stop),)]
+    cut = lambda x: _rows(x, (slice(None),) * axis + (slice(start, stop),))
     for name in factor.time_fields:
         value = getattr(factor, name)
         lead = value.shape[: axis + 1]
@@ -291,23 +305,24 @@ def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
     return factor
 
 
-def _in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFactor:
+def in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFactor:
     """The factor with the residuals of these frames alone."""
-    kept = jnp.asarray(present)
+    kept = np.asarray(present)
     if isinstance(factor, Masked):
-        return Masked(factor=factor.factor, present=factor.present & kept)
+        both = np.asarray(factor.present) & kept
+        return Masked(factor=factor.factor, present=jnp.asarray(both))
     if not factor.padding or factor.num_lags > 1:
         # A row may weigh the residual of the row before it, whose measurement must
         # therefore stay.
         values = getattr(factor, factor.time_fields[0])
         lead = values.shape[: 2 if factor.of_people else 1]
-        return Masked(factor=factor, present=jnp.broadcast_to(kept, lead))
+        return Masked(factor=factor, present=jnp.asarray(np.broadcast_to(kept, lead)))
     axis = 1 if factor.of_people else 0
     for name, fill in factor.padding.items():
-        array = getattr(factor, name)
+        array = np.asarray(getattr(factor, name))
         shape = [len(kept) if a == axis else 1 for a in range(array.ndim)]
-        empty = jnp.asarray(fill, array.dtype)
-        filled = jnp.where(kept.reshape(shape), array, empty)
+        empty = np.asarray(fill, array.dtype)
+        filled = jnp.asarray(np.where(kept.reshape(shape), array, empty))
         factor = eqx.tree_at(lambda f, n=name: getattr(f, n), factor, filled)
     return factor
 
@@ -455,7 +470,7 @@ def _prior(
     slope = place.T @ np.asarray(found.slope)[kept]
     gone = index.cameras[: 6 * (CHUNK - _reach(problem))]
     matrix, slope = _without(matrix, slope, gone, np.finfo(dtype).eps)
-    root, offset = _square_root(matrix, slope, np.finfo(dtype).eps)
+    root, offset = square_root(matrix, slope, np.finfo(dtype).eps)
     diagonal = np.diag(matrix)[index.cameras].reshape(-1, 6)
     anchor = (diagonal[:, 3:] > 0).any(axis=1)
     return dataclasses.replace(
@@ -480,7 +495,9 @@ def _without(matrix, slope, gone, eps):
     return (matrix + matrix.T) / 2, slope
 
 
-def _square_root(matrix, slope, eps):
+def square_root(
+    matrix: Float[np.ndarray, "n n"], slope: Float[np.ndarray, " n"], eps: float
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
     """`W` with `W^T W` the matrix, and `b` with `W^T b` the slope, where the matrix is
     not 0 to rounding."""
     diagonal = np.maximum(np.diag(matrix), 0.0)

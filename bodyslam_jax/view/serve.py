@@ -25,6 +25,8 @@ _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".webm": "video/webm",
     ".mp4": "video/mp4",
+    ".jpg": "image/jpeg",
+    ".json": "application/json",
 }
 _FILES = ("report.html", "scene.html", "overlay.webm", "overlay.mp4")
 """What is served of a run folder."""
@@ -86,7 +88,14 @@ def page_server(page: str, folder: Path, port: int = 0) -> PageServer:
 
     **Raises:** `InputError` if the port is taken.
     """
-    handler = functools.partial(_Handler, page.encode(), folder)
+    return local_server(functools.partial(_Handler, page.encode(), folder), port)
+
+
+def local_server(handler: Any, port: int) -> PageServer:
+    """A server of what `handler` answers, on this machine only.
+
+    **Raises:** as `page_server`.
+    """
     try:
         return PageServer((_LOOPBACK, port), handler)
     except (OSError, OverflowError) as error:
@@ -100,13 +109,11 @@ def address_of(server: ThreadingHTTPServer) -> str:
     return f"http://{_LOOPBACK}:{server.server_address[1]}/"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class PageHandler(BaseHTTPRequestHandler):
+    """Answers requests for this address by its own names, and no others."""
+
     protocol_version = "HTTP/1.1"
     timeout = _PATIENCE
-
-    def __init__(self, page: bytes, folder: Path, *args: Any):
-        self.page, self.folder = page, folder
-        super().__init__(*args)
 
     def do_GET(self) -> None:
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
@@ -114,19 +121,19 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_addressed():
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
-        name = self.path.partition("?")[0].removeprefix("/")
-        if name == "":
-            self._send(len(self.page), ".html", self._part_of_page)
-            return
-        with _opened(self.folder, name) as file:
-            if file is None:
-                self.send_error(HTTPStatus.NOT_FOUND)
-                return
-            size = os.fstat(file.fileno()).st_size
-            copy = functools.partial(self._part_of_file, file)
-            self._send(size, Path(name).suffix, copy)
+        self.answer(self.path.partition("?")[0].removeprefix("/"))
 
-    do_HEAD = do_GET
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def answer(self, name: str) -> None:
+        """Sends what has this name, or that there is no such thing."""
+        self.send_error(HTTPStatus.NOT_FOUND)
+
+    def send_bytes(self, content: bytes, suffix: str) -> None:
+        """Sends a part of, or all of, what is in memory."""
+        copy = lambda start, end: self.wfile.write(content[start:end])
+        self._send(len(content), suffix, copy)
 
     def _is_addressed(self) -> bool:
         """Whether the request is for this server under its own names: one that another
@@ -166,19 +173,6 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "GET":
             copy(start, end)
 
-    def _part_of_page(self, start: int, end: int) -> None:
-        self.wfile.write(self.page[start:end])
-
-    def _part_of_file(self, file: BinaryIO, start: int, end: int) -> None:
-        file.seek(start)
-        while start < end:
-            part = file.read(min(_CHUNK_BYTES, end - start))
-            if not part:  # the file has become shorter: its length was promised
-                self.close_connection = True
-                return
-            self.wfile.write(part)
-            start += len(part)
-
     def end_headers(self) -> None:
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -190,6 +184,36 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Requests are not worth a line."""
+
+
+class _Handler(PageHandler):
+    """Serves a page and the pictures of a run folder."""
+
+    def __init__(self, page: bytes, folder: Path, *args: Any):
+        self.page, self.folder = page, folder
+        super().__init__(*args)
+
+    def answer(self, name: str) -> None:
+        if name == "":
+            self.send_bytes(self.page, ".html")
+            return
+        with _opened(self.folder, name) as file:
+            if file is None:
+                self.send_error(HTTPStatus.NOT_FOUND)
+                return
+            size = os.fstat(file.fileno()).st_size
+            copy = functools.partial(self._part_of_file, file)
+            self._send(size, Path(name).suffix, copy)
+
+    def _part_of_file(self, file: BinaryIO, start: int, end: int) -> None:
+        file.seek(start)
+        while start < end:
+            part = file.read(min(_CHUNK_BYTES, end - start))
+            if not part:  # the file has become shorter: its length was promised
+                self.close_connection = True
+                return
+            self.wfile.write(part)
+            start += len(part)
 
 
 @contextlib.contextmanager

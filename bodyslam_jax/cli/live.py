@@ -1,0 +1,189 @@
+"""`bodyslam live`: the estimate while a video, a camera or a stream runs."""
+
+import logging
+import time
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from bodyslam_jax.cli import interrupts, unexpected
+from bodyslam_jax.cli.estimate import finish
+from bodyslam_jax.cli.types import Flat, Preset
+from bodyslam_jax.config import Config
+
+log = logging.getLogger(__name__)
+
+_SILENT, _GIVEN_UP = 5.0, 30.0
+"""s without an image after which that is told, and after which the source has ended."""
+_SHOWN_EVERY = 0.1
+"""Least s between two pictures on the page."""
+_TOLD_EVERY = 5.0
+"""s between two lines of progress."""
+
+
+def live(
+    source: tyro.conf.Positional[str],
+    /,
+    *,
+    out: Path | None = None,
+    camera: Path | None = None,
+    page: bool = True,
+    port: int = 0,
+    open: bool = False,
+    preset: Preset = "default",
+    settings: Path | None = None,
+    config: Flat = Config(),
+) -> int:
+    """Estimates camera, people and map in metres while a video runs, until Ctrl-C.
+
+    A page on this machine only shows picture and scene as they grow. At the end of the
+    source, or after Ctrl-C, the run folder is written; a second Ctrl-C gives up.
+
+    Args:
+        source: Video file, which runs at its own pace; number of a camera (0); or
+            address of a stream that OpenCV opens (rtsp://, http://).
+        out: Run folder to write. Without it runs/NAME, numbered if one is there.
+        camera: Calibration, as of `run`. Without it, or --focal or --fov, the focal
+            length is guessed and not refined.
+        page: Whether a page is served; without it, progress is told in lines.
+        port: Port of the page; 0 takes a free one.
+        open: Open the page in the default browser.
+        preset: `paper` selects the paper's weights and motion network.
+        settings: Settings file (config.yaml); it overrides the preset, and options
+            override both.
+        config: Settings of every stage; what is known of a whole video (--start,
+            --end, --height, --camera-path, --static-camera, --person) is refused.
+    """
+    from bodyslam_jax import export
+    from bodyslam_jax.cli.folders import free_folder
+    from bodyslam_jax.io.camera.calibration import read_camera
+    from bodyslam_jax.io.capture import Capture
+    from bodyslam_jax.online import Online
+    from bodyslam_jax.online.folder import write_folder
+
+    _check(config)
+    capture = Capture(source, config.fps)
+    try:
+        intrinsics = None if camera is None else read_camera(camera, capture.size)[0]
+        name = _name(source)
+        out = out or free_folder(name)
+        export.check_folder(out, {"name": name}, None)
+        online = Online(config, intrinsics=intrinsics, fps=capture.fps, name=name)
+        log.info("live: %s at %.3g frames a second -> %s", source, capture.fps, out)
+        log.info("compiling; minutes the first time, seconds later")
+        online.prepare(capture.size)
+        shown = _page(page, port, open)
+        try:
+            with interrupts.as_event() as stop:
+                indices = _follow(capture, online, shown, stop)
+        finally:
+            if shown is not None:
+                shown.close()
+    finally:
+        capture.close()
+    if capture.dropped:
+        online.warn(
+            f"{capture.dropped} of {capture.dropped + len(indices)} frames were "
+            "dropped: newer ones came before they were used"
+        )
+    if capture.path is not None:
+        online.video, online.picks = capture.path, indices
+    with unexpected.noted_in(out):
+        result = online.finish()
+        write_folder(online, result, out)
+    return finish(result, out)
+
+
+def _check(config: Config) -> None:
+    """Refuses what is known of a whole video only.
+
+    **Raises:** `InputError` that names the option.
+    """
+    from bodyslam_jax.config.errors import InputError
+
+    for name in ("start", "end", "camera_path", "static_camera", "person", "height"):
+        if getattr(config, name) not in (None, False, ()):
+            option = "--" + name.replace("_", "-")
+            raise InputError(f"{option}: `live` does not use it; use `bodyslam run`.")
+
+
+def _page(wanted: bool, port: int, open: bool) -> Any:
+    if not wanted:
+        return None
+    from bodyslam_jax.view.live_page import LivePage
+    from bodyslam_jax.view.serve import address_of
+
+    page = LivePage(port)
+    print(f"{address_of(page.server)} (Ctrl-C ends it)", flush=True)
+    if open:
+        webbrowser.open(address_of(page.server))
+    return page
+
+
+def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
+    """Takes images in until the source or the user ends it; the numbers of these."""
+    indices: list[int] = []
+    latencies: list[float] = []
+    told, drawn, begun = 0.0, 0.0, time.monotonic()
+    silent = False
+    capture.start()
+    while not stop.is_set():
+        found = capture.newest(timeout=0.5)
+        now = time.monotonic()
+        if found is None:
+            if capture.ended:
+                break
+            if capture.silent() > _SILENT and not silent:
+                silent = True
+                log.warning("%s: no image for %.0f s", capture.source, _SILENT)
+            if capture.silent() > _GIVEN_UP:
+                online.warn(f"the source gave no image for {_GIVEN_UP:.0f} s")
+                break
+            continue
+        silent = False
+        estimate = online.update(found.image, found.timestamp)
+        indices.append(found.index)
+        latencies = [*latencies[-99:], estimate.latency]
+        late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
+        rate = len(indices) / max(now - begun, 1e-9)
+        figures = _figures(estimate, rate, late, capture.dropped)
+        if page is not None and now - drawn >= _SHOWN_EVERY:
+            drawn = now
+            page.show(
+                found.image,
+                online.points,
+                online.drawn(estimate),
+                estimate.T_WC,
+                {"figures": figures, "notes": estimate.notes},
+            )
+        if now - told >= _TOLD_EVERY:
+            told = now
+            log.info(", ".join(f"{k} {v}" for k, v in figures.items()))
+    return indices
+
+
+def _figures(estimate: Any, rate: float, late: float, dropped: int) -> dict[str, str]:
+    relative = estimate.scale_sigma / estimate.scale
+    known = relative == relative
+    return {
+        "status": estimate.status,
+        "time": f"{estimate.timestamp:.1f} s",
+        "frames a second": f"{rate:.1f}",
+        "latency (95 %)": f"{1000 * late:.0f} ms",
+        "dropped": str(dropped),
+        "people": str(len(estimate.people)),
+        "sizes known to": f"{100 * relative:.0f} %" if known else "unknown",
+        "scale": f"{estimate.scale:.3f} ± {estimate.scale_sigma:.3f} m per unit"
+        if known
+        else "unknown",
+    }
+
+
+def _name(source: str) -> str:
+    """What the run is called."""
+    path = Path(source)
+    if path.is_file():
+        return path.stem
+    return f"camera-{source}" if source.isdecimal() else "stream"

@@ -1,0 +1,176 @@
+"""What is known after a frame, in the metric world, and the world itself."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import BodyModel, local_joints
+from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.levelling import upright
+from bodyslam_jax.online.window import Solved
+from bodyslam_jax.pipeline.to_metric import sole_height
+
+_FOLLOWS = 0.3
+"""Share by which the floor follows a window's."""
+_STANDS = 0.5
+"""Probability of contact from which a foot tells the floor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonEstimate:
+    """One person in one frame, in the metric world."""
+
+    person: int
+    """The same number as long as the person is recognised, and in the result's order
+    of numbers."""
+    T_WH: Float[np.ndarray, "4 4"]
+    """Root; the translation is the pelvis joint, m."""
+    poses: Float[np.ndarray, " 72"]
+    """SMPL's joint rotations, axis-angle, rad; the first is the root's in W."""
+    betas: Float[np.ndarray, " 10"]
+    joints: Float[np.ndarray, "24 3"]
+    """m"""
+    contacts: Float[np.ndarray, " 4"] | None
+    """Probability that left toe, left heel, right toe, right heel stand, in the last
+    frame that the window has solved; `None` if none has the person."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What is known as soon as a frame is there. W has y up, z ahead of the first
+    camera, and the floor at 0 once feet have stood on it."""
+
+    frame: int
+    """Number of frames before this one that were used."""
+    timestamp: float
+    """s"""
+    T_WC: Float[np.ndarray, "4 4"]
+    """Camera to world; in metres once the scale is known, before in units of the map.
+    The last known one where the camera is lost."""
+    located: bool
+    people: tuple[PersonEstimate, ...]
+    scale: float
+    """m per map unit; NaN as long as nobody told it."""
+    scale_sigma: float
+    """Standard deviation of `scale`; NaN with it."""
+    status: str
+    """`starting`: no map yet; `tracking`; `lost`: the camera fits the map nowhere;
+    `late`: the frame was not used, as its time is not after that of the last one."""
+    notes: tuple[str, ...]
+    """What to know about it, a line each."""
+    latency: float
+    """From the call to its end, s."""
+
+
+@dataclasses.dataclass
+class World:
+    """From a map's world to the metric one. It changes when a window has been solved,
+    so that estimates jump by what was learnt."""
+
+    turn: Float[np.ndarray, "3 3"] = dataclasses.field(
+        default_factory=lambda: np.diag([-1.0, -1.0, 1.0])
+    )
+    """Map to world."""
+    scale: float = 1.0
+    origin: Float[np.ndarray, " 3"] = dataclasses.field(
+        default_factory=lambda: np.zeros(3)
+    )
+    """The world's place of the map's origin, m."""
+    trunks: Float[np.ndarray, " 3"] = dataclasses.field(
+        default_factory=lambda: np.zeros(3)
+    )
+    """Sum of the trunks of frames that have left the window, in the map."""
+    height: float | None = None
+    """Of the first camera over the floor, m."""
+
+    def camera(self, T_WC: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """A camera of the map in the metric world."""
+        found = np.eye(4)
+        found[:3, :3] = self.turn @ T_WC[:3, :3]
+        found[:3, 3] = self.scale * self.turn @ T_WC[:3, 3] + self.origin
+        return found
+
+    def learn(self, solved: Solved, body: BodyModel) -> None:
+        """Takes scale, up and floor from a window."""
+        known = np.isfinite(solved.scale_sigma)
+        self.scale = solved.scale if known else 1.0
+        ups = solved.roots[..., :3, 1]
+        trunks = np.einsum("tij,htj->hti", solved.T_WC[:, :3, :3], ups)
+        there = solved.present & solved.located
+        left = np.zeros(len(solved.times), bool)
+        left[solved.left] = True
+        total = self.trunks + trunks[there].sum(axis=0)
+        self.trunks = self.trunks + trunks[there & left].sum(axis=0)
+        if np.linalg.norm(total) > 1e-9:
+            first = np.eye(4)[None]
+            self.turn = upright(first, total / np.linalg.norm(total))[:3, :3]
+        if known:
+            self._find_floor(solved, body, there)
+
+    def _find_floor(self, solved: Solved, body: BodyModel, there: np.ndarray) -> None:
+        stands = solved.contacts.reshape(*there.shape, 2, 2).max(axis=-1)
+        stands = (stands > _STANDS) & there[..., None]
+        if not stands.any():
+            return
+        T_WC = np.stack([self.camera(T) for T in solved.T_WC])
+        T_WC[:, :3, 3] -= self.origin
+        heights = []
+        for h in range(len(there)):
+            rows = np.flatnonzero(stands[h].any(axis=-1))
+            if not len(rows):
+                continue
+            p_H = joints_of(body, solved.poses[h], solved.shapes[h])[rows][
+                :, list(FEET)
+            ]
+            T_WH = T_WC[rows] @ solved.roots[h, rows]
+            up = np.einsum("ti,tfi->tf", T_WH[:, 1, :3], p_H) + T_WH[:, None, 1, 3]
+            sole = sole_height(body, solved.shapes[h])
+            heights.append((up - sole)[stands[h, rows]])
+        floor = -float(np.median(np.concatenate(heights)))
+        share = _FOLLOWS if self.height is not None else 1.0
+        before = self.height if self.height is not None else floor
+        self.height = before + share * (floor - before)
+        self.origin = np.array([0.0, self.height, 0.0])
+
+
+@eqx.filter_jit
+def _joints(body: BodyModel, poses: object, shapes: object) -> object:
+    return local_joints(body, poses, shapes)
+
+
+def joints_of(
+    body: BodyModel, poses: Float[np.ndarray, "t 23 3"], shape: Float[np.ndarray, " 10"]
+) -> Float[np.ndarray, "t 24 3"]:
+    """Joints about the pelvis in the root frame, m; compiled for two lengths."""
+    frames = len(poses)
+    size = 1 if frames == 1 else _LENGTH
+    longer = np.zeros((size, 23, 3))
+    longer[:frames] = poses
+    shapes = np.broadcast_to(shape, (size, 10))
+    dtype = body.joint_template.dtype
+    given = jnp.asarray(longer, dtype), jnp.asarray(shapes, dtype)
+    return np.asarray(_joints(body, *given), float)[:frames]
+
+
+_LENGTH = 60
+
+
+def placed(
+    person: int,
+    T_WC: Float[np.ndarray, "4 4"],
+    T_CH: Float[np.ndarray, "4 4"],
+    body_pose: Float[np.ndarray, "23 3"],
+    shape: Float[np.ndarray, " 10"],
+    body: BodyModel,
+    contacts: Float[np.ndarray, " 4"] | None,
+) -> PersonEstimate:
+    """A person of the camera frame in the world of that camera."""
+    T_WH = T_WC @ T_CH
+    local = joints_of(body, body_pose[None], shape)[0]
+    poses = np.concatenate([so3.log(T_WH[:3, :3]), body_pose.reshape(69)])
+    joints = local @ T_WH[:3, :3].T + T_WH[:3, 3]
+    return PersonEstimate(person, T_WH, poses, shape, joints, contacts)

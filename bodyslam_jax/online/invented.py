@@ -1,0 +1,42 @@
+"""An invented scene, on which programs are compiled before there is a video."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.io.camera.calibration import project_points
+from bodyslam_jax.online.window import FRAMES, Measured
+from bodyslam_jax.types import Intrinsics
+
+_POINTS = 120
+_SPEED = 0.03
+"""Map units a frame."""
+
+
+def invented(
+    intrinsics: Intrinsics, body: BodyModel, step: float
+) -> tuple[list[Measured], Float[np.ndarray, "25 3"]]:
+    """Frames of a camera that passes points and a person who stands, as many as let a
+    window move on once, and the person's keypoints in one of them."""
+    rng = np.random.default_rng(0)
+    middle = (intrinsics.width / 2, intrinsics.height / 2)
+    uv = rng.uniform(0.1, 1.9, (_POINTS, 2)) * middle
+    depth = rng.uniform(2.0, 6.0, _POINTS)
+    rays = (uv - intrinsics.params[2:4]) / intrinsics.params[:2]
+    places = np.column_stack([rays, np.ones(_POINTS)]) * depth[:, None]
+    dtype = body.joint_template.dtype
+    zero = jnp.zeros((23, 3), dtype), jnp.zeros(10, dtype)
+    standing = np.asarray(local_keypoints(body, *zero, "body25"), float)
+    standing = standing * [1.0, -1.0, -1.0] + [0.0, 0.0, 5.0]
+    frames, points = [], np.ones((25, 3))
+    for k in range(FRAMES):
+        T_WC = np.eye(4)
+        T_WC[0, 3] = _SPEED * k
+        seen = project_points(intrinsics, places - T_WC[:3, 3])
+        points[:, :2] = project_points(intrinsics, standing - T_WC[:3, 3])
+        ids = np.arange(_POINTS) + 1000 * (k // 20)
+        measured = seen + 0.3 * rng.standard_normal(seen.shape)
+        one = k * step, T_WC, True, ids, measured, {0: points.copy()}
+        frames.append(Measured(*one))
+    return frames, points

@@ -1,0 +1,625 @@
+"""`Online`: an estimate after every frame, and the usual result at the end.
+
+The thread that calls `update` follows points, locates the camera and filters people; a
+second one solves windows. The first never waits for the second: it hands over frames of
+the window ten at a time, and takes in what the last window has found as soon as it is
+there (`docs/live.md`).
+"""
+
+import dataclasses
+import logging
+import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from bodyslam_jax import solver
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.io.camera.calibration import guess_camera, project_points, with_focal
+from bodyslam_jax.online.estimate import (
+    Estimate,
+    PersonEstimate,
+    World,
+    joints_of,
+    placed,
+)
+from bodyslam_jax.online.invented import invented
+from bodyslam_jax.online.record import Record, Seen, parts_of
+from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window, between
+from bodyslam_jax.people.filter import Body, PersonFilter
+from bodyslam_jax.people.live import LivePeople
+from bodyslam_jax.pipeline.run import assemble
+from bodyslam_jax.sfm.live_map import LiveMap
+from bodyslam_jax.sfm.live_tracks import PointFollower
+from bodyslam_jax.sfm.person_mask import draw_person
+from bodyslam_jax.types import Intrinsics, Result, Sequence, SfmResult
+
+log = logging.getLogger(__name__)
+
+_RATE = 10.0
+"""Frames of the window in a second, at most: what two cores solve while the video runs
+(`benchmarks/online.md`)."""
+_MARGIN = 0.06
+"""Width that is masked around people, of their height, as offline."""
+_PLACE_EVERY = 2.0
+"""s between two places that are remembered."""
+_RELOCATE_EVERY = 3
+"""Frames between two attempts to locate a lost camera."""
+_LOST = 2.0
+"""s after which a lost camera that sees points begins a new map."""
+_PENDING = 5 * CHUNK
+"""Most frames that wait for the window; of older ones only the time is kept."""
+_BRIDGED = 2
+"""Most frames of the window in a row that are taken for located without an image."""
+_GONE = 0.5
+"""s without keypoints after which a person is not in the estimate."""
+_OF_FRONT = 8 * FRAMES
+"""Frames of the window whose first poses are remembered until it has solved them."""
+_TWO_MAPS = (
+    "the camera was lost and a new map began: the way between the two maps is not known"
+)
+_POINTS_AGAIN = 100
+"""Points that a camera begins with where it was lost."""
+
+
+@dataclasses.dataclass
+class _Counts:
+    """What happened, for the notes of the result."""
+
+    frames: int = 0
+    late: int = 0
+    lost: int = 0
+    relocated: int = 0
+    stripped: int = 0
+
+
+class Online:
+    """The estimate while a video runs; memory for a window, and a record of poses.
+
+    One object is of one video. `update` and `finish` are called by one thread.
+    """
+
+    def __init__(
+        self,
+        config: Config = Config(),
+        *,
+        intrinsics: Intrinsics | None = None,
+        fps: float = 30.0,
+        places: int = 1,
+        threads: bool = True,
+        name: str = "live",
+    ) -> None:
+        """
+        **Arguments:**
+
+        - `intrinsics`: of the camera; without them the focal length is that of
+            `config`, or else a guess, which is not refined and said in every estimate.
+        - `fps`: about how many frames come in a second.
+        - `places`: people who are in the window at once; others are filtered only.
+        - `threads`: whether windows are solved beside `update`; without it they are
+            solved in it, so that the same frames give the same estimates.
+        - `name`: of the video, for the summary.
+
+        **Raises:** `InputError` if the body model or the motion model cannot be read.
+        """
+        if not fps > 0:
+            raise InputError(f"fps: found {fps}, expected more than 0.")
+        if places < 1:
+            raise InputError(f"places: found {places}, expected 1 or more.")
+        self.config, self.fps, self.places, self.name = config, fps, places, name
+        self.body = load_body_model(config.body_model)
+        self.intrinsics = intrinsics
+        self.stride = max(1, round(fps / _RATE))
+        self.step = self.stride / fps
+        self.pool = ThreadPoolExecutor(1) if threads else None
+        self.job: Future[Solved] | None = None
+        self.found = LivePeople(fps, config.detection, config.association)
+        self.counts, self.record = _Counts(), Record()
+        self.latest: Estimate | None = None
+        self.started = self.prepared = False
+        self.done = False
+        self.filters: dict[int, PersonFilter] = {}
+        self.last_seen: dict[int, float] = {}
+        self.contacts: dict[int, np.ndarray] = {}
+        self.warnings: dict[str, None] = {}
+        self.seconds: dict[str, float] = {}
+        self.number = -1
+        """Of the map."""
+        self.video: Path | None = None
+        """The file that the frames are of, for the result's pictures."""
+        self.picks: list[int] = []
+        """Which of its frames they are."""
+        self.inputs: tuple[Sequence, SfmResult]
+        """What the result was made of, after `finish`."""
+
+    def prepare(self, size: tuple[int, int] | None = None) -> None:
+        """Compiles all programs, or takes them from JAX's cache, on an invented scene:
+        no frame waits for it then. The first `update` does it if nobody has.
+
+        **Arguments:** `size`: width and height of the images (px), from which the
+        intrinsics are guessed if none were given.
+
+        **Raises:** `InputError` if neither is known.
+        """
+        if self.prepared:
+            return
+        if self.intrinsics is None:
+            if size is None:
+                raise InputError("prepare: found neither intrinsics nor a size.")
+            self.intrinsics = self._guess(*size)
+        if self.config.people and self.config.detect != "none":
+            self.found.open()
+        frames, points = invented(self.intrinsics, self.body, self.step)
+        scratch = Window(*self._of_window())
+        scratch.advance(frames[: FRAMES - CHUNK])
+        scratch.advance(frames[FRAMES - CHUNK :])
+        solver.marginals(scratch.problem, scratch.state)
+        one = PersonFilter(self.intrinsics, self.body, self.fps, self.config.people_fit)
+        one.update(0.0, points, np.zeros(10))
+        one.update(1 / self.fps, points, np.zeros(10))
+        body = one.body()
+        given = np.eye(4), body.T_CH, body.body_pose, np.zeros(10), self.body, None
+        placed(0, *given)
+        joints_of(self.body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
+        self.prepared = True
+
+    def _of_window(self) -> tuple:
+        assert self.intrinsics is not None
+        rest = self.config, 1 / self.step, self.places
+        return self.intrinsics, self.body, *rest
+
+    # Every frame.
+
+    def update(
+        self,
+        image: UInt8[np.ndarray, "y x 3"] | None,
+        timestamp: float,
+        keypoints: Float[np.ndarray, "p 25 3"] | None = None,
+        *,
+        points: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None = None,
+    ) -> Estimate:
+        """Takes the next frame in.
+
+        **Arguments:**
+
+        - `image`: BGR; `None` where keypoints and points are given.
+        - `timestamp`: s; frames whose time is not after the last one's are not used.
+        - `keypoints`: of the people in the image, in any order (u px, v px,
+            confidence), BODY_25; without them they are found by the networks that ship.
+        - `points`: numbers and pixels of points of the scene that were followed
+            elsewhere; without them they are followed in the image.
+
+        **Raises:** `InputError` if something is missing, or after `finish`.
+        """
+        begun = time.perf_counter()
+        if self.done:
+            raise InputError("update: the estimate is finished.")
+        if self.latest is not None and timestamp <= self.latest.timestamp:
+            self.counts.late += 1
+            return dataclasses.replace(
+                self.latest, status="late", latency=time.perf_counter() - begun
+            )
+        if not self.started:
+            self._start(image)
+        assert self.intrinsics is not None
+        if image is None and points is None:
+            raise InputError("update: found neither an image nor points.")
+        people = self._find(image, keypoints)
+        gray = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if points is None:
+            assert gray is not None
+            points = self.follower.advance(gray, self._mask(people))
+        self._collect(wait=False)
+        status = self._locate(timestamp, gray, *points, people)
+        bodies = self._filter(timestamp, people)
+        self._submit(flush=False)
+        self.counts.frames += 1
+        self.latest = self._estimate(timestamp, status, bodies)
+        elapsed = time.perf_counter() - begun
+        self.latest = dataclasses.replace(self.latest, latency=elapsed)
+        return self.latest
+
+    def finish(self) -> Result:
+        """Solves what is left in the window and returns the result of all frames, as
+        an offline run has it: metric, y up, with its summary.
+
+        **Raises:** `InputError` if fewer than three frames were used.
+        """
+        if self.counts.frames < 3:
+            raise InputError(f"{self.name}: {self.counts.frames} frames, expected 3.")
+        self.done = True
+        self._collect(wait=True)
+        self._end_map()
+        if self.pool is not None:
+            self.pool.shutdown()
+        self.record.pixel_sigma = self.window.pixel_sigma
+        assert self.intrinsics is not None
+        measured, cameras, joint = parts_of(
+            self.record,
+            self.intrinsics,
+            self.name,
+            1 / self.step,
+            (*self.warnings, *self._told()),
+        )
+        if _TWO_MAPS in self.warnings:
+            measured = dataclasses.replace(measured, contradictions=(_TWO_MAPS,))
+        if self.video is not None:
+            picks = np.array(self.picks, int)
+            measured = dataclasses.replace(measured, frames=self.video, picks=picks)
+        self.inputs = measured, cameras
+        seconds = {k: round(v, 2) for k, v in self.seconds.items()}
+        given = self.config, self.body, cameras, joint, seconds
+        return assemble(measured, *given)
+
+    def warn(self, note: str) -> None:
+        """Adds a line to the notes of all further estimates and of the result."""
+        self.warnings[note] = None
+
+    @property
+    def points(self) -> Float[np.ndarray, "n 2"]:
+        """Points that are followed in the last image, px."""
+        return self.follower.uv if self.started else np.zeros((0, 2))
+
+    def drawn(
+        self, estimate: Estimate
+    ) -> list[tuple[int, Float[np.ndarray, "24 2"], Float[np.ndarray, "24 3"]]]:
+        """Number, joints in the image (px) and joints in the world (m) of the people
+        of an estimate."""
+        assert self.intrinsics is not None
+        found = []
+        for one in estimate.people:
+            T_CW = np.linalg.inv(estimate.T_WC)
+            p_C = one.joints @ T_CW[:3, :3].T + T_CW[:3, 3]
+            p_C[:, 2] = np.maximum(p_C[:, 2], 0.05)
+            found.append((one.person, project_points(self.intrinsics, p_C), one.joints))
+        return found
+
+    # Parts of a frame.
+
+    def _start(self, image: np.ndarray | None) -> None:
+        if self.intrinsics is None:
+            if image is None:
+                raise InputError("intrinsics: found none, nor an image to guess from.")
+            self.intrinsics = self._guess(image.shape[1], image.shape[0])
+        self.follower = PointFollower(self.intrinsics, self.config.tracking.num_points)
+        self.prepare()
+        self.window = Window(*self._of_window())
+        self._begin_map()
+        self.started = True
+
+    def _guess(self, width: int, height: int) -> Intrinsics:
+        known = self.config.focal_length(width)
+        guess = guess_camera(width, height)
+        if known is not None:
+            return with_focal(guess, known.value, known.sigma)
+        note = (
+            f"the focal length is a guess ({guess.params[0]:.0f} px) and is not "
+            "refined: distances are off by its error; give --camera or --focal"
+        )
+        self.warnings[note] = None
+        return guess
+
+    def _begin_map(self) -> None:
+        assert self.intrinsics is not None
+        self.map = LiveMap(self.intrinsics)
+        self.world = World()
+        self.number += 1
+        self.waiting: deque[tuple[float, dict[int, np.ndarray], np.ndarray, np.ndarray]]
+        self.waiting = deque(maxlen=(FRAMES - CHUNK) * self.stride)
+        self.pending: list[tuple[int, Measured]] = []
+        self.front: dict[int, np.ndarray] = {}
+        """First poses of the frames of the window, in the map as it is now."""
+        self.next_slot, self.first_time = 0, 0.0
+        self.lost_since: float | None = None
+        self.last_place = -np.inf
+        self.solved: Solved | None = None
+
+    def _find(
+        self, image: np.ndarray | None, keypoints: np.ndarray | None
+    ) -> dict[int, np.ndarray]:
+        if not self.config.people:
+            return {}
+        if keypoints is not None:
+            return self.found.given(np.asarray(keypoints, float), image)
+        if image is None or self.config.detect == "none":
+            return {}
+        return self.found.find(image)
+
+    def _mask(self, people: dict[int, np.ndarray]) -> np.ndarray | None:
+        if not people:
+            return None
+        assert self.intrinsics is not None
+        size = self.intrinsics.height, self.intrinsics.width
+        mask = np.zeros(size, np.uint8)
+        for points in people.values():
+            draw_person(mask, points, _MARGIN)
+        return mask
+
+    def _locate(
+        self,
+        timestamp: float,
+        gray: np.ndarray | None,
+        ids: np.ndarray,
+        uv: np.ndarray,
+        people: dict[int, np.ndarray],
+    ) -> str:
+        """Locates the camera and hands frames to the window; the status."""
+        if not self.map.begun:
+            self.waiting.append((timestamp, people, ids, uv))
+            poses = self.map.begin(ids, uv) if len(ids) else None
+            if poses is None:
+                self._note_frame(timestamp, -1, np.eye(4), False, people)
+                return "starting"
+            self._feed_waiting(poses)
+            return "tracking"
+        T_WC = self.map.locate(ids, uv)
+        if T_WC is None:
+            T_WC = self._find_again(timestamp, gray)
+        if T_WC is None:
+            self._take(timestamp, None, ids, uv, people)
+            if self.lost_since is None:
+                self.lost_since = timestamp
+                self.counts.lost += 1
+            away = timestamp - self.lost_since
+            if away > _LOST and len(ids) >= _POINTS_AGAIN // 2:
+                self._new_map()
+                return "starting"
+            return "lost"
+        self.lost_since = None
+        self._take(timestamp, T_WC, ids, uv, people)
+        if gray is not None and timestamp - self.last_place >= _PLACE_EVERY:
+            self.follower.remember(self.map.points)
+            self.last_place = timestamp
+        return "tracking"
+
+    def _find_again(
+        self, timestamp: float, gray: np.ndarray | None
+    ) -> np.ndarray | None:
+        """The camera by the places that are remembered; points to go on with."""
+        if gray is None or self.lost_since is None:
+            return None
+        if self.counts.frames % _RELOCATE_EVERY:
+            return None
+        found = self.follower.recognise(gray)
+        if found is None:
+            return None
+        points, uv = found
+        T_WC = self.map.relocated(points, uv)
+        if T_WC is None:
+            return None
+        ids = self.follower.add(uv[:_POINTS_AGAIN])
+        self.map.points.update(zip(ids.tolist(), points, strict=False))
+        self.counts.relocated += 1
+        return T_WC
+
+    def _new_map(self) -> None:
+        """Ends a map that the camera is lost in, and waits for another one."""
+        self.warnings[_TWO_MAPS] = None
+        self._collect(wait=True)
+        self._end_map()
+        self.window.restart()
+        self.follower.places.clear()
+        self._begin_map()
+
+    def _feed_waiting(self, poses: list[np.ndarray | None]) -> None:
+        """Frames that came before the map, each once; they were noted without one."""
+        rows = list(self.waiting)
+        del self.record.frames[len(self.record.frames) - len(rows) + 1 :]
+        for row, pose in zip(rows, poses[-len(rows) :], strict=True):
+            timestamp, people, ids, uv = row
+            self._take(timestamp, pose, ids, uv, people)
+        self.waiting.clear()
+
+    def _take(
+        self,
+        timestamp: float,
+        T_WC: np.ndarray | None,
+        ids: np.ndarray,
+        uv: np.ndarray,
+        people: dict[int, np.ndarray],
+    ) -> None:
+        """Takes a frame into the record, and those at the window's times into it."""
+        here = self.map.T_WC if T_WC is None else T_WC
+        if self.next_slot == 0:
+            self.first_time = timestamp
+        slot = round((timestamp - self.first_time) / self.step)
+        gap = slot - self.next_slot
+        if gap > 2 * FRAMES:  # The source stood still: time goes on from here.
+            note = f"no frame came for {gap * self.step:.0f} s"
+            self.warnings[note] = None
+            self.first_time += (gap - FRAMES) * self.step
+            slot -= gap - FRAMES
+        if 0 < slot - self.next_slot <= _BRIDGED and T_WC is not None:
+            # Frames that the source, or a slow machine, left out.
+            ends = np.array([self.next_slot - 1, slot])
+            poses = np.array([self.front[self.next_slot - 1], here])
+            for k in range(self.next_slot, slot):
+                pose = between(ends, poses, np.array([k]))[0]
+                missing = self._empty(k, pose)
+                self._put(dataclasses.replace(missing, located=True))
+        while self.next_slot < slot:
+            self._put(self._empty(self.next_slot, here))
+        if slot == self.next_slot:
+            measured = Measured(
+                self.first_time + slot * self.step,
+                here,
+                T_WC is not None,
+                ids,
+                uv,
+                people,
+            )
+            self._put(measured)
+        last = self.next_slot - 1
+        since = np.linalg.inv(self.front[last]) @ here
+        self._note_frame(timestamp, last, since, T_WC is not None, people)
+
+    def _empty(self, slot: int, T_WC: np.ndarray) -> Measured:
+        none = np.zeros(0, int), np.zeros((0, 2))
+        at = self.first_time + slot * self.step
+        return Measured(at, T_WC, False, *none, {})
+
+    def _put(self, measured: Measured) -> None:
+        self.front[self.next_slot] = measured.T_WC
+        self.front.pop(self.next_slot - _OF_FRONT, None)
+        self.pending.append((self.next_slot, measured))
+        self.next_slot += 1
+
+    def _note_frame(
+        self,
+        timestamp: float,
+        slot: int,
+        since: np.ndarray,
+        located: bool,
+        people: dict[int, np.ndarray],
+    ) -> None:
+        number = self.number if slot >= 0 else -1
+        kept = {p: np.asarray(x, np.float32) for p, x in people.items()}
+        self.record.frames.append(Seen(timestamp, number, slot, since, located, kept))
+
+    def _filter(
+        self, timestamp: float, people: dict[int, np.ndarray]
+    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """T_CH and θ of everybody who is here or was half a second ago."""
+        assert self.intrinsics is not None
+        found = {}
+        for person, points in people.items():
+            if person not in self.filters:
+                self.filters[person] = PersonFilter(
+                    self.intrinsics, self.body, self.fps, self.config.people_fit
+                )
+            self.last_seen[person] = timestamp
+        for person, one in list(self.filters.items()):
+            if timestamp - self.last_seen[person] > _GONE:
+                del self.filters[person]
+                self.contacts.pop(person, None)
+                continue
+            points = people.get(person, np.zeros((25, 3)))
+            body = one.update(timestamp, points, self._shape(person))
+            if body is not None:
+                found[person] = body.T_CH, body.body_pose
+        return found
+
+    def _shape(self, person: int) -> np.ndarray:
+        return self.record.shapes.get(person, np.zeros(10))
+
+    def _estimate(
+        self,
+        timestamp: float,
+        status: str,
+        bodies: dict[int, tuple[np.ndarray, np.ndarray]],
+    ) -> Estimate:
+        T_WC = self.world.camera(self.map.T_WC)
+        people: list[PersonEstimate] = []
+        for person, (T_CH, pose) in sorted(bodies.items()):
+            given = T_CH, pose, self._shape(person), self.body
+            people.append(placed(person, T_WC, *given, self.contacts.get(person)))
+        nan = float("nan")
+        scale = sigma = nan
+        if self.solved is not None and np.isfinite(self.solved.scale_sigma):
+            scale, sigma = self.solved.scale, self.solved.scale_sigma
+        notes = list(self.warnings)
+        if np.isnan(sigma):
+            notes.append("scale unknown: nobody has told it yet")
+        return Estimate(
+            frame=self.counts.frames - 1,
+            timestamp=timestamp,
+            T_WC=T_WC,
+            located=status == "tracking",
+            people=tuple(people),
+            scale=scale,
+            scale_sigma=sigma,
+            status=status,
+            notes=tuple(notes),
+            latency=0.0,
+        )
+
+    # The window.
+
+    def _submit(self, flush: bool) -> None:
+        """Hands the frames that wait to the window, if it has nothing to do."""
+        if self.job is not None:
+            excess = len(self.pending) - _PENDING
+            for k in range(max(excess, 0)):
+                slot, measured = self.pending[k]
+                if measured.located or measured.people:
+                    self.counts.stripped += 1
+                    self.pending[k] = slot, self._empty(slot, measured.T_WC)
+            return
+        count = min(len(self.pending) // CHUNK * CHUNK, _PENDING)
+        if flush and len(self.pending) % CHUNK:
+            while len(self.pending) % CHUNK:
+                self._put(self._empty(self.next_slot, self.map.T_WC))
+            count = min(len(self.pending), _PENDING)
+        if not count:
+            return
+        # The map may have been corrected since these frames came.
+        frames = [
+            dataclasses.replace(m, T_WC=self.front[slot])
+            for slot, m in self.pending[:count]
+        ]
+        del self.pending[:count]
+        if self.pool is not None:
+            self.job = self.pool.submit(self.window.advance, frames)
+        else:
+            self.job = Future()
+            self.job.set_result(self.window.advance(frames))
+            self._collect(wait=True)
+
+    def _collect(self, wait: bool) -> None:
+        """Takes in what the window has found, if it is there."""
+        if self.job is None or not (wait or self.job.done()):
+            return
+        solved = self.job.result()
+        self.job = None
+        first = solved.first
+        self.record.keep(self.number, solved)
+        for name, value in solved.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + value
+        located = np.flatnonzero(solved.located[CHUNK:])
+        if len(located):
+            k = CHUNK + int(located[-1])
+            before, after = self.front[first + k], solved.T_WC[k]
+            move = after @ np.linalg.inv(before)
+            self.map.corrected(before, after, solved.landmarks)
+            self.front = {i: move @ T for i, T in self.front.items()}
+            places = [p.moved(move) for p in self.follower.places]
+            self.follower.places = deque(places, maxlen=self.follower.places.maxlen)
+        self.map.forget(self.follower.ids)
+        self.world.learn(solved, self.body)
+        for h, person in enumerate(solved.people):
+            if person is not None and solved.present[h].any():
+                last = int(np.flatnonzero(solved.present[h])[-1])
+                self.contacts[person] = solved.contacts[h, last]
+                if person in self.filters:
+                    body = Body(solved.roots[h, last], solved.poses[h, last])
+                    at = float(solved.times[last])
+                    self.filters[person].anchor(at, body, self._shape(person))
+        self.solved = solved
+
+    def _end_map(self) -> None:
+        """Solves all that waits."""
+        while self.pending or self.job is not None:
+            self._submit(flush=True)
+            self._collect(wait=True)
+
+    def _told(self) -> list[str]:
+        counts, notes = self.counts, []
+        if counts.late:
+            notes.append(f"{counts.late} frames came late or twice and were not used")
+        if counts.lost:
+            notes.append(
+                f"the camera was lost {counts.lost} times and found again "
+                f"{counts.relocated} times"
+            )
+        if counts.stripped:
+            notes.append(
+                f"{counts.stripped} frames were not in the graph: the machine was slow"
+            )
+        return notes

@@ -1,0 +1,308 @@
+"""What is remembered of a running video, and the result that is made of it at the end.
+
+Of every frame: its time, where it is relative to a frame of the window, and people's
+keypoints; of the frames of the window, as they leave it: camera, roots and postures. No
+image is kept. Half a kilobyte a frame, one more for each person.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.online.window import SCALE_WALK, Solved, between
+from bodyslam_jax.types import (
+    Intrinsics,
+    JointEstimate,
+    Keypoints,
+    ScaleStart,
+    Sequence,
+    SfmResult,
+    Tracks,
+)
+
+_MOST_LANDMARKS = 20_000
+"""Landmarks that are kept for the result."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """A frame of the video."""
+
+    time: float
+    """s"""
+    map: int
+    """Number of its map; -1 before the first."""
+    slot: int
+    """The frame of the window that it is or follows."""
+    since: Float[np.ndarray, "4 4"]
+    """From its camera to that frame's, map units."""
+    located: bool
+    people: dict[int, Float[np.ndarray, "25 3"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """A frame of the window as it left it."""
+
+    time: float
+    T_WC: Float[np.ndarray, "4 4"]
+    """Map units."""
+    located: bool
+    people: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    """T_CH, θ and contacts."""
+
+
+class Record:
+    """Frames, and what is known of the maps that they are in."""
+
+    def __init__(self) -> None:
+        self.frames: list[Seen] = []
+        self.slots: dict[tuple[int, int], Slot] = {}
+        """By map and frame of the window."""
+        self.scales: dict[int, list[tuple[int, float, float]]] = {}
+        """By map: number of a frame, s and its standard deviation then."""
+        self.landmarks: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
+        """By map and track: a frame of the window that saw it, and map units."""
+        self.shapes: dict[int, np.ndarray] = {}
+        self.pixel_sigma = 0.7
+
+    def keep(self, number: int, solved: Solved) -> None:
+        """Keeps the frames of a window of map `number`, in place of what an earlier
+        window had of them."""
+        first = solved.first
+        for k in range(CHUNK, len(solved.times)):
+            people = {
+                person: (
+                    solved.roots[h, k],
+                    solved.poses[h, k],
+                    solved.contacts[h, k],
+                )
+                for h, person in enumerate(solved.people)
+                if person is not None and solved.present[h, k]
+            }
+            self.slots[number, first + k] = Slot(
+                float(solved.times[k]),
+                solved.T_WC[k],
+                bool(solved.located[k]),
+                people,
+            )
+        for h, person in enumerate(solved.people):
+            if person is not None and solved.present[h].any():
+                self.shapes[person] = solved.shapes[h]
+        told = first + len(solved.times) - 1, solved.scale, solved.scale_sigma
+        self.scales.setdefault(number, []).append(told)
+        for track, place in solved.landmarks.items():
+            if len(self.landmarks) < _MOST_LANDMARKS:
+                self.landmarks[number, track] = told[0], place
+
+
+@dataclasses.dataclass(frozen=True)
+class _Path:
+    """The frames of the windows of all maps in one metric world."""
+
+    T_WC: dict[tuple[int, int], Float[np.ndarray, "4 4"]]
+    """By map and frame of the window, m."""
+    scale: dict[tuple[int, int], float]
+    """m per map unit, by map and frame of the window."""
+
+
+def smoothed_scales(
+    told: list[tuple[int, float, float]], fps: float
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+    """s of each window that had one, by all windows (Rauch, Tung, Striebel, 1965), and
+    the standard deviation of the last; s = 1 and NaN if none had.
+
+    s is a random walk between windows, as in `window`.
+    """
+    known = [row for row in told if np.isfinite(row[2])]
+    if not known:
+        return np.array([0]), np.ones(1), float("nan")
+    frame, scale, sigma = (np.array(x) for x in zip(*known, strict=True))
+    found = scale.astype(float).copy()
+    for i in range(len(found) - 2, -1, -1):
+        walked = (SCALE_WALK * scale[i]) ** 2 * (frame[i + 1] - frame[i]) / fps
+        gain = sigma[i] ** 2 / (sigma[i] ** 2 + walked)
+        found[i] += gain * (found[i + 1] - found[i])
+    return frame, found, float(sigma[-1])
+
+
+def parts_of(
+    record: Record,
+    intrinsics: Intrinsics,
+    name: str,
+    fps: float,
+    warnings: tuple[str, ...],
+) -> tuple[Sequence, SfmResult, JointEstimate]:
+    """All frames as the stages of an offline run hand them on: what was measured, the
+    cameras, and the estimate; `fps` is that of the frames of the window."""
+    path = _path(record, fps)
+    told = record.scales[max(record.scales)] if record.scales else []
+    _, scales, sigma = smoothed_scales(told, fps)
+    scale = float(scales[-1])
+    T_WC, located = _cameras(record, path)
+    persons = sorted({p for slot in record.slots.values() for p in slot.people})
+    roots, poses, present, contacts = _people(record, path, persons, T_WC)
+    cameras = T_WC.copy()
+    cameras[:, :3, 3] /= scale
+    landmarks = np.array(
+        [
+            _placed(record, path, (number, slot), place)
+            for (number, _), (slot, place) in record.landmarks.items()
+            if (number, slot) in path.T_WC
+        ]
+    ).reshape(-1, 3)
+    measured = Sequence(
+        name=name,
+        frames=None,
+        timestamps=np.array([f.time for f in record.frames]) - record.frames[0].time,
+        intrinsics=intrinsics,
+        keypoints=_keypoints(record, persons),
+        warnings=warnings,
+    )
+    none = np.zeros(0, int)
+    sfm = SfmResult(
+        kind="moving" if record.scales else "static",
+        T_WC=cameras,
+        registered=located,
+        landmarks=landmarks / scale,
+        tracks=Tracks(none, none, np.zeros((0, 2))),
+        keep=np.zeros(0, bool),
+        prior_information=np.zeros((len(landmarks), 3, 3)),
+        prior_mean=landmarks / scale,
+        pixel_sigma=record.pixel_sigma,
+        intrinsics=np.asarray(intrinsics.params, float),
+        focal_sigma=float("nan"),
+        costs=(0.0, 0.0),
+        warnings=(),
+    )
+    start = ScaleStart()
+    if np.isfinite(sigma):
+        start = ScaleStart(motion=scale, motion_error=sigma)
+    joint = JointEstimate(
+        scale=scale,
+        start=start,
+        scale_sigma=sigma if np.isfinite(sigma) else float("inf"),
+        shape_covariance=np.full((len(persons), 10, 10), np.nan),
+        unobserved=(),
+        cameras=cameras,
+        roots=roots,
+        poses=poses,
+        shapes=np.array([record.shapes[p] for p in persons]).reshape(-1, 10),
+        landmarks=landmarks / scale,
+        intrinsics=np.asarray(intrinsics.params, float),
+        present=present,
+        status="converged",
+        stages=(),
+        contacts=contacts,
+    )
+    return measured, sfm, joint
+
+
+def _path(record: Record, fps: float) -> _Path:
+    """Windows' frames in metres; frames that were not located are between others."""
+    poses, scale_at = {}, {}
+    end = np.eye(4)
+    for number in sorted(record.scales):
+        slots = sorted(k for n, k in record.slots if n == number)
+        if not slots:
+            continue
+        frame, scales, _ = smoothed_scales(record.scales[number], fps)
+        s = np.interp(slots, frame, scales)
+        found = [record.slots[number, k] for k in slots]
+        known = np.array([x.located for x in found])
+        T = np.array([x.T_WC for x in found])
+        if known.any():
+            T = between(np.array(slots)[known], T[known], np.array(slots))
+        steps = np.diff(T[:, :3, 3], axis=0) * s[1:, None]
+        T[:, :3, 3] = T[0, :3, 3] * s[0] + np.concatenate(
+            [np.zeros((1, 3)), np.cumsum(steps, axis=0)]
+        )
+        into = end @ np.linalg.inv(T[0])
+        for k, pose, value in zip(slots, T, s, strict=True):
+            poses[number, k] = into @ pose
+            scale_at[number, k] = float(value)
+        end = poses[number, slots[-1]]
+    return _Path(poses, scale_at)
+
+
+def _cameras(
+    record: Record, path: _Path
+) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
+    """T_WC of every frame, m, and which were located."""
+    T_WC = np.tile(np.eye(4), (len(record.frames), 1, 1))
+    located = np.zeros(len(record.frames), bool)
+    for t, frame in enumerate(record.frames):
+        at = path.T_WC.get((frame.map, frame.slot))
+        if at is None:
+            continue
+        since = frame.since.copy()
+        since[:3, 3] *= path.scale[frame.map, frame.slot]
+        T_WC[t] = at @ since
+        located[t] = frame.located and record.slots[frame.map, frame.slot].located
+    if located.any():
+        rows = np.arange(len(T_WC))
+        T_WC = between(rows[located], T_WC[located], rows)
+    return T_WC, located
+
+
+def _placed(
+    record: Record, path: _Path, key: tuple[int, int], place: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"]:
+    """A landmark in the one world, m, as a camera of that time saw it."""
+    T = record.slots[key].T_WC
+    p_C = T[:3, :3].T @ (place - T[:3, 3]) * path.scale[key]
+    return path.T_WC[key][:3, :3] @ p_C + path.T_WC[key][:3, 3]
+
+
+def _keypoints(record: Record, persons: list[int]) -> Keypoints | None:
+    if not persons:
+        return None
+    found = np.zeros((len(persons), len(record.frames), 25, 3))
+    for t, frame in enumerate(record.frames):
+        for h, person in enumerate(persons):
+            found[h, t] = frame.people.get(person, 0.0)
+    return Keypoints(found[..., :2], found[..., 2])
+
+
+def _people(
+    record: Record, path: _Path, persons: list[int], T_WC: Float[np.ndarray, "t 4 4"]
+) -> tuple[
+    Float[np.ndarray, "h t 4 4"],
+    Float[np.ndarray, "h t 23 3"],
+    Bool[np.ndarray, "h t"],
+    Float[np.ndarray, "h t 4"],
+]:
+    """Roots, postures, presence and contacts in every frame, between the frames of the
+    windows."""
+    shape = len(persons), len(record.frames)
+    roots = np.tile(np.eye(4), (*shape, 1, 1))
+    poses, present = np.zeros((*shape, 23, 3)), np.zeros(shape, bool)
+    contacts = np.zeros((*shape, 4))
+    for t, frame in enumerate(record.frames):
+        pair = [(frame.map, frame.slot), (frame.map, frame.slot + 1)]
+        a, b = (record.slots.get(key) for key in pair)
+        if a is None:
+            continue
+        share = 0.0 if b is None else (frame.time - a.time) / (b.time - a.time)
+        share = float(np.clip(share, 0.0, 1.0))
+        for h, person in enumerate(persons):
+            if person not in a.people:
+                continue
+            ends = [path.T_WC[pair[0]] @ a.people[person][0]]
+            thetas, stands = [a.people[person][1]], [a.people[person][2]]
+            if b is not None and person in b.people and pair[1] in path.T_WC:
+                ends.append(path.T_WC[pair[1]] @ b.people[person][0])
+                thetas.append(b.people[person][1])
+                stands.append(b.people[person][2])
+            elif share > 0.5:
+                continue
+            T_WH = between(np.arange(len(ends)), np.array(ends), np.array([share]))[0]
+            turns = so3.exp(np.array([thetas[0], thetas[-1]]))
+            found = so3.interpolate(turns[0], turns[1], np.full(23, share))
+            roots[h, t] = np.linalg.inv(T_WC[t]) @ T_WH
+            poses[h, t], present[h, t] = so3.log(found), True
+            contacts[h, t] = stands[0] + share * (stands[-1] - stands[0])
+    return roots, poses, present, contacts

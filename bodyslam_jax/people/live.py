@@ -1,0 +1,190 @@
+"""Who is in the images of a running video: detections, tracks, and persons who return.
+
+The networks that ship look at a square around everybody who is followed, and every
+third of a second at the whole image for somebody new. Given keypoints are tracked in
+the same way. A track that lasts is a person; one that begins where somebody with the
+same clothes was lost is that person again. Looks are kept in memory only.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.config import Association, Detect
+from bodyslam_jax.people import blazepose, movenet
+from bodyslam_jax.people.appearance import SIZE, describe, difference
+from bodyslam_jax.people.found import AGREES, as_body25, find_feet
+from bodyslam_jax.people.movenet import SURE, sure_points
+from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
+from bodyslam_jax.people.regions import behind, regions
+from bodyslam_jax.people.tracking import OTHER_CLOTHES, Tracker, height
+
+_INTERVAL, _SELDOM = 0.33, 1.0
+"""s between two searches of the whole image: without anybody, and with."""
+_SEARCH, _SQUARE = 320, 256
+"""Longer side of MoveNet's input, px: of the whole image, and of a square."""
+_START, _CONTINUE = 0.22, 0.12
+"""Least score that begins a track, and that continues one."""
+_MOST = 4
+"""People who are followed, the largest ones."""
+_PRESENCE = 0.5
+_LASTS = 0.2
+"""s: shorter tracks are nobody."""
+_SAME_CLOTHES = 0.6 * OTHER_CLOTHES
+"""Difference of colours below which somebody who returns is the same person."""
+_SOON = 5.0
+"""s after which somebody whose clothes are not seen is somebody else."""
+_KEPT = 45
+"""Detections of a track that are remembered."""
+_COCO = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
+"""BODY_25's keypoint of each of COCO's."""
+
+
+@dataclasses.dataclass
+class _Person:
+    """Somebody who has a number."""
+
+    track: int
+    look: np.ndarray
+
+
+class LivePeople:
+    """Tracks of people, and the numbers of persons."""
+
+    def __init__(
+        self,
+        fps: float,
+        settings: Detect = Detect(),
+        association: Association = Association(),
+    ) -> None:
+        self.fps, self.settings = fps, settings
+        self.tracker = Tracker(fps, association.max_gap)
+        self.persons: dict[int, _Person] = {}
+        self.frame, self.next_search = 0, 0
+        self.networks: tuple | None = None
+
+    def open(self) -> None:
+        """Opens the networks.
+
+        **Raises:** as `open_network`.
+        """
+        if self.networks is None:
+            self.networks = open_network(MOVENET), open_network(BLAZEPOSE)
+
+    def find(
+        self, image: UInt8[np.ndarray, "y x 3"]
+    ) -> dict[int, Float[np.ndarray, "25 3"]]:
+        """BODY_25 keypoints (u px, v px, confidence) in the next image, by person."""
+        self.open()
+        assert self.networks is not None
+        alive = self.tracker.alive(self.frame)
+        expected = [t.expected(self.frame, self.fps) for t in alive]
+        squares = regions(expected, self.settings.min_height, _MOST)
+        found = [self._look(image, r, _SQUARE) for r in squares]
+        if self.frame >= self.next_search:
+            whole = 0, 0, image.shape[1], image.shape[0]
+            found.append(self._look(image, whole, _SEARCH))
+            wait = _SELDOM if squares else _INTERVAL
+            self.next_search = self.frame + max(1, round(wait * self.fps))
+        points = np.concatenate([np.zeros((0, 17, 3)), *(p for p, _ in found)])
+        score = np.concatenate([np.zeros(0), *(s for _, s in found)])
+        kept = movenet.distinct(points, score)
+        points, score = points[kept], score[kept]
+        large = np.array([height(p) >= self.settings.min_height for p in points], bool)
+        points, score = points[large], score[large]
+        looks = [describe(image, p, SURE) for p in points]
+        looks = np.array(looks).reshape(-1, SIZE)
+        clear = ~behind(points, score)
+        who = self._track(points, looks, clear, clear & (score >= _START))
+        return {person: self._whole(image, points[row]) for row, person in who.items()}
+
+    def given(
+        self,
+        keypoints: Float[np.ndarray, "p 25 3"],
+        image: UInt8[np.ndarray, "y x 3"] | None = None,
+    ) -> dict[int, Float[np.ndarray, "25 3"]]:
+        """Keypoints of the next frame in any order, by person."""
+        points = keypoints[:, _COCO]
+        some = np.array([sure_points(p).sum() >= 3 for p in points], bool)
+        rows = np.flatnonzero(some)
+        looks = np.full((len(rows), SIZE), np.nan)
+        if image is not None:
+            found = [describe(image, points[row], SURE) for row in rows]
+            looks = np.array(found).reshape(-1, SIZE)
+        every = np.ones(len(rows), bool)
+        who = self._track(points[rows], looks, every, every)
+        return {person: keypoints[rows[row]] for row, person in who.items()}
+
+    def _look(
+        self, image: np.ndarray, region: movenet.Region, longer: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self.networks is not None
+        points, score = movenet.find_people(self.networks[0], image, region, longer)
+        kept = score >= _CONTINUE
+        return points[kept], score[kept]
+
+    def _whole(
+        self, image: np.ndarray, points: Float[np.ndarray, "17 3"]
+    ) -> Float[np.ndarray, "25 3"]:
+        """BODY_25 with the feet that BlazePose sees."""
+        assert self.networks is not None
+        square = blazepose.turned_square(points, SURE)
+        if square is None:
+            return as_body25(points, None)
+        pose = blazepose.read_pose(self.networks[1], image, square)
+        apart = blazepose.disagreement(pose, points)
+        if pose.presence < _PRESENCE or np.median(apart[sure_points(points)]) > AGREES:
+            return as_body25(points, None)
+        return as_body25(points, find_feet(pose, points, apart))
+
+    def _track(
+        self,
+        points: np.ndarray,
+        looks: np.ndarray,
+        may_return: np.ndarray,
+        may_start: np.ndarray,
+    ) -> dict[int, int]:
+        """The person of each row, of those that are one."""
+        who = self.tracker.update(self.frame, points, looks, may_return, may_start)
+        for track in self.tracker.tracklets:
+            for kept in (track.frames, track.points, track.looks):
+                del kept[:-_KEPT]
+        self.frame += 1
+        found = {}
+        for row, number in enumerate(who.tolist()):
+            person = None if number < 0 else self._person(number)
+            if person is not None:
+                found[row] = person
+        return found
+
+    def _person(self, number: int) -> int | None:
+        for person, known in self.persons.items():
+            if known.track == number:
+                known.look = self.tracker.tracklets[number].look
+                return person
+        track = self.tracker.tracklets[number]
+        if len(track.frames) < max(2, round(_LASTS * self.fps)):
+            return None
+        look, person = track.look, len(self.persons)
+        away = [
+            (difference(known.look, look), other)
+            for other, known in self.persons.items()
+            if self._last(other) < track.frames[0]
+        ]
+        # Without an image, who comes soon after only one person went is that one.
+        lately = [
+            (0.0, other)
+            for d, other in away
+            if np.isnan(d) and self.frame - self._last(other) <= _SOON * self.fps
+        ]
+        away = lately if len(lately) == 1 else away
+        away = [(d, other) for d, other in away if d < _SAME_CLOTHES]
+        if away:
+            person = min(away)[1]
+        self.persons[person] = _Person(number, look)
+        return person
+
+    def _last(self, person: int) -> int:
+        """The frame in which a person was seen last."""
+        return self.tracker.tracklets[self.persons[person].track].frames[-1]

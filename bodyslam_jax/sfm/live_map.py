@@ -1,0 +1,259 @@
+"""Frame after frame: the camera's pose on a map of points that grows with the video.
+
+Two views with enough parallax begin a map; every other camera comes from points that
+are tracked and known; points are triangulated from keyframes. A camera that fits no map
+is lost: it is found again by descriptors of keyframes, or a new map begins. The unit of
+a map is arbitrary. Poses and points are refined elsewhere (`online.window`) and handed
+back (`corrected`).
+"""
+
+import dataclasses
+from collections import deque
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.sfm.multiview import relative_pose, resect
+from bodyslam_jax.types import Intrinsics
+
+_THRESHOLD = 3.0
+"""Reprojection error of an inlier, px at 640x480."""
+_LEAST = 12
+"""Points by which a camera is located."""
+_SHARE = 0.3
+"""Share of the known points that must agree."""
+_FIRST_ANGLE = np.radians(1.5)
+"""Median parallax from which two views begin a map."""
+_FIRST_POINTS = 40
+_FIRST_SHARE = 0.7
+"""Share of the tracks that two views must explain."""
+_WAIT = 240
+"""Frames that are kept while two views are looked for."""
+_EVERY, _LEFT = 5, 0.7
+"""A keyframe is every so many frames, and where less of the last one's points are
+left."""
+_KEYFRAMES = 12
+"""Keyframes from which points are triangulated."""
+_ANGLE = np.radians(1.0)
+"""Parallax of a new point."""
+_ENOUGH, _LEAST_ANGLE = 0.5, 0.2
+"""Share of known points from which new ones need all of that parallax, and the least
+share of it."""
+_OFF = 0.25
+"""Share of views that a new point may not fit: tracks have outliers."""
+_ROTATED = 2.0
+"""px: median distance from a pure turn up to which two views have no parallax."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Keyframe:
+    """A located frame."""
+
+    T_WC: Float[np.ndarray, "4 4"]
+    ids: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    """At depth 1."""
+
+
+class LiveMap:
+    """Points by the number of their track, keyframes, and the last camera."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self.K, self.distortion = as_opencv(intrinsics.params)
+        size = max(intrinsics.width, intrinsics.height) / 640
+        self.threshold = _THRESHOLD * max(size, 1.0) / float(self.K[0, 0])
+        self.points: dict[int, Float[np.ndarray, " 3"]] = {}
+        self.keyframes: deque[Keyframe] = deque(maxlen=_KEYFRAMES)
+        self.waiting: deque[Keyframe] = deque(maxlen=_WAIT)
+        self.T_WC = np.eye(4)
+        self.step = np.eye(4)
+        """The last motion, from camera to camera."""
+        self.since = 0
+        """Frames since the last keyframe."""
+
+    @property
+    def begun(self) -> bool:
+        return len(self.points) > 0
+
+    def begin(
+        self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
+    ) -> list[Float[np.ndarray, "4 4"] | None] | None:
+        """Takes a frame in and tries to begin a map with it and an earlier one.
+
+        **Returns:** poses of all frames that were taken in, the newest last, `None` for
+        those that do not fit; `None` as long as there is no map.
+        """
+        now = Keyframe(np.eye(4), ids, self._normalised(uv))
+        self.waiting.append(now)
+        tried = sorted({0, len(self.waiting) // 2, 3 * len(self.waiting) // 4})
+        for k in tried:
+            if k < len(self.waiting) - 5 and self._two_views(self.waiting[k], now):
+                break
+        else:
+            return None
+        found = [self._locate(f.ids, f.xy, None) for f in self.waiting]
+        for frame, pose in zip(self.waiting, found, strict=True):
+            if pose is not None:
+                self._remember(pose, frame.ids, frame.xy)
+        # Points of frames in between, by all that were located.
+        found = [self._locate(f.ids, f.xy, T) for f, T in zip(self.waiting, found)]
+        self.T_WC = found[-1] if found[-1] is not None else self.T_WC
+        self.step = np.eye(4)
+        self.waiting.clear()
+        return found
+
+    def locate(
+        self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "4 4"] | None:
+        """The pose of the next frame, `None` if it fits the map nowhere near."""
+        xy = self._normalised(uv)
+        found = self._locate(ids, xy, self.T_WC @ self.step)
+        if found is None:
+            self.step = np.eye(4)
+            return None
+        self.step = np.linalg.inv(self.T_WC) @ found
+        self.T_WC = found
+        self.since += 1
+        last = self.keyframes[-1].ids if self.keyframes else ids[:0]
+        left = np.isin(last, ids).mean() if len(last) else 0.0
+        if self.since >= _EVERY or left < _LEFT:
+            self._remember(found, ids, xy)
+            self.since = 0
+        return found
+
+    def relocated(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        uv: Float[np.ndarray, "n 2"],
+    ) -> Float[np.ndarray, "4 4"] | None:
+        """The pose of a frame that shows known points, wherever it is."""
+        found = resect(points, self._normalised(uv), self.threshold)
+        if found is None or found[2].sum() < max(_LEAST, _SHARE * len(points)):
+            return None
+        self.T_WC, self.step = _pose(found[0], found[1]), np.eye(4)
+        return self.T_WC
+
+    def corrected(
+        self,
+        before: Float[np.ndarray, "4 4"],
+        after: Float[np.ndarray, "4 4"],
+        points: dict[int, Float[np.ndarray, " 3"]],
+    ) -> None:
+        """Moves the map so that the camera that was at `before` is at `after`; `points`
+        are where they were found to be."""
+        move = after @ np.linalg.inv(before)
+        turn, shift = move[:3, :3], move[:3, 3]
+        self.points = {i: turn @ x + shift for i, x in self.points.items()}
+        self.points.update(points)
+        self.T_WC = move @ self.T_WC
+        moved = [dataclasses.replace(k, T_WC=move @ k.T_WC) for k in self.keyframes]
+        self.keyframes = deque(moved, maxlen=_KEYFRAMES)
+
+    def forget(self, kept: Int[np.ndarray, " n"]) -> None:
+        """Drops all points but these, which somebody still needs, and those of
+        keyframes."""
+        here = set(kept.tolist()).union(*(k.ids.tolist() for k in self.keyframes))
+        self.points = {i: x for i, x in self.points.items() if i in here}
+
+    def _normalised(self, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        return rays(np.asarray(uv, float).reshape(-1, 2), self.K, self.distortion)
+
+    def _two_views(self, a: Keyframe, b: Keyframe) -> bool:
+        _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+        if len(i) < _FIRST_POINTS:
+            return False
+        xy_a, xy_b = a.xy[i], b.xy[j]
+        pixel = self.threshold / _THRESHOLD
+        if np.median(np.linalg.norm(xy_a - xy_b, axis=1)) < 5 * pixel:
+            return False
+        found = relative_pose(xy_a, xy_b, pixel)
+        if found is None or found[2].mean() < _FIRST_SHARE:
+            return False
+        R, t, good = found
+        turned = np.column_stack([xy_a, np.ones(len(xy_a))]) @ R.T
+        away = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_b, axis=1)
+        if np.median(away) < _ROTATED * pixel:
+            return False
+        R_CW = np.stack([np.eye(3), R])
+        centre = np.stack([np.zeros(3), -R.T @ t])
+        rows = np.flatnonzero(good)
+        view = np.repeat([0, 1], len(rows))
+        xy = np.concatenate([xy_a[rows], xy_b[rows]])
+        which = np.tile(np.arange(len(rows)), 2)
+        given = R_CW[view], centre[view]
+        places = triangulate(*given, xy, which, len(rows), pixel)
+        angle = widest_angle(given[1], which, places)
+        front = (places @ R_CW[1].T - R_CW[1] @ centre[1])[:, 2] > 0
+        front &= places[:, 2] > 0
+        if front.sum() < _FIRST_POINTS or np.median(angle[front]) < _FIRST_ANGLE:
+            return False
+        unit = float(np.median(places[front, 2]))
+        ids = a.ids[i][rows]
+        sure = front & (angle > _ANGLE / 2)
+        self.points = {int(n): x / unit for n, x in zip(ids[sure], places[sure])}
+        return True
+
+    def _locate(
+        self,
+        ids: Int[np.ndarray, " n"],
+        xy: Float[np.ndarray, "n 2"],
+        guess: Float[np.ndarray, "4 4"] | None,
+    ) -> Float[np.ndarray, "4 4"] | None:
+        known = np.array([i in self.points for i in ids.tolist()], bool)
+        if known.sum() < _LEAST:
+            return None
+        points = np.array([self.points[i] for i in ids[known].tolist()])
+        start = None if guess is None else (guess[:3, :3].T, guess[:3, 3])
+        found = resect(points, xy[known], self.threshold, start)
+        if found is None or found[2].sum() < max(_LEAST, _SHARE * known.sum()):
+            return None
+        for i in ids[known][~found[2]].tolist():
+            # A point that moved, or was triangulated from a wrong match.
+            self.points.pop(i, None)
+        return _pose(found[0], found[1])
+
+    def _remember(
+        self,
+        pose: Float[np.ndarray, "4 4"],
+        ids: Int[np.ndarray, " n"],
+        xy: Float[np.ndarray, "n 2"],
+    ) -> None:
+        """Adds a keyframe, and the points that it and earlier ones show."""
+        self.keyframes.append(Keyframe(pose, ids, xy))
+        new = ids[[i not in self.points for i in ids.tolist()]]
+        if not len(new):
+            return
+        views = [
+            (k.T_WC, *(a[np.isin(k.ids, new)] for a in (k.ids, k.xy)))
+            for k in self.keyframes
+        ]
+        number = np.concatenate([v[1] for v in views])
+        seen = np.concatenate([v[2] for v in views])
+        T_WC = np.concatenate([np.repeat(v[0][None], len(v[1]), 0) for v in views])
+        track, row, count = np.unique(number, return_inverse=True, return_counts=True)
+        R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
+        scale = self.threshold / _THRESHOLD
+        places = triangulate(R_CW, centre, seen, row, len(track), scale)
+        p_C = np.einsum("mij,mj->mi", R_CW, places[row] - centre)
+        front = p_C[:, 2] > 1e-6
+        depth = np.where(front, p_C[:, 2], 1.0)
+        away = np.linalg.norm(p_C[:, :2] / depth[:, None] - seen, axis=1)
+        fits = front & (away < self.threshold)
+        off = np.bincount(row, ~fits, len(track)) / count
+        # Where the camera mostly turns, points of little parallax are better than none.
+        share = (len(ids) - len(new)) / (_ENOUGH * len(ids))
+        angle = _ANGLE * np.clip(share, _LEAST_ANGLE, 1.0)
+        good = (count >= 2) & (off < _OFF)
+        good &= widest_angle(centre, row, places) > angle
+        for i, x in zip(track[good].tolist(), places[good]):
+            self.points[i] = x
+
+
+def _pose(
+    R_CW: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R_CW.T, centre
+    return T

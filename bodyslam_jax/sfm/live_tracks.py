@@ -1,0 +1,207 @@
+"""Points followed from frame to frame, and places recognised, as a video runs.
+
+Corners (Shi and Tomasi, 1994) spread over the image are followed by pyramidal
+Lucas--Kanade there and back. ORB (Rublee et al., 2011) describes keyframes, so that a
+camera that lost all points can be located again. Memory does not grow.
+"""
+
+import dataclasses
+from collections import deque
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
+
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.sfm.features import epipolar_inliers, match, spread
+from bodyslam_jax.types import Intrinsics
+
+_ROUND_TRIP = 0.5
+"""Largest forward-backward error, px, as offline (`tracks`)."""
+_WINDOW = 21
+_CELLS = 8
+"""Cells along the longer side of the image, over which points are spread."""
+_SPARSE = 0.85
+"""Share of the wanted points below which new ones are looked for."""
+_BORDER = 4
+_GAP = 10
+"""Frames over which points must fit one rigid motion."""
+_EPIPOLAR = 1.5
+"""Distance from the epipolar line beyond which a point is dropped, px."""
+_STILL = 3.0
+"""Median motion over these frames, px, below which the test says nothing."""
+_PLACES = 60
+"""Keyframes that are remembered: two minutes at one in two seconds."""
+_FEATURES = 1000
+_NEAR = 3.0
+"""Distance of a corner that describes a point, px."""
+_MATCHES = 20
+"""Matches by which a place is recognised."""
+_DARK = 8.0
+"""Standard deviation of grey levels below which an image shows nothing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """What a keyframe looked like, and where its points are."""
+
+    descriptors: UInt8[np.ndarray, "n 32"]
+    points: Float[np.ndarray, "n 3"]
+    """Map units."""
+
+    def moved(self, move: Float[np.ndarray, "4 4"]) -> "Place":
+        """The place after the map was moved as a whole."""
+        points = self.points @ move[:3, :3].T + move[:3, 3]
+        return dataclasses.replace(self, points=points)
+
+
+class PointFollower:
+    """Points that are followed, and the last image."""
+
+    def __init__(self, intrinsics: Intrinsics, wanted: int) -> None:
+        self.size = intrinsics.width, intrinsics.height
+        self.K, self.distortion = as_opencv(intrinsics.params)
+        self.wanted = wanted
+        self.ids, self.uv = np.zeros(0, np.int64), np.zeros((0, 2))
+        self.step = np.zeros((0, 2))
+        self.previous: np.ndarray | None = None
+        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_GAP + 1)
+        self.next_id = 0
+        self.orb = cv2.ORB.create(_FEATURES)
+        self.places: deque[Place] = deque(maxlen=_PLACES)
+
+    def advance(
+        self, gray: UInt8[np.ndarray, "y x"], mask: UInt8[np.ndarray, "y x"] | None
+    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
+        """Follows the points to the next image; `mask` is not 0 where people are."""
+        if gray.std() < _DARK:  # Nothing to see; what comes next is compared with it.
+            self._keep(np.zeros(len(self.ids), bool))
+        if self.previous is not None and len(self.ids):
+            self._follow(gray, mask)
+            self._drop_moving()
+        if len(self.ids) < _SPARSE * self.wanted:
+            self._refill(gray, mask)
+        self.previous = gray
+        self.recent.append((self.ids, self.uv))
+        return self.ids, self.uv
+
+    def add(self, uv: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+        """Follows more points of the last image from now on; returns their numbers."""
+        ids = np.arange(self.next_id, self.next_id + len(uv))
+        self.next_id += len(uv)
+        self.ids = np.concatenate([self.ids, ids])
+        self.uv = np.concatenate([self.uv, uv])
+        self.step = np.concatenate([self.step, np.zeros_like(uv)])
+        return ids
+
+    def remember(self, points: dict[int, Float[np.ndarray, " 3"]]) -> None:
+        """Remembers the last image as a place, by its points that are known."""
+        known = np.array([i in points for i in self.ids.tolist()], bool)
+        if known.sum() < _MATCHES or self.previous is None:
+            return
+        marks, descriptors = self.orb.detectAndCompute(self.previous, None)
+        if descriptors is None:
+            return
+        # Described are ORB's own corners, turned as it sees them, next to known points.
+        ids, uv = self.ids[known], self.uv[known]
+        corners = np.array([mark.pt for mark in marks])
+        found = KDTree(uv).query(corners, distance_upper_bound=_NEAR)
+        away, near = (np.asarray(x) for x in found)
+        rows = np.flatnonzero(np.isfinite(away))
+        if len(rows) < _MATCHES:
+            return
+        where = np.array([points[i] for i in ids[near[rows]].tolist()])
+        self.places.append(Place(descriptors[rows], where))
+
+    def recognise(
+        self, gray: UInt8[np.ndarray, "y x"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]] | None:
+        """Points of the place that this image shows most likely, and their pixels."""
+        found, descriptors = self.orb.detectAndCompute(gray, None)
+        if descriptors is None or len(found) < _MATCHES:
+            return None
+        uv = np.array([p.pt for p in found])
+        best = None
+        for place in reversed(self.places):
+            pairs = match(place.descriptors, descriptors)
+            if len(pairs) >= _MATCHES and (best is None or len(pairs) > len(best[0])):
+                best = place.points[pairs[:, 0]], uv[pairs[:, 1]]
+        return best
+
+    def _keep(self, kept: np.ndarray) -> None:
+        self.ids, self.uv = self.ids[kept], self.uv[kept]
+        self.step = self.step[kept]
+
+    def _follow(self, gray: np.ndarray, mask: np.ndarray | None) -> None:
+        assert self.previous is not None
+        uv, ok = _flow(self.previous, gray, self.uv, self.uv + self.step)
+        back, ok_back = _flow(gray, self.previous, uv, self.uv)
+        ok &= ok_back & (np.linalg.norm(back - self.uv, axis=1) < _ROUND_TRIP)
+        ok &= self._inside(uv, mask)
+        self.step, self.uv = uv - self.uv, uv
+        self._keep(ok)
+
+    def _drop_moving(self) -> None:
+        """Drops what does not fit one rigid motion over the last frames."""
+        if not self.recent:
+            return
+        ids, uv = self.recent[0]
+        _, now, then = np.intersect1d(self.ids, ids, return_indices=True)
+        moved = np.linalg.norm(self.uv[now] - uv[then], axis=1)
+        if not len(now) or np.median(moved) < _STILL:
+            return
+        a, b = (rays(x, self.K, self.distortion) for x in (uv[then], self.uv[now]))
+        inlier = epipolar_inliers(a, b, _EPIPOLAR / self.K[0, 0])
+        kept = np.ones(len(self.ids), bool)
+        kept[now[~inlier]] = False
+        self._keep(kept)
+
+    def _inside(self, uv: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+        width, height = self.size
+        low, high = _BORDER, np.array([width, height]) - _BORDER
+        ok = np.array(np.logical_and(uv >= low, uv < high).all(axis=1))
+        if mask is not None:
+            at = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int)
+            ok &= mask[at[:, 1], at[:, 0]] == 0
+        return ok
+
+    def _refill(self, gray: np.ndarray, mask: np.ndarray | None) -> None:
+        free = None if mask is None else cv2.bitwise_not(mask)
+        found = cv2.goodFeaturesToTrack(gray, 3 * self.wanted, 0.005, 7, mask=free)
+        if found is None:
+            return
+        uv = found.reshape(-1, 2).astype(float)
+        uv = uv[self._inside(uv, mask)]
+        if not len(uv):
+            return
+        cell = -(-max(self.size) // _CELLS)
+        occupied = np.unique((uv // cell).astype(int), axis=0)
+        quota = -(-self.wanted // max(len(occupied), 1))
+        chosen = spread(
+            uv,
+            np.arange(len(uv), 0, -1, dtype=float),  # The strongest come first.
+            self.uv,
+            size=self.size,
+            cell=cell,
+            quota=quota,
+            distance=0.15 * cell,
+        )[: max(0, self.wanted - len(self.ids))]
+        self.add(uv[chosen])
+
+
+def _flow(
+    a: np.ndarray, b: np.ndarray, uv: np.ndarray, guess: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    found, ok, _ = cv2.calcOpticalFlowPyrLK(
+        a,
+        b,
+        uv.astype(np.float32).reshape(-1, 1, 2),
+        guess.astype(np.float32).reshape(-1, 1, 2),
+        winSize=(_WINDOW, _WINDOW),
+        maxLevel=3,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    return found.reshape(-1, 2).astype(float), ok.ravel() > 0
