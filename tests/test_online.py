@@ -174,7 +174,7 @@ def random_prior(frames: int, people: int, rng: np.random.Generator):
         landmarks=jnp.zeros((0, 3)),
         intrinsics=jnp.asarray(CAMERA.params),
     )
-    prior = priors.no_prior(state, frames, 2, (0, 1, 2))
+    prior = priors.no_prior(state, frames, 2)
     size = len(prior.offset)
     root = jnp.asarray(rng.standard_normal((size, size)))
     offset = jnp.asarray(rng.standard_normal(size))
@@ -185,7 +185,6 @@ def random_prior(frames: int, people: int, rng: np.random.Generator):
         anchor=prior.anchor,
         invariant=prior.invariant,
         reach=2,
-        joints=(0, 1, 2),
     )
 
 

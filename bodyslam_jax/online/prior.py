@@ -17,7 +17,7 @@ POSTURE = 69
 """Coordinates of a posture."""
 
 
-def no_prior(state: graph.State, frames: int, reach: int, joints: tuple[int, ...]):
+def no_prior(state: graph.State, frames: int, reach: int) -> graph.MarginalPrior:
     """A prior without information on the first `frames` frames of a state."""
     estimate = _first_frames(state, frames)
     size = len(_places(estimate, reach).order)
@@ -29,7 +29,6 @@ def no_prior(state: graph.State, frames: int, reach: int, joints: tuple[int, ...
         anchor=jnp.zeros(frames, dtype),
         invariant=jnp.zeros(3, dtype),
         reach=reach,
-        joints=joints,
     )
 
 

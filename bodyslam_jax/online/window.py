@@ -325,7 +325,7 @@ class Window:
     def _start(self) -> tuple[Sequence, graph.State, PersonState]:
         """The window as a sequence, the first state of its solve, and people's bodies
         as fitted to their keypoints alone."""
-        keypoints = Keypoints(self.uv, self.confidence, None, self.config_definition)
+        keypoints = Keypoints(self.uv, self.confidence, self.config_definition)
         sequence = Sequence(
             name="window",
             frames=None,
@@ -410,8 +410,7 @@ class Window:
         factors = [*of_people, moved, ground]
         factors = [cameras, *(in_frames(f, measured) for f in factors)]
         if self.prior is None:
-            joints = sum(graph.limbs_of(factors), ())
-            self.prior = priors.no_prior(state, PRIOR, 2, joints)
+            self.prior = priors.no_prior(state, PRIOR, 2)
         metric = np.isfinite(self.scale_sigma) or bool((told > 0).any())
         free = state.zero_step()
         ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
@@ -434,6 +433,7 @@ class Window:
             motion=predictor,
             free=free,
             common_sizes=True,
+            basis=people.posture_basis(),
         )
         variables = tuple(v for v in graph.VARIABLES if v in _VARIABLES)
         problem = dataclasses.replace(problem, variables=variables)
