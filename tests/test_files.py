@@ -66,6 +66,7 @@ OWN_FILES = {
     "batch/manifest.py": "text in memory",
     "experiments/row_cache.py": "rows of an experiment",
     "view/serve.py": "the page that it serves",
+    "io/capture.py": "cameras and streams, which are no files",
 }
 """Modules that may open files by themselves, and why."""
 _OPENERS = {

@@ -1,6 +1,7 @@
 """The estimate while a video runs: parts that need no window, and all of it (slow)."""
 
 import json
+import signal
 import threading
 import time
 import urllib.request
@@ -352,10 +353,19 @@ def type_of_path():
 
 
 def test_the_first_interrupt_ends_the_source_and_the_second_the_command():
-    import signal
 
     if threading.current_thread() is not threading.main_thread():
         pytest.skip("signals come to the main thread")
+    # A worker of the tests ignores it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        _interrupted_twice()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupted_twice():
+
     with pytest.raises(KeyboardInterrupt), interrupts.as_event() as stop:
         assert not stop.is_set()
         signal.raise_signal(signal.SIGINT)

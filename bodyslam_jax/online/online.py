@@ -155,7 +155,7 @@ class Online:
                 raise InputError("prepare: found neither intrinsics nor a size.")
             self.intrinsics = self._guess(*size)
         if self.config.people and self.config.detect != "none":
-            self.found.open()
+            self.found.load_networks()
         frames, points = invented(self.intrinsics, self.body, self.step)
         scratch = Window(*self._of_window())
         scratch.advance(frames[: FRAMES - CHUNK])

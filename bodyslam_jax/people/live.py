@@ -64,7 +64,7 @@ class LivePeople:
         self.frame, self.next_search = 0, 0
         self.networks: tuple | None = None
 
-    def open(self) -> None:
+    def load_networks(self) -> None:
         """Opens the networks.
 
         **Raises:** as `open_network`.
@@ -76,7 +76,7 @@ class LivePeople:
         self, image: UInt8[np.ndarray, "y x 3"]
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
         """BODY_25 keypoints (u px, v px, confidence) in the next image, by person."""
-        self.open()
+        self.load_networks()
         assert self.networks is not None
         alive = self.tracker.alive(self.frame)
         expected = [t.expected(self.frame, self.fps) for t in alive]

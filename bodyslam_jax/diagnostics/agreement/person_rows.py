@@ -79,7 +79,7 @@ def _keypoints(keypoints: Keypoints, persons: list[Person]) -> Keypoints:
             at = (keypoints.confidence[k] > 0).any(-1)
             uv[i, at] = keypoints.uv[k, at]
             confidence[i, at] = keypoints.confidence[k, at]
-    return dataclasses.replace(keypoints, uv=uv, confidence=confidence, depth=None)
+    return dataclasses.replace(keypoints, uv=uv, confidence=confidence)
 
 
 def _bodies(bodies: Bodies, persons: list[Person], apart) -> Bodies:

@@ -26,7 +26,7 @@ def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
     uv = np.where(confidence[..., None] > 0, uv, 0.0)
     if image.swap:
         uv, confidence = uv[:, :, BODY25_MIRRORED], confidence[:, :, BODY25_MIRRORED]
-    keypoints = dataclasses.replace(keypoints, uv=uv, confidence=confidence, depth=None)
+    keypoints = dataclasses.replace(keypoints, uv=uv, confidence=confidence)
     return dataclasses.replace(sequence, keypoints=keypoints)
 
 
