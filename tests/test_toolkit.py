@@ -520,14 +520,15 @@ class LateClock(bs.FrameFactor):
 
 @pytest.mark.slow
 def test_run_takes_factors_and_variables(case):
-    """A sensor that is right decides; one of another unit makes the result doubtful."""
+    """A sensor that is right decides; one that errs makes the result doubtful."""
     T_WC = np.asarray(case.truth.T_WC)
     path = (np.linalg.inv(T_WC[0]) @ T_WC)[:, :3, 3]
     path = path - 0.5 * np.diff(path, axis=0, prepend=path[:1])
     variables = {"late": bs.Variable(0.0, sigma=1.0)}
 
-    def found(unit):
-        sensor = LateClock(jnp.asarray(unit * path), jnp.full(FRAMES, 0.005))
+    def found(error):
+        off = error * np.random.default_rng(0).standard_normal(path.shape)
+        sensor = LateClock(jnp.asarray(path + off), jnp.full(FRAMES, 0.005))
         return bs.run(
             case.sequence,
             case.config,
@@ -535,7 +536,7 @@ def test_run_takes_factors_and_variables(case):
             variables=variables,
         )
 
-    result = found(1.0)
+    result = found(0.0)
     own = result.summary["own"]
     late = own["variables"]["late"]
     assert abs(result.scale / case.map_scale - 1) < 0.01
@@ -544,7 +545,7 @@ def test_run_takes_factors_and_variables(case):
     assert late["given_sigma"] == [1.0]
     assert own["factors"]["LateClock"]["rms"] < 2
     assert "own_factor" not in [reason["name"] for reason in result.summary["reasons"]]
-    wrong = found(3.3).summary
+    wrong = found(0.3).summary
     assert wrong["own"]["factors"]["LateClock"]["rms"] > 3
     assert wrong["status"] == "doubtful"
     assert "own_factor" in [reason["name"] for reason in wrong["reasons"]]

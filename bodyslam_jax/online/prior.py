@@ -108,7 +108,7 @@ def _of_information(
     prior: graph.MarginalPrior, matrix: np.ndarray, slope: np.ndarray
 ) -> graph.MarginalPrior:
     dtype = prior.root.dtype
-    root, offset = square_root(matrix, slope, np.finfo(dtype).eps)
+    root, offset = square_root(matrix, slope, float(np.finfo(dtype).eps))
     return dataclasses.replace(
         prior, root=jnp.asarray(root, dtype), offset=jnp.asarray(offset, dtype)
     )

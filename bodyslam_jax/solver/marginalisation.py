@@ -469,8 +469,8 @@ def _prior(
     matrix = place.T @ np.asarray(found.matrix)[np.ix_(kept, kept)] @ place
     slope = place.T @ np.asarray(found.slope)[kept]
     gone = index.cameras[: 6 * (CHUNK - _reach(problem))]
-    matrix, slope = _without(matrix, slope, gone, np.finfo(dtype).eps)
-    root, offset = square_root(matrix, slope, np.finfo(dtype).eps)
+    matrix, slope = _without(matrix, slope, gone, float(np.finfo(dtype).eps))
+    root, offset = square_root(matrix, slope, float(np.finfo(dtype).eps))
     diagonal = np.diag(matrix)[index.cameras].reshape(-1, 6)
     anchor = (diagonal[:, 3:] > 0).any(axis=1)
     return dataclasses.replace(
