@@ -216,7 +216,7 @@ def _rest(
     free = _cut(problem.free, start, stop, ~observed)
     cameras = _reach(problem)
     until = lambda x, axis, count: jnp.asarray(
-        np.asarray(x) * _from(count, np.shape(x), axis)
+        np.asarray(x) * _from(count, np.shape(x), axis), x.dtype
     )
     free = dataclasses.replace(
         free,
