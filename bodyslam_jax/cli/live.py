@@ -61,7 +61,6 @@ def live(
     from bodyslam_jax.io.camera.calibration import read_camera
     from bodyslam_jax.io.capture import Capture
     from bodyslam_jax.online import Online
-    from bodyslam_jax.online.folder import write_folder
 
     _check(config)
     capture = Capture(source, config.fps)
@@ -92,8 +91,29 @@ def live(
         online.video, online.picks = capture.path, indices
     with unexpected.noted_in(out):
         result = online.finish()
-        write_folder(online, result, out)
+        _write_folder(online, result, out)
     return finish(result, out)
+
+
+def _write_folder(online: Any, result: Any, out: Path) -> None:
+    """Writes what `online.finish` returned as `run` does; with an overlay where the
+    frames are those of a file (`Online.video`), as no image is kept.
+
+    **Raises:** `InputError` if `out` cannot be written or holds something else.
+    """
+    from bodyslam_jax import export
+    from bodyslam_jax.pipeline.pictures import check_overlay, write_pictures
+    from bodyslam_jax.pipeline.progress import Stopwatch
+
+    check_overlay(online.config)
+    watch = Stopwatch()
+    with export.locked(out), export.run_folder(out) as partial:
+        measured, cameras = online.inputs
+        given = measured, cameras, result, online.body, online.config, watch
+        still = write_pictures(partial, *given)
+        result.summary["durations_s"] |= watch.seconds
+        export.write_files(partial, result, online.config)
+        export.write_report(partial / "report.html", result, online.body, still)
 
 
 def _check(config: Config) -> None:
@@ -174,7 +194,7 @@ def _figures(estimate: Any, rate: float, late: float, dropped: int) -> dict[str,
         "latency (95 %)": f"{1000 * late:.0f} ms",
         "dropped": str(dropped),
         "people": str(len(estimate.people)),
-        "sizes known to": f"{100 * relative:.0f} %" if known else "unknown",
+        "sizes": f"known to {100 * relative:.0f} %" if known else "unknown",
         "scale": f"{estimate.scale:.3f} ± {estimate.scale_sigma:.3f} m per unit"
         if known
         else "unknown",

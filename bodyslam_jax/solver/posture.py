@@ -12,12 +12,12 @@ from bodyslam_jax.graph import TURNS, Problem
 
 
 def posture_width(problem: Problem) -> int:
-    """p"""
+    """The number p of coordinates of one posture in a step."""
     return TURNS if problem.basis is None else problem.basis.shape[1]
 
 
 def basis_of(problem: Problem, dtype) -> Float[Array, "69 p"]:
-    """B, nothing held."""
+    """The matrix B from coordinates to turns (rad), with no turn held."""
     if problem.basis is None:
         return jnp.eye(TURNS, dtype=dtype)
     return problem.basis.astype(dtype)
@@ -26,14 +26,16 @@ def basis_of(problem: Problem, dtype) -> Float[Array, "69 p"]:
 def to_coordinates(
     problem: Problem, columns: Float[Array, "*b 69"]
 ) -> Float[Array, "*b p"]:
-    """Derivatives by coordinates from those by turns, of which none is held."""
+    """Converts derivatives by turns, of which none is held, into derivatives by
+    coordinates: columns `J B`."""
     return columns if problem.basis is None else columns @ problem.basis
 
 
 def from_turns(
     problem: Problem, slope: Float[Array, "h t 23 3"]
 ) -> Float[Array, "h t p"]:
-    """A gradient by coordinates from one by turns: `B^T slope`."""
+    """Converts a gradient by turns, 0 where they are held, into one by coordinates:
+    `B^T slope`."""
     held = problem.free.poses * slope
     return to_coordinates(problem, held.reshape(*slope.shape[:2], TURNS))
 
@@ -41,7 +43,7 @@ def from_turns(
 def to_turns(
     problem: Problem, moved: Float[Array, "h t p"]
 ) -> Float[Array, "h t 23 3"]:
-    """The turns of a step: `B z`."""
+    """Returns the turns `B z` (rad) of a step, 0 where they are held."""
     free = problem.free.poses
     if problem.basis is not None:
         moved = moved @ problem.basis.T.astype(moved.dtype)
