@@ -279,7 +279,9 @@ def report():
     jax.jit(lambda: add(jnp.ones((80, 80))).sum()).lower().compile()
     return [("compiled", "slowly")]
 sys.argv = ["bodyslam", "doctor"]
-with mock.patch("bodyslam_jax.cli.environment.report", report):
+with mock.patch.multiple(
+    "bodyslam_jax.cli.environment", report=report, verdict=lambda rows: "none"
+):
     cli.main()
 """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TF_CPP")}
@@ -292,7 +294,7 @@ with mock.patch("bodyslam_jax.cli.environment.report", report):
         check=True,
         timeout=300,
     )
-    assert quiet.stdout == "compiled  slowly\n" and quiet.stderr == ""
+    assert quiet.stdout == "compiled  slowly\nverdict   none\n" and quiet.stderr == ""
 
 
 def test_settings_do_not_matter_for_who_holds_a_folder(tmp_path, sequence, holder):
