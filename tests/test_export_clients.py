@@ -1,5 +1,6 @@
 """Exported files in the programs that they are for; see `clients.py`."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 from clients import run
 from export_cases import FPS, NUM_FRAMES, SIZE, make_result, observe
+from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import export
-from bodyslam_jax.body import JOINT_NAMES, load_body_model, write_npz
+from bodyslam_jax.body import JOINT_NAMES, joints, load_body_model, write_npz
 from bodyslam_jax.export.formats.bvh import MIXAMO_NAMES
+from bodyslam_jax.export.formats.csv import angles
 
 pytestmark = pytest.mark.slow
 Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -221,6 +224,67 @@ def test_opensim_opens_trc(tmp_path, result, body):
     points = np.array(found["points"], float)
     np.testing.assert_allclose(points[there] / 1000, result.joints[1, there], atol=1e-5)
     assert np.isnan(points[~there]).all()
+
+
+_INVERSE_KINEMATICS = """
+import json, os, sys
+import opensim
+opensim.Logger.setLevelString("Off")
+os.chdir(sys.argv[1])
+assert opensim.InverseKinematicsTool("inverse_kinematics.xml").run()
+table = opensim.TimeSeriesTable("angles.mot")
+errors = opensim.TimeSeriesTable("bodyslam_ik_marker_errors.sto")
+column = lambda table, name: list(table.getDependentColumn(name).to_numpy())
+print()
+print(json.dumps({
+    "times": list(table.getIndependentColumn()),
+    "angles": {name: column(table, name) for name in table.getColumnLabels()},
+    "rms": column(errors, "marker_error_RMS"),
+}))
+"""
+
+
+def test_opensim_finds_the_angles_by_inverse_kinematics(tmp_path, result, body):
+    """Of somebody who bends hips, knees, ankles and shoulders, and faces across the
+    world's axes. The oracle is `csv`, which takes angles from rotations."""
+    rng = np.random.default_rng(3)
+    poses = np.zeros((1, NUM_FRAMES, 24, 3))
+    poses[:, :, 0] = [0.0, 2.0, 0.0]
+    swing = np.linspace(-1, 1, NUM_FRAMES)[:, None]
+    for joint in (1, 2, 16, 17):
+        poses[0, :, joint] = 0.3 * rng.standard_normal(3) * swing
+    for joint, bend in ((4, 0.5), (5, 0.4), (7, -0.2), (8, 0.1)):
+        poses[0, :, joint, 0] = bend + 0.3 * swing[:, 0]
+    betas, trans = result.betas[:1], result.trans[:1]
+    flat = poses.reshape(1, NUM_FRAMES, 72)
+    posed = joints(body, *map(jnp.asarray, (flat, betas[:, None], trans)))
+    walker = dataclasses.replace(
+        result,
+        poses=flat,
+        betas=betas,
+        trans=trans,
+        joints=np.asarray(posed),
+        present=result.present[:1],
+    )
+    (path,) = export.export(walker, tmp_path / "a", to="opensim", body=body)
+    found = run("opensim", _INVERSE_KINEMATICS, path)
+    assert max(found["rms"]) < 0.01  # m
+    turns = Rotation.from_rotvec(poses[0].reshape(-1, 3)).as_matrix()
+    true = angles(
+        turns.reshape(NUM_FRAMES, 24, 3, 3), walker.joints[0], np.array([0.0, 1.0, 0.0])
+    )
+    names = {"hip_flexion": "hip_flexion_deg", "hip_adduction": "hip_adduction_deg"}
+    names |= {"hip_rotation": "hip_internal_rotation_deg"}
+    names |= {"knee_angle": "knee_flexion_deg", "ankle_angle": "ankle_dorsiflexion_deg"}
+    for side in ("left", "right"):
+        for theirs, ours in names.items():
+            x = np.array(found["angles"][f"{theirs}_{side[0]}"])
+            np.testing.assert_allclose(x, true[f"{side}_{ours}"], atol=1.0)  # degrees
+    np.testing.assert_allclose(
+        np.stack([found["angles"][f"pelvis_t{axis}"] for axis in "xyz"], axis=1),
+        walker.joints[0, :, 0],
+        atol=0.01,
+    )
 
 
 _SMPLX = """

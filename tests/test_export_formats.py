@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import get_args
+from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,13 @@ from export_cases import FPS, NUM_FRAMES, SIZE, make_result, observe, without_pe
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import evaluation, export, io
-from bodyslam_jax.body import JOINT_NAMES, joints, load_body_model, vertices
+from bodyslam_jax.body import (
+    JOINT_NAMES,
+    PARENTS,
+    joints,
+    load_body_model,
+    vertices,
+)
 from bodyslam_jax.cli.export import Formats
 from bodyslam_jax.export import formats
 from bodyslam_jax.export.formats import csv as isb
@@ -248,6 +255,35 @@ def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
     assert float(row["time_s"]) == pytest.approx(result.timestamps[k], abs=1e-6)
     absent = np.flatnonzero(~result.present[1])
     assert len(absent) and all(rows[k]["pelvis_x_m"] == "" for k in absent)
+
+
+def test_opensim_has_the_same_markers_in_model_data_and_tasks(tmp_path, result, body):
+    """The model has this person's bones; `test_export_clients.py` runs the program."""
+    (path,) = export.export(result, tmp_path / "a", "opensim", body=body, person=1)
+    model = ElementTree.parse(path / "model.osim")
+    found = {
+        point.get("name"): np.array(point.findtext("location", "").split(), float)
+        for point in model.iter("Marker")
+    }
+    tasks = ElementTree.parse(path / "inverse_kinematics.xml")
+    assert [task.get("name") for task in tasks.iter("IKMarkerTask")] == list(found)
+    rows = [r.split("\t") for r in (path / "markers.trc").read_text().splitlines()]
+    assert [name for name in rows[3][2:] if name] == list(found)
+    values = np.array([r[2 : 2 + 3 * len(found)] for r in rows[6:]])
+    there = result.present[1]
+    assert (values[~there] == "").all()
+    points = values[there].astype(float).reshape(there.sum(), -1, 3) / 1000
+    at = {name: points[:, k] for k, name in enumerate(found)}
+    for joint, name in ((4, "left_knee"), (8, "right_ankle"), (20, "left_wrist")):
+        np.testing.assert_allclose(at[name], result.joints[1, there, joint], atol=1e-6)
+        bone = result.joints[1, there, joint] - result.joints[1, there, PARENTS[joint]]
+        length = np.linalg.norm(bone, axis=-1)
+        np.testing.assert_allclose(np.linalg.norm(found[name]), length, rtol=1e-5)
+    # What the model has between markers of a segment, the data have in every frame.
+    for a, b in (("left_ankle", "tibia_l_front"), ("humerus_r_right", "right_elbow")):
+        between = np.linalg.norm(at[a] - at[b], axis=-1)
+        expected = np.linalg.norm(found[a] - found[b])
+        np.testing.assert_allclose(between, expected, rtol=1e-4)
 
 
 def test_angles_of_joints_have_the_signs_of_the_field():

@@ -15,6 +15,7 @@ Formats = Literal[
     "kitti",
     "trc",
     "c3d",
+    "opensim",
     "csv",
     "usd",
     "rerun",

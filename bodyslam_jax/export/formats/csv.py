@@ -22,7 +22,7 @@ from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.markup import csv_table
 
-_ISB = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+SMPL_TO_ISB = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """From SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
 _LEG = {"hip": 1, "knee": 4, "ankle": 7}
 """Joint of the left side by name; that of the right side follows it."""
@@ -59,7 +59,7 @@ def angles(
     """Joint angles by name, degrees: of SMPL's joint rotations, the first of which is
     the pelvis' in the world, and of joints (m) in that world."""
     found = {}
-    in_isb = _ISB @ turns @ _ISB.T
+    in_isb = SMPL_TO_ISB @ turns @ SMPL_TO_ISB.T
     for name, left in _LEG.items():
         for side, joint, sign in (("left", left, -1.0), ("right", left + 1, 1.0)):
             flexion, adduction, rotation = cardan_zxy(in_isb[:, joint])

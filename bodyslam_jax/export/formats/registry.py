@@ -141,6 +141,18 @@ FORMATS: dict[str, Format] = {
             "person_{}.c3d",
         ),
         Format(
+            "opensim",
+            "",
+            "one person's model, markers, set-up of inverse kinematics",
+            "y up",
+            "m, mm",
+            _VIDEO_RATE,
+            "14 segments, Rajagopal's coordinates",
+            "OpenSim (`opensim-cmd run-tool inverse_kinematics.xml`)",
+            "opensim_{}",
+            turns=False,
+        ),
+        Format(
             "csv",
             ".csv",
             "one person's joints with sigmas, joint angles, speeds",
