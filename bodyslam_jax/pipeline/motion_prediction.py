@@ -10,8 +10,8 @@ from jaxtyping import Float
 from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
-from bodyslam_jax.geometry.free_fall import in_free_fall
 from bodyslam_jax.geometry.lengths import padded_length, shortened
+from bodyslam_jax.geometry.stances import in_free_fall
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.types import Sequence
@@ -60,7 +60,7 @@ def contact_probability(
     predictor: graph.MotionPredictor, state: graph.State, fps: float
 ) -> Float[np.ndarray, "h t 4"]:
     """Probabilities that toes and heels stand; 0 while a person falls freely, which
-    postures do not tell from a stance (`geometry.free_fall`)."""
+    postures do not tell from a stance (`geometry.stances.in_free_fall`)."""
     found = np.array(predict(predictor, state))
     present = np.asarray(predictor.present)
     pelvis = np.asarray(graph.world_from_root(state))[..., :3, 3]
