@@ -38,9 +38,9 @@ from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.vertical_edges import Vertical
 
 _DEGREE = np.pi / 180
-_TRUNK_SIGMA_ACROSS = 2.0 * _DEGREE
+_TRUNK_SIGMA_ACROSS_RAD = 2.0 * _DEGREE
 """Standard deviation of a mean trunk from the vertical, across the view, rad."""
-_TRUNK_SIGMA_ALONG = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
+_TRUNK_SIGMA_ALONG_RAD = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
 """The same along the view, by whether bodies are fitted to keypoints: ten simulated
 sequences gave 1.5 and 3.4 degrees root mean square; one real clip gave 11."""
 _COMMON_TRUNK_SHARE = 0.65
@@ -54,18 +54,18 @@ keypoints, and the factor by which its standard deviation is then larger."""
 _EDGE_OUTLIERS = (0.1, 5.0 * _DEGREE)
 """Probability that edges which agree are not vertical, and the standard deviation of
 their direction in that case, rad. Assumed: they were vertical in all 21 clips."""
-_LEVEL_SLOPE_SIGMA, _STEEP_SLOPE_SIGMA = 0.7 * _DEGREE, 4.0 * _DEGREE
+_LEVEL_SLOPE_SIGMA_RAD, _STEEP_SLOPE_SIGMA_RAD = 0.7 * _DEGREE, 4.0 * _DEGREE
 _GROUND_KINDS = (
     (0.5, 0.2 * _DEGREE),
-    (0.25, _LEVEL_SLOPE_SIGMA),
-    (0.25, _STEEP_SLOPE_SIGMA),
+    (0.25, _LEVEL_SLOPE_SIGMA_RAD),
+    (0.25, _STEEP_SLOPE_SIGMA_RAD),
 )
 """Probability and standard deviation of the slope (rad) of each kind of ground: floors
 of buildings, level ground outdoors, sloping ground."""
 _RELATIVE_SIZE_SIGMA = 0.05
 """Relative standard deviation of a person's size. An error of size shifts all stances
 of the person up or down by that share of the camera's height above them."""
-_HELD_HEIGHT_SIGMA = 0.01
+_HELD_HEIGHT_SIGMA_M = 0.01
 """Standard deviation of the height over a plane of people whom the estimate constrains
 to it, m."""
 
@@ -128,7 +128,7 @@ def find_upright(
     height = _height_of_camera(eyes, stances)
     size = np.full(len(stances), _RELATIVE_SIZE_SIGMA * height)
     if on_floor is not None:
-        size = np.where(on_floor, _HELD_HEIGHT_SIGMA, size)
+        size = np.where(on_floor, _HELD_HEIGHT_SIGMA_M, size)
     planes = [feet_plane(stances, size, np.median(eyes, axis=0))]
     planes.append(map_plane(landmarks, eyes, stances))
     ground = fused([plane for plane in planes if plane is not None])
@@ -188,9 +188,9 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         along = (view[:, :, None] * view[:, None, :]).mean(axis=0)
         across = np.eye(2) - along
         noise = scatter**2 / seconds
-        systematic = own_share * _TRUNK_SIGMA_ALONG[bool(fitted[h])] ** 2
+        systematic = own_share * _TRUNK_SIGMA_ALONG_RAD[bool(fitted[h])] ** 2
         weight = along / (systematic + noise)
-        weight = weight + across / (own_share * _TRUNK_SIGMA_ACROSS**2 + noise)
+        weight = weight + across / (own_share * _TRUNK_SIGMA_ACROSS_RAD**2 + noise)
         views.append(along)
         anybody_fitted |= bool(fitted[h])
         means.append(mean)
@@ -199,8 +199,8 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         return None
     tilt, covariance = _robust_mean(np.array(means), np.array(weights))
     along = np.mean(views, axis=0)
-    common = along * _TRUNK_SIGMA_ALONG[anybody_fitted] ** 2
-    common = common + (np.eye(2) - along) * _TRUNK_SIGMA_ACROSS**2
+    common = along * _TRUNK_SIGMA_ALONG_RAD[anybody_fitted] ** 2
+    common = common + (np.eye(2) - along) * _TRUNK_SIGMA_ACROSS_RAD**2
     return tilt, covariance + _COMMON_TRUNK_SHARE**2 * common
 
 
@@ -282,7 +282,7 @@ def _combined(
     if not up_tilts:
         if ground is None:
             return np.zeros(2), unknown, np.inf
-        level = ground.covariance + _LEVEL_SLOPE_SIGMA**2 * np.eye(2)
+        level = ground.covariance + _LEVEL_SLOPE_SIGMA_RAD**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
     density, tilts, slopes, covariances, is_sloping = [], [], [], [], []
     for p, mean, own in up_tilts:
@@ -302,7 +302,7 @@ def _combined(
             density.append(p * q * likelihood)
             tilts.append(mean - own @ explained)
             slopes.append(sigma**2 * explained)
-            is_sloping.append(sigma == _STEEP_SLOPE_SIGMA)
+            is_sloping.append(sigma == _STEEP_SLOPE_SIGMA_RAD)
             covariances.append(own - own @ np.linalg.solve(total, own))
     # If all likelihoods underflow, the widest combination, the last, is chosen.
     weight = np.array(density)

@@ -15,18 +15,18 @@ _DEGREE = np.pi / 180
 CAUCHY_SCALE = 2.4
 """Scale of the Cauchy loss in standard deviations: 95 % as efficient as least squares
 where errors are normal."""
-_FEET_SLOPE_SIGMA, _MAP_SLOPE_SIGMA = 0.5 * _DEGREE, 0.3 * _DEGREE
+_FEET_SLOPE_SIGMA_RAD, _MAP_SLOPE_SIGMA_RAD = 0.5 * _DEGREE, 0.3 * _DEGREE
 """Standard deviations of the systematic slope errors of the plane through feet and of
 the map's plane, rad: more feet or points do not reduce them."""
 _MAX_AUTOCORRELATION = 0.9
 """Upper bound of the autocorrelation of stance residuals: few stances determine no
 larger one."""
-_MIN_HEIGHT_SIGMA = 0.02
+_MIN_HEIGHT_SIGMA_M = 0.02
 """Lower bound of the standard deviation of the height of a standing foot, m."""
 _RELATIVE_DEPTH_SIGMA = 0.02
 """Relative standard deviation of the distance between camera and stance: the part that
 is independent between stances."""
-_HEIGHT_SCATTER = 0.04
+_MAX_HEIGHT_SCATTER_M = 0.04
 """Scatter of stances about the map's plane that estimation errors explain, m."""
 _MAX_STANCE_OFFSET = 0.25
 """Distance of the median stance from the map's plane, as a share of the camera's
@@ -85,16 +85,16 @@ def feet_plane(
         information = design.T @ scaled + prior
         return information, np.linalg.solve(information, scaled.T @ x[:, 1])
 
-    information, solution = fit(np.full(len(x), (5 * _MIN_HEIGHT_SIGMA) ** -2))
+    information, solution = fit(np.full(len(x), (5 * _MIN_HEIGHT_SIGMA_M) ** -2))
     for _ in range(19):
         residual = x[:, 1] - design @ solution
         spread = 1.4826 * np.median(np.abs(residual))
-        sigma = max(_MIN_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
+        sigma = max(_MIN_HEIGHT_SIGMA_M, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
         cauchy = 1 / (1 + (residual / (CAUCHY_SCALE * sigma)) ** 2)
         information, solution = fit(cauchy / sigma**2)
     covariance = np.linalg.inv(information)[:2, :2]
     covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
-    covariance = covariance + _FEET_SLOPE_SIGMA**2 * np.eye(2)
+    covariance = covariance + _FEET_SLOPE_SIGMA_RAD**2 * np.eye(2)
     if eye is not None:
         own = np.concatenate([s - s.mean(axis=0) for s in stances if len(s)])
         lean = _lean(own[:, [0, 2]], points - eye)
@@ -154,7 +154,7 @@ def map_plane(
         away = every @ normal + offset
         if height <= 0 or abs(np.median(away)) > _MAX_STANCE_OFFSET * height:
             return None
-        excess = max(_scatter_of_level(away) ** 2 - _HEIGHT_SCATTER**2, 0.0)
+        excess = max(_scatter_of_level(away) ** 2 - _MAX_HEIGHT_SCATTER_M**2, 0.0)
     away = landmarks @ normal + offset
     near = np.abs(away) < 0.05 * height
     flat = landmarks[near][:, [0, 2]]
@@ -166,7 +166,7 @@ def map_plane(
         covariance += excess * np.linalg.inv(flat.T @ flat / len(flat) + np.eye(2))
     return Plane(
         -normal[[0, 2]] / normal[1],
-        covariance + _MAP_SLOPE_SIGMA**2 * np.eye(2),
+        covariance + _MAP_SLOPE_SIGMA_RAD**2 * np.eye(2),
     )
 
 

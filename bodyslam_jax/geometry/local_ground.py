@@ -20,10 +20,10 @@ _ROUGHNESS = 0.04
 height above them."""
 _MIN_DOWNWARD_SINE = 0.05
 """Least sine of the angle between a ray and the horizontal, downwards."""
-_MEDIAN_WINDOW = 1.0
+_MEDIAN_WINDOW_S = 1.0
 """Length of the running median of heights, s: two steps, over which errors of postures
 average out."""
-_WANDER_SIGMA = 0.03
+_WANDER_SIGMA_M = 0.03
 """Standard deviation of the running medians that estimation errors explain, m; that of
 simulated walkers on level ground is 0.01 to 0.015."""
 
@@ -83,7 +83,7 @@ def running_median(
     values: Float[np.ndarray, " t"],
     used: Bool[np.ndarray, " t"],
     fps: float,
-    seconds: float = _MEDIAN_WINDOW,
+    seconds: float = _MEDIAN_WINDOW_S,
 ) -> Float[np.ndarray, " t"]:
     """Returns the running median of `values` where `used`, over windows of `seconds`;
     NaN where a window has no value."""
@@ -115,5 +115,5 @@ def wander(
         return slow, 0.0
     low, high = np.quantile(slow[used], [0.16, 0.84])
     variance = ((high - low) / 2) ** 2
-    excess = max(variance - _WANDER_SIGMA**2, 0.0)
+    excess = max(variance - _WANDER_SIGMA_M**2, 0.0)
     return slow * excess / max(variance, 1e-12), float(np.sqrt(excess))

@@ -15,18 +15,18 @@ from bodyslam_jax.geometry.runs import runs
 
 STANDING_SPEED = 0.6
 """Speed below which the lower foot counts as standing, m/s: assumes that toe joints err
-by well below 6 cm over `_SPEED_WINDOW`."""
-_SPEED_WINDOW = 0.1
+by well below 6 cm over `_SPEED_WINDOW_S`."""
+_SPEED_WINDOW_S = 0.1
 """Interval over which the speed of a foot is measured, s, so that the noise of single
 frames averages out."""
-_MIN_STANCE_DURATION = 0.1
+_MIN_STANCE_S = 0.1
 """Least duration of a stance, s."""
 _MIN_CONTACT_PROBABILITY = 0.7
 """Contact probability above which a toe counts as standing, for gravity and floor."""
-_MIN_FALL_ACCELERATION = 6.0
+_MIN_FALL_ACCELERATION_MPS2 = 6.0
 """Downward acceleration above which nothing supports a person, m/s². It detects 41 of
 49 flight frames of recorded jumps, and no other frame (`benchmarks/bench_jumps.py`)."""
-_FALL_WINDOW = 0.2
+_FALL_WINDOW_S = 0.2
 """Interval over which the acceleration is measured, s. Position errors of 1 cm cause
 errors of 2 m/s²."""
 
@@ -41,7 +41,7 @@ def standing_feet(
     """
     frame = np.arange(len(feet))
     lower = (feet @ up).argmin(axis=1)
-    half = max(1, round(_SPEED_WINDOW * fps / 2))
+    half = max(1, round(_SPEED_WINDOW_S * fps / 2))
     before = np.maximum(frame - half, 0)
     after = np.minimum(frame + half, len(feet) - 1)
     moved = np.linalg.norm(feet[after, lower] - feet[before, lower], axis=-1)
@@ -65,7 +65,7 @@ def find_stances(
         standing = np.zeros(feet.shape[:3], bool)
         for h, one in enumerate(present):
             standing[h] = standing_by_speed(feet[h], one, fps)
-    frames = max(2, _MIN_STANCE_DURATION * fps)
+    frames = max(2, _MIN_STANCE_S * fps)
     return [
         _stances(f, s & p[:, None], frames)
         for f, s, p in zip(feet, standing, present, strict=True)
@@ -117,7 +117,7 @@ def in_free_fall(
         pelvis: position in the world, m.
         up: unit vector; it may err by some 20 degrees.
     """
-    half = max(1, round(_FALL_WINDOW * fps / 2))
+    half = max(1, round(_FALL_WINDOW_S * fps / 2))
     k = np.arange(-half, half + 1)
     # Least squares with a parabola: its second derivative in the middle.
     weight = k**2 - np.mean(k**2)
@@ -128,5 +128,5 @@ def in_free_fall(
             height = pelvis[run] @ up
             middle = np.arange(run.start + half, run.stop - half)
             acceleration = np.correlate(height, weight, "valid")
-            found[middle] = acceleration < -_MIN_FALL_ACCELERATION
+            found[middle] = acceleration < -_MIN_FALL_ACCELERATION_MPS2
     return found

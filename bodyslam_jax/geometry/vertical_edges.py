@@ -25,30 +25,30 @@ from jaxtyping import Float, Int
 from bodyslam_jax.geometry.camera import unproject
 
 _DEGREE = np.pi / 180
-_MAX_EDGE_ANGLE = 15 * _DEGREE
+_MAX_EDGE_ANGLE_RAD = 15 * _DEGREE
 """Largest angle in the image between a segment and the rough vertical, and largest
 angle between the result and the rough vertical, rad."""
 _MIN_RAY_SINE = 0.5
 """Least sine of the angle between the ray of a segment and the vertical."""
-_AZIMUTH_SECTOR = 3 * _DEGREE
+_AZIMUTH_SECTOR_RAD = 3 * _DEGREE
 """Width of the azimuth sectors, rad; segments of one image in the same sector count as
 one edge."""
-_VIEW_ANGLE = 60 * _DEGREE
+_VIEW_ANGLE_RAD = 60 * _DEGREE
 """Change of heading after which two views of the camera do not overlap, rad."""
 _END_SIGMA_PX = 0.25
 """Standard deviation of the end points of a segment, across it, px."""
-_LEAN_SIGMA_RANGE = (0.3 * _DEGREE, 2.0 * _DEGREE)
+_LEAN_SIGMA_RANGE_RAD = (0.3 * _DEGREE, 2.0 * _DEGREE)
 """Bounds of the standard deviation of the lean of vertical edges in a fit, rad."""
-_MAX_LEAN_SIGMA = 1.4 * _DEGREE
+_MAX_LEAN_SIGMA_RAD = 1.4 * _DEGREE
 """Standard deviation of the lean above which edges are not walls and posts but, for
 instance, trees, and the error of the fit exceeds its covariance, rad."""
-_COMMON_ERROR_SIGMA = 0.2 * _DEGREE
+_COMMON_ERROR_SIGMA_RAD = 0.2 * _DEGREE
 """Standard deviation of the error in the image that all edges of a clip have in common,
 from a rolling shutter or unmodelled distortion, rad."""
 _MIN_GAIN, _MIN_EDGES = 8.0, 4.0
 """Least gain in log-likelihood over uniform directions, and least number of independent
 edges, of a result."""
-_TILT_PRIOR_SIGMA = 20 * _DEGREE
+_TILT_PRIOR_SIGMA_RAD = 20 * _DEGREE
 """Standard deviation of the prior of the tilt, which makes the system regular, rad."""
 _EM_ITERATIONS = 20
 """Number of iterations of expectation maximisation."""
@@ -130,25 +130,25 @@ def find_vertical(edges: Edges) -> Vertical | None:
     tilt, found = np.zeros(2), None
     for _ in range(2):  # The second fit is centred on the first, with all its edges.
         found = _fit(edges, tilt)
-        if found is None or np.linalg.norm(found.tilt) > np.tan(_MAX_EDGE_ANGLE):
+        if found is None or np.linalg.norm(found.tilt) > np.tan(_MAX_EDGE_ANGLE_RAD):
             return None
         tilt = found.tilt
     assert found is not None
     is_clear = found.gain > _MIN_GAIN and found.number > _MIN_EDGES
-    return found if is_clear and found.lean < _MAX_LEAN_SIGMA else None
+    return found if is_clear and found.lean < _MAX_LEAN_SIGMA_RAD else None
 
 
 def _fit(edges: Edges, centre: Float[np.ndarray, " 2"]) -> Vertical | None:
     """Fits the mixture to the segments near a tilt; `None` with fewer than three."""
     r, _, across = _residual(edges.normal, edges.ray, centre)
-    near = (across > _MIN_RAY_SINE) & (np.abs(r) < np.sin(_MAX_EDGE_ANGLE))
+    near = (across > _MIN_RAY_SINE) & (np.abs(r) < np.sin(_MAX_EDGE_ANGLE_RAD))
     if near.sum() < 3:
         return None
     normal, ray = edges.normal[near], edges.ray[near]
     noise = np.sqrt(2) * _END_SIGMA_PX / edges.length[near]
     weight = _weights(edges, near)
-    random = 1 / (2 * _MAX_EDGE_ANGLE)
-    prior = np.eye(2) / _TILT_PRIOR_SIGMA**2
+    random = 1 / (2 * _MAX_EDGE_ANGLE_RAD)
+    prior = np.eye(2) / _TILT_PRIOR_SIGMA_RAD**2
 
     def density(r: np.ndarray, lean: float) -> np.ndarray:
         variance = lean**2 + noise**2
@@ -177,7 +177,9 @@ def _fit(edges: Edges, centre: Float[np.ndarray, " 2"]) -> Vertical | None:
         excess = fisher @ (r**2 - noise**2) / max(float(fisher.sum()), 1e-12)
         lean = float(
             np.sqrt(
-                np.clip(excess, _LEAN_SIGMA_RANGE[0] ** 2, _LEAN_SIGMA_RANGE[1] ** 2)
+                np.clip(
+                    excess, _LEAN_SIGMA_RANGE_RAD[0] ** 2, _LEAN_SIGMA_RANGE_RAD[1] ** 2
+                )
             )
         )
     r, slope, _ = _residual(normal, ray, tilt)
@@ -189,7 +191,7 @@ def _fit(edges: Edges, centre: Float[np.ndarray, " 2"]) -> Vertical | None:
     covariance = np.linalg.inv(slope.T @ (slope * by_all[:, None]) + prior)
     # The common error, as an angle of every edge in the image.
     mean = slope.T @ (slope * counts[:, None]) / max(float(counts.sum()), 1e-12)
-    common = np.linalg.inv(mean / _COMMON_ERROR_SIGMA**2 + prior)
+    common = np.linalg.inv(mean / _COMMON_ERROR_SIGMA_RAD**2 + prior)
     gain = float(weight @ np.log(inlier / random + 1 - share))
     covariance = covariance + common
     number = float(counts.sum())
@@ -207,12 +209,12 @@ def _residual(normal, ray, tilt):
 def _weights(edges: Edges, near: np.ndarray) -> Float[np.ndarray, " k"]:
     """Returns the number of independent edges that each segment represents."""
     azimuth = np.arctan2(edges.ray[near, 0], edges.ray[near, 2])
-    sector = np.floor(azimuth / _AZIMUTH_SECTOR).astype(int)
+    sector = np.floor(azimuth / _AZIMUTH_SECTOR_RAD).astype(int)
     place = np.stack([edges.frame[near], sector])
     group = np.unique(place, axis=1, return_inverse=True)[1].reshape(-1)
     length = edges.length[near]
     share = length / np.bincount(group, length)[group]
     heading = np.arctan2(edges.axis[:, 0], edges.axis[:, 2])
     turned = np.angle(np.exp(1j * (heading - heading[0])))
-    views = 1 + np.ptp(turned) / _VIEW_ANGLE
+    views = 1 + np.ptp(turned) / _VIEW_ANGLE_RAD
     return share * views / len(edges.axis)
