@@ -14,8 +14,8 @@ def pose_joints(
     rest: Float[np.ndarray, "*#n j 3"],
     pelvis: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n j 3 3"], Float[np.ndarray, "n j 3"]]:
-    """Returns rotations and positions (m) of the first `j` joints in the root's parent
-    frame.
+    """Returns rotations and positions (m) of the first `j` joints, in the frame to
+    which the root's rotation maps.
 
     `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
 
