@@ -46,10 +46,12 @@ class BodyModel(eqx.Module):
 
     @property
     def num_vertices(self) -> int:
+        """Number of vertices `v`."""
         return self.template.shape[0]
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Floating-point type of the arrays."""
         return self.template.dtype
 
 

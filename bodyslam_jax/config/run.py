@@ -33,7 +33,7 @@ class Limits:
 
     @property
     def bytes(self) -> int:
-        """`input_gigabytes` in bytes."""
+        """The limit `input_gigabytes` in bytes."""
         return round(self.input_gigabytes * _GIGABYTE)
 
 

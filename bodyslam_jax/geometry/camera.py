@@ -117,6 +117,7 @@ def undistort(
 
 
 def _to_pixel(intrinsics: Array, xy: Array) -> Array:
+    """Converts distorted coordinates at depth 1 to pixels."""
     return intrinsics[..., :2] * xy + intrinsics[..., 2:4]
 
 

@@ -227,6 +227,7 @@ def _robust_mean(
 
 
 def _height_of_camera(eyes, stances) -> float:
+    """Returns the height of the camera over the stances, m; 1.5 m without any."""
     every = np.concatenate([np.zeros((0, 3)), *stances])
     if not len(every):
         return 1.5
@@ -319,4 +320,5 @@ def _combined(
 
 
 def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
+    """Returns the largest standard deviation in any direction."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance).max()))

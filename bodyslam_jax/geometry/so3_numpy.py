@@ -92,5 +92,6 @@ def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 
 
 
 def _of_vector(vector: np.ndarray) -> Rotation:
+    """Converts rotation vectors to SciPy's rotations."""
     # A copy, as SciPy rejects read-only arrays such as those from JAX.
     return Rotation.from_rotvec(np.array(vector.reshape(-1, 3)))

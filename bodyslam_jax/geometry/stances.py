@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry.runs import runs
 
-STANDING_SPEED = 0.6
+_MAX_STANCE_SPEED_MPS = 0.6
 """Speed below which the lower foot counts as standing, m/s: assumes that toe joints err
 by well below 6 cm over `_SPEED_WINDOW_S`."""
 _SPEED_WINDOW_S = 0.1
@@ -37,7 +37,8 @@ def standing_feet(
     """Returns the frames in which the lower foot stands, and the index of that foot.
 
     `feet` are the toe joints in consecutive frames, m, in any world; `up` may err by 20
-    degrees. A foot stands where its speed, in any direction, is below `STANDING_SPEED`.
+    degrees. A foot stands where its speed, in any direction, is below
+    `_MAX_STANCE_SPEED_MPS`.
     """
     frame = np.arange(len(feet))
     lower = (feet @ up).argmin(axis=1)
@@ -46,7 +47,7 @@ def standing_feet(
     after = np.minimum(frame + half, len(feet) - 1)
     moved = np.linalg.norm(feet[after, lower] - feet[before, lower], axis=-1)
     speed = moved * fps / np.maximum(after - before, 1)
-    return (speed < STANDING_SPEED) & (len(feet) > 1), lower
+    return (speed < _MAX_STANCE_SPEED_MPS) & (len(feet) > 1), lower
 
 
 def find_stances(

@@ -114,6 +114,7 @@ class Normalisation(eqx.Module):
         return (x - self.mean) / self.std
 
     def undo(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Inverts the normalisation."""
         return x * self.std + self.mean
 
 

@@ -106,7 +106,8 @@ def on_floor(
     used = stands & on[:, None]
     count = used.sum(axis=1, keepdims=True)
     # The prior of a fitted shape has a smaller σ than its uncertainty, to balance
-    # keypoints with correlated errors; other measurements of size are scaled alike.
+    # keypoints with correlated errors; other measurements of size are scaled by the
+    # same factor.
     own = weights.ground_sigma * np.where(view.fitted, weights.shape_sigma, 1.0)
     sigma = np.where(used, own[:, None] * np.sqrt(count), np.inf)
     if not used.any() or level > -_MIN_CAMERA_HEIGHT_M:

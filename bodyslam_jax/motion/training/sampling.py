@@ -55,6 +55,7 @@ class Corpus(eqx.Module):
 
     @property
     def num_windows(self) -> int:
+        """Number of frames where a segment may begin."""
         return len(self.start)
 
 
