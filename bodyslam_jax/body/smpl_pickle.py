@@ -62,7 +62,7 @@ class _Expressions:
         return self.found[id(value), depth]
 
     def _evaluated(self, value: StandIn, state: dict, depth: int) -> np.ndarray | None:
-        """Evaluates the state of one object, without looking it up."""
+        """Evaluates one object from its state, without the results in `found`."""
         if "indptr" in state:
             return self._dense(state, value.name.rpartition(".")[2].startswith("csr"))
         if depth > _MAX_DEPTH:

@@ -11,7 +11,8 @@ import jaxlie
 from jaxtyping import Array, Float
 
 _SMALL_SQUARED_ANGLE = 1e-3
-"""rad²; below it the series of `exp` are exact to rounding, with two derivatives."""
+"""Squared angle below which the series of `exp` are exact to rounding, with two
+derivatives, rad²."""
 _SMALL_SQUARED_SINE = 1e-8
 """Squared sine of half the angle below which the series of `log` is exact."""
 

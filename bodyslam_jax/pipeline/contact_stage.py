@@ -117,11 +117,11 @@ def stand_on_plane(
 ) -> graph.GroundContact:
     """Returns the ground factor with sigmas of the heights of standing feet over it.
 
-    At constant scale it determines the distance of people, so that contact with steps
-    estimated too short cannot bring them nearer. The ground is shifted to the median
-    height of standing feet, and weighted by how well it explains them: where they rise
-    and sink over seconds (`wander`), it follows them, and σ grows with the remaining
-    scatter; frames far from it, on a step or a kerb, have no weight.
+    At constant scale these heights determine the distance of people from the camera;
+    otherwise held feet with underestimated steps would move them nearer. The ground is
+    shifted to the median height of standing feet, and weighted by how well it explains
+    them: where they rise and sink over seconds (`wander`), it follows them, and σ grows
+    with the remaining scatter; frames far from it, on a step or a kerb, have no weight.
     """
     bare = eqx.tree_at(lambda f: f.sigma, contact, jnp.ones_like(contact.sigma))
     height = np.asarray(graph.residual_of(bare, state))[..., 0]

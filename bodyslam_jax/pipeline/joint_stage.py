@@ -47,7 +47,7 @@ class Uncertainty:
     """Descriptions of quantities that the measurements do not determine, a line
     each."""
     statures: Float[np.ndarray, "h 4"] | None = None
-    """The same as in `JointEstimate`."""
+    """Given statures and estimates without them, m, as in `JointEstimate.statures`."""
     marginals: solver.Marginals | None = None
     """Marginal covariances; `None` where they were not computed."""
 
