@@ -26,8 +26,8 @@ from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.pipeline import before_joint, joint_stage
 from bodyslam_jax.pipeline.case import Case, truth_of
-from bodyslam_jax.pipeline.ground_stage import with_ground_of
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.joint_stage import with_ground_of
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.simulation import sequences

@@ -12,8 +12,8 @@ from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
 from bodyslam_jax.people import PersonState
-from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
 from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.pipeline.joint_stage import is_uneven, with_ground_of
 from bodyslam_jax.types import ScaleStart
 
 UP = np.array([0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""The person: model file -> shaped body -> posed joints -> keypoints -> vertices."""
+"""The body model: file -> shaped body -> posed joints -> keypoints -> vertices."""
 
 from bodyslam_jax.body.files import DEFAULT as DEFAULT
 from bodyslam_jax.body.files import check as check

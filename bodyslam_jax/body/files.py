@@ -1,6 +1,6 @@
 """Finds, reads, checks and writes body model files.
 
-SMPL's files are found by their usual names, and read in both usual formats: the
+SMPL's files are found by their standard names, and read in both common formats: the
 original pickle, and `.npz` with the same names of arrays. SMPL-H and SMPL-X have more
 joints (hands, jaw, eyes), which are kept at rest: their skinning weights are added to
 those of the wrist or head, and the body has SMPL's 72 pose parameters.
@@ -30,10 +30,12 @@ from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.io.files import is_zip
 
 DEFAULT = Path(__file__).parent / "assets" / "default_body.npz"
-VARIABLE = "BODYSLAM_BODY_MODEL"
+"""The body model of the package."""
+PATH_VARIABLE = "BODYSLAM_BODY_MODEL"
+"""Environment variable that names a body model, or a folder of them."""
 _GENDERS = ("neutral", "female", "male")
 
-_NAMES = (
+_FILE_NAMES = (
     "SMPL_{G}.npz",
     "SMPL_{G}.pkl",
     "smpl/SMPL_{G}.npz",
@@ -56,18 +58,20 @@ _NAMES = (
 
 # Vertices of SURFACE_POINTS in SMPL's meshes (`vertex_ids.py` of smplx; the top of the
 # head is found as the highest vertex).
-_PICKS = {
+_PICKS_BY_MESH_SIZE = {
     6890: (332, 6260, 2800, 4071, 583, 3216, 3226, 3387, 6617, 6624, 6787),
     10475: (9120, 9929, 9448, 616, 6, 5770, 5780, 8846, 8463, 8474, 8635),
 }
-_KIND = {24: "smpl", 52: "smplh", 55: "smplx"}
+_KIND_BY_JOINTS = {24: "smpl", 52: "smplh", 55: "smplx"}
 
 
 def search_paths(gender: str = "neutral") -> list[Path]:
-    """Where a body model is looked for when none is named, in this order.
+    """Returns the files that are tried, in this order, when no body model is named.
 
-    The file or folder in the environment variable `BODYSLAM_BODY_MODEL`, then the
-    user's folder for data. The body that ships with the package comes after these.
+    They are in the file or folder of the environment variable `BODYSLAM_BODY_MODEL`,
+    then in the user's data folder. If none exists, the package's body is used.
+
+    **Raises:** `InputError` for an unknown gender.
     """
     return [path for location in _locations() for path in candidates(location, gender)]
 
@@ -76,18 +80,18 @@ def load_body_model(
     path: str | Path | None = None, gender: str | None = None, dtype=None
 ) -> BodyModel:
     """Reads a body model; without a path the first that `search_paths` finds, or the
-    free body that ships with the package.
+    package's free body.
 
     **Arguments:**
 
-    - `path`: a file (SMPL, SMPL-H, SMPL-X; `.pkl` or `.npz`) or a folder with the usual
-        names.
-    - `gender`: `neutral`, `female` or `male`: selects the file of a folder, and must
-        not contradict the name of a file. Without it a folder's neutral file.
-    - `dtype`: of the arrays; by default JAX's default.
+    - `path`: a file (SMPL, SMPL-H, SMPL-X; `.pkl` or `.npz`) or a folder with standard
+        file names.
+    - `gender`: `neutral`, `female` or `male`, which selects the file of a folder and
+        must not contradict the name of a file. Without it, the neutral file is taken.
+    - `dtype`: type of the arrays; by default that of JAX.
 
     **Raises:** `InputError`, with the paths that were tried if there is no file, or
-    what is wrong with the file.
+    with what is wrong in the file.
     """
     file = _find(path, gender)
     model = _assemble(file, checked(file, read_arrays(file)))
@@ -108,7 +112,9 @@ def check(path: str | Path, gender: str | None = None) -> str:
     raw = checked(file, read_arrays(file))
     num_vertices, num_joints = raw["weights"].shape
     stature = np.ptp(raw["v_template"][:, 1])
-    kind = "the default body" if file == DEFAULT else _KIND[num_joints].upper()
+    kind = (
+        "the default body" if file == DEFAULT else _KIND_BY_JOINTS[num_joints].upper()
+    )
     return (
         f"{file}: {kind}, {num_vertices} vertices, {len(raw['f'])} faces, "
         f"{num_joints} joints, {raw['shapedirs'].shape[2]} shape components, "
@@ -117,10 +123,9 @@ def check(path: str | Path, gender: str | None = None) -> str:
 
 
 def write_npz(model: BodyModel, path: str | Path) -> None:
-    """Writes SMPL's own layout, 24 joints, so that other tools for SMPL can read it.
+    """Writes a body model in SMPL's layout of 24 joints, which other tools can read.
 
-    Pose blend shapes that the model lacks are written as zeros. The file is written
-    atomically.
+    Missing pose blend shapes are written as zeros. The file is written atomically.
 
     **Raises:** `InputError` if the suffix of the path is not `.npz`; `OSError`, naming
     the path, if the file cannot be written.
@@ -152,37 +157,50 @@ def write_npz(model: BodyModel, path: str | Path) -> None:
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of a `.npz` or a pickle, recognised by content; not yet checked."""
+    """Reads the arrays of a `.npz` or a pickle, recognised by content, without checks.
+
+    **Raises:** `InputError` if the file is neither.
+    """
     if file.suffix != ".npz" and not is_zip(file):
         return read_pickle(file)
     archive = read_npz(file, "a body model (.npz)")
-    # SMPL-X has objects beside its arrays, which are not needed.
+    # Files of SMPL-X also contain objects, which are not needed.
     plain = [n for n in archive.names if archive.header(n)[1].kind in "biufSU"]
     return {name: archive.raw(name) for name in plain}
 
 
 def _locations() -> list[Path]:
-    locations = [Path(os.environ[VARIABLE])] if os.environ.get(VARIABLE) else []
+    """Returns the files and folders that are searched when no body model is named."""
+    locations = (
+        [Path(os.environ[PATH_VARIABLE])] if os.environ.get(PATH_VARIABLE) else []
+    )
     home = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return [*locations, Path(home) / "bodyslam" / "body_models"]
 
 
 def candidates(location: Path, gender: str) -> list[Path]:
-    """The files of one gender that `location`, a file or folder, may stand for."""
+    """Returns the files of one gender that `location`, a file or folder, may refer to.
+
+    **Raises:** `InputError` for an unknown gender.
+    """
     if gender not in _GENDERS:
         raise InputError(f"gender {gender!r}, expected neutral, female or male.")
     if location.suffix in (".npz", ".pkl") or location.is_file():
         return [location]
     short = gender if gender == "neutral" else gender[0]
-    names = [n.format(G=gender.upper(), g=short, gender=gender) for n in _NAMES]
+    names = [n.format(G=gender.upper(), g=short, gender=gender) for n in _FILE_NAMES]
     return [location / name for name in names]
 
 
 def _find(path: str | Path | None, gender: str | None) -> Path:
+    """Returns the body model file of `load_body_model`.
+
+    **Raises:** `InputError` if there is none, or its name contradicts `gender`.
+    """
     wanted = gender or "neutral"
     locations = _locations() if path is None else [Path(path)]
-    is_set = path is None and bool(os.environ.get(VARIABLE))
-    note = f" ({VARIABLE} is set)" if is_set else ""
+    is_set = path is None and bool(os.environ.get(PATH_VARIABLE))
+    note = f" ({PATH_VARIABLE} is set)" if is_set else ""
     for candidate in (
         file for location in locations for file in candidates(location, wanted)
     ):
@@ -200,9 +218,9 @@ def _find(path: str | Path | None, gender: str | None) -> Path:
 
 
 def named_gender(file: Path) -> str | None:
-    """The gender in a file's name; `None` without one.
+    """Returns the gender in the name of a file; `None` without one.
 
-    As in `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl` or `female/model.npz`.
+    Examples are `SMPL_FEMALE.npz`, `basicModel_f_lbs_...pkl` and `female/model.npz`.
     """
     name = (file.parent.name if file.stem == "model" else file.stem).lower()
     words = re.split(r"[^a-z]+", name)
@@ -211,6 +229,7 @@ def named_gender(file: Path) -> str | None:
 
 
 def _tried(location: Path, gender: str) -> str:
+    """Describes a searched location in an error message."""
     files = candidates(location, gender)
     if files == [location]:
         return str(location)
@@ -219,7 +238,7 @@ def _tried(location: Path, gender: str) -> str:
 
 
 def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
-    """Fields of a `BodyModel` with 24 joints, arrays in float64."""
+    """Returns the fields of a `BodyModel` with 24 joints, with arrays in float64."""
     template, weights, regressor = raw["v_template"], raw["weights"], raw["J_regressor"]
     shape_dirs, pose_dirs = raw["shapedirs"][:, :, :10], raw["posedirs"]
     num_joints = weights.shape[1]
@@ -251,17 +270,18 @@ def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
         "blocks": runs_of_vertices(weights),
         "picks": raw["picks"] if "picks" in raw else _picks(template, regressor),
         "name": file.stem,
-        "kind": "default" if file == DEFAULT else _KIND[num_joints],
+        "kind": "default" if file == DEFAULT else _KIND_BY_JOINTS[num_joints],
     }
 
 
 def _picks(template: np.ndarray, regressor: np.ndarray) -> np.ndarray:
-    """Vertices of `SURFACE_POINTS` for a mesh whose file does not name them."""
+    """Returns the vertices of `SURFACE_POINTS` in a mesh whose file does not name
+    them."""
     top = int(template[:, 1].argmax())
-    if len(template) in _PICKS:
-        return np.array([*_PICKS[len(template)], top])
-    # An unknown mesh: the vertices nearest to the default body's points, relative to
-    # head and ankles and scaled by the stature.
+    if len(template) in _PICKS_BY_MESH_SIZE:
+        return np.array([*_PICKS_BY_MESH_SIZE[len(template)], top])
+    # For an unknown mesh, the nearest vertices to the default body's points are taken,
+    # relative to head and ankles and scaled by stature.
     default = load_body_model(DEFAULT)
     joints, picks = np.asarray(default.joint_template), np.asarray(default.picks)
     points = np.asarray(default.template)[picks]

@@ -1,12 +1,12 @@
-"""Where each detector puts its keypoints, relative to the joints of the default body.
+"""Offsets of each detector's keypoints from the joints of the default body.
 
-Every detector has its own definition of a hip or a knee, which its training images were
-annotated by. A definition is an offset of each keypoint of BODY_25, in the axes of the
-joint that the keypoint moves with (at rest x left, y up, z forward), as a share of the
-stature. It is what all frames of all people have in common; the rest of a person's
-offset is estimated (`people.skeleton`, `people.definitions`).
+Every detector has its own definition of a hip or a knee, which follows from the
+annotation of its training images. A definition is an offset of each keypoint of
+BODY_25, in the axes of the joint that the keypoint moves with (at rest x left, y up, z
+forward), as a share of the stature. It is common to all frames of all people; the
+remaining offset of a person is estimated (`people.skeleton`, `people.definitions`).
 
-How the offsets were calibrated, and on what: `benchmarks/keypoints.md`. They hold for
+`benchmarks/keypoints.md` describes the calibration and its data. The offsets hold for
 the default body only; with another body model all of them are 0.
 """
 
@@ -17,13 +17,13 @@ from bodyslam_jax.body.skeleton import KEYPOINT_NAMES
 from bodyslam_jax.config.errors import InputError
 
 _Offsets = dict[str, tuple[float, float, float]]
-"""By name without its side: out (away from the body's middle plane; to the left for a
-point on it), up, forward, in % of the stature."""
+"""Offsets by name of the keypoint without its side: outwards (from the median plane; to
+the left for a point on it), up, forward, in % of the stature."""
 
 _KNEE = (0.0, -1.3, -0.3)
-"""Detectors put knees 1.0 to 1.2 % of the stature below the default body's, and these
-are 1.5 % higher than people's: 0.300 of the stature over the sole, 0.285 by Drillis and
-Contini (1966). So this is the body's offset rather than a detector's."""
+"""Detectors locate knees 1.0 to 1.2 % of the stature below those of the default body,
+which are 1.5 % higher than people's: 0.300 of the stature over the sole, but 0.285 by
+Drillis and Contini (1966). So this is an offset of the body, not of a detector."""
 _COCO: _Offsets = {
     "eye": (-0.2, 0.4, -0.9),
     "ear": (-0.8, -0.1, -0.2),
@@ -37,7 +37,7 @@ _COCO: _Offsets = {
     "knee": _KNEE,
     "ankle": (0.0, 1.3, 0.6),
 }
-_FEET_OF_BLAZEPOSE: _Offsets = {
+_BLAZEPOSE_FEET: _Offsets = {
     "big_toe": (2.9, 0.0, -3.7),
     "heel": (0.0, 0.3, 2.0),
 }
@@ -53,7 +53,7 @@ _MEDIAPIPE: _Offsets = {
     "hip": (-1.2, -0.7, 1.1),
     "knee": _KNEE,
     "ankle": (-0.4, 1.2, 1.1),
-    **_FEET_OF_BLAZEPOSE,
+    **_BLAZEPOSE_FEET,
 }
 _OPENPOSE: _Offsets = {
     "neck": (0.0, -3.8, 0.0),
@@ -62,24 +62,24 @@ _OPENPOSE: _Offsets = {
     "hip": (-0.9, 0.0, 0.9),
     "knee": _KNEE,
 }
-"""Not measured: the mean of COCO's offsets here and of those in `DETECTOR_BIAS`."""
+"""Not measured, but the mean of COCO's offsets here and of those in `DETECTOR_BIAS`."""
 
 _OFFSETS: dict[str, _Offsets] = {
     "unknown": {},
-    "movenet-blazepose": {**_COCO, **_FEET_OF_BLAZEPOSE},
+    "movenet-blazepose": {**_COCO, **_BLAZEPOSE_FEET},
     "coco": _COCO,
     "mediapipe": _MEDIAPIPE,
     "openpose": _OPENPOSE,
     "halpe": _COCO,
 }
 KEYPOINT_DEFINITIONS: tuple[str, ...] = tuple(_OFFSETS)
-"""Names of the definitions. `unknown` has keypoints at the joints, as projected bodies
-have them."""
+"""Names of the definitions. `unknown` has keypoints at the joints, as those projected
+from bodies."""
 
 
 def definition_offsets(definition: str) -> Float[np.ndarray, "25 3"]:
-    """From the joint or vertex of each keypoint of BODY_25 to where a detector puts it,
-    in the axes of the joint that it moves with, as a share of the stature.
+    """Returns the offset of each keypoint of BODY_25 from its joint or vertex, in the
+    axes of the joint that it moves with, as a share of the stature.
 
     **Raises:** `InputError` for a name that is not in `KEYPOINT_DEFINITIONS`.
     """

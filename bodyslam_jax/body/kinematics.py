@@ -1,12 +1,12 @@
 """Forward kinematics: joints and keypoints of a pose and shape.
 
-SMPL (Loper et al., 2015): the joints at rest are linear in the shape,
-`J(β) = J_0 + J_s β`; joint k turns about its parent's frame,
+In SMPL (Loper et al., 2015) the joints at rest are linear in the shape,
+`J(β) = J_0 + J_s β`; joint k rotates in its parent's frame,
 `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
 
-Keypoints on the skin need a few vertices (`BodyModel.picks`) only. Inside, the batch
-is the last axis: products of 3x3 matrices are then arithmetic on long vectors, one
-level of the kinematic tree at a time.
+Keypoints on the skin require a few vertices (`BodyModel.picks`) only. Internally, the
+batch is the last axis, so that products of 3x3 matrices are arithmetic on long vectors,
+one level of the kinematic tree at a time.
 """
 
 import functools
@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body.arguments import batch_of
 from bodyslam_jax.body.model import BodyModel
 from bodyslam_jax.body.skeleton import (
     DETECTOR_BIAS,
@@ -31,13 +30,48 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 
 _PARENT = np.array(PARENTS[1:])
+"""Parents of joints 1 to 23."""
+_ARGUMENT_AXES = {
+    "body_pose": ((23, 3), "axis-angle of joints 1 to 23, without the root"),
+    "pose": ((72,), "axis-angle of 24 joints, root first, in one axis"),
+    "shape": ((10,), "SMPL β"),
+    "trans": ((3,), "a translation, m"),
+}
+"""Last axes and meaning of each argument."""
+
+
+def batch_of(function: str, **arguments: Array) -> tuple[int, ...]:
+    """Returns the shape to which the leading axes of the arguments broadcast.
+
+    **Raises:** `InputError` naming the argument whose last axes are wrong, or all
+    leading axes if they do not broadcast.
+    """
+    leads = {}
+    for name, x in arguments.items():
+        tail, meaning = _ARGUMENT_AXES[name]
+        shape = jnp.shape(x)
+        if shape[-len(tail) :] != tail:
+            expected = ", ".join(map(str, tail))
+            raise InputError(
+                f"{function}: `{name}` has shape {shape}, expected (..., {expected}): "
+                f"{meaning}."
+            )
+        leads[name] = shape[: -len(tail)]
+    try:
+        return np.broadcast_shapes(*leads.values())
+    except ValueError:
+        found = ", ".join(f"`{name}` {lead}" for name, lead in leads.items())
+        raise InputError(
+            f"{function}: leading axes {found}, expected axes that broadcast."
+        ) from None
 
 
 @jax.jit
 def rest_joints(
     model: BodyModel, shape: Float[Array, "*b 10"]
 ) -> Float[Array, "*b 24 3"]:
-    """Joints at rest for SMPL β, m, in the model's own frame (pelvis at `J_0(β)`).
+    """Returns the joints at rest for SMPL β, m, in the model's frame (pelvis at
+    `J_0(β)`).
 
     **Raises:** `InputError` naming an argument of another shape.
     """
@@ -52,7 +86,7 @@ def local_joints(
     body_pose: Float[Array, "*#b 23 3"],
     shape: Float[Array, "*#b 10"],
 ) -> Float[Array, "*b 24 3"]:
-    """Posed joints in the root frame H, m: the pelvis is the origin, unrotated.
+    """Returns posed joints in the root frame H, m: the pelvis is the origin, unrotated.
 
     `body_pose` holds the axis-angle rotations of joints 1 to 23, rad, each in its
     parent's frame; `shape` is SMPL β. Leading axes broadcast.
@@ -71,9 +105,9 @@ def joints(
     shape: Float[Array, "*#b 10"],
     trans: Float[Array, "*#b 3"],
 ) -> Float[Array, "*b 24 3"]:
-    """Posed joints, m, in the frame into which the root rotation `pose[:3]` turns.
+    """Returns posed joints, m, in the frame to which the root rotation `pose[:3]` maps.
 
-    The pelvis is at `J_0(β) + trans` whatever the pose. Leading axes broadcast.
+    The pelvis is at `J_0(β) + trans` for every pose. Leading axes broadcast.
 
     **Raises:** `InputError` naming an argument of another shape.
     """
@@ -89,13 +123,13 @@ def local_keypoints(
     layout: str = "body25",
     bias: float | Float[Array, ""] = 0.0,
 ) -> Float[Array, "*b keypoints 3"]:
-    """Keypoints of a 2D detector in the root frame H, m: joints and picked vertices.
+    """Returns keypoints of a 2D detector in the root frame H, m: joints and vertices.
 
     **Arguments:**
 
     - `layout`: `body25`, `coco17` or `halpe26`; names are in `KEYPOINT_NAMES`.
     - `bias`: 0 for keypoints at SMPL's joints of the same names, 1 for hips, neck and
-        shoulders where detectors trained on COCO put them (`DETECTOR_BIAS`); keypoints
+        shoulders as located by detectors trained on COCO (`DETECTOR_BIAS`); keypoints
         are linear in it.
 
     **Raises:** `InputError` naming an argument of another shape.
@@ -115,16 +149,20 @@ def keypoints(
     layout: str = "body25",
     bias: float | Float[Array, ""] = 0.0,
 ) -> Float[Array, "*b keypoints 3"]:
-    """`local_keypoints`, placed like `joints`."""
+    """Returns the keypoints of `local_keypoints` in the frame of `joints`, m.
+
+    **Raises:** `InputError` naming an argument of another shape.
+    """
     batch_of("keypoints", pose=pose, shape=shape, trans=trans)
     points = lambda posed, beta: _detected(model, posed, beta, layout, bias)
     return _placed(model, pose, shape, trans, points)
 
 
 class Posed:
-    """Joints of `n` bodies relative to the pelvis, batch last; never leaves a jit.
+    """Joints of `n` bodies relative to the pelvis, with the batch last.
 
-    The frame is the one that the root's rotation maps to.
+    The frame is the one to which the root's rotation maps. Instances are used only
+    within jitted functions.
     """
 
     def __init__(self, R, rest, G, x):
@@ -133,20 +171,23 @@ class Posed:
         self.rest = rest
         """Joints at rest, m, (24, 3, n)."""
         self.G = G
-        """Rotations of all joints to that frame, (24, 3, 3, n)."""
+        """Rotations from all joints to that frame, (24, 3, 3, n)."""
         self.x = x
         """Positions of all joints, m, (24, 3, n)."""
 
 
 def rotations(pose: Float[Array, "n k 3"]) -> Float[Array, "k 3 3 n"]:
-    """Matrices of axis-angle vectors."""
+    """Converts axis-angle vectors (rad) to matrices, with the batch last.
+
+    **Raises:** `TypeError` for other types than float32 and float64.
+    """
     if pose.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"poses are of type {pose.dtype}, expected float32 or float64.")
     return so3.exp(pose.transpose(1, 0, 2)).transpose(0, 2, 3, 1)
 
 
 def _under_root(body_pose):
-    """Rotations of all joints; the root's is the identity."""
+    """Returns rotations of all joints, with the identity for the root."""
     R = rotations(body_pose)
     return jnp.concatenate([_identity(R), R])
 
@@ -154,9 +195,10 @@ def _under_root(body_pose):
 def pose_joints(
     model: BodyModel, R: Float[Array, "24 3 3 n"], shape: Float[Array, "n 10"]
 ) -> Posed:
-    """Forward kinematics of a flat batch."""
+    """Computes forward kinematics of a flat batch."""
 
     def of_shape(template, dirs):
+        """Returns template plus blend shapes, with the batch last."""
         moved = dirs.reshape(-1, 10) @ shape.T
         return template[:, :, None] + moved.reshape(*template.shape, -1)
 
@@ -168,16 +210,16 @@ def pose_joints(
 
 
 def matmul(A, B):
-    """Products of 3x3 matrices with more than one axis behind or before them.
+    """Multiplies `A` (j, 3, 3, n) and `B` (j, 3, c, n) along their middle axes.
 
-    `A` (j, 3, 3, n) times `B` (j, 3, c, n), written out: XLA makes one loop of it.
+    The product is written as a sum of terms, which XLA fuses into one loop.
     """
     term = lambda i: A[:, :, i, None] * B[:, None, i]
     return term(0) + term(1) + term(2)
 
 
 def matvec(A, x):
-    """`A` (j, 3, 3, n) times `x` (j, 3, n)."""
+    """Multiplies `A` (j, 3, 3, n) and `x` (j, 3, n)."""
     return (
         A[:, :, 0] * x[:, None, 0]
         + A[:, :, 1] * x[:, None, 1]
@@ -186,21 +228,23 @@ def matvec(A, x):
 
 
 def flatten(x, batch, num_axes):
-    """Broadcasts the leading axes to `batch` and makes one of them."""
+    """Broadcasts the leading axes to `batch` and merges them into one."""
     tail = x.shape[x.ndim - num_axes :]
     return jnp.broadcast_to(x, (*batch, *tail)).reshape(math.prod(batch), *tail)
 
 
 def pelvis_place(model, shape, trans):
-    """Position of the pelvis, m, (3, n), of a flat batch."""
+    """Returns the pelvis positions, m, (3, n), of a flat batch."""
     return (model.joint_template[0] + shape @ model.joint_shape_dirs[0].T + trans).T
 
 
 def _unflatten(points, batch):
+    """Converts points (k, 3, n) to (*batch, k, 3)."""
     return points.transpose(2, 0, 1).reshape(*batch, points.shape[0], 3)
 
 
 def _placed(model, pose, shape, trans, points):
+    """Evaluates `points` of posed bodies, and adds the position of the pelvis."""
     batch = jnp.broadcast_shapes(pose.shape[:-1], shape.shape[:-1], trans.shape[:-1])
     pose, beta = flatten(pose, batch, 1), flatten(shape, batch, 1)
     posed = pose_joints(model, rotations(pose.reshape(len(pose), 24, 3)), beta)
@@ -209,7 +253,10 @@ def _placed(model, pose, shape, trans, points):
 
 
 def _detected(model, posed, shape, layout, bias):
-    """Keypoints (k, 3, n) about the pelvis."""
+    """Returns keypoints (k, 3, n) relative to the pelvis, m.
+
+    **Raises:** `InputError` for an unknown layout.
+    """
     if layout not in KEYPOINT_NAMES:
         layouts = ", ".join(KEYPOINT_NAMES)
         raise InputError(f"keypoint layout {layout!r}, expected one of {layouts}.")
@@ -226,7 +273,8 @@ def _detected(model, posed, shape, layout, bias):
 
 
 def _picked_vertices(model, names, posed, shape):
-    """Skinned vertices of the named surface points, (k, 3, n), about the pelvis."""
+    """Returns the skinned vertices of the named surface points, (k, 3, n), relative to
+    the pelvis, m."""
     v = model.picks[np.array([SURFACE_POINTS.index(n) for n in names])]
     dirs = model.shape_dirs[v].reshape(-1, 10)
     rest = model.template[v][:, :, None] + (dirs @ shape.T).reshape(len(names), 3, -1)
@@ -244,38 +292,42 @@ def _picked_vertices(model, names, posed, shape):
 
 
 def pose_feature(R):
-    """SMPL's `vec(R_k - I)`, k = 1, 2, ...: (207, n) from (24, 3, 3, n)."""
+    """Returns SMPL's pose feature `vec(R_k - I)`, k = 1, 2, ...: (207, n) from
+    (24, 3, 3, n)."""
     eye = jnp.eye(3, dtype=R.dtype)[None, :, :, None]
     return (R[1:] - eye).reshape(207, R.shape[-1])
 
 
-# The kinematic chain with a derivative of its own: differentiating the matrix products
-# level by level is slow to compile and to run. A small rotation φ_k of joint k about
+# The kinematic chain has a custom derivative: differentiating the matrix products level
+# by level is slow to compile and to run. A small rotation φ_k of joint k about
 # its position (axis-angle, outer frame) moves every joint below it rigidly:
 #   Ω_k = Σ φ_i,  dx_k = Σ (Ω_parent(i) x b_i + G_parent(i) do_i),
 # with sums over i from the root to k, computed as products with constant 0-1 matrices;
 # o_i is the bone to joint i at rest and b_i = G_parent(i) o_i.
 
 
-_UP_TO_SELF = ancestors().T
-_UP_TO_PARENT = _UP_TO_SELF[_PARENT]
+_PATH_TO_JOINT = ancestors().T
+"""1 for each joint of the row's path from the root, including the row's own."""
+_PATH_TO_PARENT = _PATH_TO_JOINT[_PARENT]
+"""The same for the parents of joints 1 to 23."""
 
 
 @jax.custom_jvp
 def _chain(R, bones):
-    """`G` (24, 3, 3, n) and `x` (24, 3, n) from `R` and bones (23, 3, n) at rest.
+    """Returns `G` (24, 3, 3, n) and `x` (24, 3, n) from `R` and bones (23, 3, n) at
+    rest.
 
-    Rotations by doubling the length of the path at each step: a product for each of the
-    eight levels of the tree would take twice as long to compile.
+    Rotations are composed by doubling the length of the path at each step: a product
+    for each of the eight levels of the tree takes twice as long to compile.
     """
     G = jnp.concatenate([R, _identity(R)])
-    # Beyond the root stands the identity, above itself.
+    # Index 24 is the identity, the parent of the root and of itself.
     above = np.append(np.where(np.array(PARENTS) < 0, 24, PARENTS), 24)
     while (above != 24).any():
         G = matmul(G[above], G)
         above = above[above]
     G = G[:24]
-    return G, _tree_sum(_UP_TO_SELF[:, 1:], matvec(G[_PARENT], bones))
+    return G, _tree_sum(_PATH_TO_JOINT[:, 1:], matvec(G[_PARENT], bones))
 
 
 @_chain.defjvp
@@ -287,25 +339,29 @@ def _chain_jvp(primals, tangents):
     G_parent = jnp.concatenate([_identity(G), above])
     spin = lambda i, j: (dR[:, i] * R[:, j]).sum(1)  # of dR Rᵀ, which is skew
     phi = matvec(G_parent, jnp.stack([spin(2, 1), spin(0, 2), spin(1, 0)], 1))
-    omega, omega_parent = _tree_sum(_UP_TO_SELF, phi), _tree_sum(_UP_TO_PARENT, phi)
+    omega, omega_parent = (
+        _tree_sum(_PATH_TO_JOINT, phi),
+        _tree_sum(_PATH_TO_PARENT, phi),
+    )
     dx = _cross(omega_parent, matvec(above, bones)) + matvec(above, dbones)
     dG = jnp.stack([_cross(omega, G[:, :, i]) for i in range(3)], 2)
-    return (G, x), (dG, _tree_sum(_UP_TO_SELF[:, 1:], dx))
+    return (G, x), (dG, _tree_sum(_PATH_TO_JOINT[:, 1:], dx))
 
 
 def _identity(R):
-    """Identity rotations of the root, (1, 3, 3, n)."""
+    """Returns identity rotations of the root, (1, 3, 3, n), in the shape of `R`."""
     eye = jnp.eye(3, dtype=R.dtype)[..., None]
     return jnp.broadcast_to(eye, (1, 3, 3, R.shape[-1]))
 
 
 def _tree_sum(ones, u):
+    """Sums `u` (j, ...) over the joints that each row of a 0-1 matrix selects."""
     return (jnp.asarray(ones, u.dtype) @ u.reshape(len(u), -1)).reshape(
         len(ones), *u.shape[1:]
     )
 
 
 def _cross(a, b):
-    """Cross products of two arrays (j, 3, n) along their middle axis."""
+    """Returns cross products of two arrays (j, 3, n) along their middle axis."""
     c = lambda i, j: a[:, i] * b[:, j] - a[:, j] * b[:, i]
     return jnp.stack([c(1, 2), c(2, 0), c(0, 1)], 1)

@@ -1,6 +1,6 @@
-"""The kinematic chain in NumPy, where a compiler would take longer than the work.
+"""The kinematic chain in NumPy, for work that takes less time than its compilation.
 
-The equations of `kinematics`, which a test compares, on the same tree.
+A test compares it with `kinematics`, which has the same equations and tree.
 """
 
 import numpy as np
@@ -14,13 +14,14 @@ def pose_joints(
     rest: Float[np.ndarray, "*#n j 3"],
     pelvis: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n j 3 3"], Float[np.ndarray, "n j 3"]]:
-    """Rotations and positions (m) of the first `j` joints in the frame of the root.
+    """Returns rotations and positions (m) of the first `j` joints, in the frame to
+    which the root's rotation maps.
 
     `G_k = G_parent R_k`, `x_k = x_parent + G_parent (J_k - J_parent)`.
 
     Args:
         R: rotation of each joint in its parent's frame.
-        rest: joints at rest J, m; one set, or one for each body.
+        rest: joints at rest J, m; one set, or one per body.
         pelvis: position of joint 0, m.
     """
     G, x = R.copy(), np.empty(R.shape[:3])

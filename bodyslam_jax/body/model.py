@@ -1,4 +1,4 @@
-"""SMPL's parameters as arrays."""
+"""The parameters of SMPL as arrays."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 class BodyModel(eqx.Module):
     """SMPL (Loper et al., 2015) with `v` vertices and `p` pose blend shapes.
 
-    Rest pose: a T, in frame H: x to the subject's left, y up, z forward.
+    The rest pose is a T pose in frame H: x to the subject's left, y up, z forward.
     """
 
     template: Float[Array, "v 3"]
@@ -24,7 +24,7 @@ class BodyModel(eqx.Module):
     joint_shape_dirs: Float[Array, "24 3 10"]
     """Displacement of joints at rest per unit of β, m."""
     joint_regressor: Float[Array, "24 v"]
-    """Weights of the rest vertices in each joint; needed for writing files only."""
+    """Weights of the rest vertices in each joint; used only to write files."""
     skin_joint: Int[Array, "v k"]
     """The joints that each vertex follows; padded with joint 0."""
     skin_weight: Float[Array, "v k"]
@@ -34,29 +34,32 @@ class BodyModel(eqx.Module):
     picks: Int[Array, " 12"]
     """The vertices of `SURFACE_POINTS`."""
     blocks: tuple[tuple[int, int, tuple[int, ...]], ...] = eqx.field(static=True)
-    """Runs of vertices (first, one past the last) and the few joints that each follows;
-    skinning a run needs no others."""
+    """Runs of vertices (first, one past the last), each with the joints that its
+    vertices follow."""
     name: str = eqx.field(static=True)
-    """Of the file, without suffix."""
+    """Name of the file without suffix."""
     kind: str = eqx.field(static=True)
     """Kind of the file: `default`, `smpl`, `smplh` or `smplx`."""
     sized: bool = eqx.field(static=True, default=False)
-    """Whether the last component of β is the size of the whole body, not one of the
+    """True if the last component of β is the size of the whole body, in place of the
     file's (`people.with_size_axis`)."""
 
     @property
     def num_vertices(self) -> int:
+        """Number of vertices `v`."""
         return self.template.shape[0]
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Floating-point type of the arrays."""
         return self.template.dtype
 
 
 def sparse_rows(
     weights: Float[np.ndarray, "v 24"],
 ) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
-    """The non-zero entries of each row, largest first, padded with weight 0."""
+    """Returns joint and weight of the non-zero entries of each row, largest first,
+    padded with weight 0."""
     width = max(1, int((weights != 0).sum(1).max()))
     joint = np.argsort(-np.abs(weights), axis=1, kind="stable")[:, :width]
     weight = np.take_along_axis(weights, joint, axis=1)
@@ -66,9 +69,9 @@ def sparse_rows(
 def runs_of_vertices(
     weights: Float[np.ndarray, "v 24"],
 ) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
-    """Runs of vertices, in the mesh's order, that follow few joints each.
+    """Splits the vertices, in the mesh's order, into runs that follow few joints each.
 
-    Meshes list the parts of the body one after another. The cuts minimise the sum of
+    Meshes list the parts of the body successively. The cuts minimise the sum of
     (vertices x joints), plus a constant per run for its compilation, by dynamic
     programming over cells of vertices; a body has about four runs.
     """

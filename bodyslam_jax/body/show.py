@@ -1,7 +1,7 @@
-"""A picture of a body model: its shape components and a few postures.
+"""Draws a body model: its shape components and a few postures.
 
-Orthographic views of shaded triangles, drawn back to front: matplotlib's 3D axes are
-slow and order faces wrongly.
+Views are orthographic, of shaded triangles that are drawn back to front: matplotlib's
+3D axes are slow and order faces wrongly.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from bodyslam_jax.body.skinning import vertices
 from bodyslam_jax.config.errors import InputError
 
 NUM_SHAPES = 4
-"""Shape components shown at ±2 standard deviations."""
+"""Number of shape components that are drawn at ±2 standard deviations."""
 
 POSTURES: dict[str, dict[str, tuple[float, float, float]]] = {
     "arms down": {
@@ -54,7 +54,7 @@ POSTURES: dict[str, dict[str, tuple[float, float, float]]] = {
 def save_picture(model: BodyModel, path: str | Path) -> None:
     """Draws shape components at ±2σ and postures to an image file.
 
-    **Raises:** `InputError` if the path has not the suffix of an image format.
+    **Raises:** `InputError` if the path lacks the suffix of an image format.
     """
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
@@ -92,7 +92,7 @@ def save_picture(model: BodyModel, path: str | Path) -> None:
 
 
 def posture(name: str, dtype=None):
-    """One of `POSTURES` as SMPL's 72 numbers."""
+    """Returns one of `POSTURES` as SMPL's 72 pose parameters, rad."""
     pose = np.zeros((24, 3))
     for joint, rotation in POSTURES[name].items():
         pose[JOINT_NAMES.index(joint)] = rotation

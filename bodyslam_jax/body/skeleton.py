@@ -1,8 +1,9 @@
-"""SMPL's joints, and the keypoints of 2D detectors in terms of them.
+"""SMPL's joints, and the joints or vertices that keypoints of 2D detectors correspond
+to.
 
-Joint order and kinematic tree: Loper et al., SMPL, 2015. Keypoint orders: OpenPose
-(BODY_25), COCO (17), Halpe (26). Which joint or vertex a keypoint of BODY_25 is:
-`constants.JOINT_MAP` of SPIN (Kolotouros et al., 2019).
+Joint order and kinematic tree are those of Loper et al., SMPL, 2015. Keypoint orders
+are those of OpenPose (BODY_25), COCO (17) and Halpe (26). The correspondence of BODY_25
+is that of `constants.JOINT_MAP` of SPIN (Kolotouros et al., 2019).
 """
 
 import numpy as np
@@ -34,15 +35,17 @@ JOINT_NAMES: tuple[str, ...] = (
     "left_hand",
     "right_hand",
 )
+"""Names of SMPL's joints, in its order."""
 PARENTS: tuple[int, ...] = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8),
     *(9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21),
 )
+"""Parent of each joint; -1 for the root."""
 MIRRORED: tuple[int, ...] = (
     *(0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10),
     *(12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22),
 )
-"""The joint on the other side of the body."""
+"""For each joint, the one on the other side of the body."""
 
 PELVIS, NECK, HEAD = (JOINT_NAMES.index(name) for name in ("pelvis", "neck", "head"))
 HIPS, KNEES, ANKLES, FEET, WRISTS, HANDS = (
@@ -67,7 +70,7 @@ LEVELS: tuple[tuple[int, ...], ...] = (
 
 
 def ancestors() -> Float[np.ndarray, "24 24"]:
-    """1 where the joint of the row is the joint of the column or above it."""
+    """Returns 1 where the row's joint is the column's joint or one of its ancestors."""
     above = np.eye(24)
     for joint in range(1, 24):
         above[:, joint] += above[:, PARENTS[joint]]
@@ -88,9 +91,9 @@ SURFACE_POINTS: tuple[str, ...] = (
     "right_heel",
     "head_top",
 )
-"""Keypoints that are vertices: `BodyModel.picks` has them in this order."""
+"""Keypoints that are vertices, in the order of `BodyModel.picks`."""
 
-_LEFT_OF_COCO = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+_SIDED_COCO_PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 
 KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
     "body25": (
@@ -107,11 +110,11 @@ KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
     ),
     "coco17": (
         "nose",
-        *(f"{side}_{x}" for x in _LEFT_OF_COCO for side in ("left", "right")),
+        *(f"{side}_{x}" for x in _SIDED_COCO_PARTS for side in ("left", "right")),
     ),
     "halpe26": (
         "nose",
-        *(f"{side}_{x}" for x in _LEFT_OF_COCO for side in ("left", "right")),
+        *(f"{side}_{x}" for x in _SIDED_COCO_PARTS for side in ("left", "right")),
         *("head_top", "neck", "mid_hip"),
         *(
             f"{side}_{x}"
@@ -124,7 +127,7 @@ KEYPOINT_NAMES: dict[str, tuple[str, ...]] = {
 
 
 def _other_side(name: str) -> str:
-    """The name with left and right exchanged."""
+    """Exchanges left and right in a name."""
     side, _, part = name.partition("_")
     other = {"left": "right", "right": "left"}.get(side)
     return name if other is None else f"{other}_{part}"
@@ -135,7 +138,7 @@ BODY25: dict[str, int] = {name: k for k, name in enumerate(KEYPOINT_NAMES["body2
 BODY25_MIRRORED: tuple[int, ...] = tuple(
     BODY25[_other_side(name)] for name in KEYPOINT_NAMES["body25"]
 )
-"""The keypoint of BODY_25 on the other side of the body."""
+"""For each keypoint of BODY_25, the one on the other side of the body."""
 BODY25_FACE = (BODY25["nose"], BODY25["right_eye"], BODY25["left_eye"])
 BODY25_ANKLES = (BODY25["right_ankle"], BODY25["left_ankle"])
 BODY25_TOES_AND_HEELS = (
@@ -144,9 +147,9 @@ BODY25_TOES_AND_HEELS = (
 )
 """Big toe and heel of either foot."""
 BODY25_ANKLES_AND_FEET = (*BODY25_ANKLES, *range(BODY25["left_big_toe"], len(BODY25)))
-"""Ankles, toes and heels."""
+"""Ankles, toes and heels of BODY_25."""
 
-_SPREAD = {
+_SPREAD_BY_PART = {
     "nose": 0.026,
     "eye": 0.025,
     "ear": 0.035,
@@ -162,7 +165,7 @@ _SPREAD = {
     "top": 0.035,
 }
 KEYPOINT_SPREAD: dict[str, tuple[float, ...]] = {
-    layout: tuple(_SPREAD[name.rsplit("_", 1)[-1]] for name in names)
+    layout: tuple(_SPREAD_BY_PART[name.rsplit("_", 1)[-1]] for name in names)
     for layout, names in KEYPOINT_NAMES.items()
 }
 """Standard deviation of COCO's annotators, relative to the square root of the person's
@@ -172,7 +175,7 @@ KEYPOINT_JOINT: dict[str, int] = {
     "mid_hip": 0,
     **{name: j for j, name in enumerate(JOINT_NAMES) if "spine" not in name},
 }
-"""SMPL's joint of each keypoint that has one."""
+"""SMPL joint of each keypoint that corresponds to one."""
 
 DETECTOR_BIAS: dict[str, tuple[float, float, float]] = {
     "left_hip": (-0.012, -0.020, 0.018),
@@ -182,8 +185,8 @@ DETECTOR_BIAS: dict[str, tuple[float, float, float]] = {
     "left_shoulder": (-0.017, 0.021, -0.002),
     "right_shoulder": (0.017, 0.021, -0.002),
 }
-"""Where detectors trained on COCO put a keypoint, relative to the default body's joint
-of that name, m, in the joint's own frame at rest. Measured with anny's regressors of
-COCO keypoints on the mean adult. OpenPose's neck and middle hip are midpoints of its
-shoulders and of its hips, so not SMPL's neck and pelvis. `local_keypoints` adds `bias`
-times this."""
+"""Offset of keypoints by detectors trained on COCO from the default body's joint of
+that name, m, in the joint's own frame at rest. Measured with anny's regressors of COCO
+keypoints on the mean adult. OpenPose's neck and middle hip are midpoints of its
+shoulders and of its hips, and thus not SMPL's neck and pelvis. `local_keypoints` adds
+`bias` times this."""

@@ -1,8 +1,8 @@
 """Linear blend skinning: vertices of a pose and shape.
 
-SMPL (Loper et al., 2015): `v = Σ_j w_j (G_j (v_rest - J_j) + x_j)` with
+In SMPL (Loper et al., 2015) `v = Σ_j w_j (G_j (v_rest - J_j) + x_j)` with
 `v_rest = template + S β + P vec(R - I)`. If all frames share one β, rest vertices and
-weights are multiplied once (`_skin_shared`), else for each frame (`_skin_each`).
+weights are multiplied once (`_skin_shared`), otherwise per frame (`_skin_each`).
 """
 
 import math
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax.body.arguments import batch_of
 from bodyslam_jax.body.kinematics import (
+    batch_of,
     flatten,
     matvec,
     pelvis_place,
@@ -23,9 +23,9 @@ from bodyslam_jax.body.kinematics import (
 )
 from bodyslam_jax.body.model import BodyModel
 
-_CHUNK_SHARED, _CHUNK_EACH = 32, 16
-"""Frames per chunk, with one β and with one for each: a chunk fits a CPU's cache, and a
-long video needs little memory beyond its result."""
+_SHARED_CHUNK_FRAMES, _EACH_CHUNK_FRAMES = 32, 16
+"""Frames per chunk, with one β for all and with one for each: a chunk fits a CPU's
+cache, and a long video takes little memory beyond its result."""
 
 
 @jax.jit
@@ -35,10 +35,10 @@ def vertices(
     shape: Float[Array, "*#b 10"],
     trans: Float[Array, "*#b 3"],
 ) -> Float[Array, "*b v 3"]:
-    """Vertices, m, in the frame into which the root rotation `pose[:3]` turns.
+    """Returns vertices, m, in the frame to which the root rotation `pose[:3]` maps.
 
-    Leading axes broadcast. Frames that share one β (`shape` without a leading axis
-    longer than 1) are several times faster than a β for each: see `_skin_shared`.
+    Leading axes broadcast. If all frames share one β (`shape` without a leading axis
+    longer than 1), the function is several times faster: see `_skin_shared`.
 
     **Raises:** `ValueError` naming an argument of another shape.
     """
@@ -59,7 +59,8 @@ def vertices(
 
 
 def _skin_shared(model, T, shape):
-    """One β for all: `[w_j v_rest; w_j]` is one matrix for each run of vertices."""
+    """Skins frames that share one β: `[w_j v_rest; w_j]` is one matrix per run of
+    vertices."""
     rest = model.template + (model.shape_dirs.reshape(-1, 10) @ shape).reshape(-1, 3)
     rest = jnp.concatenate([rest.T, jnp.ones((1, len(rest)), rest.dtype)])
     runs = []
@@ -73,11 +74,12 @@ def _skin_shared(model, T, shape):
         points = jnp.concatenate(parts, -1)
         return points.reshape(len(T), 3, model.num_vertices).transpose(0, 2, 1)
 
-    return _by_chunks(skin, _CHUNK_SHARED, T.transpose(3, 1, 0, 2))
+    return _by_chunks(skin, _SHARED_CHUNK_FRAMES, T.transpose(3, 1, 0, 2))
 
 
 def _skin_each(model, T, shape, feature):
-    """A rest surface for each frame: blend the transforms, then apply them."""
+    """Skins frames with a rest surface each: blends the transforms, then applies
+    them."""
     v, num_features = model.num_vertices, feature.shape[-1]
     S, P = (
         dirs.transpose(2, 1, 0).reshape(-1, 3 * v)
@@ -100,25 +102,27 @@ def _skin_each(model, T, shape, feature):
             parts.append(row(0) + row(1) + row(2) + A[:, :, 3])
         return jnp.concatenate(parts, -1).transpose(0, 2, 1)
 
-    return _by_chunks(skin, _CHUNK_EACH, T.transpose(3, 1, 2, 0), shape, feature)
+    return _by_chunks(skin, _EACH_CHUNK_FRAMES, T.transpose(3, 1, 2, 0), shape, feature)
 
 
 def _by_run(model, T, axis):
-    """The transforms that each run of vertices follows: one gather, then slices."""
+    """Returns the transforms that each run of vertices follows, by one gather and
+    slices."""
     every = np.concatenate([joints for *_, joints in model.blocks])
     ends = np.cumsum([len(joints) for *_, joints in model.blocks])
     return jnp.split(jnp.take(T, every, axis=axis), ends[:-1], axis=axis)
 
 
 def _weights(model, start, stop, joints):
-    """Weights (joints, vertices) of a run, dense: few joints, so few zeros."""
+    """Returns the dense weights (joints, vertices) of a run, which follows few
+    joints."""
     j = jnp.array(joints, model.skin_joint.dtype)[:, None, None]
     is_joint = (model.skin_joint[start:stop] == j).astype(model.dtype)
     return (model.skin_weight[start:stop] * is_joint).sum(-1)
 
 
 def _by_chunks(function, chunk, *arrays):
-    """`function` over the leading axis, `chunk` frames at a time."""
+    """Applies `function` over the leading axis, to `chunk` frames at a time."""
     n = len(arrays[0])
     if n <= chunk:
         return function(*arrays)

@@ -1,6 +1,6 @@
-"""The arrays in SMPL's original pickles, without chumpy or SciPy.
+"""Reads the arrays in SMPL's original pickles, without chumpy or SciPy.
 
-These files hold chumpy expressions and scipy.sparse matrices beside NumPy arrays.
+These files contain chumpy expressions and scipy.sparse matrices beside NumPy arrays.
 `io.safe_pickle` loads them as inert stand-ins, from whose state the numbers are taken.
 """
 
@@ -14,17 +14,17 @@ from bodyslam_jax.io.safe_pickle import StandIn, restricted_load
 
 _LIBRARIES = ("chumpy", "scipy.sparse")
 _MAX_DEPTH = 8
-"""Nested chumpy expressions that are followed."""
+"""Largest depth of nested chumpy expressions that are evaluated."""
 _MAX_NUMBERS = 20_000_000
-"""Of all arrays that sparse matrices and selections stand for; SMPL-X's regressor has
-576,000 and its shapes 12 million."""
+"""Largest total size of the arrays that sparse matrices and selections expand to;
+SMPL-X's regressor has 576,000 numbers, its shapes have 12 million."""
 
 
 def read_pickle(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a pickled dictionary, by name; what is not an array is left out.
+    """Reads the arrays of a pickled dictionary, by name; other values are skipped.
 
     **Raises:** `InputError`, one line that names the file, if it is not a pickle of a
-    dictionary, is cut short, or asks for anything but plain data.
+    dictionary, is truncated, or contains anything but plain data.
     """
     content = restricted_load(path, stand_ins=_LIBRARIES)
     if not isinstance(content, dict):
@@ -42,15 +42,17 @@ def read_pickle(path: Path) -> dict[str, np.ndarray]:
 
 
 class _Expressions:
-    """The numbers of chumpy's objects and of sparse matrices, each evaluated once."""
+    """Evaluates chumpy objects and sparse matrices to arrays, each of them once."""
 
     def __init__(self) -> None:
         self.found: dict[tuple[int, int], np.ndarray | None] = {}
-        """By identity of a stand-in and depth of the expression."""
+        """Results by identity of a stand-in and depth of the expression."""
         self.left = _MAX_NUMBERS
+        """How many numbers may still be expanded."""
 
     def array(self, value: Any, depth: int = 0) -> np.ndarray | None:
-        """The numbers of an array, a chumpy object or a sparse matrix; else `None`."""
+        """Evaluates an array, a chumpy object or a sparse matrix; else returns
+        `None`."""
         if isinstance(value, np.ndarray):
             return value
         if not isinstance(value, StandIn) or not isinstance(value.state, dict):
@@ -60,6 +62,7 @@ class _Expressions:
         return self.found[id(value), depth]
 
     def _evaluated(self, value: StandIn, state: dict, depth: int) -> np.ndarray | None:
+        """Evaluates one object from its state, without the results in `found`."""
         if "indptr" in state:
             return self._dense(state, value.name.rpartition(".")[2].startswith("csr"))
         if depth > _MAX_DEPTH:
@@ -73,6 +76,7 @@ class _Expressions:
         return None
 
     def _selected(self, state: dict, depth: int) -> np.ndarray | None:
+        """Evaluates chumpy's selection of entries of another expression."""
         source, index = self.array(state["a"], depth + 1), np.asarray(state["idxs"])
         if source is None or index.dtype.kind not in "iu":
             return None
@@ -81,7 +85,7 @@ class _Expressions:
         return source.ravel()[index.ravel()].reshape(shape)
 
     def _dense(self, state: dict, by_row: bool) -> np.ndarray | None:
-        """A compressed sparse matrix (SciPy's csc or csr) as a plain one."""
+        """Converts a compressed sparse matrix (SciPy's csc or csr) to a dense one."""
         shape = state.get("_shape", state.get("shape"))
         parts = [state.get(name) for name in ("data", "indices", "indptr")]
         if shape is None or not all(isinstance(part, np.ndarray) for part in parts):
@@ -109,6 +113,7 @@ class _Expressions:
         return dense
 
     def _spend(self, numbers: int) -> None:
+        """**Raises:** `ValueError` if all expansions exceed `_MAX_NUMBERS`."""
         self.left -= numbers
         if self.left < 0:
             raise ValueError(f"expressions of more than {_MAX_NUMBERS} numbers")

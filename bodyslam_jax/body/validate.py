@@ -1,4 +1,5 @@
-"""Checks of a body model's arrays: shapes, types and values that later code assumes."""
+"""Checks the arrays of a body model: shapes, types and values that later code
+assumes."""
 
 from pathlib import Path
 
@@ -9,7 +10,14 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.declared import as_array, fields
 from bodyslam_jax.io.files import parse_json
 
-_NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+_REQUIRED_ARRAYS = (
+    "v_template",
+    "shapedirs",
+    "J_regressor",
+    "weights",
+    "kintree_table",
+    "f",
+)
 
 
 def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -20,7 +28,7 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     **Raises:** `InputError`, one line: the file, what was found, what was expected.
     """
-    missing = [name for name in _NEEDED if name not in raw]
+    missing = [name for name in _REQUIRED_ARRAYS if name not in raw]
     if missing:
         found = ", ".join(sorted(raw)[:12]) or "nothing"
         lacks = ", ".join(missing)
@@ -69,6 +77,7 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _expect(file, name, array, is_right, expected) -> None:
+    """**Raises:** `InputError` with the shape of the array unless `is_right`."""
     if not is_right:
         raise InputError(
             f"{file}: {name} has shape {array.shape}, expected {expected}."
@@ -76,6 +85,10 @@ def _expect(file, name, array, is_right, expected) -> None:
 
 
 def _numbers(file, name, array) -> np.ndarray:
+    """Returns an array of finite numbers in float64.
+
+    **Raises:** `InputError` for any other value.
+    """
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
         raise InputError(f"{file}: {name} is of type {found}, expected real numbers.")
@@ -85,6 +98,10 @@ def _numbers(file, name, array) -> np.ndarray:
 
 
 def _integers(file, name, array) -> np.ndarray:
+    """Returns an array of whole numbers in int64.
+
+    **Raises:** `InputError` for any other value.
+    """
     array = _numbers(file, name, array)
     if (array != np.round(array)).any():
         raise InputError(f"{file}: {name} has fractions, expected whole numbers.")
@@ -92,6 +109,7 @@ def _integers(file, name, array) -> np.ndarray:
 
 
 def _sums_to_one(file, name, rows, tolerance) -> None:
+    """**Raises:** `InputError` if a row does not sum to 1."""
     worst = float(np.abs(rows.sum(-1) - 1).max())
     if worst > tolerance:
         raise InputError(
@@ -101,7 +119,11 @@ def _sums_to_one(file, name, rows, tolerance) -> None:
 
 
 def _parents(file, table, num_joints) -> list[int]:
-    """Parent of each joint from row 0 of the kinematic tree; -1 for the root."""
+    """Returns the parent of each joint from row 0 of the kinematic tree; -1 for the
+    root.
+
+    **Raises:** `InputError` if the tree has a cycle or is not that of SMPL.
+    """
     table = _integers(file, "kintree_table", table)
     row = table[0] if table.ndim == 2 and len(table) else table
     _expect(
@@ -127,7 +149,11 @@ def _parents(file, table, num_joints) -> list[int]:
 
 
 def _picks(file, header, num_vertices) -> np.ndarray:
-    """Vertices of the surface points, named in the header of our own files."""
+    """Returns the vertices of surface points named in the header of this project's
+    files.
+
+    **Raises:** `InputError` for a missing or invalid one.
+    """
     named = fields(file, parse_json(str(header), file, "a header (JSON)"), "header")
     named = named.fields("keypoints")
     return np.array([named.whole(n, 0, num_vertices - 1) for n in SURFACE_POINTS])

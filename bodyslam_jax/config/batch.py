@@ -1,4 +1,4 @@
-"""Settings of where the jobs of a batch run."""
+"""Settings of the engine that runs the jobs of a batch."""
 
 import dataclasses
 from typing import Literal
@@ -16,11 +16,11 @@ class Distribution:
     arrays on a SLURM cluster. The last two need the extra of that name and an output
     folder that all machines share."""
     workers: int | None = None
-    """Jobs that run at once. Without it: of `local` one per GPU, else one per core as
-    far as memory allows; of `ray` one per GPU, else one per core of the cluster; of
-    `slurm` 16 tasks."""
+    """Number of simultaneous jobs. Without it: for `local` one per GPU, else one per
+    core as far as memory allows; for `ray` one per GPU, else one per core of the
+    cluster; for `slurm` 16 tasks."""
     retries: int = 2
-    """How often a job is started again whose process, machine or allocation is lost."""
+    """How often a job is restarted if its process, machine or allocation is lost."""
     ray_address: str | None = None
     """Address of a running Ray cluster, HOST:PORT or `auto`. Without it, Ray is started
     on this machine."""
@@ -36,7 +36,7 @@ class Distribution:
         self.slurm_parameters()
 
     def slurm_parameters(self) -> dict[str, int | str]:
-        """`slurm` by name, whole numbers as such.
+        """Returns `slurm` as a dictionary, with whole numbers as `int`.
 
         **Raises:** `InputError` for an entry without `=`.
         """

@@ -1,4 +1,4 @@
-"""Checks of settings: type, range, finiteness."""
+"""Checks type, range and finiteness of settings."""
 
 import dataclasses
 import math
@@ -11,6 +11,7 @@ from typing import Any
 from bodyslam_jax.config.errors import InputError
 
 Range = tuple[int | float, int | float]
+"""Least and largest value."""
 SHARE: Range = (0, 1)
 NOT_NEGATIVE: Range = (0, math.inf)
 
@@ -21,11 +22,12 @@ def check(
     *,
     infinite: Collection[str] = (),
 ) -> None:
-    """Refuses invalid settings before anything is computed.
+    """Rejects invalid settings before anything is computed.
 
-    Whole numbers are 1 or more, others more than 0, unless `ranges` has the least and
-    the largest value. Those named in `infinite` may be infinite: a standard deviation
-    that disables a term. Arrays are not checked: JAX may be tracing them.
+    Whole numbers must be 1 or more, other numbers more than 0, unless `ranges` has the
+    least and the largest value. Those named in `infinite` may be infinite, as a
+    standard deviation that disables a term. Arrays are not checked, as JAX may be
+    tracing them.
 
     **Raises:** `InputError` that names the setting, what was found and what was
     expected.
@@ -45,7 +47,7 @@ def check(
 
 
 def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
-    """What was expected, or `None` if `found` is valid."""
+    """Returns a description of the expected value, or `None` if `found` is valid."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if found is None and types.NoneType in arguments:
@@ -71,6 +73,7 @@ def _refused(found: Any, kind: Any, within: Range | None) -> str | None:
 
 
 def _out_of_range(found: Any, kind: type, within: Range | None) -> str | None:
+    """Returns a description of the expected number, or `None` if `found` is valid."""
     whole = isinstance(found, int) and not isinstance(found, bool)
     if not (whole or (kind is float and isinstance(found, float))):
         return "a whole number" if kind is int else "a number"

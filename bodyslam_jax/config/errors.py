@@ -1,31 +1,31 @@
-"""The error of an input: a file, a folder, an option or an argument that is wrong."""
+"""The error that is raised for invalid files, folders, options and arguments."""
 
 
 class InputError(ValueError):
-    """What the user gave cannot be used; the message names it, in one line.
+    """An input of the user cannot be used; the message names it, in one line.
 
-    The command line ends with exit code 1 for it, and with 70 for every error that
-    nobody expected, so that no fault of the program is blamed on a file.
+    The command line ends with exit code 1 for this error, and with 70 for every
+    unexpected one, so that no fault of the program is attributed to a file.
 
-    Messages quote what files hold, which may be anything: each argument is one line of
-    the message, without signs that no terminal should get, and of bounded length.
+    Messages quote the content of files, which is arbitrary: each argument is converted
+    to one line of bounded length, with control characters escaped.
     """
 
     def __init__(self, *lines: object) -> None:
         self.lines = [_line(str(line)) for line in lines]
-        """Each mistake, where there are several; the message has them in one line."""
+        """One line per mistake; the message joins them in one line."""
         super().__init__(" ".join(self.lines))
 
 
-_MAX_LETTERS = 1000
-"""Of a line of a message; what it quotes is seldom a tenth of that."""
+_MAX_LINE_LENGTH = 1000
+"""Largest length of a line of a message; most quotations have less than a tenth."""
 
 
 def _line(text: str) -> str:
-    """The text in one line: signs that cannot be printed as Python writes them."""
+    """Converts a text to one line, with characters that cannot be printed escaped."""
     if not text.isprintable():
         text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    if len(text) > _MAX_LETTERS:
-        half = _MAX_LETTERS // 2
+    if len(text) > _MAX_LINE_LENGTH:
+        half = _MAX_LINE_LENGTH // 2
         text = f"{text[:half]} ... {text[-half:]}"
     return text

@@ -14,15 +14,16 @@ from bodyslam_jax.config.check import NOT_NEGATIVE, check
 from bodyslam_jax.config.errors import InputError
 
 HEIGHT_SIGMA = 0.02
-"""m. Self-reported statures are 1 cm too tall on average and scatter by 2 cm
-(Gorber et al., Obesity Reviews 2007)."""
+"""Standard deviation of a stature, m. Self-reported statures are 1 cm too tall on
+average and scatter by 2 cm (Gorber et al., Obesity Reviews 2007)."""
 FOCAL_SIGMA = 0.02
-"""Of the focal length: a data sheet's lens, before stabilisation crops the image."""
+"""Relative standard deviation of a focal length: that of a data sheet, before
+stabilisation crops the image."""
 GRAVITY_SIGMA = math.radians(1.0)
-"""rad: a phone's accelerometer at rest in a hand."""
+"""Standard deviation of gravity, rad: that of a phone's accelerometer held still."""
 PATH_SIGMA = 0.01
-"""Of a camera path: its scale if it is metric, and its positions by the median distance
-of the scene; rotations in rad."""
+"""Standard deviation of a camera path: relative for its scale if it is metric, over the
+median distance of the scene for positions, in rad for rotations."""
 
 RANGES = {
     "gravity": (-math.inf, math.inf),
@@ -30,9 +31,10 @@ RANGES = {
     "end": NOT_NEGATIVE,
     "person": NOT_NEGATIVE,
 }
-"""Ranges of the numbers."""
+"""Ranges of numbers other than positive ones."""
 _SIGMA = re.compile(r"±|\+-|\+/-")
-_NARROWEST, _WIDEST = 1.0, 179.0
+_MIN_FOV_DEG, _MAX_FOV_DEG = 1.0, 179.0
+"""Range of fields of view, degrees."""
 
 
 KeypointDefinition = Literal[
@@ -44,7 +46,9 @@ class Measured(NamedTuple):
     """A number and its standard deviation, in the same unit."""
 
     value: float
+    """Measured value."""
     sigma: float
+    """Standard deviation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Known:
     fov: str | None = None
     """Horizontal field of view, degrees, in place of the focal length: `65`, `65±2`."""
     camera_path: str | None = None
-    """Camera poses from elsewhere: TUM trajectory, COLMAP `images.txt` or `images.bin`,
+    """Given camera poses: TUM trajectory, COLMAP `images.txt` or `images.bin`,
     nerfstudio `transforms.json`, Stray Scanner or Record3D (these in metres). Structure
     from motion then only makes the map. If its clock is not the video's, the offset is
     found from the images."""
@@ -79,15 +83,15 @@ class Known:
     end: float | None = None
     """End of the part of the video that is used, s."""
     keypoint_definition: KeypointDefinition | None = None
-    """Detector of the given keypoints, which decides where on a body its hips, knees
-    and the others are. Without it, found from the file. `unknown`: at the body's
-    joints."""
+    """Detector of the given keypoints, which determines their position on the body,
+    such as that of hips and knees. Without it, inferred from the file. `unknown`: at
+    the body's joints."""
     person: tuple[int, ...] = ()
     """Numbers of the people that are estimated; all without it. The others are still
     masked in the map."""
 
     def check_known(self) -> None:
-        """Refuses impossible values and combinations.
+        """Rejects impossible values and combinations.
 
         **Raises:** `InputError` that names the option, what was found and what was
         expected.
@@ -112,7 +116,7 @@ class Known:
             raise InputError("static_camera and camera_path: expected one of them.")
 
     def heights(self) -> dict[int | None, Measured]:
-        """Statures, m, by the person's number.
+        """Returns statures, m, by the person's number.
 
         A stature given without a number applies to all other people; its key is `None`.
 
@@ -140,7 +144,10 @@ class Known:
         return found
 
     def focal_length(self, width: int) -> Measured | None:
-        """Focal length, px, of images `width` px wide; `None` if it is not known."""
+        """Returns the focal length, px, of images `width` px wide; `None` if not given.
+
+        **Raises:** `InputError` for an invalid focal length or field of view.
+        """
         if self.focal is not None:
             found = _measured("focal", self.focal, None, "PIXELS or PIXELS±SIGMA")
             if not 0 < found.value < math.inf:
@@ -149,10 +156,10 @@ class Known:
         if self.fov is None:
             return None
         angle = _measured("fov", self.fov, None, "DEGREES or DEGREES±SIGMA")
-        if not _NARROWEST <= angle.value <= _WIDEST:
+        if not _MIN_FOV_DEG <= angle.value <= _MAX_FOV_DEG:
             raise InputError(
-                f"fov: found {angle.value:g}, expected {_NARROWEST:g} to {_WIDEST:g} "
-                "degrees."
+                f"fov: found {angle.value:g}, expected {_MIN_FOV_DEG:g} to "
+                f"{_MAX_FOV_DEG:g} degrees."
             )
         half = math.radians(angle.value) / 2
         focal = width / 2 / math.tan(half)
@@ -162,13 +169,17 @@ class Known:
 
 
 def _or_share(found: Measured, share: float) -> Measured:
-    """The measurement, with `share` times the value in place of a NaN sigma."""
+    """Replaces a NaN sigma by `share` times the value."""
     sigma = share * found.value if math.isnan(found.sigma) else found.sigma
     return Measured(found.value, sigma)
 
 
 def _measured(name: str, text: str, sigma: float | None, expected: str) -> Measured:
-    """`VALUE` or `VALUE±SIGMA`; NaN for a sigma that is neither given nor default."""
+    """Parses `VALUE` or `VALUE±SIGMA`; sigma is NaN if it is neither given nor has a
+    default.
+
+    **Raises:** `InputError` if a number is invalid.
+    """
     parts = _SIGMA.split(str(text))
     try:
         numbers = [float(part) for part in parts]

@@ -1,4 +1,4 @@
-"""Settings of the training of a motion model."""
+"""Settings of the training of motion models and of the contact network."""
 
 import dataclasses
 from typing import Literal
@@ -6,8 +6,8 @@ from typing import Literal
 from bodyslam_jax.config.check import NOT_NEGATIVE, SHARE, check
 from bodyslam_jax.config.errors import InputError
 
-_SHARES = "future averaging clean_share"
-_MAY_BE_0 = (
+_SHARE_FIELDS = "future averaging clean_share"
+_NOT_NEGATIVE_FIELDS = (
     "weight_decay slope_weight segment_weight drift_deg white_deg root_drift "
     "shape_sigma run_weight other_weight"
 )
@@ -21,11 +21,11 @@ class MotionTraining:
     """`metric`: network on joint positions in metres over a window; `paper`: the
     paper's network on joint angles."""
     past: int = 16
-    """Past frames in a window."""
+    """Number of past frames in a window."""
     future: int = 1
     """1 if the window includes the frame that the displacement leads to, else 0."""
     width: tuple[int, ...] = (320, 256, 256)
-    """Units of the hidden layers."""
+    """Number of units of each hidden layer."""
     members: int = 1
     """Number of networks whose mean predicts displacement."""
     seed: int = 0
@@ -36,11 +36,12 @@ class MotionTraining:
     validate_every: int = 1
     """Epochs between two evaluations on the validation subjects."""
     segments: int = 128
-    """Segments in a batch, each of another person, speed and noise level."""
+    """Number of segments in a batch, each with its own person, speed and noise
+    level."""
     steps: int = 16
-    """Successive windows in a segment."""
+    """Number of successive windows in a segment."""
     learning_rate: float = 1.5e-3
-    """Adam's initial learning rate."""
+    """Initial learning rate of Adam."""
     decay: bool = True
     """Whether the learning rate decays to 0 along a cosine."""
     weight_decay: float = 1e-4
@@ -49,10 +50,11 @@ class MotionTraining:
     """Largest magnitude of a gradient's entry. Without it, gradients are not
     clipped."""
     averaging: float = 0.998
-    """Decay of the exponential moving average of the weights, which is what is saved;
-    0: no average."""
+    """Decay of the exponential moving average of the weights, which is saved; 0: no
+    average."""
     slope_weight: float = 2.0
-    """Penalty on the squared bias of displacement per noise level: bias is scale."""
+    """Penalty on the squared bias of displacement per noise level, as a biased
+    displacement biases the scale."""
     segment_weight: float = 0.5
     """Penalty on the mean error over a segment, beside that of single steps."""
     drift_deg: float = 10.0
@@ -64,14 +66,14 @@ class MotionTraining:
     clean_share: float = 0.3
     """Share of segments without correlated errors, 0 to 1."""
     shape_sigma: float = 1.0
-    """Standard deviation of each component of the β that are drawn."""
+    """Standard deviation of each component of random β."""
     strides: tuple[int, ...] = (3, 4, 4, 4, 5)
     """Steps through 120 Hz data, one drawn per segment: 4 is real speed."""
     run_weight: float = 2.0
     """Weight with which windows of running are drawn, relative to walking; they are
     rare."""
     other_weight: float = 0.15
-    """The same for all other motion, most of which is slow; 0 leaves it out."""
+    """The same for all other motion, most of which is slow; 0 excludes it."""
     mirror: bool = True
     """Whether half of the segments are mirrored."""
     sliding: bool = True
@@ -79,8 +81,8 @@ class MotionTraining:
     drawn one by one (`steps` 1)."""
 
     def __post_init__(self):
-        ranges = dict.fromkeys(_SHARES.split(), SHARE)
-        ranges |= dict.fromkeys(_MAY_BE_0.split(), NOT_NEGATIVE)
+        ranges = dict.fromkeys(_SHARE_FIELDS.split(), SHARE)
+        ranges |= dict.fromkeys(_NOT_NEGATIVE_FIELDS.split(), NOT_NEGATIVE)
         # The range of JAX's random keys.
         check(self, ranges | {"seed": (-(2**63), 2**63 - 1)})
         if not self.sliding and self.steps > 1:
@@ -91,7 +93,8 @@ class MotionTraining:
 
     @staticmethod
     def paper() -> "MotionTraining":
-        """Section 3.4 of the paper: two frames of exact joint angles, plain Adam."""
+        """Returns the settings of section 3.4 of the paper: two frames of exact joint
+        angles, plain Adam."""
         return MotionTraining(
             network="paper",
             past=2,
@@ -121,17 +124,18 @@ class ContactTraining:
     """Training of the contact network."""
 
     half: int = 8
-    """Frames before and after the one that is judged."""
+    """Number of frames before, and after, the classified frame."""
     width: tuple[int, ...] = (256, 128)
-    """Units of the hidden layers."""
+    """Number of units of each hidden layer."""
     updates: int = 4000
-    """Steps of the optimiser."""
+    """Number of steps of the optimiser."""
     segments: int = 64
-    """Segments in a batch, each of another person, speed and noise level."""
+    """Number of segments in a batch, each with its own person, speed and noise
+    level."""
     steps: int = 12
-    """Successive windows in a segment."""
+    """Number of successive windows in a segment."""
     learning_rate: float = 2e-3
-    """Adam's learning rate after warming up; it falls to 0 along a cosine."""
+    """Learning rate of Adam after warm-up; it decays to 0 along a cosine."""
     drift_deg: float = 10.0
     """Largest standard deviation of the correlated error of joint angles, degrees."""
     clean_share: float = 0.2

@@ -1,4 +1,4 @@
-"""Settings from text: `--fps 25 --weights.pixel-sigma 0.5`, as on the command line."""
+"""Parses settings from text, such as `--fps 25 --weights.pixel-sigma 0.5`."""
 
 import dataclasses
 import difflib
@@ -12,12 +12,12 @@ from bodyslam_jax.config.errors import InputError
 
 S = TypeVar("S")
 REMOVED = {"people_fit.walking_knees": "knees are as measured"}
-"""Settings of earlier versions, with the stage before a dot, and what replaces them."""
-_SWITCH = {"true": True, "yes": True, "false": False, "no": False}
+"""Settings of earlier versions, with the stage before a dot, and their replacement."""
+_BOOL_BY_WORD = {"true": True, "yes": True, "false": False, "no": False}
 
 
 def with_options(settings: S, text: str) -> S:
-    """The settings changed by options as the command line has them.
+    """Returns the settings changed by options in the syntax of the command line.
 
     **Raises:** `InputError`, one line, for an option or value that does not exist.
     """
@@ -29,9 +29,10 @@ def with_options(settings: S, text: str) -> S:
 
 
 def with_values(settings: S, values: Mapping[str, Sequence[str]]) -> S:
-    """The settings with fields changed: `{"weights.pixel_sigma": ["0.5"]}`.
+    """Returns the settings with changed fields, such as `{"weights.pixel_sigma":
+    ["0.5"]}`.
 
-    All change at once, since some are valid beside others only.
+    All fields change at once, since some are valid only in combination with others.
 
     **Raises:** as `with_options`.
     """
@@ -46,7 +47,7 @@ def with_values(settings: S, values: Mapping[str, Sequence[str]]) -> S:
 
 
 def field_names(settings: Any, prefix: str = "") -> list[str]:
-    """All fields with the stage before a dot: `fps`, `weights.pixel_sigma`."""
+    """Returns all fields with the stage before a dot: `fps`, `weights.pixel_sigma`."""
     found = []
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -58,15 +59,18 @@ def field_names(settings: Any, prefix: str = "") -> list[str]:
 
 
 def removed(name: str) -> str | None:
-    """What replaces a setting or option of an earlier version, as part of a message;
-    `None` for a name that never was one."""
+    """Returns the part of a message that tells what replaces a setting or option of an
+    earlier version; `None` for a name that never was one."""
     stage, dot, field = name.removeprefix("--").replace("-", "_").rpartition(".")
     text = REMOVED.get(f"{stage}{dot}{field.removeprefix('no_')}")
     return None if text is None else f"no longer exists: {text}"
 
 
 def _grouped(words: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Each option's name and values."""
+    """Returns the name and values of each option.
+
+    **Raises:** `InputError` for a value before any option.
+    """
     found: list[tuple[str, list[str]]] = []
     for word in words:
         if word.startswith("--"):
@@ -80,7 +84,10 @@ def _grouped(words: Sequence[str]) -> list[tuple[str, list[str]]]:
 
 
 def _parsed_field(settings: Any, name: str, texts: list[str]) -> list[Any]:
-    """Stages and field that the name of an option is of, and its value."""
+    """Returns the stages and the field that an option names, and its parsed value.
+
+    **Raises:** `InputError` for an unknown option or an invalid value.
+    """
     *stages, field = name.replace("-", "_").split(".")
     within = settings
     for stage in stages:
@@ -104,6 +111,7 @@ def _parsed_field(settings: Any, name: str, texts: list[str]) -> list[Any]:
 
 
 def _replaced(settings: Any, changes: Mapping[str, Any]) -> Any:
+    """Replaces fields of nested settings."""
     inner = {
         name: _replaced(getattr(settings, name), value)
         if isinstance(value, dict)
@@ -114,7 +122,10 @@ def _replaced(settings: Any, changes: Mapping[str, Any]) -> Any:
 
 
 def _parsed(kind: Any, values: Sequence[str], name: str) -> Any:
-    """Text as a value of the field's type."""
+    """Converts text to a value of the field's type.
+
+    **Raises:** `InputError` if that is impossible.
+    """
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if list(values) in (["none"], ["None"]):
@@ -129,9 +140,9 @@ def _parsed(kind: Any, values: Sequence[str], name: str) -> Any:
         raise InputError(f"--{name}: found {' '.join(values)!r}, expected one value.")
     (text,) = values
     if kind is bool:
-        if text.lower() not in _SWITCH:
+        if text.lower() not in _BOOL_BY_WORD:
             raise InputError(f"--{name}: found {text!r}, expected yes or no.")
-        return _SWITCH[text.lower()]
+        return _BOOL_BY_WORD[text.lower()]
     if kind in (int, float):
         try:
             return kind(text)

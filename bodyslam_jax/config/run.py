@@ -1,14 +1,40 @@
-"""Settings of a whole run: one class per stage."""
+"""Settings of a whole run, with one class per stage, and limits of its inputs."""
 
 import dataclasses
 from typing import Literal
 
 from bodyslam_jax.config.check import check
-from bodyslam_jax.config.front_end import Association, Detect, Structure, Tracking
+from bodyslam_jax.config.front_end import (
+    Association,
+    Detect,
+    PeopleFit,
+    Structure,
+    Tracking,
+)
 from bodyslam_jax.config.known import RANGES, Known
-from bodyslam_jax.config.limits import Limits
-from bodyslam_jax.config.people import PeopleFit
 from bodyslam_jax.config.weights import GraphWeights
+
+_GIGABYTE = 1_000_000_000
+"""Bytes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Upper bounds for one input, which is rejected unread if it exceeds them."""
+
+    input_gigabytes: float = 1.0
+    """Size of a file, and of what it expands to, GB. Videos are exempt: they are read
+    frame by frame."""
+    frames: int = 100_000
+    """Number of frames of inputs without a video, which only numbers in a file tell."""
+
+    def __post_init__(self) -> None:
+        check(self, {"input_gigabytes": (0.001, 1000.0), "frames": (1, 100_000_000)})
+
+    @property
+    def bytes(self) -> int:
+        """The limit `input_gigabytes` in bytes."""
+        return round(self.input_gigabytes * _GIGABYTE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,28 +43,28 @@ class Config(Known):
 
     body_model: str | None = None
     """Body model file or folder. Without it, the body model found on this machine or
-    the one that ships (`bodyslam doctor`)."""
+    that of the package (`bodyslam doctor`)."""
     motion_model: str | None = None
     """Motion model: a weights file, or `paper` for the paper's network. Without it, the
-    default model; both ship."""
+    default model; both are in the package."""
     people: bool = True
     """Whether people are estimated. Without them cameras and map have no metric
     scale."""
     detect: Literal["auto", "built-in", "yolox", "none"] = "auto"
-    """Networks that detect people where no keypoints are given: `built-in` (also
-    `auto`) ship, `yolox` (YOLOX and RTMPose) are downloaded once."""
+    """Networks that detect people if no keypoints are given: `built-in` (also `auto`)
+    are in the package, `yolox` (YOLOX and RTMPose) are downloaded once."""
     offline: bool = False
     """Whether downloads are forbidden; networks must then be present already."""
     device: Literal["cpu", "gpu"] | None = None
-    """Device that computes. Without it JAX's default: a GPU if there is one."""
+    """Device for computations. Without it JAX's default: a GPU if there is one."""
     overlay: bool = True
     """Whether `overlay.webm` is written."""
     overlay_video: Literal["webm", "mp4"] = "webm"
     """Format of the overlay: `webm` (VP8), or `mp4` (H.264, smaller), which needs the
     extra `video`."""
     overlay_measurements: bool = False
-    """Whether the overlay shows what was measured, too: tracked points of the scene,
-    and keypoints beside those of the bodies."""
+    """Whether the overlay also shows measurements: tracked points of the scene, and
+    keypoints beside those of the bodies."""
     uncertainty: bool = True
     """Whether standard deviations and unobservable directions are computed."""
     detection: Detect = Detect()
@@ -64,9 +90,9 @@ class Config(Known):
 
     @classmethod
     def paper(cls) -> "Config":
-        """Sections 3.4 and 3.6 of the paper: its weights, its motion network, whose
-        predictions are constant measurements, and its first-order schedule. For what
-        still differs see docs/differences_from_the_paper.md."""
+        """Returns the settings of sections 3.4 and 3.6 of the paper: its weights, its
+        motion network, whose predictions are constant measurements, and its first-order
+        schedule. See docs/differences_from_the_paper.md for remaining differences."""
         return cls(
             motion_model="paper",
             motion_coupling="frozen",

@@ -9,19 +9,19 @@ class Simulation:
     """A simulated sequence: walkers, camera and measurements."""
 
     sequence: Literal["E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3"] = "M2"
-    """Easy, medium or difficult, by the speed of the camera."""
+    """Name of the sequence: easy (E), medium (M) or difficult (D), by camera speed."""
     family: Literal["room", "follow"] = "room"
     """`room`: the camera stays within about a metre and turns; `follow`: it follows the
     person."""
     length: int | None = None
-    """Number of frames at 30 fps. Without it the sequence's own, 600 to 1000."""
+    """Number of frames at 30 fps. Without it, that of the sequence, 600 to 1000."""
     seed: int | None = None
-    """Random seed. Without it the sequence's own."""
+    """Random seed. Without it, that of the sequence."""
     motion: str | None = None
     """Motion data that the walkers use (CMU archive, AMASS, BVH). Without it, the clips
-    that ship."""
+    of the package."""
     noise: Literal["none", "low", "real"] = "real"
-    """Errors of all measurements, unless set apart below."""
+    """Level of errors of all measurements, unless set individually below."""
     keypoint_noise: Literal["none", "low", "real"] | None = None
     """Errors of the keypoints."""
     body_noise: Literal["none", "low", "real"] | None = None
@@ -65,17 +65,19 @@ class Experiment:
     sequences: tuple[
         Literal["E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3"], ...
     ] = ()
-    """Simulated sequences; without them the experiment's own."""
+    """Simulated sequences. Without them, those of the experiment."""
     family: Literal["room", "follow", "both"] | None = None
-    """Family of the simulated sequences; without it the experiment's own."""
+    """Family of the simulated sequences. Without it, that of the experiment."""
     frames: int | None = None
-    """Frames of each sequence at 30 fps; without it the sequence's own, 600 to 1000."""
+    """Number of frames of each sequence at 30 fps. Without it, that of the sequence,
+    600 to 1000."""
     noise: Literal["none", "low", "real"] = "real"
     """Errors of all measurements."""
     motion: str | None = None
-    """Motion to walk with (CMU archive, AMASS, BVH); without it the clips that ship."""
+    """Motion data that walkers use (CMU archive, AMASS, BVH). Without it, the clips of
+    the package."""
     seed: int | None = None
     """Random seed, combined with the sequence's name. Without it, the name alone."""
     motion_models: tuple[str, ...] = ()
-    """Weights of other motion models that `ablation` compares with, such as models of
-    more or fewer past frames."""
+    """Weights of other motion models that `ablation` compares, such as models with more
+    or fewer past frames."""

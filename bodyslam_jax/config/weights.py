@@ -1,10 +1,10 @@
-"""Standard deviations and robust losses of the graph's factors."""
+"""Standard deviations and robust losses of the factors of the graph."""
 
 import dataclasses
 
 from bodyslam_jax.config.check import NOT_NEGATIVE, check
 
-_CORRELATED = 0.999999
+_MAX_CORRELATION = 0.999999
 """Largest AR(1) coefficient: constant errors would be indistinguishable from the
 measured quantity."""
 
@@ -24,10 +24,10 @@ class GraphWeights:
     """Scale of the Cauchy loss on static points, in standard deviations."""
     keypoint_sigma: float | None = None
     """Standard deviation of a keypoint of confidence 1, px; divided by the confidence.
-    Without it, the usual error of detectors in metres on the body, projected at the
+    Without it, the typical error of detectors in metres on the body, projected at the
     person's depth."""
     keypoint_inflation: float = 2.5
-    """Factor on the usual error of detectors at 30 fps; grows with the square root of
+    """Factor on the typical error of detectors at 30 fps; grows with the square root of
     the frame rate. Keypoint errors are correlated over about 0.15 s; modelled as
     independent, they stretch the body by some per cent."""
     keypoint_loss: float = 4.0
@@ -57,14 +57,14 @@ class GraphWeights:
     Published errors of joints, 98 mm and 19.9 m/s² (HMR2 on EMDB), correspond to
     0.987."""
     posture_predicted: bool = False
-    """Whether postures are held to the motion model's prediction, in frames that have
-    one, in place of the regressed posture."""
+    """Whether the prior of postures is the motion model's prediction, in frames that
+    have one, in place of the regressed posture."""
     shape_sigma: float = 0.4
     """Standard deviation of regressed β, one measurement per person because a
     regressor's error is common to all frames. Where bodies are fitted to keypoints, it
     holds β to the fit, whose reported standard deviation is the prior's, 1."""
     shape_each_frame: bool = False
-    """Whether β of each frame is a measurement of its own."""
+    """Whether β of each frame is a separate measurement."""
     orientation_sigma: float | None = None
     """Standard deviation of the motion model's predicted turn in a frame of 1/30 s, rad
     per axis. Without it, the prediction is not used."""
@@ -101,7 +101,7 @@ class GraphWeights:
 
     def __post_init__(self):
         ranges = {
-            name: (0, _CORRELATED) for name in vars(self) if "correlation" in name
+            name: (0, _MAX_CORRELATION) for name in vars(self) if "correlation" in name
         }
         free = ("step_error", "fitted_step_error")
         # An infinite standard deviation disables a term; other infinities are errors.
@@ -112,11 +112,12 @@ class GraphWeights:
 
     @classmethod
     def paper(cls) -> "GraphWeights":
-        """λ_lm = 64/b² with b = 2.25 px, λ_mm = 100, λ_posture = λ_shape = 1.
+        """Returns λ_lm = 64/b² with b = 2.25 px, λ_mm = 100, λ_posture = λ_shape = 1.
 
-        Its joint weight is read as confidence squared (SMPLify), in px^-2, outside the
-        robust loss; the scale of its Cauchy loss is not stated, and is that of OKVIS,
-        whose λ_lm it has. What else differs: docs/differences_from_the_paper.md.
+        Its joint weight is interpreted as confidence squared (SMPLify), in px^-2,
+        outside the robust loss. The scale of its Cauchy loss is not stated; it is taken
+        from OKVIS, which has the same λ_lm. See docs/differences_from_the_paper.md for
+        other differences.
         """
         return cls(
             pixel_sigma=2.25 / 8,

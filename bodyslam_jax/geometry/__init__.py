@@ -1,1 +1,1 @@
-"""Cameras, rotations, planes and smoothing: what every stage computes with."""
+"""Camera models, rotations, triangulation, planes and smoothing, for all stages."""

@@ -1,12 +1,12 @@
-"""Pinhole cameras with or without OpenCV's distortion: project and unproject.
+"""Projection and unprojection of pinhole cameras, with or without lens distortion.
 
 Intrinsics are one array of 4 numbers `fx fy cx cy` (px) or 8, with `k1 k2 p1 p2` at the
 end. C has x right, y down, z forward; pixel (0, 0) is the top-left pixel's centre.
 Distortion: OpenCV's `calib3d` (Brown--Conrady), two radial and two tangential terms.
 
 Every function broadcasts over leading axes. Values and derivatives are finite, also at
-and behind the camera plane, where a projection means nothing: mask it out with
-`depth_is_valid`.
+and behind the camera plane, where a projection is meaningless: `depth_is_valid` masks
+such points.
 """
 
 import jax
@@ -17,14 +17,15 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.geometry.lengths import padded_rows
 
 MIN_DEPTH = 1e-3
-"""Smallest depth that is divided by, in the unit of the points."""
+"""Lower bound of the depth in divisions, in the unit of the points."""
 
 _MAX_RADIUS_SQUARED = 16.0
-"""The radial polynomial is frozen beyond 76 degrees off the axis, if not before."""
+"""Squared radius at depth 1 (76 degrees off the axis) from which the radial polynomial
+is held constant, unless it stops growing before."""
 
 
 def depth_is_valid(p_C: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
-    """Whether a point is far enough before the camera plane for a true projection."""
+    """True for points that lie in front of the camera by more than `MIN_DEPTH`."""
     return p_C[..., 2] > MIN_DEPTH
 
 
@@ -32,10 +33,10 @@ def depth_is_valid(p_C: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
 def project(
     intrinsics: Float[Array, "*#b i"], p_C: Float[Array, "*#b 3"]
 ) -> Float[Array, "*_ 2"]:
-    """Pixel (px) of a point in the camera frame.
+    """Projects points in the camera frame to pixels (px).
 
-    The depth is held at `MIN_DEPTH` or more, so that a point behind the camera has a
-    finite pixel and derivative; which points those are, `depth_is_valid` says.
+    Depths below `MIN_DEPTH` are raised to it, so that points behind the camera have a
+    finite pixel and derivative; `depth_is_valid` tells which points are affected.
     """
     depth = jnp.maximum(p_C[..., 2:], MIN_DEPTH)
     return _to_pixel(intrinsics, distort(intrinsics, p_C[..., :2] / depth))
@@ -44,7 +45,8 @@ def project(
 def project_rows(
     intrinsics: Float[Array | np.ndarray, " i"], p_C: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "m 2"]:
-    """`project` of a table of points, compiled for few lengths of tables."""
+    """Projects a table of points like `project`, and pads it to a power of two rows so
+    that few programs are compiled."""
     count = len(p_C)
     rows = np.ones((padded_rows(count), 3))
     rows[:count] = p_C
@@ -56,7 +58,8 @@ def project_rows(
 def unproject(
     intrinsics: Float[Array, "*#b i"], uv: Float[Array, "*#b 2"]
 ) -> Float[Array, "*_ 3"]:
-    """Ray of a pixel in the camera frame, at depth 1: inverse of `project`."""
+    """Returns the points at depth 1, in the camera frame, that project to pixels `uv`
+    (px): the inverse of `project`."""
     distorted = (uv - intrinsics[..., 2:4]) / intrinsics[..., :2]
     xy = undistort(intrinsics, distorted)
     return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
@@ -67,10 +70,11 @@ def distort(
 ) -> Float[Array, "*_ 2"]:
     """Applies lens distortion to coordinates on the plane at depth 1.
 
-    Equal to OpenCV up to the radius where the radial polynomial stops growing. Beyond
-    it the polynomial's factor is held: what lies far outside the image must not fold
-    back into it, as it does in OpenCV. Derivatives take that radius to be fixed, though
-    it follows `k1` and `k2`: beyond it those by the two are not what differences give.
+    Equals OpenCV's model up to the radius where the radial polynomial stops growing.
+    Beyond that radius the radial factor is held constant, so that points far outside
+    the image are not folded back into it, as they are in OpenCV. Derivatives treat the
+    radius as constant although it depends on `k1` and `k2`; beyond it, derivatives with
+    respect to these two differ from finite differences.
     """
     if intrinsics.shape[-1] == 4:
         return xy + 0 * intrinsics[..., :2]
@@ -91,7 +95,7 @@ def distort(
 def undistort(
     intrinsics: Float[Array, "*#b i"], xy: Float[Array, "*#b 2"], iterations: int = 10
 ) -> Float[Array, "*_ 2"]:
-    """Inverse of `distort`, by Newton's method from the distorted point."""
+    """Inverts `distort` by Newton's method, which starts at the distorted point."""
     xy = xy + 0 * intrinsics[..., :2]
     if intrinsics.shape[-1] == 4:
         return xy
@@ -108,19 +112,20 @@ def undistort(
         step_y = (a[..., 0] * r[..., 1] - a[..., 1] * r[..., 0]) / determinant
         return estimate - jnp.stack([step_x, step_y], axis=-1)
 
-    # A scan, not an unrolled loop: ten linearisations in line would be slow to compile.
+    # A scan, not an unrolled loop: ten inlined linearisations are slow to compile.
     return jax.lax.scan(lambda p, _: (newton(p), None), xy, length=iterations)[0]
 
 
 def _to_pixel(intrinsics: Array, xy: Array) -> Array:
+    """Converts distorted coordinates at depth 1 to pixels."""
     return intrinsics[..., :2] * xy + intrinsics[..., 2:4]
 
 
 def _turning_point(k1: Array, k2: Array) -> Array:
-    """Squared radius at which `r (1 + k1 r^2 + k2 r^4)` stops growing.
+    """Returns the squared radius at which `r (1 + k1 r^2 + k2 r^4)` stops growing.
 
-    The smallest positive root of `1 + 3 k1 q + 5 k2 q^2`, written as `2 / (-b + sqrt)`
-    so that `k2 = 0` needs no case of its own.
+    It is the smallest positive root of `1 + 3 k1 q + 5 k2 q^2`, written as `2 / (-b +
+    sqrt)` so that `k2 = 0` needs no special case.
     """
     b, discriminant = 3 * k1, 9 * k1 * k1 - 20 * k2
     real = discriminant >= 0

@@ -1,23 +1,23 @@
-"""The direction of gravity, from trunks, feet, the map's ground plane and edges.
+"""Estimates the direction of gravity from trunks, feet, the map's ground and edges.
 
-Without an accelerometer four cues determine it, each with an error of its own:
+Without an accelerometer four cues determine it, each with its own error:
 
-- People keep their trunk upright, to some degrees. Lean across the view is observed in
-  the image; lean along the view is mostly inferred and less accurate.
-- Floors are level, most ground outdoors to a degree or so, and some of it slopes.
-  Its plane is estimated twice: from the feet that stand on it, and from the points of
-  the map that lie in one plane below the camera.
-- Walls and posts are vertical to some tenths of a degree, where there are any
+- People keep their trunk upright to within some degrees. Lean across the view is
+  observed in the image; lean along the view is mostly inferred and less accurate.
+- Floors are level, most ground outdoors is level to about a degree, and some slopes.
+  Its plane is estimated twice: from the feet that stand on it, and from the map points
+  that lie in one plane below the camera.
+- Walls and posts, where visible, are vertical to some tenths of a degree
   (`geometry.vertical_edges`).
 
 The two planes are fused by their covariances; then the plane's normal, the trunks' mean
-and the vertical of edges are combined. Each can be far off: on a hill, where postures
-are wrong, where edges that are not vertical agree. So each has a mixture of a narrow
-and a wide error distribution, and the result is the posterior mean over all
-combinations.
+and the vertical of edges are combined. Each can be an outlier: on a hill, where
+postures are wrong, or where edges agree that are not vertical. So the error of each is
+a mixture of a narrow and a wide normal distribution, and the result is the posterior
+mean over all combinations.
 
-Small angles: a direction is its first and third coordinate over its second, in a frame
-whose y axis is nearly up.
+Angles are small: a direction is given by its *tilt*, x/y and z/y in a frame whose y
+axis is nearly up.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.config import GRAVITY_SIGMA
 from bodyslam_jax.geometry.ground_slope import (
-    CAUCHY,
+    CAUCHY_SCALE,
     Plane,
     feet_plane,
     fused,
@@ -38,34 +38,36 @@ from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.geometry.vertical_edges import Vertical
 
 _DEGREE = np.pi / 180
-_TRUNK_ACROSS = 2.0 * _DEGREE
-"""Standard deviation of a person's mean trunk from the vertical, across the view."""
-_TRUNK_ALONG = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
-"""The same along the view, without and with bodies fitted to keypoints: ten simulated
-sequences gave 1.5 and 3.4 degrees root mean square; of real clips one gave 11."""
-_TRUNK_COMMON = 0.65
-"""Share of these standard deviations that is common to all people of a video, whom one
-detector sees from one side: averaging over people does not reduce it. Assumed; the
-sequences with a known up have one or two people."""
-_WORSE_TRUNKS = {False: 0.05, True: 0.15}
-_HOW_MUCH_WORSE = 2.5
-"""Probability that a person's trunk is a worse measurement, without and with bodies
-fitted to keypoints, and the factor by which its standard deviation is then larger."""
-_WRONG_EDGES = (0.1, 5.0 * _DEGREE)
+_TRUNK_SIGMA_ACROSS_RAD = 2.0 * _DEGREE
+"""Standard deviation of a mean trunk from the vertical, across the view, rad."""
+_TRUNK_SIGMA_ALONG_RAD = {False: 2.0 * _DEGREE, True: 4.5 * _DEGREE}
+"""The same along the view, by whether bodies are fitted to keypoints: ten simulated
+sequences gave 1.5 and 3.4 degrees root mean square; one real clip gave 11."""
+_COMMON_TRUNK_SHARE = 0.65
+"""Share of these standard deviations that all people of a video have in common, as one
+detector sees them from one side: averaging over people does not reduce it. Assumed; the
+sequences with a known up direction show one or two people."""
+_TRUNK_OUTLIER_PROBABILITY = {False: 0.05, True: 0.15}
+_TRUNK_OUTLIER_FACTOR = 2.5
+"""Probability that a person's trunk is an outlier, by whether bodies are fitted to
+keypoints, and the factor by which its standard deviation is then larger."""
+_EDGE_OUTLIERS = (0.1, 5.0 * _DEGREE)
 """Probability that edges which agree are not vertical, and the standard deviation of
-their direction in that case. Assumed: of 21 clips with such edges none was wrong."""
-_LEVEL, _STEEP = 0.7 * _DEGREE, 4.0 * _DEGREE
-_GROUNDS = ((0.5, 0.2 * _DEGREE), (0.25, _LEVEL), (0.25, _STEEP))
-"""Kinds of ground, each with its probability and the standard deviation of its slope:
-floors of buildings, level ground outdoors, ground that slopes."""
-_SIZE = 0.05
-"""Relative standard deviation of a person's size. A person who is estimated too large
-has all stances too low or too high by that share of the camera's height above them."""
-
-
-_HELD = 0.01
-"""Standard deviation of a person's height over a plane that the estimate holds them on,
-m."""
+their direction in that case, rad. Assumed: they were vertical in all 21 clips."""
+_LEVEL_SLOPE_SIGMA_RAD, _STEEP_SLOPE_SIGMA_RAD = 0.7 * _DEGREE, 4.0 * _DEGREE
+_GROUND_KINDS = (
+    (0.5, 0.2 * _DEGREE),
+    (0.25, _LEVEL_SLOPE_SIGMA_RAD),
+    (0.25, _STEEP_SLOPE_SIGMA_RAD),
+)
+"""Probability and standard deviation of the slope (rad) of each kind of ground: floors
+of buildings, level ground outdoors, sloping ground."""
+_RELATIVE_SIZE_SIGMA = 0.05
+"""Relative standard deviation of a person's size. An error of size shifts all stances
+of the person up or down by that share of the camera's height above them."""
+_HELD_HEIGHT_SIGMA_M = 0.01
+"""Standard deviation of the height over a plane of people whom the estimate constrains
+to it, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +79,8 @@ class Upright:
     normal: Float[np.ndarray, " 3"]
     """Upwards unit normal of the ground's plane; `up` if no plane was found."""
     sigma: float
-    """Standard deviation of `up` along its less certain axis, rad, that holds on level
-    and on sloping ground; infinite without any cue."""
+    """Standard deviation of `up` along its less certain axis, rad, valid on level and
+    on sloping ground; infinite without any cue."""
     trunks: float
     """Angle between `up` and the mean direction of trunks, rad; NaN without people."""
     ground: float
@@ -86,10 +88,11 @@ class Upright:
     edges: float = np.nan
     """Angle between `up` and the vertical of edges, rad; NaN without such edges."""
     unaided: float = np.nan
-    """Angle between gravity that was given and up without it, rad; NaN where none
-    was."""
+    """Angle between the measured up direction and the one estimated without it, rad;
+    NaN if none was measured."""
     unaided_sigma: float = np.inf
-    """Standard deviation of up without the gravity that was given, as `sigma`."""
+    """Standard deviation of the up direction estimated without measured gravity,
+    defined as `sigma`."""
 
 
 def find_upright(
@@ -105,30 +108,31 @@ def find_upright(
     edges: Vertical | None = None,
     on_floor: Bool[np.ndarray, " h"] | None = None,
 ) -> Upright:
-    """Up from all available cues, in a frame whose y axis is roughly up.
+    """Estimates the up direction from all available cues, given in a frame whose y axis
+    is roughly up.
 
     Args:
         trunks: y axes of the people's root frames, unit vectors.
         feet: toe joints, m.
         eyes: centres of the camera, m.
-        landmarks: points of the map, m; none where the camera did not move.
-        fitted: whether a person's body was fitted to keypoints, not regressed.
-        measured_up: up by an accelerometer, with `GRAVITY_SIGMA`.
-        standing: toes that stand; without it, by their speed (`find_stances`).
-        edges: the vertical by edges in the images.
-        on_floor: people whom an estimate holds on one plane, so that a wrong size does
-            not put them above or below it.
+        landmarks: map points, m; empty if the camera did not move.
+        fitted: True for people whose body was fitted to keypoints, not regressed.
+        measured_up: up according to an accelerometer, with `GRAVITY_SIGMA`.
+        standing: toes that stand; without it, `find_stances` decides by speed.
+        edges: the vertical estimated from edges in the images.
+        on_floor: people whom an estimate constrains to one plane, so that errors of
+            their size do not put them above or below it.
     """
     trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
     stances = find_stances(feet, present, fps, standing)
     height = _height_of_camera(eyes, stances)
-    size = np.full(len(stances), _SIZE * height)
+    size = np.full(len(stances), _RELATIVE_SIZE_SIGMA * height)
     if on_floor is not None:
-        size = np.where(on_floor, _HELD, size)
+        size = np.where(on_floor, _HELD_HEIGHT_SIGMA_M, size)
     planes = [feet_plane(stances, size, np.median(eyes, axis=0))]
     planes.append(map_plane(landmarks, eyes, stances))
     ground = fused([plane for plane in planes if plane is not None])
-    worse = _WORSE_TRUNKS[bool((fitted & present.any(axis=1)).any())]
+    worse = _TRUNK_OUTLIER_PROBABILITY[bool((fitted & present.any(axis=1)).any())]
     if measured_up is not None:
         trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
     tilt, slope, sigma = _combined(_tilts(trunk_tilt, worse, edges), ground)
@@ -145,13 +149,14 @@ def find_upright(
 
 
 def _direction(tilt: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 3"]:
-    """The unit vector of a tilt."""
+    """Converts a tilt (x/y, z/y) to a unit vector."""
     found = np.array([tilt[0], 1.0, tilt[1]])
     return found / np.linalg.norm(found)
 
 
 def _with_measured(trunk_tilt, up):
-    """The trunks' tilt fused with an accelerometer's, and its covariance, rad²."""
+    """Fuses the trunks' tilt with that of an accelerometer; returns the tilt and its
+    covariance, rad²."""
     tilt, weight = up[[0, 2]] / up[1], np.eye(2) / GRAVITY_SIGMA**2
     if trunk_tilt is None:
         return tilt, np.linalg.inv(weight)
@@ -161,11 +166,11 @@ def _with_measured(trunk_tilt, up):
 
 
 def _trunks(trunks, present, eyes, feet, fps, fitted):
-    """Mean direction of people's trunks as a tilt (x, z over y), and its covariance,
+    """Returns the mean direction of people's trunks as a tilt, and its covariance,
     rad²; `None` without upright people."""
     means, weights = [], []
     views, anybody_fitted = [], False
-    own_share = 1 - _TRUNK_COMMON**2
+    own_share = 1 - _COMMON_TRUNK_SHARE**2
     for h in np.flatnonzero(present.any(axis=1)):
         frames = present[h]
         own = trunks[h, frames]
@@ -183,9 +188,9 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         along = (view[:, :, None] * view[:, None, :]).mean(axis=0)
         across = np.eye(2) - along
         noise = scatter**2 / seconds
-        systematic = own_share * _TRUNK_ALONG[bool(fitted[h])] ** 2
+        systematic = own_share * _TRUNK_SIGMA_ALONG_RAD[bool(fitted[h])] ** 2
         weight = along / (systematic + noise)
-        weight = weight + across / (own_share * _TRUNK_ACROSS**2 + noise)
+        weight = weight + across / (own_share * _TRUNK_SIGMA_ACROSS_RAD**2 + noise)
         views.append(along)
         anybody_fitted |= bool(fitted[h])
         means.append(mean)
@@ -194,26 +199,26 @@ def _trunks(trunks, present, eyes, feet, fps, fitted):
         return None
     tilt, covariance = _robust_mean(np.array(means), np.array(weights))
     along = np.mean(views, axis=0)
-    common = along * _TRUNK_ALONG[anybody_fitted] ** 2
-    common = common + (np.eye(2) - along) * _TRUNK_ACROSS**2
-    return tilt, covariance + _TRUNK_COMMON**2 * common
+    common = along * _TRUNK_SIGMA_ALONG_RAD[anybody_fitted] ** 2
+    common = common + (np.eye(2) - along) * _TRUNK_SIGMA_ACROSS_RAD**2
+    return tilt, covariance + _COMMON_TRUNK_SHARE**2 * common
 
 
 def _robust_mean(
     means: Float[np.ndarray, "h 2"], weights: Float[np.ndarray, "h 2 2"]
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "2 2"]]:
-    """The mean weighted by information, and its covariance, with a Cauchy loss.
+    """Returns the information-weighted mean under a Cauchy loss, and its covariance.
 
-    People who sit or bend down are outliers among those who stand. Iteratively
-    reweighted from the median on. The covariance is enlarged by the squared Birge ratio
-    where those who count disagree.
+    People who sit or bend down are outliers among those who stand. Iterative
+    reweighting starts at the median. The covariance is enlarged by the squared Birge
+    ratio where inliers disagree.
     """
     mean, covariance = np.median(means, axis=0), np.linalg.inv(weights.sum(axis=0))
     chi2, cauchy = np.zeros(len(means)), np.ones(len(means))
     for _ in range(20):
         apart = means - mean
         chi2 = np.einsum("hi,hij,hj->h", apart, weights, apart)
-        cauchy = 1 / (1 + chi2 / CAUCHY**2)
+        cauchy = 1 / (1 + chi2 / CAUCHY_SCALE**2)
         scaled = cauchy[:, None, None] * weights
         covariance = np.linalg.inv(scaled.sum(axis=0))
         mean = covariance @ np.einsum("hij,hj->i", scaled, means)
@@ -222,6 +227,7 @@ def _robust_mean(
 
 
 def _height_of_camera(eyes, stances) -> float:
+    """Returns the height of the camera over the stances, m; 1.5 m without any."""
     every = np.concatenate([np.zeros((0, 3)), *stances])
     if not len(every):
         return 1.5
@@ -233,14 +239,14 @@ def _tilts(
     worse: float,
     edges: Vertical | None,
 ) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Up from trunks and edges: a mixture of normal distributions of its tilt, each
-    with its weight, mean and covariance; empty without either."""
+    """Returns the distribution of the tilt of up given trunks and edges: a mixture of
+    normal distributions (weight, mean, covariance); empty without either cue."""
     trunks, verticals = [], []
     if trunk_tilt is not None:
         mean, own = trunk_tilt
-        trunks = [(1 - worse, mean, own), (worse, mean, _HOW_MUCH_WORSE**2 * own)]
+        trunks = [(1 - worse, mean, own), (worse, mean, _TRUNK_OUTLIER_FACTOR**2 * own)]
     if edges is not None:
-        wrong, sigma = _WRONG_EDGES
+        wrong, sigma = _EDGE_OUTLIERS
         wide = edges.covariance + sigma**2 * np.eye(2)
         verticals = [(1 - wrong, edges.tilt, edges.covariance)]
         verticals.append((wrong, edges.tilt, wide))
@@ -257,8 +263,8 @@ def _tilts(
 def _agreement(
     apart: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"]
 ) -> tuple[float, Float[np.ndarray, " 2"]]:
-    """Likelihood of a difference, up to a constant, and its product with the inverse of
-    its covariance."""
+    """Returns the normal likelihood of a difference, up to a constant, and the inverse
+    covariance times the difference."""
     explained = np.linalg.solve(covariance, apart)
     likelihood = np.exp(-apart @ explained / 2) / np.sqrt(np.linalg.det(covariance))
     return float(likelihood), explained
@@ -267,17 +273,17 @@ def _agreement(
 def _combined(
     up_tilts: list[tuple[float, np.ndarray, np.ndarray]], ground: Plane | None
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
-    """The tilt of up, the slope of the ground, and the standard deviation of the less
-    sure direction of up, rad.
+    """Returns the tilt of up, the slope of the ground, and the standard deviation of up
+    along its less certain axis, rad.
 
-    The standard deviation is at least that about the same tilt if the ground slopes:
-    most ground is level, and trunks are not exact enough to tell which ground is not.
+    The standard deviation is at least the one about the same tilt on sloping ground:
+    most ground is level, and trunks are too inaccurate to recognise ground that slopes.
     """
     unknown = np.full(2, np.nan)
     if not up_tilts:
         if ground is None:
             return np.zeros(2), unknown, np.inf
-        level = ground.covariance + _LEVEL**2 * np.eye(2)
+        level = ground.covariance + _LEVEL_SLOPE_SIGMA_RAD**2 * np.eye(2)
         return -ground.gradient, np.zeros(2), _largest(level)
     density, tilts, slopes, covariances, is_sloping = [], [], [], [], []
     for p, mean, own in up_tilts:
@@ -291,15 +297,15 @@ def _combined(
         # Up is `mean + e`, with covariance `own`; the ground's gradient is
         # `slope - up`.
         apart = ground.gradient + mean
-        for q, sigma in _GROUNDS:
+        for q, sigma in _GROUND_KINDS:
             total = own + ground.covariance + sigma**2 * np.eye(2)
             likelihood, explained = _agreement(apart, total)
             density.append(p * q * likelihood)
             tilts.append(mean - own @ explained)
             slopes.append(sigma**2 * explained)
-            is_sloping.append(sigma == _STEEP)
+            is_sloping.append(sigma == _STEEP_SLOPE_SIGMA_RAD)
             covariances.append(own - own @ np.linalg.solve(total, own))
-    # If all likelihoods underflow the widest combination, the last, is taken.
+    # If all likelihoods underflow, the widest combination, the last, is chosen.
     weight = np.array(density)
     weight[-1] += 1e-300
     weight = weight / weight.sum()
@@ -314,4 +320,5 @@ def _combined(
 
 
 def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
+    """Returns the largest standard deviation in any direction."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance).max()))

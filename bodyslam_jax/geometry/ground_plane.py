@@ -1,15 +1,17 @@
-"""The ground of a map: the level plane below the camera that most points lie in."""
+"""Finds the ground of a map: the level plane below the camera with the most points."""
 
 import numpy as np
 from jaxtyping import Float
 
-_TILT = np.cos(np.radians(20.0))
-"""The ground may lean this far from level, as up is only known from people's trunks."""
-_THICKNESS = 0.05
-"""Half the ground's thickness, of the camera's height above it."""
-_BELOW = 0.15
-"""Share of points that may lie under the ground: under a table there are more."""
-_TRIES = 1000
+_MIN_LEVEL_COSINE = np.cos(np.radians(20.0))
+"""Cosine of the largest angle between the ground's normal and the assumed up direction,
+which is only known from people's trunks."""
+_MAX_PLANE_DISTANCE = 0.05
+"""Inlier distance from the plane, as a share of the camera's height above it."""
+_MAX_SHARE_BELOW = 0.15
+"""Largest share of points below the ground: under the plane of a table lie more."""
+_RANSAC_SAMPLES = 1000
+"""Number of planes through three random points that RANSAC evaluates."""
 
 
 def find_ground(
@@ -17,10 +19,11 @@ def find_ground(
     eyes: Float[np.ndarray, "t 3"],
     up: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " 4"] | None:
-    """The plane `n x + d = 0` (n upwards, unit) of the ground, or `None`; by RANSAC.
+    """Returns the ground plane `n x + d = 0`, with n a unit vector upwards, by RANSAC.
 
-    `points` and the camera's centres `eyes` are in any one unit; `up` is a unit vector,
-    right to within 20 degrees.
+    Returns `None` if no plane has enough points. `points` and the camera's centres
+    `eyes` are in the same, arbitrary unit; `up` is a unit vector that may err by 20
+    degrees.
     """
     level = np.median(eyes @ up)
     below = points[points @ up < level]
@@ -28,16 +31,16 @@ def find_ground(
         return None
     rng = np.random.default_rng(0)
     best, most = None, max(30, 0.15 * len(points))
-    for _ in range(_TRIES):
+    for _ in range(_RANSAC_SAMPLES):
         a, b, c = below[rng.choice(len(below), 3, replace=False)]
         plane = _plane(np.cross(b - a, c - a), a, up)
         height = np.median(eyes @ plane[:3] + plane[3])
-        if plane[:3] @ up < _TILT or height <= 0:
+        if plane[:3] @ up < _MIN_LEVEL_COSINE or height <= 0:
             continue
         away = below @ plane[:3] + plane[3]
-        near = np.abs(away) < _THICKNESS * height
-        deeper = np.count_nonzero(away < -2 * _THICKNESS * height)
-        if near.sum() > most and deeper < _BELOW * len(points):
+        near = np.abs(away) < _MAX_PLANE_DISTANCE * height
+        deeper = np.count_nonzero(away < -2 * _MAX_PLANE_DISTANCE * height)
+        if near.sum() > most and deeper < _MAX_SHARE_BELOW * len(points):
             best, most = near, near.sum()
     if best is None:
         return None
@@ -51,6 +54,7 @@ def _plane(
     point: Float[np.ndarray, " 3"],
     up: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " 4"]:
+    """Returns the plane through a point with a normal that is made unit and upward."""
     length = np.linalg.norm(normal)
     normal = normal / max(length, 1e-12) * (1 if normal @ up >= 0 else -1)
     return np.append(normal, -normal @ point)

@@ -1,4 +1,4 @@
-"""The slope of the ground, from standing feet and from the landmarks of the map.
+"""Estimates the slope of the ground from standing feet and from landmarks of the map.
 
 Both cues are planes in a frame whose y axis is nearly up, each with the covariance of
 its slope; `fused` combines them.
@@ -12,25 +12,25 @@ from jaxtyping import Float, Int
 from bodyslam_jax.geometry.ground_plane import find_ground
 
 _DEGREE = np.pi / 180
-CAUCHY = 2.4
+CAUCHY_SCALE = 2.4
 """Scale of the Cauchy loss in standard deviations: 95 % as efficient as least squares
 where errors are normal."""
-_FEET_SYSTEMATIC, _MAP_SYSTEMATIC = 0.5 * _DEGREE, 0.3 * _DEGREE
-"""Standard deviations of the systematic errors of slope, of the plane through feet and
-of the map's plane: more feet or points do not reduce them."""
-_AUTOCORRELATION = 0.9
-"""Greatest autocorrelation of the residuals of stances: few stances determine no
+_FEET_SLOPE_SIGMA_RAD, _MAP_SLOPE_SIGMA_RAD = 0.5 * _DEGREE, 0.3 * _DEGREE
+"""Standard deviations of the systematic slope errors of the plane through feet and of
+the map's plane, rad: more feet or points do not reduce them."""
+_MAX_AUTOCORRELATION = 0.9
+"""Upper bound of the autocorrelation of stance residuals: few stances determine no
 larger one."""
-_HEIGHT_SIGMA = 0.02
-"""Least standard deviation of the height of a foot that stands, m."""
-_DEPTH = 0.02
-"""Standard deviation of the distance of a stance from the camera, as a share of it:
-that which changes from stance to stance."""
-_HEIGHT_SCATTER = 0.04
-"""Scatter of stances about the map's plane that errors of estimates explain, m."""
-_OFF_THE_PLANE = 0.25
-"""People do not stand on the map's plane if the median stance is further from it than
-this share of the camera's height."""
+_MIN_HEIGHT_SIGMA_M = 0.02
+"""Lower bound of the standard deviation of the height of a standing foot, m."""
+_RELATIVE_DEPTH_SIGMA = 0.02
+"""Relative standard deviation of the distance between camera and stance: the part that
+is independent between stances."""
+_MAX_HEIGHT_SCATTER_M = 0.04
+"""Scatter of stances about the map's plane that estimation errors explain, m."""
+_MAX_STANCE_OFFSET = 0.25
+"""Distance of the median stance from the map's plane, as a share of the camera's
+height, above which people do not stand on that plane."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Plane:
     gradient: Float[np.ndarray, " 2"]
     """dy/dx and dy/dz."""
     covariance: Float[np.ndarray, "2 2"]
-    """Of `gradient`, rad²."""
+    """Covariance of `gradient`, rad²."""
 
 
 def feet_plane(
@@ -49,18 +49,20 @@ def feet_plane(
     person_sigma: float | Float[np.ndarray, " h"],
     eye: Float[np.ndarray, " 3"] | None = None,
 ) -> Plane | None:
-    """Robust least-squares plane through the positions of standing feet, m.
+    """Fits a plane to the positions of standing feet (m) by robust least squares.
 
-    `None` with fewer than three stances. One height offset per person, with the prior
-    standard deviation `person_sigma` (m), is estimated with the plane: a wrong size of
-    a person shifts all of that person's feet alike. Iteratively reweighted with a
-    Cauchy loss, whose scale is estimated from the median absolute residual. Residuals
-    of stances that follow one another are alike where the ground is not a plane, as on
-    stairs: the covariance grows with their autocorrelation.
+    Returns `None` with fewer than three stances. One height offset per person, with the
+    prior standard deviation `person_sigma` (m), is estimated with the plane, as an
+    error of a person's size shifts all feet of that person by the same height. The fit
+    is iteratively reweighted with a Cauchy loss, whose scale is estimated from the
+    median absolute residual. Residuals of successive stances are correlated where the
+    ground is not a plane, as on stairs: the covariance grows with their
+    autocorrelation.
 
-    Seen from `eye`, an error of distance moves a stance along the line of sight, up as
-    it moves away. Where people hardly move, the plane therefore leans towards that
-    line: its covariance grows by the square of what `_DEPTH` explains.
+    Seen from `eye` (m), an error of distance moves a stance along the line of sight, so
+    that it rises as it recedes. Where people hardly move, the plane is therefore biased
+    towards that line: the covariance grows by the square of the bias that
+    `_RELATIVE_DEPTH_SIGMA` explains.
     """
     people = np.concatenate(
         [np.zeros(0, int), *(np.full(len(s), h) for h, s in enumerate(stances))]
@@ -78,21 +80,21 @@ def feet_plane(
     prior = np.diag([1.0, 1.0, 1e-6, *offsets])
 
     def fit(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted least-squares solution, its information matrix first."""
+        """Returns the information matrix and the weighted least-squares solution."""
         scaled = design * weight[:, None]
         information = design.T @ scaled + prior
         return information, np.linalg.solve(information, scaled.T @ x[:, 1])
 
-    information, solution = fit(np.full(len(x), (5 * _HEIGHT_SIGMA) ** -2))
+    information, solution = fit(np.full(len(x), (5 * _MIN_HEIGHT_SIGMA_M) ** -2))
     for _ in range(19):
         residual = x[:, 1] - design @ solution
         spread = 1.4826 * np.median(np.abs(residual))
-        sigma = max(_HEIGHT_SIGMA, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
-        cauchy = 1 / (1 + (residual / (CAUCHY * sigma)) ** 2)
+        sigma = max(_MIN_HEIGHT_SIGMA_M, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
+        cauchy = 1 / (1 + (residual / (CAUCHY_SCALE * sigma)) ** 2)
         information, solution = fit(cauchy / sigma**2)
     covariance = np.linalg.inv(information)[:2, :2]
     covariance = covariance * _variance_factor(x[:, 1] - design @ solution, people)
-    covariance = covariance + _FEET_SYSTEMATIC**2 * np.eye(2)
+    covariance = covariance + _FEET_SLOPE_SIGMA_RAD**2 * np.eye(2)
     if eye is not None:
         own = np.concatenate([s - s.mean(axis=0) for s in stances if len(s)])
         lean = _lean(own[:, [0, 2]], points - eye)
@@ -103,12 +105,13 @@ def feet_plane(
 def _lean(
     places: Float[np.ndarray, "n 2"], sight: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " 2"]:
-    """The gradient that errors of distance give a plane through level places: that of
-    least squares with errors in the places.
+    """Returns the gradient of a plane through level stances that errors of their
+    distance cause: the bias of least squares with errors in the regressors.
 
-    `places` are about each person's mean, `sight` is from the eye to the places, m.
+    `places` are horizontal positions about each person's mean, `sight` the vectors from
+    the eye to the stances, m.
     """
-    error = _DEPTH * sight
+    error = _RELATIVE_DEPTH_SIGMA * sight
     spread = places.T @ places / len(places) + 1e-6 * np.eye(2)
     return np.linalg.solve(spread, error[:, [0, 2]].T @ error[:, 1] / len(error))
 
@@ -116,15 +119,15 @@ def _lean(
 def _variance_factor(
     residual: Float[np.ndarray, " n"], people: Int[np.ndarray, " n"]
 ) -> float:
-    """Factor by which an autoregressive error of first order enlarges the variance of
-    a mean; 1 without positive autocorrelation."""
+    """Returns the factor by which first-order autoregressive errors enlarge the
+    variance of a mean; 1 without positive autocorrelation."""
     spread = 1.4826 * np.median(np.abs(residual))
     r = np.clip(residual, -3 * spread, 3 * spread)
     same = people[1:] == people[:-1]
     if same.sum() < 4 or not spread:
         return 1.0
     rho = np.sum(r[1:] * r[:-1] * same) / np.sum((r[1:] ** 2 + r[:-1] ** 2) / 2 * same)
-    rho = np.clip(rho, 0.0, _AUTOCORRELATION)
+    rho = np.clip(rho, 0.0, _MAX_AUTOCORRELATION)
     return float((1 + rho) / (1 - rho))
 
 
@@ -133,10 +136,11 @@ def map_plane(
     eyes: Float[np.ndarray, "t 3"],
     stances: list[Float[np.ndarray, "_ 3"]],
 ) -> Plane | None:
-    """The ground plane of the map's landmarks (m).
+    """Returns the ground plane of the map's landmarks (m).
 
-    `None` if there is none, or if people do not stand on it. Where few stances are at
-    one height over it, it may lie across steps: its covariance grows by their scatter.
+    Returns `None` if there is none, or if people do not stand on it. Stances that
+    scatter in height over the plane indicate that it lies across steps: its covariance
+    grows by their scatter.
     """
     up = np.array([0.0, 1.0, 0.0])
     plane = find_ground(landmarks, eyes, up) if len(landmarks) else None
@@ -148,9 +152,9 @@ def map_plane(
     excess = 0.0
     if len(every):
         away = every @ normal + offset
-        if height <= 0 or abs(np.median(away)) > _OFF_THE_PLANE * height:
+        if height <= 0 or abs(np.median(away)) > _MAX_STANCE_OFFSET * height:
             return None
-        excess = max(_scatter_of_level(away) ** 2 - _HEIGHT_SCATTER**2, 0.0)
+        excess = max(_scatter_of_level(away) ** 2 - _MAX_HEIGHT_SCATTER_M**2, 0.0)
     away = landmarks @ normal + offset
     near = np.abs(away) < 0.05 * height
     flat = landmarks[near][:, [0, 2]]
@@ -162,14 +166,14 @@ def map_plane(
         covariance += excess * np.linalg.inv(flat.T @ flat / len(flat) + np.eye(2))
     return Plane(
         -normal[[0, 2]] / normal[1],
-        covariance + _MAP_SYSTEMATIC**2 * np.eye(2),
+        covariance + _MAP_SLOPE_SIGMA_RAD**2 * np.eye(2),
     )
 
 
 def _scatter_of_level(heights: Float[np.ndarray, " n"]) -> float:
-    """Standard deviation of the heights at the most frequent level, by the shortest
-    interval with 40 % of them: half of its length is 0.524 σ of a normal distribution.
-    """
+    """Returns the standard deviation of heights about their mode, from the shortest
+    interval that contains 40 % of them: for a normal distribution, half of its length
+    is 0.524 σ."""
     ordered = np.sort(heights)
     count = max(1, round(0.4 * len(ordered)))
     length = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
@@ -177,9 +181,10 @@ def _scatter_of_level(heights: Float[np.ndarray, " n"]) -> float:
 
 
 def fused(planes: list[Plane]) -> Plane | None:
-    """The planes' mean weighted by information (inverse covariance).
+    """Averages the planes with information (inverse covariance) as weights; `None` for
+    an empty list.
 
-    Its covariance is enlarged by the squared Birge ratio where the planes disagree.
+    The covariance is enlarged by the squared Birge ratio where the planes disagree.
     """
     if not planes:
         return None

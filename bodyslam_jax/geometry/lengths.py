@@ -1,7 +1,7 @@
-"""Few lengths of arrays over frames, so that videos of any length share programs.
+"""Padding of arrays to few lengths, so that videos of any length share programs.
 
-XLA compiles a program for each shape. Arrays over frames are therefore lengthened to
-one of a few lengths before a compiled function sees them, and its results are cut.
+XLA compiles a program for each shape. Arrays over frames are therefore padded to one of
+a few lengths before they enter a compiled function, and its results are truncated.
 """
 
 from typing import Any
@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 LENGTHS = (20, 60, 120, 200, 340, 600, 1020)
-"""In frames. A video of 30 to 1,020 frames becomes 1.36 times as long on average (of
-the logarithm of its length), and at most twice as long. The first is for examples."""
+"""Padded lengths, frames. Padding makes a video of 30 to 1,020 frames longer by a
+factor of 1.36 on average (over the logarithm of its length), and of at most 2. The
+shortest length is for examples."""
 
 
 def round_up(count: int, parts: int = 4) -> int:
-    """The next of a few sizes, each above the one before by at most one in `parts` (a
-    power of 2)."""
+    """Rounds up to the next of a few sizes, whose successive ratio is at most
+    `1 + 1 / parts` (`parts` is a power of 2)."""
     if count <= parts:
         return max(count, 1)
     step = max(2 ** int(np.log2(count)) // parts, 1)
@@ -26,8 +27,8 @@ def round_up(count: int, parts: int = 4) -> int:
 
 
 def padded_length(frames: int) -> int:
-    """The least of `LENGTHS` that holds so many frames; beyond the last, one of more
-    lengths, an eighth apart."""
+    """Returns the least of `LENGTHS` that is not below `frames`; beyond the last one,
+    lengths grow by an eighth."""
     for length in LENGTHS:
         if frames <= length:
             return length
@@ -35,14 +36,15 @@ def padded_length(frames: int) -> int:
 
 
 def padded_rows(count: int) -> int:
-    """The next power of two, for tables whose length is not that of a video."""
+    """Returns the next power of two, for tables whose length is not a number of
+    frames."""
     return 1 << max(count - 1, 0).bit_length()
 
 
 def lengthened(tree: Any, frames: int, axis: int = 0) -> Any:
-    """Every array of a tree with the last entry of `axis` repeated, up to `frames`.
+    """Pads every array of a tree to `frames` by repeating the last entry of `axis`.
 
-    Outside of `jit` by NumPy: JAX would compile one small program for each shape.
+    Outside `jit` it uses NumPy, as JAX would compile a small program for each shape.
     """
 
     def one(x):
@@ -56,7 +58,7 @@ def lengthened(tree: Any, frames: int, axis: int = 0) -> Any:
 
 
 def shortened(tree: Any, frames: int, axis: int = 0) -> Any:
-    """The first `frames` entries of `axis` of every array of a tree."""
+    """Truncates every array of a tree to the first `frames` entries of `axis`."""
 
     def one(x):
         at = (slice(None),) * axis + (slice(frames),)

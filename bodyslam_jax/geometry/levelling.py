@@ -1,4 +1,4 @@
-"""A world whose y axis is up, from cues in any world."""
+"""Aligns the y axis of the world with the estimated up direction."""
 
 import dataclasses
 
@@ -22,13 +22,19 @@ def level(
     edges: Edges | None = None,
     on_floor: Bool[np.ndarray, " h"] | None = None,
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
-    """The rigid motion to a world whose y axis is up, and the cues it is based on.
+    """Returns the rigid motion to a world whose y axis is up, and the estimate of up.
 
     Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
     opposite to `gravity` (in the first camera's axes) if that is measured, else the
     mean direction of people's trunks, or, without people, the first camera's -y.
-    `up` and `normal` of the cues are in the world that is given. Where gravity is
-    measured, up is found once more without it, to be compared.
+    `up` and `normal` of the returned `Upright` are in the given world. Where gravity is
+    measured, up is estimated a second time without it, for comparison.
+
+    Args:
+        T_WC, T_WH: poses of the camera and of people's roots, m.
+        feet: toe joints in the world, m.
+        gravity: direction of gravity in the first camera's axes; empty if not measured.
+        landmarks, fitted, standing, edges, on_floor: see `find_upright`.
     """
     up = -T_WC[0, :3, 1]
     if gravity:
@@ -68,8 +74,8 @@ def level(
 def upright(
     T_WC: Float[np.ndarray, "t 4 4"], up: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion to a world with y along the unit vector `up` and z ahead of the
-    first camera, which is its origin."""
+    """Returns the rigid motion to a world whose origin is the first camera, with y
+    along the unit vector `up` and z horizontal in the camera's viewing direction."""
     y = up
     ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
     if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.

@@ -1,31 +1,31 @@
-"""Ground that is not a plane: its height under a foot, and how far it wanders.
+"""Ground that is not a plane: its height under a foot, and its deviation from level.
 
-The height under a foot follows from the landmarks about the point where the ray from
-the camera through the foot meets them. That needs no scale: a ray has none.
+The height under a foot follows from the landmarks around the point where the ray from
+the camera through the foot meets them. It needs no scale, as a ray is scale-free.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-_REACH = 0.25
-"""Landmarks count within this distance of the ray, as a share of the camera's height
-above them: 0.4 m for a camera at eye level."""
-_FEWEST = 5
-"""Landmarks that determine the height of the ground."""
-_SHARE = 1 / 4
-"""Of the landmarks near the ray, the share at one height for the ground to be there;
-more are at the side of a box beside the foot than at any one height of it."""
+_MAX_RAY_DISTANCE = 0.25
+"""Largest distance between landmark and ray, as a share of the camera's height above
+the landmark: 0.4 m for a camera at eye level."""
+_MIN_LANDMARKS = 5
+"""Least number of landmarks that determine the height of the ground."""
+_MIN_LEVEL_SHARE = 1 / 4
+"""Least share of the landmarks near the ray that lie at the height of the ground. The
+side of a box next to the foot has many landmarks, but fewer at any one height."""
 _ROUGHNESS = 0.04
-"""By which landmarks of one height differ, as a share of the camera's height above
-them."""
-_STEEPEST = 0.05
-"""Least sine of the angle by which a ray goes downwards."""
-_SECOND = 1.0
-"""Length of the running median of heights, s: two steps, in which the errors of
-postures average out."""
-_WANDER = 0.03
-"""Standard deviation of running medians that errors of estimates explain, m; simulated
-walkers on level ground have 0.01 to 0.015."""
+"""Largest difference between landmarks at one height, as a share of the camera's
+height above them."""
+_MIN_DOWNWARD_SINE = 0.05
+"""Least sine of the angle between a ray and the horizontal, downwards."""
+_MEDIAN_WINDOW_S = 1.0
+"""Length of the running median of heights, s: two steps, over which errors of postures
+average out."""
+_WANDER_SIGMA_M = 0.03
+"""Standard deviation of the running medians that estimation errors explain, m; that of
+simulated walkers on level ground is 0.01 to 0.015."""
 
 
 def ground_under(
@@ -34,39 +34,41 @@ def ground_under(
     landmarks: Float[np.ndarray, "l 3"],
     normal: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " t"]:
-    """Height `n x` of the ground where rays from the camera meet it; NaN if unknown.
+    """Returns the height `n x` of the ground where rays from the camera meet it; NaN if
+    unknown.
 
-    Each landmark is compared with the ray's point at its own height. The ground is the
-    highest level at which there are enough that are near: it would hide a lower one.
+    Each landmark is compared with the point of the ray at its own height. The ground is
+    the highest level with enough landmarks near the ray, as it would occlude lower
+    ones.
 
     Args:
         eyes: the camera's centres, in the unit of `landmarks`.
-        rays: towards a sole, in the world, of any length.
-        normal: n, a unit vector, upwards to some degrees.
+        rays: directions towards a sole, in the world, of any length.
+        normal: n, a unit vector that points upwards to within some degrees.
     """
     down = -(rays @ normal) / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
     level, high = landmarks @ normal, eyes @ normal
     found = np.full(len(eyes), np.nan)
-    for k in np.flatnonzero(down > _STEEPEST):
+    for k in np.flatnonzero(down > _MIN_DOWNWARD_SINE):
         below = level < high[k]
         depth = high[k] - level[below]
         towards = rays[k] / -(rays[k] @ normal)
         away = eyes[k] + depth[:, None] * towards - landmarks[below]
-        near = (away**2).sum(axis=1) < (_REACH * depth) ** 2
+        near = (away**2).sum(axis=1) < (_MAX_RAY_DISTANCE * depth) ** 2
         found[k] = _highest(level[below][near], high[k])
     return found
 
 
 def _highest(level: Float[np.ndarray, " n"], eye: float) -> float:
-    """The highest of the heights at which many of these landmarks are; NaN if none."""
+    """Returns the highest level that has enough of these landmarks; NaN if none has."""
     level = np.sort(level)
     depth = eye - level
     # A lower level has landmarks within a larger distance.
     weight = np.concatenate([[0.0], np.cumsum(depth**-2.0)])
     first = np.searchsorted(level, level - _ROUGHNESS * depth)
     stop = np.arange(len(level)) + 1
-    enough = stop - first >= _FEWEST
-    enough &= weight[stop] - weight[first] >= _SHARE * weight[-1]
+    enough = stop - first >= _MIN_LANDMARKS
+    enough &= weight[stop] - weight[first] >= _MIN_LEVEL_SHARE * weight[-1]
     if not enough.any():
         return np.nan
     k = np.flatnonzero(enough)[-1]
@@ -81,9 +83,10 @@ def running_median(
     values: Float[np.ndarray, " t"],
     used: Bool[np.ndarray, " t"],
     fps: float,
-    seconds: float = _SECOND,
+    seconds: float = _MEDIAN_WINDOW_S,
 ) -> Float[np.ndarray, " t"]:
-    """Median of the values in use within `seconds` of time; NaN where there is none."""
+    """Returns the running median of `values` where `used`, over windows of `seconds`;
+    NaN where a window has no value."""
     half = max(1, round(seconds * fps / 2))
     padded = np.pad(np.where(used, values, np.nan), half, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
@@ -96,11 +99,12 @@ def running_median(
 def wander(
     heights: Float[np.ndarray, "h t"], used: Bool[np.ndarray, "h t"], fps: float
 ) -> tuple[Float[np.ndarray, "h t"], float]:
-    """How far the ground is from each person's mean ground over time, m.
+    """Returns the deviation of the ground from each person's mean ground over time, m,
+    and its standard deviation, m.
 
-    Of the running medians of `heights` (of feet over the ground that is assumed, m) it
-    is the share of their variance that errors of estimates do not explain, and the
-    standard deviation of that part. Both are 0 on ground that is as assumed.
+    The deviation is the running median of `heights` (of feet over the assumed ground,
+    m), scaled by the share of its variance that estimation errors do not explain. Both
+    results are 0 where the ground is as assumed.
     """
     slow = np.zeros(heights.shape)
     for h, (one, frames) in enumerate(zip(heights, used, strict=True)):
@@ -111,5 +115,5 @@ def wander(
         return slow, 0.0
     low, high = np.quantile(slow[used], [0.16, 0.84])
     variance = ((high - low) / 2) ** 2
-    excess = max(variance - _WANDER**2, 0.0)
+    excess = max(variance - _WANDER_SIGMA_M**2, 0.0)
     return slow * excess / max(variance, 1e-12), float(np.sqrt(excess))

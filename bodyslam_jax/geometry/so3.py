@@ -11,13 +11,14 @@ import jaxlie
 from jaxtyping import Array, Float
 
 _SMALL_SQUARED_ANGLE = 1e-3
-"""rad²; below it the series of `exp` are exact to rounding, with two derivatives."""
+"""Squared angle below which the series of `exp` are exact to rounding, with two
+derivatives, rad²."""
 _SMALL_SQUARED_SINE = 1e-8
-"""Squared sine of half the angle, below which the series of `log` is exact."""
+"""Squared sine of half the angle below which the series of `log` is exact."""
 
 
 def exp(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix of a rotation vector: Rodrigues' formula.
+    """Converts rotation vectors to matrices by Rodrigues' formula.
 
     `R = I + a [θ]x + b [θ]x²` with `a = sin|θ| / |θ|`, `b = (1 - cos|θ|) / |θ|²`.
     """
@@ -44,10 +45,10 @@ def exp(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
 
 def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """Rotation vector of a rotation matrix, at most π long.
+    """Converts rotation matrices to rotation vectors, at most π long.
 
-    At π, where the vector jumps to its opposite, the derivative is that of the branch
-    which is returned.
+    At π, where the vector jumps to its opposite, the derivative is that of the returned
+    branch.
     """
     return _log_quaternion(jaxlie.SO3.from_matrix(rotation).wxyz)
 
@@ -55,20 +56,20 @@ def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
 def compose(
     first: Float[Array, "*#b 3"], second: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 3"]:
-    """`Log(Exp(first) Exp(second))`: `second` is in the frame that `first` leads to."""
+    """Returns `Log(Exp(first) Exp(second))`, with `second` in the rotated frame."""
     return _log_quaternion(_product(_quaternion(first), _quaternion(second)))
 
 
 def between(
     first: Float[Array, "*#b 3"], second: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 3"]:
-    """`Log(Exp(first)ᵀ Exp(second))`: the rotation from one to the other, in the frame
-    of the first; at most π long."""
+    """Returns `Log(Exp(first)ᵀ Exp(second))`, the rotation from `first` to `second` in
+    the frame of `first`; at most π long."""
     return compose(-first, second)
 
 
 def inverse(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """The transposed matrix."""
+    """Transposes rotation matrices."""
     return rotation.swapaxes(-1, -2)
 
 
@@ -77,17 +78,17 @@ def interpolate(
     end: Float[Array, "*#b 3 3"],
     share: Float[Array, "*#b"],
 ) -> Float[Array, "*b 3 3"]:
-    """Matrices on the shortest geodesic from `start` (share 0) to `end` (share 1)."""
+    """Interpolates along the geodesic from `start` (share 0) to `end` (share 1)."""
     return start @ exp(share[..., None] * log(inverse(start) @ end))
 
 
 def from_quaternion(xyzw: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix of a quaternion of any length but 0."""
+    """Converts quaternions (x, y, z, w) of any length but 0 to rotation matrices."""
     return jaxlie.SO3.from_quaternion_xyzw(xyzw).as_matrix()
 
 
 def inverse_right_jacobian(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """`d Log(Exp(θ) Exp(δ)) / dδ` at δ = 0; finite below a full turn."""
+    """Returns `d Log(Exp(θ) Exp(δ)) / dδ` at δ = 0; finite for angles below 2π."""
     squared = jnp.sum(vector**2, axis=-1)[..., None, None]
     small = squared < 1e-4
     safe = jnp.where(small, 1.0, squared)
@@ -103,14 +104,15 @@ def inverse_right_jacobian(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3
 
 
 def _quaternion(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
-    """(w, x, y, z) of a rotation vector."""
+    """Converts rotation vectors to unit quaternions (w, x, y, z)."""
     return jaxlie.SO3.exp(vector).wxyz
 
 
 def _product(
     first: Float[Array, "*#b 4"], second: Float[Array, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
-    """Hamilton's product; jaxlie's own mixes integers in, which strict types forbid."""
+    """Returns Hamilton's product. That of jaxlie promotes integers, which strict dtype
+    promotion forbids."""
     a, b, c, d = (first[..., i] for i in range(4))
     w, x, y, z = (second[..., i] for i in range(4))
     return jnp.stack(
@@ -125,10 +127,10 @@ def _product(
 
 
 def _log_quaternion(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
-    """`2 atan2(|v|, w) v / |v|` of the quaternion (w, v), w made not negative.
+    """Returns `2 atan2(|v|, w) v / |v|` for a quaternion (w, v) with w made >= 0.
 
-    jaxlie's logarithm is constant near π, so that its derivative by a further rotation
-    about the axis vanishes there.
+    The logarithm of jaxlie is constant near π, so that its derivative with respect to a
+    further rotation about the axis vanishes there.
     """
     q = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
     w, v = q[..., :1], q[..., 1:]

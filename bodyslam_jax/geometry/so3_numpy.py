@@ -1,8 +1,8 @@
 """The rotation group SO(3) in NumPy, for stages that run once per clip.
 
-The functions of `so3` under the same names, on SciPy's `Rotation`, which is used
-nowhere else. A module of its own, so that reading files and structure from motion do
-not import JAX. Rotation vectors are in rad, quaternions in order x y z w.
+The module has the functions of `so3` under the same names, based on SciPy's `Rotation`,
+which is used nowhere else. It is separate so that reading files and structure from
+motion do not import JAX. Rotation vectors are in rad, quaternions in order x y z w.
 """
 
 import numpy as np
@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 
 def exp(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Rotation matrix of a rotation vector."""
+    """Converts rotation vectors to matrices."""
     return _of_vector(vector).as_matrix().reshape(*vector.shape, 3)
 
 
 def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
-    """Rotation vector of a rotation matrix, at most π long.
+    """Converts rotation matrices to rotation vectors, at most π long.
 
-    A matrix that is not quite orthogonal is replaced by the nearest rotation; NaN for
-    one that is not finite.
+    A matrix that is not exactly orthogonal is replaced by the nearest rotation; one
+    that is not finite gives NaN.
 
     **Raises:** `ValueError` for matrices whose determinant is not positive.
     """
@@ -33,7 +33,7 @@ def log(rotation: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
 def compose(
     first: Float[np.ndarray, "*b 3"], second: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "*b 3"]:
-    """`Log(Exp(first) Exp(second))`: `second` is in the frame that `first` leads to."""
+    """Returns `Log(Exp(first) Exp(second))`, with `second` in the rotated frame."""
     product = _of_vector(first) * _of_vector(second)
     return product.as_rotvec().reshape(second.shape)
 
@@ -41,8 +41,8 @@ def compose(
 def between(
     first: Float[np.ndarray, "*b 3"], second: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "*b 3"]:
-    """`Log(Exp(first)ᵀ Exp(second))`: the rotation from one to the other, in the frame
-    of the first; at most π long."""
+    """Returns `Log(Exp(first)ᵀ Exp(second))`, the rotation from `first` to `second` in
+    the frame of `first`; at most π long."""
     return compose(-first, second)
 
 
@@ -51,7 +51,7 @@ def interpolate(
     end: Float[np.ndarray, "*b 3 3"],
     share: Float[np.ndarray, "*b"],
 ) -> Float[np.ndarray, "*b 3 3"]:
-    """Matrices on the shortest geodesic from `start` (share 0) to `end` (share 1)."""
+    """Interpolates along the geodesic from `start` (share 0) to `end` (share 1)."""
     whole = log(np.swapaxes(start, -1, -2) @ end)
     return start @ exp(share[..., None] * whole)
 
@@ -61,33 +61,37 @@ def interpolate_path(
     rotations: Float[np.ndarray, "n 3 3"],
     at: Real[np.ndarray, " t"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Matrices at the times `at`, which lie within increasing `times` (n >= 2)."""
+    """Interpolates matrices at the times `at`, which lie within increasing `times`
+    (n >= 2)."""
     return Slerp(times, Rotation.from_matrix(rotations))(at).as_matrix()
 
 
 def from_quaternion(xyzw: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Rotation matrix of a quaternion of any length but 0."""
+    """Converts quaternions of any length but 0 to rotation matrices."""
     rotation = Rotation.from_quat(xyzw.reshape(-1, 4))
     return rotation.as_matrix().reshape(*xyzw.shape[:-1], 3, 3)
 
 
 def quaternion(vector: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 4"]:
-    """Unit quaternion of a rotation vector."""
+    """Converts rotation vectors to unit quaternions."""
     return _of_vector(vector).as_quat().reshape(*vector.shape[:-1], 4)
 
 
 def euler(vector: Float[np.ndarray, "*b 3"], order: str) -> Float[np.ndarray, "*b 3"]:
-    """Intrinsic Euler angles (rad) of a rotation vector, in an order such as `ZXY`."""
+    """Converts rotation vectors to intrinsic Euler angles (rad), in an order such as
+    `ZXY`."""
     return _of_vector(vector).as_euler(order).reshape(vector.shape)
 
 
 def optical_axis_to_ray(xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 3"]:
-    """Rotation vector of the smallest rotation from +z to the ray (x, y, 1)."""
+    """Returns the rotation vector of the smallest rotation from +z to a ray (x, y,
+    1)."""
     tangent = np.linalg.norm(xy, axis=-1, keepdims=True)
     axis = np.stack([-xy[..., 1], xy[..., 0], np.zeros(xy.shape[:-1])], axis=-1)
     return np.arctan(tangent) * axis / np.where(tangent > 0, tangent, 1.0)
 
 
 def _of_vector(vector: np.ndarray) -> Rotation:
-    # A copy: SciPy refuses read-only arrays, as those that come from JAX.
+    """Converts rotation vectors to SciPy's rotations."""
+    # A copy, as SciPy rejects read-only arrays such as those from JAX.
     return Rotation.from_rotvec(np.array(vector.reshape(-1, 3)))

@@ -1,7 +1,7 @@
 """Triangulation of many points, each from any number of views.
 
-Linear first: the point nearest to its rays in space, reweighted (iteratively
-reweighted least squares with a Cauchy loss). Gauss--Newton on reprojection errors then
+The linear solution comes first: the point nearest to its rays in space, by iteratively
+reweighted least squares with a Cauchy loss. Gauss--Newton on reprojection errors then
 removes the bias of that point towards the cameras. Coordinates `xy` are undistorted,
 at depth 1 (a pixel over the focal length).
 """
@@ -16,7 +16,7 @@ _MIN_DEPTH = 1e-9
 
 
 def unit_rays(xy: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-    """Unit vectors in the camera frame through `xy` at depth 1."""
+    """Returns the unit vectors in the camera frame through `xy` at depth 1."""
     rays = np.concatenate([xy, np.ones_like(xy[:, :1])], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
@@ -29,14 +29,15 @@ def triangulate(
     num_landmarks: int,
     scale: float,
 ) -> Float[np.ndarray, "l 3"]:
-    """Points of the world from `m` views of them.
+    """Triangulates `l` points of the world from `m` views.
 
-    A landmark without views, or with parallel rays only, has a finite point without
-    meaning: see `widest_angle`.
+    A landmark without views, or with parallel rays only, gets a finite but meaningless
+    point: see `widest_angle`.
 
     Args:
-        R_CW, centre: world-to-camera rotation and camera centre of each view.
-        landmark: which point each view is of.
+        R_CW, centre: world-to-camera rotation and camera centre of each view, in the
+            unit of the scene.
+        landmark: index of the point that each view observes.
         scale: scale of the Cauchy loss at depth 1: of the order of one pixel.
     """
     ray = np.einsum("mji,mj->mi", R_CW, unit_rays(xy))
@@ -59,10 +60,10 @@ def triangulate(
 
 
 def _refined(R_CW, centre, xy, landmark, points, scale) -> Float[np.ndarray, "l 3"]:
-    """Gauss--Newton on reprojection errors with a Cauchy loss.
+    """Refines points by Gauss--Newton on reprojection errors with a Cauchy loss.
 
-    The linear solution is biased towards the cameras: noise of the rays' directions
-    adds apparent parallax, a fifth of it where rays are 0.5 degrees apart.
+    The linear solution is biased towards the cameras: noise of the ray directions adds
+    apparent parallax, by a fifth where rays are 0.5 degrees apart.
     """
     for _ in range(5):
         p_C = np.einsum("mij,mj->mi", R_CW, points[landmark] - centre)
@@ -87,8 +88,8 @@ def widest_angle(
     landmark: Int[np.ndarray, " m"],
     points: Float[np.ndarray, "l 3"],
 ) -> Float[np.ndarray, " l"]:
-    """Parallax (rad): the largest angle at each point between the camera centre of its
-    first view and that of another; 0 without views."""
+    """Returns the parallax of each point (rad): the largest angle at the point between
+    the camera centre of its first view and that of another; 0 without views."""
     to = centre - points[landmark]
     to = to / np.maximum(np.linalg.norm(to, axis=-1, keepdims=True), 1e-12)
     first = np.full(len(points), len(to))

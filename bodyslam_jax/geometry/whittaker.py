@@ -1,9 +1,9 @@
 """A low-pass filter for postures and paths of people, as used in gait laboratories.
 
-The estimate follows each frame's keypoints, noise included, as the graph ties postures
-of successive frames only by the AR(1) errors of the regressor: stronger smoothing
-within the estimation would shrink the swing of the legs, from which the scale is
-estimated. So noise is filtered afterwards. Whittaker's smoother minimises
+The estimate follows the keypoints of each frame, including their noise, as the graph
+couples postures of successive frames only through the AR(1) errors of the regressor:
+stronger smoothing within the estimation would reduce the swing of the legs, from which
+the scale is estimated. So noise is filtered afterwards. Whittaker's smoother minimises
 `|x - y|² + λ |D² x|²` over each run of frames; its gain at frequency f is
 `1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, preserves constant speed, and
 halves amplitudes at the cutoff.
@@ -24,8 +24,8 @@ def low_pass(
 ) -> Float[np.ndarray, " t *channels"]:
     """Smooths every channel over each run of frames that are `present`.
 
-    `cutoff` is in Hz; from half of `fps` on nothing changes, nor do runs of fewer than
-    three frames.
+    `cutoff` is in Hz; if it is at least `fps` / 2, values are returned unchanged, and
+    so are runs of fewer than three frames.
     """
     out = values.astype(float).copy()
     if cutoff >= fps / 2:
@@ -40,7 +40,8 @@ def low_pass(
         corner = weight * second.T @ second
         bands = np.zeros((3, n))
         for k in range(3):
-            # Rows repeat between the two ends, where they are those of a short run.
+            # Between its ends the matrix has constant diagonals; a run of five frames
+            # gives all distinct entries.
             row = np.diagonal(corner, k)
             middle = row[len(row) // 2]
             full = np.full(n - k, middle)
@@ -59,10 +60,10 @@ def low_pass_rotations(
     fps: float,
     cutoff: float,
 ) -> Float[np.ndarray, "t *j 3"]:
-    """`low_pass` of rotation vectors, rad, through their quaternions.
+    """Smooths rotation vectors (rad) by applying `low_pass` to their quaternions.
 
-    Signs of quaternions are chosen so that they change little from frame to frame; a
-    rotation may pass through π.
+    Signs of quaternions are chosen for continuity between frames, so that rotations may
+    pass through π. `cutoff` is in Hz.
     """
     shape = angles.shape
     q = so3.quaternion(angles).reshape(len(angles), -1, 4)

@@ -1,19 +1,13 @@
-"""From tracks and bodies to an initial state in metres and the factors of the graph.
+"""Makes the initial state, in metres, and the factors of the graph (section 3.6).
 
-Section 3.6 of the paper: cameras and landmarks up to scale from structure from motion,
-people placed by `T_WH = T_WC T_CH`. The initial scale has a closed form: the motion
-model's residual is linear in s, and so is the height of people's feet above the ground.
+Cameras and landmarks come from structure from motion, up to scale; people are placed by
+`T_WH = T_WC T_CH`. The initial scale has a closed form: the motion model's residual is
+linear in s, and so is the height of people's feet above the ground.
 """
 
 from bodyslam_jax.initialisation.carried_people import carried as carried
 from bodyslam_jax.initialisation.carried_people import (
     lines_of_carried as lines_of_carried,
-)
-from bodyslam_jax.initialisation.contact_factors import (
-    contact_factor as contact_factor,
-)
-from bodyslam_jax.initialisation.contact_factors import (
-    without_contacts as without_contacts,
 )
 from bodyslam_jax.initialisation.ground import ground_contact as ground_contact
 from bodyslam_jax.initialisation.ground import (
@@ -32,9 +26,13 @@ from bodyslam_jax.initialisation.motion_factors import (
     optional_factors as optional_factors,
 )
 from bodyslam_jax.initialisation.motion_factors import steps_shown as steps_shown
+from bodyslam_jax.initialisation.people_factors import contact_factor as contact_factor
 from bodyslam_jax.initialisation.people_factors import keypoint_sigma as keypoint_sigma
 from bodyslam_jax.initialisation.people_factors import people_factors as people_factors
 from bodyslam_jax.initialisation.people_factors import stature_factor as stature_factor
+from bodyslam_jax.initialisation.people_factors import (
+    without_contacts as without_contacts,
+)
 from bodyslam_jax.initialisation.placement import first_state as first_state
 from bodyslam_jax.initialisation.placement import free_people as free_people
 from bodyslam_jax.initialisation.placement import no_people as no_people

@@ -1,10 +1,10 @@
-"""People whose displacement has another cause than their steps.
+"""Detects people whose displacement is not caused by their steps.
 
 On wheels or in a boat people move without stepping; on a treadmill they step without
 moving. The motion model predicts displacement from postures, so its prediction must not
 determine the scale for such people. They are recognised by comparing predicted with
-observed displacements, which needs a scale from elsewhere: a static camera, the ground,
-or a camera path in metres.
+observed displacements, which needs a scale from another source: a static camera, the
+ground, or a camera path in metres.
 """
 
 import numpy as np
@@ -12,13 +12,14 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, motion
 
-_WINDOW = 1.0
-"""s: displacements over this time are larger than the noise of depth."""
-_MIN_SPEED = 0.5
-"""m/s: below it, in both displacements, nothing is concluded."""
+_WINDOW_S = 1.0
+"""Interval over which displacements are compared, s: they exceed the noise of depth."""
+_MIN_SPEED_MPS = 0.5
+"""Least of the larger of both speeds at which a person is classified, m/s."""
 _MAX_DIFFERENCE = 0.75
-"""Difference of the displacements as a share of the larger one: 1 on a treadmill or on
-wheels, below 0.3 of people who walk, 0.5 if the scale is wrong by a factor of 2."""
+"""Largest difference between both displacements, as a share of the larger one: it is 1
+on a treadmill or on wheels, below 0.3 for people who walk, and 0.5 if the scale is
+wrong by a factor of 2."""
 
 
 def carried(
@@ -28,12 +29,13 @@ def carried(
     scale: float,
     fps: float,
 ) -> dict[int, tuple[float, float]]:
-    """People whose displacement is not that of their steps: observed and predicted
-    speed of each, m/s (medians over windows of a second).
+    """Returns the people whose displacement contradicts their steps, each with observed
+    and predicted speed, m/s (medians over windows of a second).
 
     Args:
         present: frames in which people are present and cameras are registered.
-        scale: m per unit of the map, from other cues than people's motion; without
+        prediction: displacements by the motion model, m.
+        scale: m per unit of the map, from other cues than people's motion; it has no
             effect for a static camera.
     """
     C_WC = np.asarray(state.cameras[:, :3, :3])
@@ -47,13 +49,13 @@ def carried(
     valid = np.asarray(prediction.valid) & present
     found = {}
     for h in range(len(step)):
-        window = max(2, round(_WINDOW * fps))
+        window = max(2, round(_WINDOW_S * fps))
         speeds = _compare(step[h], position[h], valid[h], window)
         if speeds is None:
             continue
         observed, expected, difference = (float(x) * fps for x in speeds)
         larger = max(observed, expected)
-        if larger > _MIN_SPEED and difference > _MAX_DIFFERENCE * larger:
+        if larger > _MIN_SPEED_MPS and difference > _MAX_DIFFERENCE * larger:
             found[h] = (observed, expected)
     return found
 
@@ -64,8 +66,9 @@ def _compare(
     valid: Bool[np.ndarray, " t"],
     n: int,
 ) -> Float[np.ndarray, " 3"] | None:
-    """Medians over windows of `n` frames, m per frame: of the observed displacement, of
-    the predicted one, and of their difference; `None` without a complete window."""
+    """Returns the lengths of the observed displacement, the predicted one and their
+    difference, m per frame, as medians over windows of `n` frames; `None` without a
+    complete window."""
     if len(step) <= n:
         return None
     walked = np.cumsum(np.where(valid[:, None], step, 0.0), axis=0)
@@ -80,7 +83,7 @@ def _compare(
 
 
 def lines_of_carried(found: dict[int, tuple[float, float]]) -> tuple[str, ...]:
-    """A warning for each of these people, for the report."""
+    """Returns a warning for each person that `carried` found, for the report."""
     lines = []
     for h, (observed, expected) in found.items():
         line = (

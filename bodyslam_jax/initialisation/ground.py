@@ -1,4 +1,4 @@
-"""The ground that people stand on: the map's plane, or its height under their feet."""
+"""Estimates the ground under people: the map's plane, or its height at their feet."""
 
 from typing import cast
 
@@ -18,25 +18,26 @@ from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONFIDENCE = 0.2
-"""From which a keypoint of the feet counts as visible."""
+"""Confidence above which a keypoint of the feet counts as visible."""
 _MAX_SPREAD = 0.3
-"""Interquartile range of the scales of single frames, as a share of their median. It is
-larger where people do not stand on the ground of the map."""
-_FLAT = 0.015
+"""Largest interquartile range of the scales of single frames, as a share of their
+median. It is larger where people do not stand on the ground of the map."""
+_MAX_PLANE_RESIDUAL = 0.015
 """Standard deviation of the ground under feet about the plane, as a share of the
-camera's height, up to which the plane explains it: landmarks err by half of that."""
-_BETTER = 0.7
-"""By as much as this the scales of single frames must be closer to each other with the
-ground under feet than with the plane."""
-_SMOOTH = 0.5
-"""Length of the running median of heights of the ground, s; it fills gaps too."""
-_FEWEST = 15
-"""Frames with known ground, for its heights to be compared with the plane, or used."""
-_LEAST_SHARE = 0.2
-"""The same, as a share of the frames with visible feet."""
-_MEAN_OF_WANDER = 1.5
-"""The error of the mean ground for each standard deviation by which it wanders: one
-that rises steadily from the plane is in the mean 1.7 of its standard deviations off."""
+camera's height, below which the plane explains it: landmarks err by half of that."""
+_MAX_RANGE_RATIO = 0.7
+"""Largest ratio between the ranges of scales of single frames, with the ground under
+feet over with the plane, at which the ground under feet is preferred."""
+_MEDIAN_WINDOW_S = 0.5
+"""Length of the running median of ground heights, s; it also fills gaps."""
+_MIN_GROUND_FRAMES = 15
+"""Least number of frames with known ground height for it to be considered."""
+_MIN_GROUND_SHARE = 0.2
+"""The same limit as a share of the frames with visible feet."""
+_MEAN_ERROR_PER_WANDER = 1.5
+"""Error of the mean height of the ground over the standard deviation of its wander:
+ground that rises steadily from the plane is off by 1.7 standard deviations on average.
+"""
 
 
 def ground_contact(
@@ -47,16 +48,16 @@ def ground_contact(
     weights: GraphWeights,
     fps: float,
 ) -> graph.GroundContact | None:
-    """The factor of people who stand on the ground of the map, in frames with visible
-    feet; `None` without ground, or if scales disagree from frame to frame.
+    """Returns the factor of people standing on the ground of the map, in frames with
+    visible feet; `None` without ground, or if the scales of single frames disagree.
 
-    The ground is the map's plane where that explains the landmarks under people's feet.
-    Where it does not, on stairs or uneven ground, or where there is no plane, it is the
-    height of these landmarks, in frames in which there are enough, if people then have
-    one scale more nearly than on the plane. Up is the mean direction of their trunks.
+    The ground is the map's plane if it explains the landmarks under people's feet.
+    Otherwise, on stairs or uneven ground or without a plane, it is the height of these
+    landmarks in frames with enough of them, provided that the scales of single frames
+    then agree better than with the plane. Up is the mean direction of trunks.
 
     Args:
-        present: frames with a camera and a person whose legs are not only guessed.
+        present: frames with a camera and a person whose legs are observed.
     """
     visible = with_visible_feet(present, keypoints)
     if weights.ground_sigma is None or visible.sum() < 2:
@@ -74,7 +75,8 @@ def ground_contact(
 def with_visible_feet(
     present: Bool[np.ndarray, "h t"], keypoints: Keypoints | None
 ) -> Bool[np.ndarray, "h t"]:
-    """The frames in which a foot is seen; all of `present` without keypoints."""
+    """Returns the frames in which a foot is visible; all of `present` without
+    keypoints."""
     if keypoints is None:
         return present
     feet = keypoints.confidence[:, :, BODY25_ANKLES_AND_FEET]
@@ -84,14 +86,14 @@ def with_visible_feet(
 def with_wander(
     contact: graph.GroundContact, state: graph.State, fps: float
 ) -> graph.GroundContact:
-    """The factor with a larger error where feet rise and sink over the ground in the
+    """Enlarges the sigma of the factor where feet rise and sink over the ground in the
     course of the sequence (`geometry.local_ground.wander`)."""
     sigma = np.asarray(contact.sigma)
     used = np.isfinite(sigma)
     every = scales(contact, state)
     high = (every - np.median(every[used])) * heights_of_camera(contact, state)
     _, moved = wander(high, used, fps)
-    more = np.sqrt(used.sum()) * _MEAN_OF_WANDER * moved
+    more = np.sqrt(used.sum()) * _MEAN_ERROR_PER_WANDER * moved
     return eqx.tree_at(
         lambda f: f.sigma,
         contact,
@@ -102,7 +104,8 @@ def with_wander(
 def heights_of_camera(
     contact: graph.GroundContact, state: graph.State
 ) -> Float[np.ndarray, "h t"]:
-    """Height of the camera over the ground under each person, units of the map."""
+    """Returns the height of the camera over the ground under each person, units of the
+    map."""
     eyes = np.asarray(state.cameras[:, :3, 3] @ contact.normal)
     return eyes + np.asarray(contact.offset)
 
@@ -110,14 +113,15 @@ def heights_of_camera(
 def scales(
     contact: graph.GroundContact, state: graph.State
 ) -> Float[np.ndarray, "h t"]:
-    """The scales that would put people's feet on the ground."""
+    """Returns the scales that put people's feet on the ground, m per unit of the
+    map."""
     return _scales_and_soles(contact, state)[0]
 
 
 def _ground(
     state: graph.State, visible: Bool[np.ndarray, "h t"], body: BodyModel, fps: float
 ) -> tuple[graph.GroundContact | None, Bool[np.ndarray, "h t"]]:
-    """The factor with σ = 1, and the frames in which it is used."""
+    """Returns the factor with σ = 1, and the frames in which it is used."""
     landmarks = np.asarray(state.landmarks)
     eyes = np.asarray(state.cameras[:, :3, 3])
     up = mean_up(state, visible)
@@ -135,39 +139,41 @@ def _ground(
     for h, frames in enumerate(visible):
         own = np.full(len(frames), np.nan)
         own[frames] = ground_under(eyes[frames], rays[h, frames], landmarks, normal)
-        level[h] = running_median(own, np.isfinite(own), fps, _SMOOTH)
+        level[h] = running_median(own, np.isfinite(own), fps, _MEDIAN_WINDOW_S)
     known = visible & np.isfinite(level)
-    enough = known.sum() >= max(_FEWEST, _LEAST_SHARE * visible.sum())
+    enough = known.sum() >= max(_MIN_GROUND_FRAMES, _MIN_GROUND_SHARE * visible.sum())
     if not enough:
         return (None if plane is None else contact), visible
     offset = jnp.asarray(np.where(known, -level, d))
     local = eqx.tree_at(lambda f: f.offset, contact, offset)
     if plane is None:
         return local, known
-    flat = _spread(level[known] + d) < _FLAT * np.median(eyes @ normal + d)
-    # Scale is one number: landmarks of furniture in front of feet put it elsewhere.
+    flat = _spread(level[known] + d) < _MAX_PLANE_RESIDUAL * np.median(
+        eyes @ normal + d
+    )
+    # The scale is constant; landmarks of furniture in front of feet make it vary.
     apart = [_range(scales(ground, state)[known]) for ground in (contact, local)]
-    if flat or apart[1] > _BETTER * apart[0]:
+    if flat or apart[1] > _MAX_RANGE_RATIO * apart[0]:
         return contact, visible
     return local, known
 
 
 def _range(values: Float[np.ndarray, " n"]) -> float:
-    """From the 5th to the 95th percentile, as a share of the median."""
+    """Returns the range from the 5th to the 95th percentile over the median."""
     low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
     return float((high - low) / max(abs(middle), 1e-12))
 
 
 def _spread(heights: Float[np.ndarray, " n"]) -> float:
-    """Standard deviation about zero, by the quantiles of 5 and 95 %."""
+    """Returns the standard deviation about zero, from the quantiles of 5 and 95 %."""
     return float(np.abs(np.quantile(heights, [0.05, 0.95])).max() / 1.645)
 
 
 def _scales_and_soles(
     contact: graph.GroundContact, state: graph.State
 ) -> tuple[Float[np.ndarray, "h t"], Float[np.ndarray, "h t 3"]]:
-    """`contact.scales` and `contact.soles`, with the number of frames rounded up, so
-    that videos of about the same length share a program."""
+    """Evaluates `contact.scales` and `contact.soles` with a padded number of frames, so
+    that videos of similar length share a program."""
     frames = len(state.cameras)
     more = padded_length(frames) - frames
     none = jnp.zeros((0, 3), state.landmarks.dtype)

@@ -1,4 +1,4 @@
-"""Factors of cameras and landmarks, from structure from motion and a known path."""
+"""Factors of cameras and landmarks, from structure from motion and a given path."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,22 +9,23 @@ from bodyslam_jax.config import PATH_SIGMA, GraphWeights
 from bodyslam_jax.types import Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
-"""px: plausible noise of tracks; a measured value outside it means that the model is
-wrong, and is clipped."""
+"""Plausible noise of tracks, px; a measured value outside this range indicates a wrong
+model, and is clipped."""
 
 
 def landmark_sigma(measured: float, weights: GraphWeights) -> float:
-    """Standard deviation of an observed landmark in the joint graph, px: `pixel_sigma`
-    of the weights, or else the noise `measured` by bundle adjustment."""
+    """Returns the standard deviation of landmark observations in the joint graph, px:
+    `weights.pixel_sigma` if set, else the noise `measured` by bundle adjustment."""
     return measured if weights.pixel_sigma is None else weights.pixel_sigma
 
 
 def map_factor(
     tracks: Tracks, keep: Bool[np.ndarray, " m"], sigma: float, weights: GraphWeights
 ) -> graph.Reprojection:
-    """Observations of static landmarks; rejected ones (not in `keep`) have no weight.
+    """Returns the reprojection factor of static landmarks; observations that are not in
+    `keep` have no weight.
 
-    `sigma` is the noise of the tracks that bundle adjustment measured, px.
+    `sigma` is the noise of the tracks as measured by bundle adjustment, px.
     """
     sigma = landmark_sigma(sigma, weights)
     return graph.Reprojection(
@@ -41,7 +42,7 @@ def revisit_factor(
     prior_information: Float[np.ndarray, "l 3 3"],
     sigma: float,
 ) -> graph.LandmarkPrior:
-    """A prior on each landmark from other observations of the same point.
+    """Returns a prior on each landmark from other observations of the same point.
 
     Args:
         prior_mean: positions, in units of the map (`sfm.loop_closure`).
@@ -61,12 +62,12 @@ def path_factors(
     given: Bool[np.ndarray, " t"] | None,
     scale: float = float("nan"),
 ) -> list[graph.Factor]:
-    """Priors on camera poses, and on the scale.
+    """Returns priors on camera poses, and on the scale, from a given camera path.
 
     Args:
-        path: T'_WC of a camera path that came with the video; no factors without it.
-        given: the frames in which it has a pose.
-        scale: metres per unit of the map, if the path is in metres; else NaN.
+        path: poses T'_WC in units of the map; without it there are no factors.
+        given: the frames in which the path has a pose.
+        scale: metres per unit of the map if the path is in metres, else NaN.
     """
     if path is None or given is None:
         return []

@@ -1,4 +1,4 @@
-"""Factors of the motion model's prediction."""
+"""Factors of the displacements and rotations that the motion model predicts."""
 
 import math
 from collections.abc import Collection
@@ -14,8 +14,8 @@ from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 from bodyslam_jax.geometry.runs import runs
 
-STRIDE = 1.0
-"""Duration of a stride, two steps, of people who walk, s."""
+_STRIDE_S = 1.0
+"""Duration of a stride (two steps) in walking, s."""
 
 
 def motion_factor(
@@ -27,13 +27,13 @@ def motion_factor(
     shared_error: Float[np.ndarray, " h"] | float = 0.0,
     without: Collection[int] = (),
 ) -> graph.HumanMotion:
-    """The predicted displacements, with the model's covariance, in leg lengths or, with
-    `motion_in_legs` false, in metres.
+    """Returns the factor of predicted displacements with the model's covariance, in leg
+    lengths or, if `weights.motion_in_legs` is false, in metres.
 
     Args:
-        shapes: β, for the leg lengths.
-        shared_error: relative error common to all of a person's displacements. However
-            many they are, together they determine the scale no better than this.
+        shapes: SMPL β, from which leg lengths follow.
+        shared_error: relative error common to all displacements of a person. It bounds
+            the precision of the scale, however many displacements there are.
         without: people (rows) whose displacements have no weight.
     """
     shared = jnp.broadcast_to(jnp.asarray(shared_error, shapes.dtype), len(shapes))
@@ -60,22 +60,22 @@ def motion_factor(
 def steps_shown(
     prediction: motion.Prediction, legs: Bool[np.ndarray, "h t"], fps: float
 ) -> motion.Prediction:
-    """The prediction without the steps of legs that are only guessed.
+    """Marks predictions as invalid where legs are not observed.
 
-    A posture that nothing in the image shows is one of the prior's, or of a regressor:
-    its displacement is that of no step, and tells nothing of the size of the scene. In
-    a gap shorter than a stride the postures before and after it determine the phase of
-    the gait, so that its steps are kept.
+    A posture without support in the image comes from a prior or a regressor: the
+    displacement predicted from it is not that of a real step, and carries no
+    information on scale. In a gap shorter than a stride the postures on both sides
+    determine the phase of the gait, so its steps are kept.
 
     Args:
-        legs: frames with legs that are shown (`people.legs_shown`).
+        legs: frames with observed legs (`people.legs_shown`).
     """
     known = legs.copy()
     for frames in known:
         last = len(frames)
         for gap in runs(~frames):
             bounded = gap.start > 0 and gap.stop < last
-            if bounded and gap.stop - gap.start < STRIDE * fps:
+            if bounded and gap.stop - gap.start < _STRIDE_S * fps:
                 frames[gap] = True
     return eqx.tree_at(
         lambda p: p.valid, prediction, prediction.valid & jnp.asarray(known)
@@ -84,11 +84,11 @@ def steps_shown(
 
 @eqx.filter_jit
 def _whitened_steps(prediction, shapes, body, weights, shared_error):
-    """Displacements (h, t, 3) in leg lengths or metres, and their whitening matrices
-    `W` (h, t, 3, 3), with `W^T W` the inverse covariance.
+    """Returns displacements (h, t, 3) in leg lengths or metres, and their whitening
+    matrices `W` (h, t, 3, 3), where `W^T W` is the inverse covariance.
 
-    `W` is scaled down such that a relative error `shared_error` common to all steps of
-    a person is accounted for; it is zero in frames without a prediction.
+    `W` is scaled down to account for a relative error `shared_error` common to all
+    steps of a person; it is zero in frames without a prediction.
     """
     valid = prediction.valid
     eye = jnp.eye(3, dtype=prediction.translation.dtype)
@@ -101,7 +101,7 @@ def _whitened_steps(prediction, shapes, body, weights, shared_error):
     whitening = jnp.where(valid[..., None, None], whitening, 0.0)
     step = jnp.where(valid[..., None], prediction.translation, 0.0)
     rho = weights.motion_correlation
-    # Information on one factor of all of a person's displacements, with AR(1) errors.
+    # Information on a common factor of all displacements of a person, for AR(1) errors.
     information = jnp.sum((whitening @ step[..., None]) ** 2, (1, 2, 3), keepdims=True)
     information = information * (1 - rho) / (1 + rho)
     whitening = whitening / jnp.sqrt(1 + shared_error**2 * information)
@@ -114,7 +114,7 @@ def _whitened_steps(prediction, shapes, body, weights, shared_error):
 def optional_factors(
     prediction: motion.Prediction, fps: float, weights: GraphWeights
 ) -> list[graph.Factor]:
-    """A factor of the predicted change of root orientation from frame to frame.
+    """Returns the factor of the predicted change of root orientation between frames.
 
     The list is empty unless `weights.orientation_sigma` (rad, at 30 fps) is finite.
     """

@@ -1,7 +1,8 @@
-"""Factors of people, from keypoints, regressed or fitted bodies and known statures."""
+"""Factors of people: keypoints, body priors, statures, and contact of standing feet."""
 
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -13,20 +14,24 @@ from bodyslam_jax.config import GraphWeights, Measured
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.types import Sequence
 
-_PREDICTED_AFTER = 16 / 30
-"""s: a pose counts as predicted after the person was present for as long, where the
-prediction itself is not given: the longest window of the models that ship."""
+_MIN_PREDICTION_S = 16 / 30
+"""Time for which a person has been present before the pose counts as predicted, s, if
+no prediction is given: the longest window of the motion models in the package."""
+_CONTACT_LOSS_SIGMAS = 3.0
+"""Cauchy scale of the displacement of a point in contact, in standard deviations."""
+_MIN_CONTACT_PROBABILITY = 0.05
+"""Probability of contact in two successive frames below which a point has no weight."""
 
 
 def keypoint_sigma(
     sequence: Sequence, roots: PersonState, weights: GraphWeights
 ) -> Float[np.ndarray, "h t 25"]:
-    """Standard deviation of each keypoint, px; `inf` where missing.
+    """Returns the standard deviation of each keypoint, px; `inf` where it is missing.
 
-    A detector's error grows with the person's size in the image, so it is given in
-    metres of the body (larger for loosely defined points and for low confidence) and
-    projected at the person's depth. With `keypoint_sigma` it is that over the
-    confidence.
+    A detector's error grows with the person's size in the image, so it is defined in
+    metres on the body (larger for loosely defined points and for low confidence) and
+    projected at the person's depth. If `weights.keypoint_sigma` is set, the result is
+    that value divided by the confidence.
     """
     keypoints = sequence.keypoints
     assert keypoints is not None
@@ -46,7 +51,8 @@ def keypoint_sigma(
 
 
 def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
-    """Factor on σ for errors that are correlated over frames, at this frame rate."""
+    """Returns the factor by which temporal correlation of keypoint errors inflates σ at
+    the frame rate of the sequence."""
     if weights.keypoint_sigma is not None:
         return 1.0
     return weights.keypoint_inflation * float(np.sqrt(sequence.fps / 30.0))
@@ -55,8 +61,8 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
 def _keypoint_loss(
     sequence: Sequence, sigma: Float[np.ndarray, "h t 25"], weights: GraphWeights
 ) -> graph.GemanMcClure:
-    """A loss of the same scale in px whatever the inflation or the confidence: these
-    lower a keypoint's weight, not the distance from which it is an outlier."""
+    """Returns a loss whose scale in px does not depend on inflation and confidence:
+    these lower a keypoint's weight, but not the distance at which it is an outlier."""
     if weights.keypoint_sigma is None:
         scale = weights.keypoint_loss / _inflation(sequence, weights)
         return graph.GemanMcClure(jnp.asarray(scale))
@@ -73,11 +79,14 @@ def people_factors(
     *,
     predicted: Bool[Array, "h t"] | None = None,
 ) -> list[graph.Factor]:
-    """Factors of keypoints, poses, shapes, roots and smoothness of `h` people.
+    """Returns the factors of keypoints, poses, shapes, roots and smoothness of `h`
+    people.
 
     Args:
-        predicted: frames with a valid prediction of the motion model. Body poses have a
-            prior in these only, if it is the prediction (`weights.posture_predicted`).
+        roots: people in the camera frame, from regressed or fitted bodies.
+        predicted: frames with a valid prediction of the motion model. If the prior of
+            body poses is the prediction (`weights.posture_predicted`), it applies to
+            these frames only.
     """
     factors: list[graph.Factor] = []
     present = jnp.asarray(roots.present)
@@ -105,7 +114,7 @@ def people_factors(
     with_prior = present
     if weights.posture_predicted:
         if predicted is None:
-            count = 1 + round(_PREDICTED_AFTER * sequence.fps)
+            count = 1 + round(_MIN_PREDICTION_S * sequence.fps)
             predicted = jnp.asarray(_in_a_row(roots.present, count))
         with_prior = present & predicted
     factors.append(
@@ -146,8 +155,11 @@ def people_factors(
 def _without_keypoints(
     sequence: Sequence, roots: PersonState
 ) -> Bool[np.ndarray, "h t"]:
-    """Frames more than a second from any keypoint of the person. Elsewhere keypoints
-    determine the position better than a regressor, across short gaps too."""
+    """Returns the frames that are more than a second from any keypoint of the person.
+
+    In all others keypoints determine the position better than a regressor does, also
+    across short gaps.
+    """
     if sequence.keypoints is None or sequence.bodies is None:
         return roots.present & (sequence.keypoints is None)
     detected = (sequence.keypoints.confidence > 0).any(axis=-1).astype(np.uint8)
@@ -163,6 +175,7 @@ def _position_factor(
     correlation: Float[Array, "h t"],
     weights: GraphWeights,
 ) -> graph.RootPositionPrior:
+    """Returns the prior of the regressed root positions in the frames `placed`."""
     measured = placed[..., None]
     sigma = np.array([weights.root_direction, weights.root_depth])
     return graph.RootPositionPrior(
@@ -179,6 +192,8 @@ def _shape_factor(
     measured: Float[np.ndarray, "h 10"],
     weights: GraphWeights,
 ) -> graph.ShapePrior:
+    """Returns the prior of SMPL β, in every frame in which a person is present or,
+    without `weights.shape_each_frame`, in the first one."""
     counted = present.astype(float)
     if not weights.shape_each_frame:
         counted = np.zeros_like(counted)
@@ -192,7 +207,8 @@ def _shape_factor(
 
 
 def _in_a_row(present: Bool[np.ndarray, "h t"], count: int) -> Bool[np.ndarray, "h t"]:
-    """Frames that end `count` consecutive frames in which the person is present."""
+    """Returns the frames at the end of `count` successive frames with the person
+    present."""
     found = present.copy()
     for lag in range(1, count):
         found[:, lag:] &= present[:, :-lag]
@@ -205,7 +221,8 @@ def stature_factor(
     present: Bool[np.ndarray, "h t"],
     body: BodyModel,
 ) -> graph.Stature:
-    """Known statures, one measurement for each person in `statures`, by row."""
+    """Returns the factor of known statures, m: one measurement for each person (row) in
+    `statures`."""
     linear = people.linear_stature(body)
     height, sigma = np.ones(present.shape), np.full(present.shape, np.inf)
     for h, stature in statures.items():
@@ -218,3 +235,49 @@ def stature_factor(
         height=jnp.asarray(height),
         sigma=jnp.asarray(sigma),
     )
+
+
+def contact_factor(
+    probability: Float[Array, "h t 4"],
+    state: graph.State,
+    present: Bool[np.ndarray, "h t"],
+    fps: float,
+    body: BodyModel,
+    weights: GraphWeights,
+) -> graph.FootContact:
+    """Returns the factor that penalises displacement of foot points in contact, with
+    `weights.contact_sigma` (leg lengths in a frame of 1/30 s).
+
+    `probability` is the contact probability of each toe and heel; β and s are constants
+    taken from `state`.
+    """
+    assert weights.contact_sigma is not None
+    both = probability * _previous_frame(probability)
+    both = jnp.where(
+        (present & np.asarray(_previous_frame(present)))[..., None], both, 0.0
+    )
+    leg = motion.leg_length(body, state.shapes)[:, None, None]
+    sigma = weights.contact_sigma * np.sqrt(30.0 / fps) * leg
+    stands = both > _MIN_CONTACT_PROBABILITY
+    sigma = jnp.where(stands, sigma / jnp.sqrt(jnp.where(stands, both, 1.0)), jnp.inf)
+    shape = jnp.broadcast_to(state.shapes[:, None], (*present.shape, 10))
+    scale = jnp.broadcast_to(state.scale, present.shape)
+    loss = graph.Cauchy(jnp.asarray(_CONTACT_LOSS_SIGMAS))
+    return graph.FootContact(body, shape, scale, sigma.astype(shape.dtype), loss=loss)
+
+
+def without_contacts(
+    state: graph.State, fps: float, body: BodyModel, weights: GraphWeights
+) -> graph.FootContact:
+    """Returns `contact_factor` with contact probabilities of zero, and so of zero
+    cost."""
+    count, frames = state.poses.shape[:2]
+    probability = jnp.zeros((count, frames, 4), state.poses.dtype)
+    nobody = np.zeros((count, frames), bool)
+    return contact_factor(probability, state, nobody, fps, body, weights)
+
+
+def _previous_frame(x):
+    """Returns the values of the previous frame; zero in the first one."""
+    xp = jnp if isinstance(x, jax.Array) else np
+    return xp.concatenate([xp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)

@@ -1,4 +1,4 @@
-"""The initial state: people placed relative to cameras, with the scale unknown."""
+"""Makes the initial state: people relative to cameras, before the scale is known."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ def first_state(
     roots: PersonState,
     intrinsics: Float[np.ndarray, " i"],
 ) -> graph.State:
-    """The state before the scale is known: s = 1."""
+    """Returns the state before the scale is known, with s = 1 m per unit of the map."""
     return graph.State(
         scale=jnp.ones(()),
         cameras=jnp.asarray(cameras),
@@ -30,7 +30,7 @@ def first_state(
 
 
 def no_people(num_frames: int) -> PersonState:
-    """An empty list of people, for cameras alone."""
+    """Returns the state of zero people, for problems of cameras alone."""
     return PersonState(
         np.zeros((0, num_frames), bool),
         np.zeros((0, num_frames, 4, 4)),
@@ -40,7 +40,8 @@ def no_people(num_frames: int) -> PersonState:
 
 
 def free_people(state: graph.State) -> graph.Step:
-    """Only people are free: for a static camera, or one that only rotates."""
+    """Returns the mask of free variables, people's only, for a camera that is static or
+    only rotates."""
     free = jax.tree.map(jnp.zeros_like, state.zero_step())
     ones = lambda x: jnp.ones_like(x)
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""The initial scale in closed form: from motion, the ground, and a known path."""
+"""The initial scale in closed form: from motion, the ground, and a given path."""
 
 import dataclasses
 from collections.abc import Collection
@@ -22,13 +22,13 @@ def scale_start(
     path: float = float("nan"),
     without: Collection[int] = (),
 ) -> ScaleStart:
-    """Scales from motion, and from the ground and a camera path in metres, if given.
+    """Estimates the scale from motion and, if given, from the ground and a metric path.
 
     Args:
-        contact: the ground factor; `None` without ground.
+        contact: factor of ground contact; `None` without ground.
         shared_error: relative error common to all predicted displacements.
-        path: m per unit of the map according to the path; NaN without one.
-        without: people whose motion is not used.
+        path: m per unit of the map according to the camera path; NaN without one.
+        without: people (rows) whose motion is not used.
     """
     start = _motion_scale(state, prediction, without)
     if np.isfinite(path):
@@ -48,7 +48,8 @@ def scale_start(
 def _motion_scale(
     state: graph.State, prediction: motion.Prediction, without: Collection[int]
 ) -> ScaleStart:
-    """Robust regression of predicted on observed displacements, mean over people."""
+    """Averages over people the robust regression of predicted on observed
+    displacements, weighted by information."""
     C_WC, r_WC = state.cameras[:, :3, :3], state.cameras[:, :3, 3]
     C_WH = C_WC @ state.roots[..., :3, :3]
     offset = jnp.einsum("tij,htj->hti", C_WC, state.roots[..., :3, 3])

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.config.limits import Limits
+from bodyslam_jax.config.run import Limits
 
 MAX_DEPTH = 64
 """Levels of nesting in JSON and YAML: formats that are read have 8 at most."""

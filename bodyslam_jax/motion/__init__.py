@@ -1,6 +1,6 @@
-"""The motion model: displacement of the body in metres, from postures.
+"""The motion model predicts displacements of the body, in metres, from postures.
 
-Section 3.4 of the paper, made robust to errors of estimated postures.
+It follows section 3.4 of the paper, and is robust to errors of estimated postures.
 """
 
 from bodyslam_jax.config import MotionTraining as MotionTraining

@@ -1,9 +1,9 @@
-"""Which of heels and toes stand on the ground, from postures.
+"""Predicts from postures which heels and toes are in contact with the ground.
 
-A multilayer perceptron reads the joints of a person over about half a second, relative
-to the pelvis and turned into the root frame of the middle frame, in leg lengths. Steady
-yaw is removed first, as for displacements. The path of the person is not an input:
-contacts are to correct it.
+The input of a multilayer perceptron is the joints of a person over about half a second,
+relative to the pelvis and rotated into the root frame of the middle frame, in leg
+lengths. Steady yaw is removed first, as for displacements. The path of the person is
+not an input, as contacts serve to correct it.
 """
 
 import equinox as eqx
@@ -27,20 +27,21 @@ from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 
 POINTS = ("left toe", "left heel", "right toe", "right heel")
 """The points of the feet, in the order of `body.skeleton.BODY25_TOES_AND_HEELS`."""
-_JOINTS = np.array([1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 20, 21])
-"""Joints that are read: legs, spine, head, wrists."""
+_INPUT_JOINTS = np.array([1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 20, 21])
+"""Joints that are input to the network: legs, spine, head, wrists."""
 
 
 class ContactModel(eqx.Module):
-    """A network, with the body and the frame rate that it is made for."""
+    """A contact network, with its body model and frame rate."""
 
     layers: tuple[Layer, ...]
     inputs: Normalisation
     half: int = eqx.field(static=True)
-    """Frames before and after the one that is judged."""
+    """Number of frames before, and after, the classified frame."""
     body: str = eqx.field(static=True)
-    """Kind of body model that it was trained on."""
+    """Kind of body model that the network was trained on."""
     fps: float = eqx.field(static=True)
+    """Frame rate of the input, 1/s."""
     about: str = eqx.field(static=True, default="{}")
     """The file's header as JSON: data, licence, metrics."""
 
@@ -48,13 +49,13 @@ class ContactModel(eqx.Module):
     def init(
         key: PRNGKeyArray, body: str, fps: float, half: int, width: tuple[int, ...]
     ) -> "ContactModel":
-        """An untrained network."""
-        d = (2 * half + 1) * len(_JOINTS) * 3
+        """Returns an untrained network."""
+        d = (2 * half + 1) * len(_INPUT_JOINTS) * 3
         layers = init_layers(key, (d, *width, len(POINTS)), 0.1)
         return ContactModel(layers, no_normalisation(d), half, body, fps)
 
     def logits(self, features: Float[Array, "*b d"]) -> Float[Array, "*b 4"]:
-        """Log-odds that each of `POINTS` stands."""
+        """Returns the log-odds of contact of each of `POINTS`."""
         return apply_layers(self.layers, self.inputs(features))
 
 
@@ -63,14 +64,14 @@ def contact_features(
     joints: Float[Array, "t 24 3"],
     rows: Int[Array, "w f"],
 ) -> Float[Array, "w d"]:
-    """What the network reads: cosine coefficients of joints over each window.
+    """Returns the input of the network: cosine coefficients of joints over each window.
 
     Args:
-        orientation: takes H to any one frame; steady yaw removed.
-        joints: relative to the pelvis, in H, leg lengths.
-        rows: the frames of each window; the middle one is judged.
+        orientation: rotates H into any fixed frame, without steady yaw.
+        joints: positions relative to the pelvis, in H, leg lengths.
+        rows: the frames of each window; the middle one is classified.
     """
-    facing = jnp.einsum("tab,tjb->tja", orientation, joints[:, _JOINTS])
+    facing = jnp.einsum("tab,tjb->tja", orientation, joints[:, _INPUT_JOINTS])
     middle = orientation[rows[:, rows.shape[1] // 2]]
     seen = jnp.einsum("wba,wfjb->wfja", middle, facing[rows])
     basis = jnp.asarray(cosine_basis(rows.shape[1]), seen.dtype)
@@ -85,14 +86,14 @@ def predict_contact(
     shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Float[Array, "t 4"]:
-    """Probability that each of `POINTS` stands on the ground, 0 in absent frames.
+    """Predicts the contact probability of each of `POINTS`, 0 in absent frames.
 
     Args:
-        orientation: takes H to any frame that is common to the sequence.
+        orientation: rotates H into any frame common to the sequence.
         body_pose: θ, rad, at the model's frame rate.
-        shape: β.
-        present: the frames to be used. Near the ends of a run of frames the first or
-            the last one is repeated.
+        shape: SMPL β.
+        present: frames that are used. Near the ends of a run of frames the first or the
+            last one is repeated.
 
     **Raises:** `InputError` if the weights belong to another body model.
     """
@@ -110,7 +111,7 @@ def predict_contact(
 
 
 def windows_within(present: Bool[Array, " t"], half: int) -> Int[Array, "t f"]:
-    """Frames around each frame, kept within its run of present frames."""
+    """Returns the frames around each frame, clipped to its run of present frames."""
     t = len(present)
     frame = jnp.arange(t, dtype=jnp.int32)
     absent = jnp.where(present, jnp.int32(-1), frame)

@@ -1,6 +1,6 @@
-"""The contact network in one `.npz`: a JSON header, then plain arrays.
+"""Files of the contact network: one `.npz` with a JSON header and plain arrays.
 
-Layers are kept in float16, in half the space; read without pickle.
+Layers are stored in float16, which halves the size; reading does not use pickle.
 """
 
 import dataclasses
@@ -19,11 +19,11 @@ from bodyslam_jax.io.files import reading
 from bodyslam_jax.motion.contact_network import ContactModel
 
 _FORMAT = "bodyslam-contact-1"
-_SHIPPED = Path(__file__).parent / "assets" / "contact.npz"
+_DEFAULT_FILE = Path(__file__).parent / "assets" / "contact.npz"
 
 
 def save_contact_model(path: Path | str, model: ContactModel) -> None:
-    """Writes a model atomically."""
+    """Writes a contact network to a file, atomically."""
     path = Path(path)
     header = {
         "format": _FORMAT,
@@ -41,11 +41,11 @@ def save_contact_model(path: Path | str, model: ContactModel) -> None:
 
 
 def load_contact_model(path: Path | str | None = None) -> ContactModel:
-    """Reads a contact network (float32); without a path, the one that ships.
+    """Reads a contact network (float32); by default that of the package.
 
-    **Raises:** `InputError` if the file holds none.
+    **Raises:** `InputError` if the file is not a contact network.
     """
-    path = _SHIPPED if path is None else Path(path)
+    path = _DEFAULT_FILE if path is None else Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such contact network.")
     archive = read_npz(path, "a contact network (.npz)")

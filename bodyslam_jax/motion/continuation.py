@@ -16,15 +16,15 @@ from bodyslam_jax.motion.prediction import (
     leg_length,
 )
 
-_FASTEST = 0.35
-"""Largest turn of a joint in one frame, rad: 600 degrees a second."""
+_MAX_STEP_RAD = 0.35
+"""Largest rotation of a joint in one frame, rad: 600 degrees a second."""
 
 
 class Rollout(eqx.Module):
-    """A motion: the given frames and those that follow."""
+    """A motion: the given frames, and predicted ones after them."""
 
     orientation: Float[Array, "t 3 3"]
-    """C_WH, W as given."""
+    """C_WH, in the given world W."""
     body_pose: Float[Array, "t 23 3"]
     """θ, rad."""
     trans: Float[Array, "t 3"]
@@ -43,7 +43,14 @@ def rollout(
     """Continues a motion by `frames` frames from `p` given postures.
 
     Two postures suffice: a window longer than `p` is filled by extrapolating the first
-    rate of change backwards. Rates are limited to plausible ones.
+    rate of change backwards. Rates are limited to plausible values.
+
+    Args:
+        orientation: C_WH.
+        body_pose: θ, rad, at the frame rate of the model.
+        shape: SMPL β.
+
+    **Raises:** `InputError` if the model belongs to another body model.
     """
     check_compatible(model, body, model.fps)
     dtype = body_pose.dtype
@@ -70,7 +77,7 @@ def rollout(
 
     def advance(carry, _):
         turn, pose = carry  # the last `past` frames
-        # The posture head does not read the last frame of its window.
+        # The predicted posture does not depend on the last frame of the window.
         ahead = guess(
             jnp.concatenate([turn, turn[-1:]]), jnp.concatenate([pose, pose[-1:]])
         )
@@ -93,7 +100,8 @@ def rollout(
 
 
 def _given_path(guess, turn, pose, orientation, body_pose, given):
-    """Predicted positions in the given frames, the last one at the origin."""
+    """Returns predicted positions in the given frames, with the last one at the
+    origin."""
     turns = jnp.concatenate([turn[: len(turn) - min(given, len(turn))], orientation])
     poses = jnp.concatenate([pose[: len(pose) - min(given, len(pose))], body_pose])
     size = len(turn) + 1
@@ -113,13 +121,15 @@ def _given_path(guess, turn, pose, orientation, body_pose, given):
 
 
 def _limited(angles: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    """Scales rotation vectors down to a length of at most `_MAX_STEP_RAD`."""
     square = (angles * angles).sum(-1, keepdims=True)
     norm = jnp.sqrt(jnp.maximum(square, 1e-12))
-    return angles * jnp.minimum(1.0, _FASTEST / norm)
+    return angles * jnp.minimum(1.0, _MAX_STEP_RAD / norm)
 
 
 def _extended(turn, pose, past):
-    """The last `past` frames; missing ones are extrapolated with decaying rates."""
+    """Returns the last `past` frames; missing ones are extrapolated with decaying
+    rates."""
     missing = past - len(pose)
     if missing <= 0:
         return turn[-past:], pose[-past:]

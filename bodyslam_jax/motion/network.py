@@ -1,8 +1,8 @@
-"""Input, output and layers of the networks.
+"""Input, output and layers of the motion networks.
 
 A network maps a `Window`, frames k-n to k of one person relative to H_{k-1}, to a
 `Guess` of the step from k-1 to k. The two networks are in `paper_network.py` and
-`position_network.py`; `function_network.py` wraps a user's function.
+`position_network.py`; `own_model.py` wraps a user's function.
 """
 
 import abc
@@ -17,16 +17,16 @@ from bodyslam_jax.geometry import so3
 
 
 class Window(eqx.Module):
-    """Frames k-n to k as a network reads them (`p = n + 1`; the last one is k)."""
+    """Input of a network: frames k-n to k (`p = n + 1`; the last one is k)."""
 
     rotation: Float[Array, "*b p 3 3"]
     """C_{H_{k-1}}^T C_{H_i}: root orientations relative to the body at k-1."""
     body_pose: Float[Array, "*b p 23 3"]
     """θ, axis-angle, rad."""
     joints: Float[Array, "*b p 24 3"]
-    """Relative to the pelvis, turned into H_{k-1}, in leg lengths."""
+    """Positions relative to the pelvis, rotated into H_{k-1}, in leg lengths."""
     shape: Float[Array, "*b 10"]
-    """β"""
+    """SMPL β."""
     leg: Float[Array, "*b"]
     """Leg length, m."""
 
@@ -45,20 +45,20 @@ class Guess(eqx.Module):
 
 
 class MotionNetwork(eqx.Module):
-    """Parameters, and a function from what precedes a step to a guess of the step.
+    """A parametrised function that maps a window to a guess of its last step.
 
-    A custom one is trained by `train(..., network=...)`, by the Gaussian likelihood of
-    its guesses, and used by `bs.build` and `Problem.with_motion_model` within a
-    `MotionModel`. All its float32 arrays are trained.
+    A custom network is trained by `train(..., network=...)`, with the Gaussian
+    likelihood of its guesses, and used by `bs.build` and `Problem.with_motion_model`
+    within a `MotionModel`. All its float32 arrays are trained.
     """
 
     @abc.abstractmethod
     def __call__(self, window: Window) -> Guess:
-        """The guess of each window; leading axes of both are the same."""
+        """Returns the guess for each window, with the same leading axes."""
 
 
 class Layer(eqx.Module):
-    """An affine map."""
+    """An affine map `x W + b`."""
 
     weight: Float[Array, "i o"]
     bias: Float[Array, " o"]
@@ -70,7 +70,7 @@ class Layer(eqx.Module):
 def init_layers(
     key: PRNGKeyArray, sizes: tuple[int, ...], last: float = 1.0
 ) -> tuple[Layer, ...]:
-    """He's initialisation; the last layer is scaled by `last`."""
+    """Initialises layers by He's method; the last one is scaled by `last`."""
     layers = []
     for i, (rows, columns) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         gain = np.sqrt(2 / rows) if i < len(sizes) - 2 else last / np.sqrt(rows)
@@ -84,7 +84,7 @@ def init_layers(
 def apply_layers(
     layers: tuple[Layer, ...], x: Float[Array, "*b i"], smooth: bool = True
 ) -> Float[Array, "*b o"]:
-    """Affine maps with SiLU (or ReLU) between them, none after the last."""
+    """Applies affine maps with SiLU (or ReLU) between them, and none after the last."""
     for layer in layers[:-1]:
         x = layer(x)
         x = jax.nn.silu(x) if smooth else jax.nn.relu(x)
@@ -92,7 +92,7 @@ def apply_layers(
 
 
 def lower_triangle(entries: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
-    """A Cholesky factor: three log-diagonals, then the entries 10, 20, 21."""
+    """Returns a Cholesky factor from three log-diagonals and the entries 10, 20, 21."""
     diagonal = jnp.exp(jnp.clip(entries[..., :3], -12.0, 6.0))
     off = entries[..., 3:] * diagonal[..., np.array([1, 2, 2])]
     zero = jnp.zeros_like(diagonal[..., 0])
@@ -114,22 +114,25 @@ class Normalisation(eqx.Module):
         return (x - self.mean) / self.std
 
     def undo(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Inverts the normalisation."""
         return x * self.std + self.mean
 
 
 def normalisation(samples: Float[np.ndarray, "n d"]) -> Normalisation:
-    """Mean and standard deviation of samples; constant components keep unit scale."""
+    """Computes mean and standard deviation of samples; constant components keep unit
+    scale."""
     mean, std = samples.mean(0), samples.std(0)
     std = np.where(std < 1e-5, 1.0, std)
     return Normalisation(jnp.asarray(mean, jnp.float32), jnp.asarray(std, jnp.float32))
 
 
 def no_normalisation(size: int) -> Normalisation:
-    """The identity."""
+    """Returns the normalisation that changes nothing."""
     return Normalisation(jnp.zeros(size, jnp.float32), jnp.ones(size, jnp.float32))
 
 
 def joint_angles(window: Window) -> Float[Array, "*b p 24 3"]:
-    """The root's rotation vector relative to H_{k-1}, and θ, of every frame (rad)."""
+    """Returns the root's rotation vector relative to H_{k-1}, and θ, of every frame
+    (rad)."""
     root = so3.log(window.rotation)[..., None, :]
     return jnp.concatenate([root, window.body_pose], -2)

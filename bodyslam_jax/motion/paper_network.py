@@ -1,4 +1,4 @@
-"""The paper's network (section 3.4): joint angles up to frame k-1."""
+"""The paper's network (section 3.4), whose input is joint angles up to frame k-1."""
 
 import jax
 import jax.numpy as jnp
@@ -19,26 +19,28 @@ from bodyslam_jax.motion.network import (
 
 
 class PaperNetwork(MotionNetwork):
-    """Section 3.4: encoder on joint angles, decoders for position and posture."""
+    """An encoder of joint angles, with decoders for displacement and posture."""
 
     encoder: tuple[Layer, ...]
     position: tuple[Layer, ...]
     posture: tuple[Layer, ...]
     inputs: Normalisation
     outputs: Normalisation
-    """Of displacement (3) and of posture (72)."""
+    """Normalisation of displacement (3) and of posture (72)."""
     spread: Float[Array, "3 3"]
-    """Cholesky factor of the error's covariance on validation data, m: constant."""
+    """Cholesky factor of the error covariance on validation data, m; it is constant."""
 
     @staticmethod
     def features(window: Window) -> Float[Array, "*b d"]:
-        """Angles of frames k-n..k-1, the root's relative to frame k-1, and β."""
+        """Returns the angles (rad) of frames k-n..k-1, with the root's relative to
+        frame k-1, and β."""
         angles = joint_angles(window)[..., :-1, :, :]
         flat = angles.reshape(*angles.shape[:-3], -1)
         return jnp.concatenate([flat, window.shape], -1)
 
     @staticmethod
     def init(key: PRNGKeyArray, past: int, width: int = 1024) -> "PaperNetwork":
+        """Returns an untrained network."""
         keys = jax.random.split(key, 3)
         d = past * 72 + 10
         return PaperNetwork(
@@ -51,7 +53,7 @@ class PaperNetwork(MotionNetwork):
         )
 
     def normalised(self, features: Float[Array, "*b d"]) -> Float[Array, "*b 75"]:
-        """Displacement and posture as the loss sees them, normalised."""
+        """Returns normalised displacement and posture, as compared by the loss."""
         x = jax.nn.relu(apply_layers(self.encoder, self.inputs(features), smooth=False))
         move = apply_layers(self.position, x, smooth=False)
         change = apply_layers(self.posture, x, smooth=False)

@@ -1,4 +1,4 @@
-"""The default network: joint positions over a window, in leg lengths."""
+"""The default network, whose input is joint positions over a window, in leg lengths."""
 
 import equinox as eqx
 import jax
@@ -21,39 +21,40 @@ from bodyslam_jax.motion.network import (
     no_normalisation,
 )
 
-INPUT_JOINTS = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
-"""Joints that the default network reads: legs, spine, head, hands."""
-CONTACTS = (*ANKLES, *FEET)
-"""Joints that may stand on the ground: ankles and feet."""
+_INPUT_JOINTS = (1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 16, 17, 20, 21)
+"""Joints that are input to the default network: legs, spine, head, hands."""
+_CONTACT_JOINTS = (*ANKLES, *FEET)
+"""Joints that may be in contact with the ground: ankles and feet."""
 
 
 class MetricNetwork(MotionNetwork):
     """Predicts displacement from joint positions and from joints in ground contact.
 
-    If a joint stands on the ground, the pelvis moves opposite to the joint's motion
-    relative to it. The displacement is the weighted sum of that over contact joints and
-    past frames (weights positive, of sum 1, from the network), plus a correction. All
-    is in leg lengths, so the size of the person cancels exactly.
+    If a joint is in contact with the ground, the pelvis moves opposite to the joint's
+    motion relative to it. The displacement is the weighted sum of these motions over
+    contact joints and past frames (weights from the network, positive, with sum 1),
+    plus a correction. Lengths are in leg lengths, so that the size of the person
+    cancels exactly.
     """
 
     trunks: tuple[tuple[Layer, ...], ...]
-    """One per member of the ensemble; members are averaged."""
+    """Hidden layers of each member of the ensemble, whose outputs are averaged."""
     heads: tuple[Layer, ...]
-    """Logits of contact weights, then the correction (3)."""
+    """Output layers: logits of contact weights, then the correction (3)."""
     spreads: tuple[tuple[Layer, ...], ...]
-    """The error's Cholesky factor from the trunk's last layer."""
+    """Layers that map the trunk's output to the Cholesky factor of the error."""
     posture: tuple[Layer, ...]
     inputs: Normalisation
     posture_inputs: Normalisation
     posture_outputs: Normalisation
     unit: Float[Array, ""]
-    """Typical displacement in leg lengths: scale of the correction."""
+    """Typical displacement, leg lengths, by which the correction is scaled."""
     gain: Float[Array, ""]
-    """Factor on displacement, calibrated after training; 1 before."""
+    """Factor on displacement: 1, until calibrated after training."""
     future: int = eqx.field(static=True, default=1)
     """1 if displacement may depend on the posture of frame k itself, else 0."""
     posture_frames: int = eqx.field(static=True, default=6)
-    """How many past frames the predicted posture depends on."""
+    """Number of past frames that the predicted posture depends on."""
 
     @staticmethod
     def init(
@@ -65,12 +66,13 @@ class MetricNetwork(MotionNetwork):
         posture_frames: int = 6,
         posture_width: int = 256,
     ) -> "MetricNetwork":
+        """Returns an untrained network."""
         frames = past + future
         posture_frames = min(posture_frames, past)
-        d = frames * len(INPUT_JOINTS) * 3
+        d = frames * len(_INPUT_JOINTS) * 3
         d_posture = 72 * (posture_frames - 1) + 69
         keys = jax.random.split(key, 3 * members + 1)
-        outputs = (frames - 1) * len(CONTACTS) + 3
+        outputs = (frames - 1) * len(_CONTACT_JOINTS) + 3
         return MetricNetwork(
             trunks=tuple(
                 init_layers(keys[3 * m], (d, *width), np.sqrt(2.0))
@@ -97,20 +99,21 @@ class MetricNetwork(MotionNetwork):
         )
 
     def frames(self, window: Window) -> Float[Array, "*b f 24 3"]:
-        """Joints over the frames that displacement depends on."""
+        """Returns the joints of the frames that displacement depends on."""
         count = window.joints.shape[-3] - 1 + self.future
         return window.joints[..., :count, :, :]
 
     def features(self, window: Window) -> Float[Array, "*b d"]:
-        """Positions over time as coefficients of a discrete cosine transform."""
-        joints = self.frames(window)[..., np.array(INPUT_JOINTS), :]
+        """Returns the discrete cosine transform of joint positions over time."""
+        joints = self.frames(window)[..., np.array(_INPUT_JOINTS), :]
         basis = jnp.asarray(cosine_basis(joints.shape[-3]), joints.dtype)
         flat = joints.reshape(*joints.shape[:-2], -1)
         out = jnp.einsum("wf,...fd->...wd", basis, flat)
         return out.reshape(*out.shape[:-2], -1)
 
     def posture_features(self, window: Window) -> Float[Array, "*b d"]:
-        """Rotations from frame k-1 to earlier frames, and the posture of k-1."""
+        """Returns rotations from frame k-1 to earlier frames, and the posture of
+        k-1."""
         angles = joint_angles(window)[..., -1 - self.posture_frames : -1, :, :]
         change = so3.between(angles[..., -1:, :, :], angles[..., :-1, :, :])
         flat = lambda x, n: x.reshape(*x.shape[:-n], -1)
@@ -119,8 +122,8 @@ class MetricNetwork(MotionNetwork):
     def moves(
         self, window: Window, features: Float[Array, "*b d"]
     ) -> tuple[Float[Array, "m *b 3"], Float[Array, "m *b 6"]]:
-        """Displacement and Cholesky entries of each member, in leg lengths."""
-        contacts = self.frames(window)[..., np.array(CONTACTS), :]
+        """Returns displacement and Cholesky entries of each member, leg lengths."""
+        contacts = self.frames(window)[..., np.array(_CONTACT_JOINTS), :]
         still = contacts[..., :-1, :, :] - contacts[..., 1:, :, :]
         still = still.reshape(*still.shape[:-3], -1, 3)
         x = self.inputs(features)
@@ -133,12 +136,12 @@ class MetricNetwork(MotionNetwork):
             weight = jax.nn.softmax(out[..., :-3], -1)
             stance = jnp.einsum("...i,...ic->...c", weight, still)
             moves.append(stance + self.unit * out[..., -3:])
-            # The covariance must not influence what the trunk learns.
+            # The gradient of the covariance must not reach the trunk.
             spreads.append(apply_layers(spread, jax.lax.stop_gradient(hidden)))
         return jnp.stack(moves), jnp.stack(spreads)
 
     def change(self, window: Window) -> Float[Array, "*b 24 3"]:
-        """Rotation of every joint from k-1 to k, in its own frame (rad)."""
+        """Returns the rotation of every joint from k-1 to k, in its own frame (rad)."""
         x = self.posture_inputs(self.posture_features(window))
         out = self.posture_outputs.undo(apply_layers(self.posture, x))
         return out.reshape(*out.shape[:-1], 24, 3)
@@ -162,7 +165,8 @@ class MetricNetwork(MotionNetwork):
 def nearest_turn(
     angles: Float[Array, "*b 3"], reference: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
-    """The rotation vector of the same rotation that is nearer to a reference."""
+    """Returns, of the two rotation vectors of the same rotation, the one nearer to a
+    reference (rad)."""
     square = (angles * angles).sum(-1, keepdims=True)
     small = square < 1e-6
     norm = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -172,7 +176,7 @@ def nearest_turn(
 
 
 def cosine_basis(frames: int) -> Float[np.ndarray, "f f"]:
-    """Orthonormal DCT-II: row 0 is the mean over the window, row 1 the trend, ..."""
+    """Returns the orthonormal DCT-II basis: row 0 is the mean, row 1 the trend, ..."""
     i = np.arange(frames)
     basis = np.cos(np.pi * (i[None] + 0.5) * i[:, None] / frames)
     basis *= np.sqrt(2 / frames)

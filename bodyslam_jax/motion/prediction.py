@@ -18,13 +18,14 @@ from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
 
 
 class MotionModel(eqx.Module):
-    """A network, or a user's function, with the body and frame rate it is made for."""
+    """A network, or a user's function, with its body model and frame rate."""
 
     network: MotionNetwork
     body: str = eqx.field(static=True)
-    """Kind of body model it was trained on, such as `default` or `smpl`."""
+    """Kind of body model that the network was trained on, such as `default` or
+    `smpl`."""
     fps: float = eqx.field(static=True)
-    """Frames per second that it expects."""
+    """Frame rate of the input, 1/s."""
     past: int = eqx.field(static=True)
     """Number of past frames that a prediction needs."""
     about: str = eqx.field(static=True, default="{}")
@@ -37,18 +38,21 @@ class Prediction(eqx.Module):
     translation: Float[Array, "t 3"]
     """Displacement of the pelvis joint in H_{k-1}, m per frame."""
     covariance: Float[Array, "t 3 3"]
-    """Of `translation`'s error in one frame, m²; errors are correlated in time."""
+    """Covariance of the error of `translation` in one frame, m²; errors are correlated
+    in time."""
     body_pose: Float[Array, "t 23 3"]
-    """θ_k as predicted from frames up to k-1, rad."""
+    """θ_k predicted from frames up to k-1, rad."""
     rotation: Float[Array, "t 3"]
-    """Rotation vector of C_{H_{k-1}}^T C_{H_k}, from frames up to k-1, rad."""
+    """Rotation vector of C_{H_{k-1}}^T C_{H_k} predicted from frames up to k-1, rad."""
     valid: Bool[Array, " t"]
-    """Whether all frames that row k needs are present; else values are undefined."""
+    """True if all frames that row k depends on are present; else values are
+    undefined."""
 
 
 @jax.jit
 def leg_length(body: BodyModel, shape: Float[Array, "*b 10"]) -> Float[Array, "*b"]:
-    """Hip to knee to ankle, mean of both sides, of a shaped body (m)."""
+    """Returns the leg length of a body (m): hip to knee to ankle, mean of both
+    sides."""
     rest = rest_joints(body, shape)
     bones = rest[..., np.array([4, 7, 5, 8]), :] - rest[..., np.array([1, 4, 2, 5]), :]
     return jnp.sqrt((bones**2).sum(-1)).sum(-1) / 2
@@ -61,10 +65,11 @@ def sequence_windows(
     shape: Float[Array, " 10"],
     past: int,
 ) -> Window:
-    """The `t - past` windows of a sequence; the first one's target is frame `past`.
+    """Returns the `t - past` windows of a sequence; the target of the first is frame
+    `past`.
 
-    Root orientations are relative to the frame before the target, so neither the
-    heading nor the up axis of the world matters.
+    Root orientations are relative to the frame before the target, so that neither
+    heading nor up axis of the world matters.
     """
     leg = leg_length(body, shape)
     joints = local_joints(body, body_pose, shape) / leg
@@ -84,7 +89,7 @@ Arrays = TypeVar("Arrays", bound=eqx.Module)
 
 
 def in_dtype(model: Arrays, dtype: DTypeLike) -> Arrays:
-    """The same model in another floating-point precision."""
+    """Converts the arrays of a model to another floating-point precision."""
     cast = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
     return jax.tree.map(cast, model)
 
@@ -114,10 +119,10 @@ def predict(
     """Predicts the displacements of one person from postures and shape (section 3.4).
 
     Args:
-        orientation: takes H to any frame that is common to the sequence.
+        orientation: rotates H into any frame common to the sequence.
         body_pose: θ, rad, at the model's frame rate.
-        shape: β.
-        present: the frames to be used.
+        shape: SMPL β.
+        present: frames that are used.
 
     Neither position, heading nor the direction of gravity is needed. For the default
     network steady yaw is removed from the orientations first (`yaw_removal.py`), which

@@ -1,7 +1,8 @@
 """Predictions at any frame rate from a model that works at 30 frames per second.
 
-Postures are interpolated to the model's ticks (slerp), predicted displacements are
-summed to a path, and the path is interpolated at the times of the frames.
+Postures are interpolated (slerp) at the model's ticks, the times of its frames.
+Predicted displacements are summed to a path, which is interpolated at the times of the
+video's frames.
 """
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
 
 
 class Clock(eqx.Module):
-    """Relative positions in time of `t` frames and the `g` ticks of a motion model."""
+    """Relative positions in time of `t` video frames and the `g` ticks of a model."""
 
     frame: Int[Array, " g"]
     """The frame at or before each tick."""
@@ -32,10 +33,11 @@ class Clock(eqx.Module):
     steps: Float[Array, " t"]
     """Ticks since the previous frame."""
     same: bool = eqx.field(static=True)
-    """Whether frames coincide with ticks, so that nothing is interpolated."""
+    """True if frames coincide with ticks, so that nothing is interpolated."""
 
     def lengthened(self, frames: int) -> "Clock":
-        """For sequences with frames added at the end: these lie at the last tick.
+        """Returns the clock of a padded sequence, whose added frames lie at the last
+        tick.
 
         The number of ticks is rounded up, to half a tick for each frame, so that it
         depends on the frame rate but hardly on the number of frames.
@@ -46,7 +48,7 @@ class Clock(eqx.Module):
             ticks = frames
         else:
             ticks = -(-2 * len(self.frame) // len(self.tick)) * frames // 2
-        # Ticks that are added lie at the last of these frames, where nobody is present.
+        # Added ticks lie at the last of these frames, where nobody is present.
         more = ticks - len(self.frame)
         last = np.full(more, frames - 1, self.frame.dtype)
         none = np.zeros(more, self.between.dtype)
@@ -64,8 +66,8 @@ class Clock(eqx.Module):
         )
 
     def from_frame(self, start: int) -> "Clock":
-        """For the sequence from a frame on, with the ticks from that frame on; frames
-        before the first of them lie at it."""
+        """Returns the clock of the sequence that begins at frame `start`, with the
+        ticks from there on; frames before the first tick lie at it."""
         tick, beyond = np.asarray(self.tick)[start:], np.asarray(self.beyond)[start:]
         first = int(tick[0] + (beyond[0] > 1e-9))
         before = tick < first
@@ -80,7 +82,8 @@ class Clock(eqx.Module):
 
 
 def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = 30.0) -> Clock:
-    """Lays the model's ticks, `fps` a second, over a video's timestamps (s)."""
+    """Aligns the ticks of a model, `fps` per second, with the timestamps (s) of a
+    video."""
     position = (timestamps - timestamps[0]) * fps
     t = len(position)
     same = bool(np.abs(np.diff(position) - 1).max(initial=0) < 0.02)
@@ -112,9 +115,11 @@ def predict_between(
     shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Prediction:
-    """`predict` at the frames of a `Clock`: row k is the step from frame k-1 to k.
+    """Predicts steps between the frames of a `Clock`: row k is that from frame k-1 to
+    k.
 
-    Errors of successive ticks are taken as fully correlated within one frame's step.
+    Errors of successive ticks are assumed fully correlated within one frame's step. See
+    `predict` for the arguments.
     """
     network, clock = model
     if clock.same:
@@ -157,7 +162,8 @@ def contact_between(
     shape: Float[Array, " 10"],
     present: Bool[Array, " t"],
 ) -> Float[Array, "t 4"]:
-    """`predict_contact` at the frames of a `Clock`, interpolated between ticks."""
+    """Predicts contact at the frames of a `Clock`, interpolated between ticks; see
+    `predict_contact` for the arguments."""
     network, clock = model
     if clock.same:
         return predict_contact(network, body, orientation, body_pose, shape, present)
@@ -176,7 +182,7 @@ def _at_ticks(
     body_pose: Float[Array, "t 23 3"],
     present: Bool[Array, " t"],
 ) -> tuple[Float[Array, "g 3 3"], Float[Array, "g 23 3"], Bool[Array, " g"]]:
-    """Orientations, postures and presence at the ticks of a clock."""
+    """Returns orientations, postures and presence at the ticks of a clock."""
     between = clock.between.astype(body_pose.dtype)
     following = jnp.minimum(clock.frame + 1, len(body_pose) - 1)
 

@@ -7,24 +7,26 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.motion.prediction import Prediction
 
-_MODEL_SPREAD = 0.03
-"""Standard deviation of the model's bias between sequences, relative to displacement;
-it does not average out within one. From validation subjects at 5° drift."""
+_MODEL_BIAS_SIGMA = 0.03
+"""Standard deviation of the model's bias between sequences, relative to displacement.
+The bias does not average out within a sequence. From validation subjects at 5° drift.
+"""
 
-_DURATIONS = (1, 5, 15, 30, 60)
-"""Frames over which displacement is compared; sums average the noise of depth."""
+_DURATIONS_FRAMES = (1, 5, 15, 30, 60)
+"""Durations over which displacements are compared, frames at the sequence's rate; sums
+reduce the noise of depth."""
 
 
 class Scale(NamedTuple):
     """Metres per unit of a trajectory, with its standard error."""
 
     value: float
-    """NaN without enough displacement."""
+    """Scale, m per unit; NaN without enough displacement."""
     standard_error: float
-    """Of `value`: from the disagreement between parts of the sequence and the model's
-    bias of a few per cent per sequence; inf with a single part."""
+    """Standard error of `value`, from the disagreement between parts of the sequence
+    and the model's bias of a few per cent per sequence; inf with a single part."""
     per_duration: dict[int, float]
-    """The same estimate from displacements over this many frames each."""
+    """Estimates from displacements over each number of frames."""
 
 
 def scale_from_motion(
@@ -33,14 +35,15 @@ def scale_from_motion(
     camera: Float[Array | np.ndarray, "t 3"],
     offset: Float[Array | np.ndarray, "t 3"],
 ) -> Scale:
-    """The scale `s` at which people move as predicted, by linear regression.
+    """Estimates the scale `s` at which people move as predicted, by linear regression.
 
     `orientation` is `C_WH`; `camera` the unscaled camera centre `r'_WC`; `offset` the
     pelvis joint relative to the camera, `C_WC r_CH`, in metres. Over every window of
     frames a to b, `s (r'_b - r'_a) + (offset_b - offset_a)` should equal the sum of
-    predicted displacements turned into the world: linear in `s`. Solved with Cauchy
-    weights, for windows of 1 to 60 frames; the value is the median over durations of 5
-    frames and more, where depth noise weighs less.
+    predicted displacements rotated into the world, which is linear in `s`. The
+    equations are solved with Cauchy weights for windows of 1 to 60 frames; the value is
+    the median over durations of 5 frames and more, where depth noise has less
+    influence.
     """
     turn, r_C, r_CH = (np.asarray(x, float) for x in (orientation, camera, offset))
     valid = np.asarray(prediction.valid)
@@ -50,7 +53,7 @@ def scale_from_motion(
     walked = np.cumsum(step, 0)
     gaps = np.cumsum(~valid)
     found, errors, ratio = {}, {}, {}
-    for n in _DURATIONS:
+    for n in _DURATIONS_FRAMES:
         if len(r_C) <= n:
             continue
         whole = gaps[n:] == gaps[:-n]
@@ -65,21 +68,21 @@ def scale_from_motion(
         return Scale(float("nan"), float("inf"), {})
     chosen = [n for n in found if n >= 5] or list(found)
     value = float(np.median([found[n] for n in chosen]))
-    # a short sequence has too few long windows for an error of theirs
+    # a short sequence has too few long windows for a standard error
     sure = [n for n in chosen if np.isfinite(errors[n])] or chosen
     best = min(sure, key=lambda n: abs(found[n] - value))
     apart = np.std([found[n] for n in chosen])
-    parts = (errors[best], apart, _MODEL_SPREAD * ratio[best])
+    parts = (errors[best], apart, _MODEL_BIAS_SIGMA * ratio[best])
     return Scale(value, float(np.linalg.norm(parts)), found)
 
 
 def _robust_ratio(
     x: Float[np.ndarray, "m 3"], y: Float[np.ndarray, "m 3"], duration: int
 ) -> tuple[float, float]:
-    """`argmin_s Σ ρ(|s x - y|)` with its standard error.
+    """Returns `argmin_s Σ ρ(|s x - y|)` and its standard error.
 
-    The error comes from leaving out one block after another (jackknife): blocks of at
-    least a second are nearly independent, single frames are not.
+    The error is that of a jackknife over blocks: blocks of at least a second are nearly
+    independent, single frames are not.
     """
 
     def solve(x, y):

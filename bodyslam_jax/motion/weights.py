@@ -1,7 +1,7 @@
-"""Weights in one `.npz`: a JSON header that describes them, then plain arrays.
+"""Files of motion models: one `.npz` with a JSON header and plain arrays.
 
-Read without pickle. The header holds format, network, sizes, body, fps, data, licence
-and metrics.
+Reading does not use pickle. The header holds format, network, sizes, body, fps, data,
+licence and metrics.
 """
 
 import json
@@ -23,21 +23,23 @@ from bodyslam_jax.motion.prediction import MotionModel
 
 _FORMAT = "bodyslam-motion-1"
 _MAX_WIDTH, _MAX_FRAMES, _MAX_MEMBERS = 10_000, 1000, 100
-"""Width of a layer, frames that a network sees, and layers or networks, at most."""
+"""Upper bounds of a layer's width, of the frames of a window, and of the number of
+layers or ensemble members."""
 _ASSETS = Path(__file__).parent / "assets"
-SHIPPED = ("default", "paper")
-"""Motion models that come with the package: the default, and the paper's network."""
+PACKAGE_MODELS = ("default", "paper")
+"""Names of the motion models in the package: the default, and the paper's network."""
 
 
 def save_motion_model(
     path: Path | str, model: MotionModel, *, half: bool = False
 ) -> None:
-    """Writes a model atomically.
+    """Writes a motion model to a file, atomically.
 
-    `half` stores the weights of layers in float16, in half the space; they are of order
-    1 and lose their fourth digit. All else stays in float32.
+    `half` stores the weights of layers in float16, which halves the size; they are of
+    order 1 and lose their fourth digit. All other arrays remain in float32.
 
-    **Raises:** `InputError` for a custom network, whose class no reader would know.
+    **Raises:** `InputError` for a custom network, whose class `load_motion_model` does
+    not know.
     """
     path = Path(path)
     network = model.network
@@ -77,12 +79,12 @@ def save_motion_model(
 
 
 def load_motion_model(path: Path | str | None = None) -> MotionModel:
-    """Reads a model's weights (float32): of a file, or by name of `SHIPPED`.
+    """Reads a motion model (float32) from a file, or by a name in `PACKAGE_MODELS`.
 
-    **Raises:** `InputError` if the file holds no motion model.
+    **Raises:** `InputError` if the file is not a motion model.
     """
     name = "default" if path is None else str(path)
-    path = _ASSETS / f"{name}.npz" if name in SHIPPED else Path(name)
+    path = _ASSETS / f"{name}.npz" if name in PACKAGE_MODELS else Path(name)
     if not path.exists():
         raise InputError(f"{path}: no such motion model.")
     archive = read_npz(path, "a motion model (.npz)")
@@ -114,9 +116,9 @@ def load_motion_model(path: Path | str | None = None) -> MotionModel:
 
 
 def _untrained(header: Fields) -> MetricNetwork | PaperNetwork:
-    """Shapes and types of the network in a header.
+    """Returns the shapes and types of the network that a header describes.
 
-    **Raises:** `InputError`, naming the file, if there is no network of these sizes.
+    **Raises:** `InputError`, naming the file, if no network can have these sizes.
     """
     sizes, key = header.fields("sizes"), jax.random.key(0)
     past = sizes.whole("past", 1, _MAX_FRAMES)

@@ -1,7 +1,7 @@
-"""Removes steady yaw from the orientations that the motion model reads.
+"""Removes steady yaw from the orientations that are input to the motion model.
 
-Training data are mostly straight walks; on curves the network predicts displacements
-that are some per cent too short. A curve changes the direction of later steps, which
+Training data are mostly straight walks; on curves the network underestimates
+displacements by some per cent. A curve changes the direction of later steps, which
 does not matter in the frame of the previous pose, in which displacement is predicted.
 So the slowly varying yaw rate about the body's up axis is removed, and the oscillation
 with each stride is kept.
@@ -14,22 +14,23 @@ from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.geometry import so3
 
-_SIGMA = 15
-"""Standard deviation of the smoothing, frames at 30 fps: about half a stride."""
+_SIGMA_FRAMES = 15
+"""Standard deviation of the smoothing kernel, frames at 30 fps: about half a stride."""
 
 
 def turning_rate(
     orientation: Float[Array, "t 3 3"], present: Bool[Array, " t"]
 ) -> Float[Array, " t"]:
-    """Low-pass filtered yaw about the body's y axis from frame k-1 to k, rad, in row k.
+    """Returns the low-pass filtered yaw about the body's y axis from frame k-1 to k,
+    rad, in row k.
 
-    `orientation` takes H to any one frame: the result depends neither on its heading
-    nor on its up axis. Frames that are not `present` have no weight.
+    `orientation` rotates H into any fixed frame: the result depends neither on its
+    heading nor on its up axis. Frames that are not `present` have no weight.
     """
     step = so3.log(so3.inverse(orientation[:-1]) @ orientation[1:])[:, 1]
     weight = (present[:-1] & present[1:]).astype(step.dtype)
-    reach = min(3 * _SIGMA, len(orientation))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SIGMA) ** 2)
+    reach = min(3 * _SIGMA_FRAMES, len(orientation))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SIGMA_FRAMES) ** 2)
     kernel = jnp.asarray(kernel, step.dtype)
     smooth = lambda x: jnp.convolve(x, kernel, "full")[reach : reach + len(x)]
     rate = smooth(jnp.where(weight > 0, step, 0)) / jnp.maximum(smooth(weight), 1e-3)
@@ -39,7 +40,7 @@ def turning_rate(
 def straightened(
     orientation: Float[Array, "t 3 3"], rate: Float[Array, " t"]
 ) -> Float[Array, "t 3 3"]:
-    """The same relative rotations without `rate`: `C'_k = C'_{k-1} Y(-rate) ΔC_k`."""
+    """Subtracts `rate` from the relative rotations: `C'_k = C'_{k-1} Y(-rate) ΔC_k`."""
     up = jnp.array([0.0, 1.0, 0.0], rate.dtype)
     step = so3.inverse(orientation[:-1]) @ orientation[1:]
     step = so3.exp(-rate[1:, None] * up) @ step

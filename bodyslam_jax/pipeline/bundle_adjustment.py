@@ -1,7 +1,7 @@
 """Bundle adjustment of all frames and landmarks, and of a guessed focal length.
 
-A guessed focal length is a variable with a wide prior around the guess; parallax and
-rotation that do not fit together determine it. Distortion is not estimated here.
+A guessed focal length is a variable with a wide prior around the guess. Inconsistency
+between parallax and rotation determines it. Distortion is not estimated here.
 """
 
 import dataclasses
@@ -18,25 +18,25 @@ from bodyslam_jax.types import Intrinsics, SfmResult, Tracks
 
 log = logging.getLogger(__name__)
 
-HELD_SIGMA = 1e-6
+HELD_FOCAL_SIGMA = 1e-6
 """Relative sigma of a prior that holds the focal length constant."""
 
-_SAME_FOCAL = 0.005
-"""Relative change of the focal length beyond which the priors of landmarks, which were
-triangulated with the former one, are dropped."""
+_MAX_FOCAL_CHANGE = 0.005
+"""Relative change of the focal length above which the priors of landmarks, which were
+triangulated with the previous one, are dropped."""
 _ASPECT_SIGMA = 1e-4
 """Sigma of the difference of fx and fy, relative to the focal length."""
-_WIDE_FOCAL, _WIDE_CENTRE = 0.5, 0.2
-"""Standard deviations, relative to the focal length, of priors that only keep a
-self-calibration from diverging."""
-_OUTLIER = 10.0
-"""Residuals beyond this many sigmas are outliers."""
+_FOCAL_PRIOR_SIGMA, _CENTRE_PRIOR_SIGMA = 0.5, 0.2
+"""Standard deviations of focal length and principal point, relative to the focal
+length, of priors that only prevent self-calibration from diverging."""
+_MAX_RESIDUAL_SIGMAS = 10.0
+"""Residual, in sigmas, above which an observation is an outlier."""
 
 
 def adjust(
     cameras: SfmResult, sigma: float, config: Config, guess: Intrinsics | None
 ) -> SfmResult:
-    """Cameras and map at the optimum, with inliers and noise measured anew.
+    """Adjusts cameras and map, and determines inliers and pixel noise again.
 
     Args:
         sigma: standard deviation of the observations, px.
@@ -44,7 +44,7 @@ def adjust(
             all intrinsics constant.
     """
     state = _first_state(cameras)
-    free = guess is not None and config.structure.focal_sigma > HELD_SIGMA
+    free = guess is not None and config.structure.focal_sigma > HELD_FOCAL_SIGMA
     factors = _factors(cameras, sigma, config, free)
     problem = _problem(factors, state, config.structure, guess)
     solution = solver.solve(problem, state)
@@ -53,7 +53,7 @@ def adjust(
     state = solution.state
     focal_sigma = float("nan")
     prior_information = cameras.prior_information
-    if abs(float(state.intrinsics[0]) / cameras.focal - 1) > _SAME_FOCAL:
+    if abs(float(state.intrinsics[0]) / cameras.focal - 1) > _MAX_FOCAL_CHANGE:
         prior_information = np.zeros_like(prior_information)
     if guess is not None:
         covariance = solver.marginals(problem, state).intrinsics
@@ -71,7 +71,7 @@ def adjust(
         landmarks=np.asarray(state.landmarks),
         intrinsics=np.asarray(state.intrinsics),
         focal_sigma=focal_sigma,
-        keep=keep & (error < _OUTLIER * noise),
+        keep=keep & (error < _MAX_RESIDUAL_SIGMAS * noise),
         prior_information=prior_information,
         pixel_sigma=noise,
         costs=(before, float(solution.cost)),
@@ -81,20 +81,21 @@ def adjust(
 def self_calibrated(
     cameras: SfmResult, config: Config
 ) -> Float[np.ndarray, "3 2"] | None:
-    """fx, cx and cy by the tracks alone, each with its standard deviation, px.
+    """Estimates fx, cx and cy from the tracks alone, each with its standard deviation,
+    px.
 
-    They are variables about the intrinsics of `cameras`, with a wide prior whose
-    information is taken out of the answer again. `None` where there are no tracks or
-    they determine nothing.
+    They are variables near the intrinsics of `cameras`, with a wide prior whose
+    information is subtracted from the result. Returns `None` if there are no tracks or
+    they do not determine the intrinsics.
     """
     if not cameras.keep.any():
         return None
     state, sigma = _first_state(cameras), cameras.pixel_sigma
     intrinsics = np.asarray(cameras.intrinsics, float)
     focal, runs = float(intrinsics[0]), config.structure.focal_runs
-    prior = np.full(len(intrinsics), HELD_SIGMA * focal)
-    prior[:2] = _WIDE_FOCAL * focal / np.sqrt(runs)
-    prior[2:4] = _WIDE_CENTRE * focal / np.sqrt(runs)
+    prior = np.full(len(intrinsics), HELD_FOCAL_SIGMA * focal)
+    prior[:2] = _FOCAL_PRIOR_SIGMA * focal / np.sqrt(runs)
+    prior[2:4] = _CENTRE_PRIOR_SIGMA * focal / np.sqrt(runs)
     problem = _with_free_intrinsics(
         _factors(cameras, sigma, config, free=True), state, intrinsics, prior
     )
@@ -104,7 +105,7 @@ def self_calibrated(
     information = np.linalg.inv(covariance[np.ix_(at, at)])
     moved = np.asarray(solution.state.intrinsics)[at] - intrinsics[at]
     moment = information @ moved
-    # The prior on fy is another one on fx, to which it is tied.
+    # fy is tied to fx, so that its prior is a second one on fx.
     information -= np.diag(np.array([2.0, 1.0, 1.0]) * prior[at] ** -2.0) / runs
     strength = np.linalg.eigvalsh(information)
     if not np.isfinite(moment).all() or strength[0] <= 1e-6 * strength[-1]:
@@ -114,6 +115,7 @@ def self_calibrated(
 
 
 def _first_state(cameras: SfmResult) -> graph.State:
+    """Returns the state of cameras and landmarks, without people."""
     nobody = initialisation.no_people(len(cameras.T_WC))
     return initialisation.first_state(
         cameras.T_WC, cameras.landmarks, nobody, cameras.intrinsics
@@ -123,8 +125,9 @@ def _first_state(cameras: SfmResult) -> graph.State:
 def _factors(
     cameras: SfmResult, sigma: float, config: Config, free: bool
 ) -> list[graph.Factor]:
-    """Factors of cameras and map; `free` if intrinsics are variables."""
-    # A noise that is set for the joint graph is not that of the observations.
+    """Returns the factors of cameras and map; `free` is True if intrinsics are
+    variables."""
+    # The noise set for the joint graph is not that of the observations.
     weights = dataclasses.replace(config.weights, pixel_sigma=None)
     factor = initialisation.map_factor(cameras.tracks, cameras.keep, sigma, weights)
     prior = initialisation.revisit_factor(
@@ -138,13 +141,14 @@ def _factors(
 
 
 def clipped_sigma(sigma: float) -> float:
-    """A measured noise, px, within the range that the graph allows."""
+    """Clips a measured noise, px, to the range that the graph allows."""
     low, high = initialisation.PIXEL_SIGMA_RANGE
     return float(np.clip(sigma, low, high))
 
 
 def _pixel_errors(tracks: Tracks, state: graph.State) -> Float[np.ndarray, "m 2"]:
-    """Where landmarks are projected less where they were observed, px."""
+    """Returns the reprojection errors of the landmarks, predicted minus observed,
+    px."""
     T_WC = np.asarray(state.cameras)[tracks.frame]
     offset = np.asarray(state.landmarks)[tracks.landmark] - T_WC[:, :3, 3]
     p_C = np.einsum("mji,mj->mi", T_WC[:, :3, :3], offset)
@@ -157,6 +161,7 @@ def _problem(
     structure: Structure,
     guess: Intrinsics | None,
 ) -> graph.Problem:
+    """Returns the problem, with the focal length as a variable if a guess is given."""
     if guess is None:
         return graph.make_problem(factors, state, common_sizes=True)
     params = np.asarray(guess.params, float)
@@ -164,7 +169,7 @@ def _problem(
     # Errors of a track are temporally correlated, so that `focal_runs` observations
     # count as one. Multiplying the prior's information by that number has the same
     # effect on the focal length as dividing that of the observations.
-    sigma = np.full(len(params), HELD_SIGMA * focal)
+    sigma = np.full(len(params), HELD_FOCAL_SIGMA * focal)
     error = guess.focal_sigma or structure.focal_sigma * focal
     sigma[:2] = min(error, structure.focal_sigma * focal) / np.sqrt(
         structure.focal_runs
@@ -178,8 +183,8 @@ def _with_free_intrinsics(
     params: Float[np.ndarray, " i"],
     sigma: Float[np.ndarray, " i"],
 ) -> graph.Problem:
-    """The problem with intrinsics as variables near `params`, and their aspect ratio
-    held."""
+    """Returns the problem with intrinsics as variables near `params`, px, and with
+    their aspect ratio held."""
     focal = float(params[0])
     factors = [
         *factors,

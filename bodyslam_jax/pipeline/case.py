@@ -1,4 +1,4 @@
-"""A simulated sequence with its truth, taken to where the joint estimate begins."""
+"""A simulated sequence with ground truth and the results of the front end."""
 
 import dataclasses
 from pathlib import Path
@@ -22,10 +22,10 @@ from bodyslam_jax.types import Bodies, Result, Sequence, SfmResult
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One simulated sequence: measurements, truth, and what the front end made."""
+    """A simulated sequence: measurements, ground truth and results of the front end."""
 
     name: str
-    """Such as `M2-room`."""
+    """Name of sequence and scene, such as `M2-room`."""
     sequence: Sequence
     """The measurements: tracks, keypoints, regressed bodies, intrinsics."""
     truth: Trajectories
@@ -39,7 +39,7 @@ class Case:
 
     @property
     def map_scale(self) -> float:
-        """Metres per unit of the map: what s should be, by Sim(3) on the cameras."""
+        """True scale, m per unit of the map, by Sim(3) alignment of the cameras."""
         found = evaluation.umeyama(
             self.truth.T_WC[:, :3, 3],
             jnp.asarray(self.cameras.T_WC[:, :3, 3]),
@@ -50,22 +50,26 @@ class Case:
 
     @property
     def radius(self) -> float:
-        """RMS distance of the true camera from its mean place, m."""
+        """RMS distance of the true camera from its mean position, m."""
         centre = np.asarray(self.truth.T_WC[:, :3, 3])
         return float(np.sqrt(((centre - centre.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
     def prepare(self, config: Config | None = None) -> Prepared:
-        """The joint problem and its start, as in `run`, with
-        other settings than the case's if they are given."""
+        """Makes the joint problem and its first state as `run` does.
+
+        Args:
+            config: settings that replace those of the case.
+        """
         return prepare(
             self.sequence, self.cameras, self.bodies, self.body, config or self.config
         )
 
     def trajectories(self, state: graph.State) -> Trajectories:
-        """Cameras and people of a state, to be compared with `truth` by `evaluate`.
+        """Returns cameras and people of a state, which `evaluate` compares with
+        `truth`.
 
-        Differentiates and maps over states. People are present where they are in the
-        truth; the world is the map's, in metres.
+        The function can be differentiated and mapped over states. People are present
+        in the same frames as in the truth; the world is that of the map, in metres.
         """
         return trajectories(
             state,
@@ -86,13 +90,14 @@ def simulate_case(
 ) -> Case:
     """Simulates a sequence and runs the stages before the joint estimate on it.
 
-    These are structure from motion with bundle adjustment on the simulated tracks, and
-    the cleaning of the regressed bodies: what `build` needs, as in `run`.
+    These stages are structure from motion with bundle adjustment on the simulated
+    tracks, and the cleaning of the regressed bodies, as in `run`; `build` needs them.
 
     Args:
         sequence: a name from `E1` to `D3`, or all settings.
-        frames: at 30 fps; without it the sequence's own number, 600 to 1000.
-        cache: a folder in which finished stages are kept, one folder of it a sequence.
+        frames: number of frames at 30 fps; by default that of the sequence, 600 to
+            1000.
+        cache: folder in which finished stages are kept, in a subfolder per sequence.
         settings: other fields of `config.Simulation`, such as `family="follow"`,
             `seed`, `noise`.
 
@@ -100,7 +105,7 @@ def simulate_case(
     """
     if not isinstance(sequence, Simulation):
         sequence = Simulation(
-            # `Simulation` refuses other names.
+            # `Simulation` rejects other names.
             sequence=sequence,  # pyright: ignore[reportArgumentType]
             length=frames,
             **settings,
@@ -127,7 +132,7 @@ def simulate_case(
 
 
 def truth_of(result: Result) -> Trajectories:
-    """A simulation's truth as what is compared with."""
+    """Converts the ground truth of a simulation to `Trajectories`."""
     joints = jnp.asarray(result.joints)
     t = len(result.timestamps)
     fps = (t - 1) / (result.timestamps[-1] - result.timestamps[0])
@@ -148,7 +153,8 @@ def trajectories(
     registered: Bool[Array | np.ndarray, " t"],
     fps: Float[Array, ""],
 ) -> Trajectories:
-    """Cameras, pelvis and joints of a state in metres, in the map's world frame."""
+    """Returns cameras and joints of a state in metres, in the world frame of the
+    map."""
     cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
     T_WH = graph.world_from_root(state)
     p_H = local_joints(body, state.poses, state.shapes[:, None])

@@ -1,14 +1,14 @@
-"""Feet that stand are held still after the joint estimate: only roots and poses change.
+"""Holds standing feet after the joint estimate: only roots and poses change.
 
-Which points of the feet stand is read from the postures of the joint estimate
-(`motion.contact_network`). Then people's roots and poses are estimated once more with
-the same factors, the one of standing points (`graph.FootContact`), and a larger weight
-of their height over the ground of the map. Cameras, map, scale and shapes are
-constants: thousands of landmarks and the size of the person determine them, and steps
-would stretch them by the errors of postures.
+The contact network (`motion.contact_network`) infers from the postures of the joint
+estimate which points of the feet are in contact. Then people's roots and poses are
+estimated again with the same factors, the factor of contact points
+(`graph.FootContact`), and a larger weight of their height over the ground of the map.
+Cameras, map, scale and shapes are constants: thousands of landmarks and the size of the
+person determine them, and contact would distort them by the errors of postures.
 
-The factor of standing points is in the joint problem from the beginning, without
-weight, so that both solves are one compiled program.
+The factor of contact points is in the joint problem from the beginning, without weight,
+so that both solves share one compiled program.
 """
 
 import dataclasses
@@ -31,26 +31,27 @@ from bodyslam_jax.pipeline.motion_prediction import (
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Sequence, SfmResult
 
-_HEIGHT_SIGMA = 0.08
-"""Standard deviation of the height of the lower foot over the ground, m in a frame of
-1/30 s: 2 cm in a stance, in which its error lasts."""
-_SCATTER = 0.04
-"""Scatter of these heights from which the ground counts less, m: more than estimates
-have on level ground."""
-_FEWEST_FRAMES = 10
-"""With standing feet, for the ground to be shifted to their height."""
+_HEIGHT_SIGMA_M = 0.08
+"""Standard deviation of the height of the lower foot over the ground in a frame of
+1/30 s, m: it is 2 cm for a stance, during which the error is constant."""
+_MAX_HEIGHT_SCATTER_M = 0.04
+"""Scatter of these heights above which the ground is weighted down, m: more than that
+of estimates on level ground."""
+_MIN_STANDING_FRAMES = 10
+"""Least number of frames with standing feet for the ground to be shifted to their
+height."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Standing:
-    """People whose feet stand still."""
+    """People with standing feet held."""
 
     state: graph.State
     probability: Float[np.ndarray, "h t 4"] | None = None
-    """That left toe, left heel, right toe and right heel stand, 0 where legs are only
-    guessed; `None` if unknown."""
+    """Contact probabilities of left toe, left heel, right toe and right heel; 0 where
+    legs are not observed; `None` if unknown."""
     stages: tuple[dict, ...] = ()
-    """Report entries of what was solved."""
+    """Report entries of the solves."""
 
 
 def hold_standing_feet(
@@ -61,7 +62,8 @@ def hold_standing_feet(
     body: BodyModel,
     config: Config,
 ) -> Standing:
-    """The optimum `best` of the joint problem with roots and poses estimated anew.
+    """Estimates roots and poses again, from the optimum `best` of the joint problem,
+    with standing feet held.
 
     Nothing changes without people, without `weights.contact_sigma`, or with a body
     model that the contact network was not trained on.
@@ -113,25 +115,25 @@ def stand_on_plane(
     probability: Float[np.ndarray, "h t 4"],
     fps: float,
 ) -> graph.GroundContact:
-    """The factor of the ground, with the weight of heights over it.
+    """Returns the ground factor with sigmas of the heights of standing feet over it.
 
-    At constant scale it says how far away people are, so that short steps of estimated
-    postures cannot bring them nearer. The ground is shifted to the median height of
-    standing feet, and believed only as far as it explains them: where they rise and
-    sink over seconds (`wander`) it follows them, and its σ grows with what is left of
-    their scatter; frames far from it, on a step or a kerb, have no weight.
+    At constant scale these heights determine the distance of people from the camera;
+    otherwise held feet with underestimated steps would move them nearer. The ground is
+    shifted to the median height of standing feet, and weighted by how well it explains
+    them: where they rise and sink over seconds (`wander`), it follows them, and σ grows
+    with the remaining scatter; frames far from it, on a step or a kerb, have no weight.
     """
     bare = eqx.tree_at(lambda f: f.sigma, contact, jnp.ones_like(contact.sigma))
     height = np.asarray(graph.residual_of(bare, state))[..., 0]
     stands = probability.max(axis=-1)
     used = np.isfinite(np.asarray(contact.sigma)) & (stands > 0.5)
-    if used.sum() < _FEWEST_FRAMES:
+    if used.sum() < _MIN_STANDING_FRAMES:
         return contact
     offset = float(np.median(height[used])) + wander(height, used, fps)[0]
     away = np.abs(height - offset)
-    spread = max(1.4826 * float(np.median(away[used])) / _SCATTER, 1.0)
-    near = used & (away < 3 * spread * _SCATTER)
-    sigma = _HEIGHT_SIGMA * spread * np.sqrt(fps / 30.0)
+    spread = max(1.4826 * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0)
+    near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)
+    sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / 30.0)
     sigma = np.where(near, sigma / np.sqrt(np.maximum(stands, 0.5)), np.inf)
     shifted = np.asarray(contact.offset) - offset / float(state.scale)
     return eqx.tree_at(

@@ -1,4 +1,4 @@
-"""Which body model a run takes: of the bodies' gender, and where none is named."""
+"""Chooses the body model of a run, by gender of given bodies and by motion model."""
 
 import dataclasses
 from pathlib import Path
@@ -13,16 +13,16 @@ from bodyslam_jax.pipeline.stage_cache import body_model_file
 def with_compatible_body(
     config: Config, gender: str | None = None
 ) -> tuple[Config, tuple[str, ...]]:
-    """The settings with a body that the motion model was trained on, and warnings.
+    """Returns settings with a body that the motion model was trained on, and warnings.
 
     Args:
-        gender: of the model that given bodies belong to, if they tell. The model of
-            that gender is taken from the folder in the settings, or from those that
-            are installed; a warning says so where there is none.
+        gender: gender of the body model that given bodies belong to, if stated. The
+            model of that gender is taken from the folder in the settings, or from the
+            installed ones; if there is none, a warning says so.
 
     A body model that was found on this machine, not named by the user, is replaced by
     the default body if the motion model belongs to that one; a warning says so. A body
-    model that the user names is kept: the mismatch is refused later.
+    model that the user names is kept: a mismatch is rejected later.
     """
     config, warnings = _with_default_body(config)
     if gender is None or not config.people:
@@ -48,8 +48,8 @@ def with_compatible_body(
 
 
 def _with_default_body(config: Config) -> tuple[Config, tuple[str, ...]]:
-    """The settings with the default body in place of one that was found on this machine
-    but does not suit the motion model, and a warning."""
+    """Replaces a body model that was found on this machine but does not match the
+    motion model by the default body; returns settings and warnings."""
     file = body_model_file(config.body_model)
     if config.body_model is not None or file is None or not config.people:
         return config, ()

@@ -1,4 +1,4 @@
-"""A sequence whose intrinsics were refined: what its bodies and keypoints become."""
+"""Adapts the bodies and keypoints of a sequence to refined intrinsics."""
 
 import dataclasses
 
@@ -13,14 +13,16 @@ def with_intrinsics(
     intrinsics: Float[np.ndarray, " i"],
     zoom: Float[np.ndarray, " t"] | None = None,
 ) -> Sequence:
-    """The sequence with other intrinsics, and bodies and keypoints to match.
+    """Returns the sequence with other intrinsics, and with bodies and keypoints to
+    match.
 
-    Regressed bodies keep their position and size in the image: a regressor reads depth
-    off the size, so depth is proportional to the focal length.
+    Regressed bodies keep their position and size in the image: a regressor infers depth
+    from size, so depth is proportional to the focal length.
 
     Args:
+        intrinsics: new intrinsics, px.
         zoom: logarithm of each frame's focal length over that of `intrinsics`. The
-            keypoints and bodies returned are those of the images with the zoom undone.
+            returned keypoints and bodies are those of images without the zoom.
     """
     if zoom is not None:
         sequence = _without_zoom(sequence, zoom)
@@ -42,6 +44,7 @@ def with_intrinsics(
 
 
 def _without_zoom(sequence: Sequence, zoom: Float[np.ndarray, " t"]) -> Sequence:
+    """Returns the sequence with keypoints and bodies as seen without the zoom."""
     size = np.exp(zoom)
     keypoints, bodies = sequence.keypoints, sequence.bodies
     if keypoints is not None:
@@ -50,7 +53,7 @@ def _without_zoom(sequence: Sequence, zoom: Float[np.ndarray, " t"]) -> Sequence
         uv = np.where(keypoints.confidence[..., None] > 0, uv, keypoints.uv)
         keypoints = dataclasses.replace(keypoints, uv=uv)
     if bodies is not None:
-        # The same offset from the optical axis; depth in proportion to magnification.
+        # The offset from the optical axis is kept; depth is proportional to the zoom.
         trans = bodies.trans * np.stack([size * 0 + 1, size * 0 + 1, size], axis=-1)
         bodies = dataclasses.replace(bodies, trans=trans)
     return dataclasses.replace(sequence, keypoints=keypoints, bodies=bodies)

@@ -1,4 +1,4 @@
-"""The joint problem and its start: cameras, people, map and scale in one graph."""
+"""Builds the joint problem and its first state: cameras, people, map and scale."""
 
 import dataclasses
 import functools
@@ -31,56 +31,57 @@ from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
 
-_TRIPODS = ("static", "rotation")
-"""Kinds of camera motion that show no map, so that people alone show the floor."""
+_KINDS_WITHOUT_MAP = ("static", "rotation")
+"""Kinds of camera motion without a map, where people alone determine the floor."""
 
-_REGRESSED_STATURE = 0.07
-"""m: spread of the statures of adults of one sex (NCD-RisC, eLife 2016), which those of
-regressors hardly follow."""
+_STATURE_SIGMA_M = 0.07
+"""Standard deviation of the statures of adults of one sex, m (NCD-RisC, eLife 2016),
+with which regressed statures hardly correlate."""
 
 Passengers = dict[int, tuple[float, float]]
-"""People whose steps are no measurement of scale, as something carries them: their
-number -> speeds over the ground as `initialisation.carried` returns them, m/s."""
+"""People whose steps do not measure scale, as a vehicle or treadmill moves them: a map
+from their number to their speeds, m/s, as returned by `initialisation.carried`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A joint problem and where its solution starts."""
+    """A joint problem and its first state."""
 
     problem: graph.Problem
     state: graph.State
     scale: ScaleStart
     roots: PersonState
     moving: bool
-    """Whether the camera moves, so that its path has a scale to be estimated."""
+    """True if the camera moves, so that the scale of its path is to be estimated."""
     warnings: tuple[str, ...] = ()
-    """Lines for the report."""
+    """Warnings for the report, a line each."""
     passengers: tuple[int, ...] = ()
-    """People (rows) whom something carries."""
+    """People (rows) whose displacement is not caused by their steps."""
     crowd: "StartingPeople | None" = None
-    """The people as they start."""
+    """People before the joint solve."""
     legs_shown: Bool[np.ndarray, "h t"] | None = None
-    """Frames in which people's legs are not only guessed (`people.legs_shown`); `None`
-    where all are."""
+    """Frames in which people's legs are observed (`people.legs_shown`); `None` if all
+    are."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StartingPeople:
-    """`h` people before the joint problem."""
+    """Initial values of `h` people, and what is known of them."""
 
     roots: PersonState
-    """Start values, with known statures applied; the shape prior is centred on their
+    """Initial values, with known statures applied; the shape prior is centred on their
     β."""
     unaided: Float[np.ndarray, "h 10"]
-    """SMPL β as fitted or regressed, without known statures."""
+    """SMPL β as fitted or regressed, before known statures are applied."""
     unaided_sigma: Float[np.ndarray, " h"]
-    """Standard deviation of the statures of these, m."""
+    """Standard deviation of the statures of `unaided`, m."""
     fitted: Bool[np.ndarray, " h"]
-    """Whether the bodies were fitted to keypoints, not regressed from images."""
+    """True for bodies fitted to keypoints, not regressed from images."""
     statures: dict[int, Measured]
     """Measured statures and their sigma, m, by person."""
     legs_shown: Bool[np.ndarray, "h t"]
-    """Frames whose steps and feet are measured, whatever the bodies are from."""
+    """Frames in which steps and feet are observed, whatever the source of the
+    bodies."""
 
 
 def prepare(
@@ -93,12 +94,16 @@ def prepare(
     feet: bool = True,
     edges: Edges | None = None,
 ) -> Prepared:
-    """The first scale in closed form, then the whole graph; nothing is solved.
+    """Computes the first scale in closed form, then builds the graph; nothing is
+    solved.
 
-    People start as their bodies are given. With `feet` the problem has the factor of
-    standing feet, without weight, which `contact_stage.hold_standing_feet` replaces.
-    `edges` are straight edges in the world of a camera that does not move, which tell
-    how the floor lies there.
+    Args:
+        cameras: cameras and map up to scale.
+        bodies: people in the camera frame, where the problem starts.
+        feet: True to include the factor of standing feet, without weight, which
+            `contact_stage.hold_standing_feet` replaces.
+        edges: straight edges in the world of a camera that does not move, which
+            determine the slope of the floor.
 
     **Raises:** `InputError` if there is neither a moving camera nor a person.
     """
@@ -118,7 +123,11 @@ def prepare(
     )
     factors = _camera_factors(cameras, config) if moving else []
     floor = None
-    if cameras.kind in _TRIPODS and anybody and weights.ground_sigma is not None:
+    if (
+        cameras.kind in _KINDS_WITHOUT_MAP
+        and anybody
+        and weights.ground_sigma is not None
+    ):
         floor = without_floor(body, roots.present)
         factors.append(floor)
     start, passengers, prediction = ScaleStart(), {}, None
@@ -205,6 +214,7 @@ def _starting_people(
     body: BodyModel,
     config: Config,
 ) -> StartingPeople:
+    """Collects the initial values of people, with known statures applied."""
     bodies = dataclasses.replace(bodies, present=bodies.present & cameras.within)
     roots = people.roots_from_bodies(bodies, body)
     fitted = people.without_bodies(sequence)
@@ -215,15 +225,15 @@ def _starting_people(
         unaided[:, -1] = 0.0
     regressed = sequence.bodies is not None and sequence.bodies.shapes_regressed
     per_unit = float(np.linalg.norm(people.linear_stature(body).slope))
-    # The prior of a fitted shape has a sigma that is smaller than its uncertainty
-    # (`diagnostics.scale_uncertainty`), and that of a regressed one is of its noise,
-    # not of its bias.
+    # The prior of a fitted shape has a smaller sigma than its uncertainty
+    # (`diagnostics.scale_uncertainty`); that of a regressed one describes its noise,
+    # not its bias.
     unsure = np.where(
         fitted,
         1.0,
         np.maximum(
             config.weights.shape_sigma,
-            _REGRESSED_STATURE / per_unit if regressed else 0.0,
+            _STATURE_SIGMA_M / per_unit if regressed else 0.0,
         ),
     )
     roots = people.with_statures(roots, statures, body, unsure)
@@ -233,7 +243,7 @@ def _starting_people(
 
 
 def _camera_factors(cameras: SfmResult, config: Config) -> list[graph.Factor]:
-    """Factors of a moving camera: the map, loop closures, a given path."""
+    """Returns the factors of a moving camera: map, loop closures and a given path."""
     weights = config.weights
     sigma = initialisation.landmark_sigma(cameras.pixel_sigma, weights)
     return [
@@ -256,8 +266,8 @@ def _people_factors(
     body: BodyModel,
     config: Config,
 ) -> tuple[list[graph.Factor], graph.GroundContact | None]:
-    """Factors of people but for their motion, and the one of ground contact, if any,
-    which is among them."""
+    """Returns the factors of people except those of motion; and the ground contact
+    factor, which is one of them, or `None`."""
     weights, roots = config.weights, crowd.roots
     predicted = prediction.valid if weights.posture_predicted else None
     factors = initialisation.people_factors(
@@ -293,7 +303,7 @@ def _motion_factors(
     body: BodyModel,
     config: Config,
 ) -> list[graph.Factor]:
-    """Factors of people's motion in the world."""
+    """Returns the factors of people's motion in the world."""
     return [
         initialisation.motion_factor(
             prediction,
@@ -317,9 +327,9 @@ def _start_of_scale(
     present: Bool[np.ndarray, "h t"],
     config: Config,
 ) -> tuple[ScaleStart, Passengers]:
-    """The first scale from all cues, and the people whose steps are left out of it.
+    """Returns the first scale from all cues, and the people whose steps it excludes.
 
-    Passengers are found by their speed at the scale of the other cues, so only where
+    Passengers are detected by their speed at the scale of the other cues, and only if
     there are others; a camera that does not move has scale 1.
     """
     if cameras.kind != "moving":
@@ -356,7 +366,7 @@ def _start_of_scale(
 def _shared_error(
     fitted: Bool[np.ndarray, " h"], config: Config
 ) -> Float[np.ndarray, " h"]:
-    """Relative error that all steps of a person have in common."""
+    """Returns the relative error common to all steps of a person."""
     weights = config.weights
     return np.where(fitted, weights.fitted_step_error, weights.step_error)
 
@@ -369,9 +379,9 @@ def _make_problem(
     predictor: graph.MotionPredictor | None,
     free: graph.Step | None,
 ) -> graph.Problem:
-    """The problem, with cameras beyond a cut of the video held constant: no factor
-    determines them. Before a camera that does not move the scale is free where there is
-    a floor."""
+    """Makes the problem, with cameras beyond a cut of the video held constant, as no
+    factor determines them. For a camera that does not move, the scale is free if there
+    is a floor."""
     if free is not None and any(isinstance(f, graph.GroundContact) for f in factors):
         free = dataclasses.replace(free, scale=jnp.ones_like(free.scale))
     problem = graph.make_problem(

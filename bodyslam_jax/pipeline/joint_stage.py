@@ -1,29 +1,39 @@
 """The joint estimate: cameras, people, map and scale in one problem (section 3.6).
 
-Where people stand on uneven ground it is solved once more (`ground_stage.py`). Then
-standing feet are held (`contact_stage.py`).
+Finally, standing feet are held (`contact_stage.py`). Before that, the problem is solved
+a second time if people stand on uneven ground. The ground under a foot is where the ray
+through the foot meets the landmarks. Its first estimate uses people and landmarks from
+before the joint estimate. A second one, at the optimum, is a fixed point: a third
+changes scale by less than 0.1 %. A plane does not change with people and landmarks, so
+only ground that is not a plane is estimated again (`benchmarks/contact.md`).
 """
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from bodyslam_jax import graph, people, solver
+from bodyslam_jax import graph, initialisation, people, solver
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import Config
+from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
 )
 from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
-from bodyslam_jax.pipeline.ground_stage import is_uneven, with_ground_of
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.own_terms import OwnTerms
 from bodyslam_jax.pipeline.people_floor import people_on_floor
 from bodyslam_jax.pipeline.solve_stage import solve_stage
-from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, Sequence, SfmResult
+from bodyslam_jax.types import (
+    Bodies,
+    JointEstimate,
+    Keypoints,
+    ScaleStart,
+    Sequence,
+    SfmResult,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +41,13 @@ class Uncertainty:
     """Uncertainty of an optimum; NaN where it was not computed."""
 
     scale_sigma: float
-    """m per unit of the map"""
+    """Standard deviation of the scale, m per unit of the map."""
     shape_covariance: Float[np.ndarray, "h 10 10"]
     unobserved: tuple[str, ...] = ()
-    """Quantities that the measurements do not determine, a line each."""
+    """Descriptions of quantities that the measurements do not determine, a line
+    each."""
     statures: Float[np.ndarray, "h 4"] | None = None
-    """As in `JointEstimate`."""
+    """Given statures and estimates without them, m, as in `JointEstimate.statures`."""
     marginals: solver.Marginals | None = None
     """Marginal covariances; `None` where they were not computed."""
 
@@ -50,11 +61,16 @@ def estimate(
     edges: Edges | None = None,
     own: OwnTerms = OwnTerms(),
 ) -> JointEstimate:
-    """The paper's graph: two steps, then the optimum of everything; with a user's `own`
-    terms.
+    """Builds and solves the joint problem, with a user's `own` terms, by the schedule
+    of the paper: two partial steps, then the optimum of all variables.
 
-    **Raises:** as `prepare`, unless a detector looked at all images and found nobody;
-    `InputError` where an own term does not fit.
+    Args:
+        cameras: cameras and map up to scale.
+        bodies: people in the camera frame.
+        edges: straight edges in the world of a camera that does not move.
+
+    **Raises:** as `prepare`, unless a detector searched all images and found nobody;
+    `InputError` if an own term does not fit the problem.
     """
     searched = sequence.detected is not None and sequence.keypoints is None
     if searched and cameras.kind != "moving" and not len(bodies.present):
@@ -101,10 +117,10 @@ def of_state(
     stages: tuple[dict, ...],
     contacts: Float[np.ndarray, "h t 4"] | None = None,
 ) -> JointEstimate:
-    """The estimate that a state of the prepared problem is, `contacts` those of the
-    contact stage."""
+    """Converts a state of the prepared problem to a `JointEstimate`; `contacts` are the
+    contact probabilities of the contact stage."""
     return JointEstimate(
-        # Before a camera that does not move it is the height of the floor.
+        # With a camera that does not move, s is the height of the floor.
         scale=float(state.scale) if prepared.moving else 1.0,
         start=prepared.scale,
         scale_sigma=uncertainty.scale_sigma,
@@ -136,8 +152,8 @@ def estimate_uncertainty(
     body: BodyModel,
     config: Config,
 ) -> Uncertainty:
-    """Marginal covariances of scale and shapes at the optimum `best`, and what the
-    measurements leave undetermined."""
+    """Returns the marginal covariances of scale and shapes at the optimum `best`, and
+    the quantities that the measurements do not determine."""
     if not config.uncertainty:
         shapes = np.full((len(best.shapes), 10, 10), np.nan)
         return Uncertainty(np.nan, shapes)
@@ -152,8 +168,8 @@ def estimate_uncertainty(
         variance, shapes = inflate_fitted_shapes(
             variance, shapes, best.scale, best.shapes, body, sigma, anywhere
         )
-    # Smooth motion of people alone is no measurement of size: of a camera that follows
-    # somebody it makes the path too short (0.57 of the truth, 0.32 its stated error).
+    # Smoothness of people's motion alone does not measure scale: if the camera follows
+    # a person, the path becomes too short (0.57 of the truth, with a sigma of 0.32).
     metric = np.isfinite(prepared.scale.standard_error)
     scale_sigma = covariance_sigma(
         float(variance), moving=prepared.moving, metric=bool(metric)
@@ -170,8 +186,8 @@ def _statures(
     body: BodyModel,
     config: Config,
 ) -> Float[np.ndarray, "h 4"] | None:
-    """Given statures and those without them, with their sigma; NaN for people whose
-    stature was not given."""
+    """Returns given statures, and estimates without them, each with its sigma, m; NaN
+    for people without a given stature, `None` without any."""
     crowd = prepared.crowd
     if crowd is None or not crowd.statures:
         return None
@@ -196,8 +212,8 @@ def _statures(
 
 
 def empty_estimate(cameras: SfmResult) -> JointEstimate:
-    """The estimate of a camera that does not move and sees nobody: the cameras as
-    structure from motion has them, scale 1, of unknown size."""
+    """Returns the estimate for a camera that does not move and sees nobody: the cameras
+    of structure from motion, with scale 1 of unknown uncertainty."""
     frames = len(cameras.registered)
     return JointEstimate(
         scale=1.0,
@@ -215,3 +231,38 @@ def empty_estimate(cameras: SfmResult) -> JointEstimate:
         status="converged",
         stages=(),
     )
+
+
+def with_ground_of(
+    state: graph.State,
+    prepared: Prepared,
+    registered: Bool[np.ndarray, " t"],
+    keypoints: Keypoints | None,
+    body: BodyModel,
+    weights: GraphWeights,
+    fps: float,
+) -> Prepared:
+    """Returns the problem with the ground estimated again from people and landmarks of
+    `state`; `prepared` itself if there is no ground, or too little of it."""
+    factors = prepared.problem.factors
+    old = next((f for f in factors if isinstance(f, graph.GroundContact)), None)
+    present = prepared.roots.present & registered
+    if prepared.legs_shown is not None:
+        present = present & prepared.legs_shown
+    contact = initialisation.ground_contact(
+        state, present, keypoints, body, weights, fps
+    )
+    if old is None or contact is None:
+        return prepared
+    contact = initialisation.with_wander(contact, state, fps)
+    changed = tuple(contact if factor is old else factor for factor in factors)
+    return dataclasses.replace(
+        prepared, problem=dataclasses.replace(prepared.problem, factors=changed)
+    )
+
+
+def is_uneven(problem: graph.Problem) -> bool:
+    """Returns True if people stand on ground that is not one plane."""
+    grounds = [f for f in problem.factors if isinstance(f, graph.GroundContact)]
+    used = [np.asarray(f.offset)[np.isfinite(np.asarray(f.sigma))] for f in grounds]
+    return any(len(offset) > 0 and np.ptp(offset) > 0 for offset in used)

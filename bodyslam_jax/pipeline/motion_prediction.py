@@ -1,4 +1,4 @@
-"""The motion model's predictions for the frames of one sequence."""
+"""Predictions of the motion model and the contact network for one sequence."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from jaxtyping import Float
 from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
-from bodyslam_jax.geometry.free_fall import in_free_fall
 from bodyslam_jax.geometry.lengths import padded_length, shortened
+from bodyslam_jax.geometry.stances import in_free_fall
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.types import Sequence
@@ -20,7 +20,7 @@ from bodyslam_jax.types import Sequence
 def motion_predictor(
     sequence: Sequence, roots: PersonState, body: BodyModel, config: Config
 ) -> graph.MotionPredictor:
-    """The motion model, resampled to the times of the sequence's frames."""
+    """Returns the motion model, resampled to the frame times of the sequence."""
     model = motion.load_motion_model(config.motion_model)
     clock = motion.make_clock(sequence.timestamps, model.fps)
     present = jnp.asarray(roots.present)
@@ -30,7 +30,7 @@ def motion_predictor(
 def contact_predictor(
     sequence: Sequence, roots: PersonState, body: BodyModel, config: Config
 ) -> graph.MotionPredictor | None:
-    """The contact network, resampled to the times of the sequence's frames; `None`
+    """Returns the contact network, resampled to the frame times of the sequence; `None`
     without `weights.contact_sigma`, or if it was not trained on this kind of body."""
     if not config.weights.contact_sigma:
         return None
@@ -43,10 +43,10 @@ def contact_predictor(
 
 
 def predict(predictor: graph.MotionPredictor, state: graph.State) -> Any:
-    """The predictor's result for the people of a state: a `motion.Prediction` of the
-    motion model, or probabilities `h t 4` of the contact network."""
-    # Landmarks have no part in it. Without them the program's shapes are those of the
-    # people alone, so that maps of different sizes share one compilation.
+    """Evaluates a predictor for the people of a state: returns a `motion.Prediction` of
+    the motion model, or probabilities `h t 4` of the contact network."""
+    # Predictions do not depend on landmarks. Without them, shapes depend on people
+    # alone, so that maps of different sizes share one compiled program.
     none = jnp.zeros((0, 3), state.landmarks.dtype)
     state = eqx.tree_at(lambda s: s.landmarks, state, none)
     frames = len(state.cameras)
@@ -59,8 +59,9 @@ def predict(predictor: graph.MotionPredictor, state: graph.State) -> Any:
 def contact_probability(
     predictor: graph.MotionPredictor, state: graph.State, fps: float
 ) -> Float[np.ndarray, "h t 4"]:
-    """Probabilities that toes and heels stand; 0 while a person falls freely, which
-    postures do not tell from a stance (`geometry.free_fall`)."""
+    """Returns the contact probabilities of toes and heels; 0 in free fall, which
+    postures alone do not distinguish from a stance
+    (`geometry.stances.in_free_fall`)."""
     found = np.array(predict(predictor, state))
     present = np.asarray(predictor.present)
     pelvis = np.asarray(graph.world_from_root(state))[..., :3, 3]

@@ -1,8 +1,8 @@
-"""Factors and variables of a user's own in the joint problem of `run`.
+"""User-defined factors and variables in the joint problem of `run`.
 
-They enter the problem when all of its other terms are there, so that first values and
-the initial scale are those of the video alone. While standing feet are held
-(`contact_stage.py`) cameras, map and scale are constants, and so are the variables.
+They are added to the complete problem, so that first values and the initial scale
+depend on the video alone. While standing feet are held (`contact_stage.py`), cameras,
+map and scale are constants, and so are the user's variables.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.types import OwnFactor, OwnVariable
 
 Factors = Many[graph.Factor] | Callable[[graph.State], Many[graph.Factor]]
-"""Factors, or a function that makes them of the state in which the joint solve begins:
-`t` frames, `h` people, the landmarks and cameras in units of the map."""
+"""Factors, or a function that makes them from the initial state of the joint solve: `t`
+frames, `h` people, landmarks and cameras in units of the map."""
 
 
 @dataclasses.dataclass(frozen=True)
 class OwnTerms:
-    """What a user adds to the joint problem."""
+    """Factors and variables that a user adds to the joint problem."""
 
     factors: Factors = ()
     variables: Mapping[str, graph.Variable] = dataclasses.field(default_factory=dict)
@@ -34,7 +34,7 @@ class OwnTerms:
         return callable(self.factors) or bool(self.factors or self.variables)
 
     def added_to(self, prepared: Prepared) -> Prepared:
-        """The prepared problem and its state with these terms.
+        """Adds these terms to the prepared problem and its state.
 
         **Raises:** `InputError` if a factor does not fit the problem, naming it.
         """
@@ -58,8 +58,11 @@ class OwnTerms:
         state: graph.State,
         marginals: solver.Marginals | None,
     ) -> tuple[tuple[OwnVariable, ...], tuple[OwnFactor, ...]]:
-        """Variables and misfits of factors at the optimum `state` of `problem`, which
-        is `before` with these terms. Without `marginals` no variable has a sigma."""
+        """Returns values of the variables and misfits of the factors at the optimum.
+
+        `state` is the optimum of `problem`, which is `before` with these terms added.
+        Without `marginals` the sigmas of variables are NaN.
+        """
         if not self:
             return (), ()
         values = problem.named(state.globals)
@@ -79,7 +82,7 @@ class OwnTerms:
                     numbers(np.broadcast_to(given.sigma, np.shape(values[name]))),
                 )
             )
-        # Priors of variables stand before the user's factors.
+        # Priors of variables precede the user's factors.
         first = len(before.factors)
         factors = [
             _misfit(name, factor, state)
@@ -90,7 +93,7 @@ class OwnTerms:
 
 
 def _misfit(name: str, factor: graph.Factor, state: graph.State) -> OwnFactor:
-    """Residuals that are exactly 0 are of measurements that are missing."""
+    """Returns the misfit of a factor; residuals of exactly 0 count as missing."""
     residual = np.asarray(graph.residual_of(factor, state))
     count = int(np.count_nonzero(residual))
     cost = float(factor.cost(state))

@@ -1,10 +1,11 @@
-"""The floor before a camera that does not move: people's feet alone determine it.
+"""Estimates the floor from people's feet alone, for a camera that does not move.
 
 Such a camera has no map, and each person's distance follows from their size alone, so
-that people whose sizes err differently would stand on floors of different heights. They
-stand on one plane here: its normal is that of `geometry.gravity`, and its distance from
-the camera, `s d` with d constant, is estimated with people's sizes: s, the metres per
-unit of the map, is free for want of another length in the map.
+that people whose sizes have different errors would stand on floors of different
+heights. Here they stand on one plane: its normal comes from `geometry.gravity`, and its
+distance from the camera, `s d` with constant d, is estimated with people's sizes. The
+variable s, metres per unit of the map, is free for this, as the map has no other
+length.
 """
 
 import dataclasses
@@ -25,25 +26,26 @@ from bodyslam_jax.geometry.stances import toes_standing
 from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.types import Keypoints
 
-_STANDS = 0.5
-"""Probability of a foot to stand from which the frame counts."""
-_SIZE = 0.055
-"""Relative standard deviation of a person's size, and so of the height of the camera
+_MIN_CONTACT_PROBABILITY = 0.5
+"""Contact probability of a foot above which it counts as standing."""
+_RELATIVE_SIZE_SIGMA = 0.055
+"""Relative standard deviation of a person's size, and thus of the height of the camera
 over the feet."""
-_FOOT, _TILT = 0.04, 0.05
-"""Standard deviations of a foot's height in a posture, m, and of the floor's slope,
-rad."""
-_FEWEST = 10
-"""Frames with standing feet, for a person to be on the floor."""
-_LOWEST_CAMERA = 0.1
-"""Height of the camera over the feet from which the floor tells distances, m."""
-_OFF = 2.5
-"""Standard deviations from the others by which somebody stands on another floor."""
+_FOOT_SIGMA_M, _TILT_SIGMA_RAD = 0.04, 0.05
+"""Standard deviations of the height of a foot, m, from errors of posture, and of the
+slope of the floor, rad."""
+_MIN_STANDING_FRAMES = 10
+"""Least number of frames with standing feet of a person on the floor."""
+_MIN_CAMERA_HEIGHT_M = 0.1
+"""Least height of the camera over feet at which the floor determines distances, m."""
+_MAX_FLOOR_SIGMAS = 2.5
+"""Difference in height, in standard deviations, above which a person stands on another
+floor than the others."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What is known of people and camera beside the state."""
+    """Measurements of people and camera that are not part of the state."""
 
     present: Bool[np.ndarray, "h t"]
     keypoints: Keypoints | None
@@ -57,7 +59,7 @@ class View:
 def without_floor(
     body: BodyModel, present: Bool[np.ndarray, "h t"]
 ) -> graph.GroundContact:
-    """The factor of ground contact without weight: `on_floor` takes its place."""
+    """Returns a ground contact factor without weight, which `on_floor` replaces."""
     return graph.GroundContact(
         body,
         jnp.array([0.0, -1.0, 0.0]),
@@ -73,19 +75,22 @@ def on_floor(
     body: BodyModel,
     weights: GraphWeights,
 ) -> graph.GroundContact:
-    """The factor of people who stand on one floor; without weight where too few do.
+    """Returns the factor of people who stand on one floor, without weight if too few
+    do.
 
-    `probability` is that of toes and heels to stand; without it feet stand by their
-    speed. Whoever stands higher or lower than the others by more than errors of sizes
-    explain is on no floor.
+    `probability` is the contact probability of toes and heels; without it, feet stand
+    by their speed. People who stand higher or lower than the others, by more than
+    errors of their size explain, are not on the floor.
     """
     present = initialisation.with_visible_feet(view.present, view.keypoints)
     none = without_floor(body, present)
     assert weights.ground_sigma is not None
     stands = present
     if probability is not None:
-        stands = present & (np.asarray(probability).max(axis=-1) > _STANDS)
-    if not (stands.sum(axis=1) >= _FEWEST).any():
+        stands = present & (
+            np.asarray(probability).max(axis=-1) > _MIN_CONTACT_PROBABILITY
+        )
+    if not (stands.sum(axis=1) >= _MIN_STANDING_FRAMES).any():
         return none
     normal = _upright(state, probability, view, body).normal
     bare = eqx.tree_at(
@@ -100,11 +105,12 @@ def on_floor(
     )
     used = stands & on[:, None]
     count = used.sum(axis=1, keepdims=True)
-    # The prior of a fitted shape has a smaller σ than its uncertainty, to hold its own
-    # against keypoints whose errors are correlated; so has what else tells sizes.
+    # The prior of a fitted shape has a smaller σ than its uncertainty, to balance
+    # keypoints with correlated errors; other measurements of size are scaled by the
+    # same factor.
     own = weights.ground_sigma * np.where(view.fitted, weights.shape_sigma, 1.0)
     sigma = np.where(used, own[:, None] * np.sqrt(count), np.inf)
-    if not used.any() or level > -_LOWEST_CAMERA:
+    if not used.any() or level > -_MIN_CAMERA_HEIGHT_M:
         return none
     return eqx.tree_at(
         lambda f: (f.offset, f.sigma),
@@ -114,7 +120,7 @@ def on_floor(
 
 
 def people_on_floor(problem: graph.Problem) -> Bool[np.ndarray, " h"] | None:
-    """Who stands on the floor; `None` if nobody does."""
+    """Returns which people stand on the floor; `None` if nobody does."""
     for factor in problem.factors:
         if isinstance(factor, graph.GroundContact):
             on = np.array([np.isfinite(sigma).any() for sigma in factor.sigma])
@@ -127,23 +133,23 @@ def common_height(
     places: Float[np.ndarray, "h t 3"],
     used: Bool[np.ndarray, "h t"],
 ) -> tuple[float, Bool[np.ndarray, " h"]]:
-    """The height of the floor over the camera, m, and who stands on it.
+    """Returns the height of the floor over the camera, m, and which people stand on it.
 
-    `height` is that of people's lower foot over the camera, `places` where they are in
-    the plane. Of all floors that one person stands on it is the one that most frames
-    agree with.
+    `height` is the height of the lower foot over the camera, m, `places` are people's
+    positions in the plane, m. Of the floors that each person defines, the one that
+    agrees with most frames is chosen.
     """
     count = used.sum(axis=1)
-    some = np.flatnonzero(count >= _FEWEST)
+    some = np.flatnonzero(count >= _MIN_STANDING_FRAMES)
     on = np.zeros(len(height), bool)
     if not len(some):
         return 0.0, on
     own = np.array([np.median(height[h, used[h]]) for h in some])
-    sigma = np.hypot(_FOOT, _SIZE * own)
+    sigma = np.hypot(_FOOT_SIGMA_M, _RELATIVE_SIZE_SIGMA * own)
     middle = np.array([np.median(places[h, used[h]], axis=0) for h in some])
     way = np.linalg.norm(middle[:, None] - middle, axis=-1)
-    error = np.hypot(np.hypot(sigma[:, None], sigma), _TILT * way)
-    agree = np.abs(own[:, None] - own) < _OFF * error
+    error = np.hypot(np.hypot(sigma[:, None], sigma), _TILT_SIGMA_RAD * way)
+    agree = np.abs(own[:, None] - own) < _MAX_FLOOR_SIGMAS * error
     chosen = agree[np.argmax(agree @ count[some])]
     on[some[chosen]] = True
     weight = sigma[chosen] ** -2.0
@@ -156,6 +162,7 @@ def _upright(
     view: View,
     body: BodyModel,
 ) -> Upright:
+    """Estimates the up direction from people and edges at `state`, without a map."""
     cameras = np.asarray(state.cameras)
     roots = cameras @ np.asarray(state.roots)
     joints = np.asarray(_local_joints(body, state.poses, state.shapes[:, None]))

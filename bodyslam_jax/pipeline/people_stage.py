@@ -1,4 +1,4 @@
-"""People: found in the images where no keypoints are given, then fitted as bodies."""
+"""Detects people, if no keypoints are given, and estimates their bodies."""
 
 import dataclasses
 
@@ -16,20 +16,20 @@ from bodyslam_jax.types import Bodies, Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Detections:
-    """People found in all images, one frame after the other."""
+    """People detected in all images, concatenated over frames."""
 
     count: Int[np.ndarray, " t"]
-    """People in each frame."""
+    """Number of people in each frame."""
     points: Float[np.ndarray, "p 25 3"]
-    """BODY_25: u px, v px, confidence"""
+    """BODY_25 keypoints: u (px), v (px), confidence."""
 
     def by_frame(self) -> list[np.ndarray]:
-        """The people of each frame."""
+        """Splits the people by frame."""
         return np.split(self.points, np.cumsum(self.count)[:-1])
 
 
 def check_people(sequence: Sequence, config: Config) -> None:
-    """Refuses an input in which nobody can be found, before anything is computed.
+    """Rejects an input in which nobody can be found, before anything is computed.
 
     **Raises:** `InputError` if people are to be estimated, but there are neither
     keypoints nor bodies, nor images to find them in.
@@ -49,7 +49,7 @@ def check_people(sequence: Sequence, config: Config) -> None:
 def find_people(
     sequence: Sequence, config: Config = Config(), cache: Cache = Cache(None)
 ) -> Sequence:
-    """The sequence with people found in its images, as `run` finds them.
+    """Returns the sequence with people detected in its images, as in `run`.
 
     **Raises:** as `run`.
     """
@@ -59,10 +59,10 @@ def find_people(
 def detect(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
-    """The sequence with keypoints of the people in its images, if it has none.
+    """Returns the sequence with keypoints of the people in its images.
 
-    Unchanged where there are no images, and where nobody is to be estimated and given
-    masks or tracks already keep people out of the map.
+    It is returned unchanged if it has keypoints or no images, or if people are not to
+    be estimated and given masks or tracks already exclude them from the map.
     """
     if config.detect == "none" or sequence.keypoints is not None:
         return sequence
@@ -77,7 +77,8 @@ def detect(
 def _detect_per_frame(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
-    """People of every frame by YOLOX and RTMPose, then associated over time."""
+    """Detects people in every frame with YOLOX and RTMPose, then associates them over
+    time."""
 
     def compute() -> Detections:
         found = people.detect_people(
@@ -100,7 +101,7 @@ def _detect_per_frame(
 def _detect_and_track(
     sequence: Sequence, config: Config, cache: Cache, watch: Stopwatch
 ) -> Sequence:
-    """People by the networks that ship, which detect and track in one pass."""
+    """Detects and tracks people in one pass with the networks of the package."""
     compute = lambda: people.find_people_tracked(
         io.frames(sequence),
         sequence.fps,
@@ -123,12 +124,13 @@ def _detect_and_track(
 
 
 def estimate_bodies(sequence: Sequence, body: BodyModel, config: Config) -> Bodies:
-    """Bodies in the camera frame; of nobody where people are not to be estimated."""
+    """Returns bodies in the camera frame; of zero people if none are to be
+    estimated."""
     if not config.people:
         return people.nobody(sequence.num_frames)
     return people.estimate_bodies(sequence, body, config.people_fit)
 
 
 def with_warnings(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
-    """The sequence with `warnings` after its own."""
+    """Appends `warnings` to those of the sequence."""
     return dataclasses.replace(sequence, warnings=(*sequence.warnings, *warnings))

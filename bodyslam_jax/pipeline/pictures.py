@@ -1,4 +1,4 @@
-"""What a person looks at, made from one pass through the video: overlay and scene."""
+"""Writes overlay video and 3D scene in one pass through the images."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,13 +11,16 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline.progress import Stopwatch
 from bodyslam_jax.types import Result, Sequence, SfmResult, Tracks
 
-_CODECS: dict[str, view.Codec] = {"webm": "VP8", "mp4": "H264"}
+_CODEC_BY_SUFFIX: dict[str, view.Codec] = {"webm": "VP8", "mp4": "H264"}
 
 
 def check_overlay(config: Config) -> None:
-    """**Raises:** `ValueError` if the overlay's encoder is not installed."""
+    """Checks that the encoder of the overlay is installed.
+
+    **Raises:** `ValueError` if it is not.
+    """
     if config.overlay:
-        view.check_codec(_CODECS[config.overlay_video])
+        view.check_codec(_CODEC_BY_SUFFIX[config.overlay_video])
 
 
 def write_pictures(
@@ -33,7 +36,7 @@ def write_pictures(
     without a video.
 
     Args:
-        sequence: with the keypoints of the result's people, in its order.
+        sequence: the input, with the keypoints of the people of `result` in its order.
     """
     observations = _map_observations(cameras)
     middle = view.middle_frame(result)
@@ -50,10 +53,10 @@ def write_pictures(
                     result,
                     body,
                     observations if measured else None,
-                    codec=_CODECS[config.overlay_video],
+                    codec=_CODEC_BY_SUFFIX[config.overlay_video],
                     keypoints=sequence.keypoints if measured else None,
                 )
-            for _ in images:  # Those that the overlay did not need.
+            for _ in images:  # The sampler sees those that the overlay did not need.
                 pass
     with watch("scene"):
         view.write_scene(folder / "scene.html", result, body, sampler.samples())
@@ -63,7 +66,7 @@ def write_pictures(
 
 
 def _images(sequence: Sequence, cameras: SfmResult) -> Iterator[np.ndarray]:
-    """The images, with the zoom undone if the camera zooms."""
+    """Returns the images; for a camera that zooms, with the zoom undone."""
     images = io.frames(sequence)
     if cameras.zoom is None:
         return images
@@ -71,6 +74,6 @@ def _images(sequence: Sequence, cameras: SfmResult) -> Iterator[np.ndarray]:
 
 
 def _map_observations(cameras: SfmResult) -> Tracks:
-    """The inlier observations of the landmarks."""
+    """Returns the inlier observations of the landmarks."""
     tracks, keep = cameras.tracks, cameras.keep
     return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])

@@ -1,4 +1,4 @@
-"""`build`: the joint problem and its start, with nothing of it solved."""
+"""`build`: makes the joint problem and its first state, without solving anything."""
 
 import dataclasses
 
@@ -18,21 +18,21 @@ def build(
     config: Config | None = None,
     hold: tuple[str, ...] = (),
 ) -> tuple[graph.Problem, graph.State]:
-    """The joint problem of section 3.6 and a first state for it.
+    """Makes the joint problem of section 3.6 and a first state for it.
 
-    Cameras and landmarks start where structure from motion put them, people where
-    their bodies are given, and the scale at its closed form from people's motion and
-    the ground. `run` first solves for the bodies alone with cameras held; `build` does
-    not, so that its start is a little farther from the solution. Of a `Sequence` the
-    front end runs here, as in `run`; of a `Case` it has run.
+    Cameras and landmarks start at the result of structure from motion, people at their
+    given bodies, and the scale at its closed form from people's motion and the ground.
+    `run` first solves for the bodies alone with cameras held; `build` does not, so that
+    its start is slightly farther from the solution. For a `Sequence` the front end runs
+    here, as in `run`; for a `Case` it has run already.
 
     Args:
-        config: without it that of the case, or the defaults.
-        hold: groups of variables that stay as they are in the first state, among the
+        config: settings; by default those of the case, or the defaults of `Config`.
+        hold: groups of variables that keep the values of the first state, among the
             fields of `State`: `scale`, `cameras`, `roots`, `poses`, `shapes`,
             `landmarks`, `intrinsics`.
 
-    **Raises:** `InputError` as `run`, and for a name in `hold` that is none of these.
+    **Raises:** `InputError` as `run`, and for any other name in `hold`.
     """
     unknown = sorted(set(hold) - set(graph.VARIABLES))
     if isinstance(hold, str) or unknown:
@@ -56,7 +56,8 @@ def build(
 
 
 def hold_groups(problem: graph.Problem, hold: tuple[str, ...]) -> graph.Problem:
-    """The problem with these groups held; their blocks are not even formed."""
+    """Returns the problem with these groups held constant; the solver does not form
+    their blocks of the Hessian."""
     variables = tuple(name for name in problem.variables if name not in hold)
     free = graph.set_constant(problem.free, *hold)
     return dataclasses.replace(problem, free=free, variables=variables)

@@ -1,8 +1,8 @@
-"""Durations of stages and progress within them, through the log.
+"""Logs the durations of stages and the progress within them.
 
 The records carry their figures as attributes (`stage`, `done`, `total`, `seconds`,
 `compile_seconds`, `peak_mb`) beside the text, so that a handler can draw a bar or write
-JSON without reading messages.
+JSON without parsing messages.
 """
 
 import contextlib
@@ -16,19 +16,19 @@ import jax
 
 log = logging.getLogger(__name__)
 
-_SECONDS_BETWEEN_LINES = 5.0
-_SECONDS_BETWEEN_UPDATES = 0.2
-_COMPILING = (
+_LINE_INTERVAL_S = 5.0
+_UPDATE_INTERVAL_S = 0.2
+_COMPILATION_EVENTS = (
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
     "/jax/core/compile/backend_compile_duration",
 )
-"""JAX's events for lowering and for XLA (or reading XLA's result from the cache)."""
-_LEAST_COMPILING = 1.0
-"""Seconds of compilation below which a stage's line leaves them out."""
+"""JAX's monitoring events of lowering and of XLA (or of reading its cached result)."""
+_MIN_COMPILATION_S = 1.0
+"""Time of compilation below which the log line of a stage does not mention it, s."""
 
 
 class Stopwatch:
-    """Seconds by stage, and a log line at the start and at the end of each."""
+    """Measures the seconds of each stage, and logs a line at its start and its end."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -52,14 +52,14 @@ class Stopwatch:
             "%s: %.1f s%s",
             stage,
             self.seconds[stage],
-            text if compiling >= _LEAST_COMPILING else "",
+            text if compiling >= _MIN_COMPILATION_S else "",
             extra=figures,
         )
 
 
 class Counter:
-    """How many frames of a stage are done: a log line every few seconds, and records of
-    level DEBUG in between for whoever draws a bar."""
+    """Reports how many frames of a stage are done: by a log line every few seconds, and
+    by DEBUG records in between, from which a handler can draw a bar."""
 
     def __init__(self, stage: str, total: int) -> None:
         self.stage, self.total = stage, total
@@ -67,8 +67,8 @@ class Counter:
 
     def __call__(self, done: int) -> None:
         now = time.perf_counter()
-        is_line = now - self._last_line > _SECONDS_BETWEEN_LINES
-        if now - self._last_update < _SECONDS_BETWEEN_UPDATES and done < self.total:
+        is_line = now - self._last_line > _LINE_INTERVAL_S
+        if now - self._last_update < _UPDATE_INTERVAL_S and done < self.total:
             return
         log.log(
             logging.INFO if is_line else logging.DEBUG,
@@ -82,12 +82,12 @@ class Counter:
 
 @functools.cache
 def _compile_clock() -> list[float]:
-    """The seconds that this process has spent on compiling since the first call, in a
-    list of one number that JAX's events add to."""
+    """Returns a list of one number, to which JAX's events add: the seconds that this
+    process has spent on compilation since the first call."""
     clock = [0.0]
 
     def add(event: str, duration_secs: float, **_: object) -> None:
-        if event in _COMPILING:
+        if event in _COMPILATION_EVENTS:
             clock[0] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(add)
@@ -95,8 +95,8 @@ def _compile_clock() -> list[float]:
 
 
 def _peak_mb() -> int | None:
-    """The largest memory that this process has had, MB; `None` where it is not
-    counted."""
+    """Returns the peak memory of this process, MB; `None` if the system does not report
+    it."""
     try:
         import resource
     except ImportError:

@@ -1,4 +1,4 @@
-"""The whole flow: video -> people -> tracks -> cameras -> bodies -> graph -> result.
+"""Runs all stages: video -> people -> tracks -> cameras -> bodies -> graph -> result.
 
 Each stage's result is kept in a `Cache` under a fingerprint of all that it depends on.
 """
@@ -20,9 +20,9 @@ from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.own_terms import Factors, OwnTerms
 from bodyslam_jax.pipeline.people_stage import with_warnings
 from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+from bodyslam_jax.pipeline.sfm_stage import find_edges
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import to_metric
-from bodyslam_jax.pipeline.vertical_stage import find_edges
 from bodyslam_jax.types import (
     Bodies,
     JointEstimate,
@@ -32,7 +32,8 @@ from bodyslam_jax.types import (
     Tracks,
 )
 
-_FEWEST_FRAMES = 3
+_MIN_FRAMES = 3
+"""Least number of frames of a sequence that can be estimated."""
 
 
 def run(
@@ -46,14 +47,14 @@ def run(
     """Estimates cameras, people and map in metres; `cache` keeps finished stages.
 
     Args:
-        factors: a user's own, which the joint problem has beside all others; or a
-            function that makes them of the state in which the joint solve begins.
+        factors: user-defined factors, which are added to the joint problem; or a
+            function that makes them from the initial state of the joint solve.
         variables: named globals that `factors` depend on, with their priors.
             `summary["own"]` has their values and sigmas, and how each factor fits; a
             factor that the optimum contradicts makes the result doubtful.
 
-    **Raises:** `InputError`, in one line, if the sequence holds nothing that cameras or
-    people can be estimated from, or a factor does not fit the problem.
+    **Raises:** `InputError`, in one line, if neither cameras nor people can be
+    estimated from the sequence, or if a factor does not fit the problem.
     """
     gender = sequence.bodies.gender if sequence.bodies else None
     config, warnings = with_compatible_body(config, gender)
@@ -64,8 +65,9 @@ def run(
 def run_stages(
     sequence: Sequence, config: Config, cache: Cache, own: OwnTerms = OwnTerms()
 ) -> tuple[Result, SfmResult, Sequence]:
-    """`run`, the cameras before the joint estimate, and the input as it was used: with
-    the people who were found, in the order of the result, and without zoom.
+    """Does the work of `run`; returns also the cameras before the joint estimate, and
+    the input as it was used: with the detected people, in the order of the result, and
+    without zoom.
 
     **Raises:** as `run`.
     """
@@ -73,7 +75,7 @@ def run_stages(
     watch = Stopwatch()
     body = load_body_model(config.body_model)
     model = motion.load_motion_model(config.motion_model)
-    if config.people:  # Before minutes are spent on the stages that need no motion.
+    if config.people:  # Checked before stages that take minutes and need no motion.
         motion.check_compatible(model, body, model.fps)
     sequence = people_stage.detect(sequence, config, cache, watch)
     sequence = diagnostics.reconcile(sequence, body)
@@ -84,13 +86,13 @@ def run_stages(
     refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     files_body, body = body, _body_that_reaches(body, config)
     edges = None
-    if cameras.kind != "moving":  # They show how the floor lies.
+    if cameras.kind != "moving":  # Edges determine the slope of the floor.
         with watch("edges"):
             edges = find_edges(everybody, cameras, cache=cache)
     with watch("joint"):
         given = refined, cameras, bodies, body, config, edges, own
         compute = lambda: joint_stage.estimate(*given)
-        # Code that a factor brings has no fingerprint.
+        # The code of a user-defined factor has no fingerprint.
         joint = compute() if own else cache.stage("joint", key, JointEstimate, compute)
     if cameras.kind == "moving":
         with watch("edges"):
@@ -100,15 +102,16 @@ def run_stages(
 
 
 def _body_that_reaches(body: BodyModel, config: Config) -> BodyModel:
-    """The body model, with a size axis where a given stature is beyond its shapes."""
+    """Returns the body model, with a size axis if a given stature is beyond its
+    shapes."""
     heights = (height.value for height in config.heights().values())
     beyond = any(people.beyond_reach(body, height) for height in heights)
     return people.with_size_axis(body) if beyond else body
 
 
 def _with_shapes_of(body: BodyModel, used: BodyModel, result: Result) -> Result:
-    """The result with the shapes of the body model itself, which other programs have,
-    where the estimate used a size axis; joints are those of the estimate."""
+    """Converts shapes with a size axis to those of the plain body model, which other
+    programs know; joints remain those of the estimate."""
     if not used.sized:
         return result
     betas = [people.in_model(used, body, shape) for shape in result.betas]
@@ -127,8 +130,8 @@ def before_joint(
     cache: Cache = Cache(None),
     watch: Stopwatch | None = None,
 ) -> tuple[SfmResult, Bodies]:
-    """Cameras and map up to scale, and bodies in the camera frame: the start values of
-    the graph.
+    """Estimates cameras and map up to scale, and bodies in the camera frame: the
+    initial values of the graph.
 
     **Raises:** as `run`.
     """
@@ -169,7 +172,7 @@ def assemble(
     seconds: dict[str, float],
     edges: Edges | None = None,
 ) -> Result:
-    """The joint estimate in metres, judged, with its summary.
+    """Returns the joint estimate in metres, with its verdict and summary.
 
     `seconds` are the durations of the stages, for the summary; `edges` are straight
     edges in the images, for gravity.
@@ -181,14 +184,16 @@ def assemble(
 
 
 def _check_length(sequence: Sequence) -> None:
-    if sequence.num_frames < _FEWEST_FRAMES:
+    """**Raises:** `InputError` for a sequence that is too short."""
+    if sequence.num_frames < _MIN_FRAMES:
         raise InputError(
             f"{sequence.name}: {sequence.num_frames} frames, expected at least "
-            f"{_FEWEST_FRAMES}: size and motion come from what moves."
+            f"{_MIN_FRAMES}: size and motion come from what moves."
         )
 
 
 def _tracks(sequence: Sequence, config: Config) -> Tracks:
+    """Returns the given tracks, or tracks features through the images."""
     if sequence.tracks is not None:
         return sequence.tracks
     counter = Counter("tracks", sequence.num_frames)

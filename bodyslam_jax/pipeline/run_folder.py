@@ -1,8 +1,8 @@
-"""A run whose stages and result are kept in a folder, which one process holds."""
+"""Runs that keep stages and result in a locked folder, and the demonstration."""
 
 from pathlib import Path
 
-from bodyslam_jax import evaluation, export
+from bodyslam_jax import evaluation, export, io, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.evaluation import before_after
@@ -16,14 +16,18 @@ from bodyslam_jax.pipeline.run import run_stages
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.types import Result, Sequence
 
+_SCENE_FOLDER = "scene"
+"""Subfolder of the run folder that holds the input of the demonstration."""
+
 
 def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:
-    """`run`, with finished stages kept in `out` and everything of the contract written.
+    """Runs all stages, keeps finished ones in `out` and writes all files of a run
+    folder.
 
-    Where the sequence has a ground truth, the report contains the errors.
+    If the sequence has a ground truth, the report contains the errors.
 
-    **Raises:** `ValueError` if `out` cannot be written, holds something else, or is
-    being written by another process.
+    **Raises:** as `run`; `ValueError` if `out` cannot be written, holds something else,
+    or is being written by another process.
     """
     gender = sequence.bodies.gender if sequence.bodies else None
     config, warnings = with_compatible_body(config, gender)
@@ -36,14 +40,14 @@ def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> R
 
 
 def stage_cache_of(sequence: Sequence, out: Path) -> Cache:
-    """The cache of stages in the run folder `out`, for this sequence."""
+    """Returns the cache of stages in the run folder `out`, for this sequence."""
     return Cache(out / ".cache", describe(sequence))
 
 
 def run_in_locked_folder(
     sequence: Sequence, out: Path, config: Config, cache: Cache
 ) -> Result:
-    """`run_to_folder` for a caller that holds the folder's lock."""
+    """Does the work of `run_to_folder` for a caller that holds the folder's lock."""
     check_overlay(config)
     export.clear_partial(out)
     body = load_body_model(config.body_model)
@@ -60,3 +64,32 @@ def run_in_locked_folder(
         export.write_files(partial, result, config)
         export.write_report(partial / "report.html", result, body, still)
     return result
+
+
+def demo(
+    out: Path,
+    config: Config = Config(),
+    *,
+    from_pixels: bool = True,
+) -> Result:
+    """Renders a walker filmed by a moving camera and runs the pipeline on the images.
+
+    The scene is written to `out/scene`, a sequence folder with its ground truth.
+
+    Args:
+        from_pixels: True to detect people in the images, with the networks of the
+            package; False to use simulated keypoints and bodies.
+
+    **Raises:** `ValueError` if `out` cannot be written.
+    """
+    config, warnings = with_compatible_body(config)
+    cache = Cache(out / ".cache", {"name": _SCENE_FOLDER})
+    export.check_folder(out, cache.source, cache.owner())
+    with export.locked(out):
+        folder = out / _SCENE_FOLDER
+        with Stopwatch()("rendering"):
+            simulation.demo_scene(folder, people=not from_pixels)
+            sequence = with_warnings(io.read_sequence(folder), warnings)
+        cache = stage_cache_of(sequence, out)
+        export.check_folder(out, cache.source, cache.owner())
+        return run_in_locked_folder(sequence, out, config, cache)

@@ -1,39 +1,45 @@
-"""Tracks -> cameras and map up to scale, and the focal length if it was a guess.
+"""Estimates cameras and map up to scale from tracks, and a guessed focal length.
 
-Camera model, structure from motion, then bundle adjustment of all frames and
-landmarks. Structure from motion is repeated where bundle adjustment changes a guessed
-focal length.
+The stage selects the camera model, runs structure from motion, and then bundle
+adjustment of all frames and landmarks. Structure from motion is repeated if bundle
+adjustment changes a guessed focal length. `find_edges` finds straight segments, which
+show the vertical, in the images of these cameras.
 """
 
 import dataclasses
 import logging
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from bodyslam_jax import sfm
 from bodyslam_jax.config import Config
+from bodyslam_jax.geometry.vertical_edges import Edges, make_edges
 from bodyslam_jax.pipeline.bundle_adjustment import (
-    HELD_SIGMA,
+    HELD_FOCAL_SIGMA,
     adjust,
     clipped_sigma,
     self_calibrated,
 )
-from bodyslam_jax.types import Intrinsics, Sequence, SfmResult, Tracks
+from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
+from bodyslam_jax.types import Intrinsics, JointEstimate, Sequence, SfmResult, Tracks
 
 log = logging.getLogger(__name__)
 
-_REPEAT_CHANGE = 0.02
-"""Relative change of the focal length after which structure from motion is repeated."""
-_ROTATION_REFUSED = 1.5
-"""Error of a camera that only rotates, over that of a moving one, beyond which rotation
-does not explain the images."""
+_MAX_FOCAL_CHANGE = 0.02
+"""Relative change of the focal length above which structure from motion is repeated."""
+_MAX_ROTATION_ERROR_RATIO = 1.5
+"""Ratio between the errors of a rotating and of a moving camera above which rotation
+alone does not explain the images."""
+_EDGE_IMAGES = 24
+"""Number of images that are searched for edges, evenly spread over the clip."""
 
 
 def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
-    """Cameras, map and intrinsics of a sequence, up to scale.
+    """Estimates cameras, map and intrinsics of a sequence, up to scale.
 
-    The result's `kind` tells whether the camera moves, rotates or stands still; the
-    last two keep a guessed focal length.
+    The result's `kind` tells whether the camera moves, rotates or stands still; in the
+    last two cases a guessed focal length is kept.
     """
     cameras = _estimate(sequence, tracks, config)
     for text in cameras.warnings:
@@ -57,6 +63,7 @@ def estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
 
 
 def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
+    """Does the work of `estimate`, without its log lines."""
     num_frames = sequence.num_frames
     warnings = tracks.warnings
     tracks, share = sfm.without_burnt_in(tracks, sequence.intrinsics, num_frames)
@@ -94,7 +101,8 @@ def _estimate(sequence: Sequence, tracks: Tracks, config: Config) -> SfmResult:
 
 
 def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> SfmResult:
-    """Cameras of a sequence whose intrinsics are the model's, adjusted."""
+    """Returns the bundle-adjusted cameras of a sequence with the intrinsics of
+    `model`."""
     guess, found = sequence.intrinsics, model.found
     cameras = _unadjusted(sequence, found, guess, config)
     if found.kind != "moving":
@@ -108,14 +116,15 @@ def _of_model(sequence: Sequence, model: sfm.CameraModel, config: Config) -> Sfm
     if not guess.is_guess:
         found_by_tracks = self_calibrated(cameras, config)
         cameras = dataclasses.replace(cameras, from_tracks=found_by_tracks)
-    # Only now, because whole tracks determine path and focal length better.
+    # Last, because unsplit tracks determine path and focal length better.
     return _split_tracks(cameras, config.structure.landmark_span)
 
 
 def _with_focal(
     sequence: Sequence, tracks: Tracks, cameras: SfmResult, error: float, config: Config
 ) -> SfmResult:
-    """Cameras with the focal length estimated, if the camera's path determines it."""
+    """Returns cameras with an estimated focal length, or with the guess if the camera's
+    path does not determine it."""
     guess = sequence.intrinsics
     sigma = clipped_sigma(error / sfm.ERROR_PER_SIGMA)
     adjusted = cameras
@@ -123,7 +132,7 @@ def _with_focal(
         adjusted = adjust(cameras, sigma, config, guess)
         if adjusted.focal_sigma > config.structure.focal_accuracy * adjusted.focal:
             return _with_guess(sequence, tracks, adjusted, config)
-        if abs(adjusted.focal / cameras.focal - 1) < _REPEAT_CHANGE:
+        if abs(adjusted.focal / cameras.focal - 1) < _MAX_FOCAL_CHANGE:
             break
         better = dataclasses.replace(guess, params=adjusted.intrinsics)
         again = reconstruct(sequence, tracks, better, config)
@@ -132,16 +141,16 @@ def _with_focal(
             adjusted.pixel_sigma,
         )
         if again.kind != "moving":
-            if again.error > _ROTATION_REFUSED * sfm.ERROR_PER_SIGMA * sigma:
-                return adjusted  # It moves little, but rotation does not explain it.
+            if again.error > _MAX_ROTATION_ERROR_RATIO * sfm.ERROR_PER_SIGMA * sigma:
+                return adjusted  # Rotation alone does not explain the small motion.
             # With a wrong focal length, a rotating camera appeared to move.
             return dataclasses.replace(cameras, focal_sigma=adjusted.focal_sigma)
     return adjusted
 
 
 def _split_tracks(cameras: SfmResult, span: int) -> SfmResult:
-    """Landmarks of long tracks in pieces of at most `span` frames, so that each is seen
-    by few cameras. Each piece has the information of the others as its prior."""
+    """Splits landmarks of long tracks into pieces of at most `span` frames, so that
+    each is observed by few cameras; the information of other pieces becomes a prior."""
     tracks = cameras.tracks
     of, piece = sfm.split_tracks(tracks.frame, tracks.landmark, span)
     kept = cameras.keep
@@ -163,7 +172,8 @@ def _split_tracks(cameras: SfmResult, span: int) -> SfmResult:
 def reconstruct(
     sequence: Sequence, tracks: Tracks, intrinsics: Intrinsics, config: Config
 ) -> sfm.Reconstruction:
-    """Structure from motion with these intrinsics, and the given camera path if any."""
+    """Runs structure from motion with these intrinsics, and with a given camera
+    path."""
     return sfm.reconstruct(
         tracks,
         intrinsics,
@@ -180,6 +190,7 @@ def _unadjusted(
     intrinsics: Intrinsics,
     config: Config,
 ) -> SfmResult:
+    """Converts a reconstruction to an `SfmResult`, before bundle adjustment."""
     path = sequence.camera_path if found.kind == "moving" else None
     return SfmResult(
         kind=found.kind,
@@ -204,11 +215,11 @@ def _unadjusted(
 def _with_guess(
     sequence: Sequence, tracks: Tracks, adjusted: SfmResult, config: Config
 ) -> SfmResult:
-    """Cameras with the guess held constant, and a warning, where the camera's path does
-    not determine the focal length."""
+    """Returns cameras with the guessed focal length held constant, and a warning, for a
+    path that does not determine it."""
     guess = sequence.intrinsics
     found = reconstruct(sequence, tracks, guess, config)
-    held = dataclasses.replace(config.structure, focal_sigma=HELD_SIGMA)
+    held = dataclasses.replace(config.structure, focal_sigma=HELD_FOCAL_SIGMA)
     cameras = adjust(
         _unadjusted(sequence, found, guess, config),
         adjusted.pixel_sigma,
@@ -223,3 +234,47 @@ def _with_guess(
     return dataclasses.replace(
         cameras, focal_sigma=float("nan"), warnings=(*cameras.warnings, text)
     )
+
+
+def find_edges(
+    sequence: Sequence,
+    cameras: SfmResult,
+    joint: JointEstimate | None = None,
+    cache: Cache = Cache(None),
+) -> Edges | None:
+    """Finds straight segments in images, outside people, in the world of the cameras.
+
+    Returns `None` without images or cameras.
+
+    Args:
+        sequence: the input, with the zoom of its images.
+        cameras: result of structure from motion.
+        joint: its cameras and intrinsics are used instead, if given.
+
+    **Raises:** `ValueError` if an image cannot be read.
+    """
+    if sequence.frames is None or cameras.kind == "failed":
+        return None
+    wanted = _images_with_edges(cameras)
+    segments = cache.stage(
+        "segments",
+        fingerprint(sequence, wanted),
+        sfm.Segments,
+        lambda: sfm.find_segments(sequence, wanted),
+    )
+    ends = segments.ends
+    T_WC, intrinsics = cameras.T_WC, cameras.intrinsics
+    if joint is not None:
+        T_WC, intrinsics = joint.cameras, joint.intrinsics
+    if cameras.zoom is not None:
+        centre = intrinsics[2:4]
+        size = np.exp(cameras.zoom[segments.frame])[:, None, None]
+        ends = centre + (ends - centre) / size
+    return make_edges(segments.frame, ends, wanted, T_WC[:, :3, :3], intrinsics)
+
+
+def _images_with_edges(cameras: SfmResult) -> Int[np.ndarray, " n"]:
+    """Returns the indices of the images that are searched for segments."""
+    frames = np.flatnonzero(cameras.within)
+    places: Float[np.ndarray, " n"] = np.linspace(0, len(frames) - 1, _EDGE_IMAGES)
+    return np.unique(frames[places.round().astype(int)])

@@ -1,4 +1,4 @@
-"""One solve of a problem, logged and described for the report."""
+"""Solves a problem once, logs it and describes it for the report."""
 
 import dataclasses
 import logging
@@ -10,19 +10,19 @@ from bodyslam_jax.config import Config
 log = logging.getLogger(__name__)
 
 COST_ATOL = 0.005
-"""Decrease of the cost below which a step is not worth taking. The cost is a negative
+"""Decrease of the cost below which the solver stops. The cost is a negative
 log-likelihood, in which one standard deviation of one residual is 0.5. Without this
-bound, a few landmarks with little parallax move on for dozens of steps, with no effect
-on the rest of the state."""
+bound, a few landmarks with little parallax keep moving for dozens of steps, with no
+effect on the rest of the state."""
 
 
 def solve_stage(
     problem: graph.Problem, state: graph.State, config: Config, name: str
 ) -> tuple[solver.Solution, dict]:
-    """`solver.solve`, a log line, and the stage's entry for the report.
+    """Solves the problem and returns the solution and the stage's entry for the report.
 
-    The stage named `joint` takes the schedule of the paper, any other the last step of
-    it.
+    The stage named `joint` follows the schedule of the paper, any other only its last
+    step.
     """
     start = time.perf_counter()
     schedule = schedule_of(config)
@@ -45,6 +45,6 @@ def solve_stage(
 
 
 def schedule_of(config: Config) -> tuple[solver.Stage, ...]:
-    """The stages of the joint solve."""
+    """Returns the stages of the joint solve, which stop by `COST_ATOL`."""
     schedule = solver.paper_schedule(config.solver)
     return tuple(dataclasses.replace(stage, atol=COST_ATOL) for stage in schedule)

@@ -1,8 +1,9 @@
-"""Results of stages on disk, so that an interrupted run resumes.
+"""Keeps results of stages on disk, so that an interrupted run resumes.
 
-A result is a dataclass of arrays and plain values, stored as an `.npz` whose name has a
-hash of all inputs: the sequence, the settings, the content of files that they name, and
-the source of the package. If any of them changes, the stage is computed again.
+A result is a dataclass of arrays and plain values, stored as an `.npz` whose name
+contains a hash of all inputs: the sequence, the settings, the content of files that
+they name, and the source of the package. If any of them changes, the stage is computed
+again.
 """
 
 import dataclasses
@@ -28,20 +29,23 @@ from bodyslam_jax.io.error_line import error_line
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_EDGE = 1 << 20
-_SOURCE = "source.json"
-_CACHE = ".cache"
+_HASHED_BYTES = 1 << 20
+"""Number of bytes hashed at each end of a file."""
+_SOURCE_FILE = "source.json"
+"""File in the cache folder that describes the input."""
+_CACHE_FOLDER = ".cache"
 """Name of the folder of stage results inside a run folder."""
 _HEADER, _DIGEST = "__header__", "__sha256__"
-"""Members of a stage file beside its arrays: the structure, and the hash of all."""
-_MAY_BE_NAN = ("shape_covariance",)
-"""Fields whose arrays are NaN where nothing was computed; all others are finite."""
-_FILES = ("body_model", "motion_model", "motion")
-"""Settings that name a file: their fingerprint is that of its content."""
+"""Members of a stage file beside its arrays: its structure, and a hash of the
+content."""
+_NAN_FIELDS = ("shape_covariance",)
+"""Fields whose arrays may contain NaN where nothing was computed."""
+_FILE_SETTINGS = ("body_model", "motion_model", "motion")
+"""Settings that name a file, whose content is hashed in place of its name."""
 
 
 def fingerprint(*parts: Any) -> str:
-    """A hash of settings, arrays and files (by size and content of their ends).
+    """Returns a hash of settings, arrays and files (by size and content of their ends).
 
     Files that settings name are hashed by content; the source of the package is
     included.
@@ -53,7 +57,7 @@ def fingerprint(*parts: Any) -> str:
 
 
 def body_model_file(setting: str | None) -> Path | None:
-    """The file or folder of the setting `body_model`.
+    """Returns the file or folder of the setting `body_model`.
 
     Without a setting it is the body model found on this machine, or `None` for the
     default body.
@@ -65,7 +69,7 @@ def body_model_file(setting: str | None) -> Path | None:
 
 @functools.cache
 def package_hash() -> bytes:
-    """A hash of the package's source, models and motion."""
+    """Returns a hash of the source, models and motion files of the package."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     kept = (
@@ -77,6 +81,7 @@ def package_hash() -> bytes:
 
 
 def _update(digest: Any, part: Any) -> None:
+    """Adds an array, file, folder, dataclass, sequence or plain value to a hash."""
     if isinstance(part, np.ndarray):
         digest.update(str((part.shape, part.dtype)).encode())
         digest.update(np.ascontiguousarray(part).tobytes())
@@ -85,22 +90,24 @@ def _update(digest: Any, part: Any) -> None:
         if part.is_dir():
             for item in sorted(part.iterdir()):
                 # A run folder inside the input is not part of the input.
-                run = item.is_dir() and (item / _CACHE).is_dir()
+                run = item.is_dir() and (item / _CACHE_FOLDER).is_dir()
                 if not item.name.startswith(".") and not run:
                     _update(digest, item)
         elif part.is_file():
             size = part.stat().st_size
             digest.update(str(size).encode())
             with part.open("rb") as file:
-                digest.update(file.read(_EDGE))
-                file.seek(max(0, size - _EDGE))
-                digest.update(file.read(_EDGE))
+                digest.update(file.read(_HASHED_BYTES))
+                file.seek(max(0, size - _HASHED_BYTES))
+                digest.update(file.read(_HASHED_BYTES))
     elif dataclasses.is_dataclass(part) and not isinstance(part, type):
         digest.update(type(part).__name__.encode())
         for field in dataclasses.fields(part):
             digest.update(field.name.encode())
             value = getattr(part, field.name)
-            if field.name in _FILES and (value is None or isinstance(value, str)):
+            if field.name in _FILE_SETTINGS and (
+                value is None or isinstance(value, str)
+            ):
                 value = _named_file(field.name, value)
             _update(digest, value)
     elif isinstance(part, (tuple, list)):
@@ -112,9 +119,11 @@ def _update(digest: Any, part: Any) -> None:
 
 
 def _named_file(name: str, setting: str | None) -> Path | None:
+    """Returns the file that a setting in `_FILE_SETTINGS` names; `None` for the
+    default."""
     if name == "body_model":
         return body_model_file(setting)
-    # The default belongs to the package, which has a hash of its own.
+    # The default belongs to the package, which `package_hash` covers.
     return None if setting is None else Path(setting)
 
 
@@ -124,10 +133,11 @@ class Cache:
 
     folder: Path | None
     source: dict[str, Any] | None = None
-    """Description of the input, stored beside the stages for `owner`."""
+    """Description of the input, stored beside the stages and returned by `owner`."""
 
     def stage(self, name: str, key: str, kind: type[T], compute: Callable[[], T]) -> T:
-        """The result of stage `name`, from disk if stored under the same `key`."""
+        """Returns the result of stage `name`, from disk if stored under the same
+        `key`."""
         if self.folder is None:
             return compute()
         path = self.folder / f"{name}-{key}.npz"
@@ -135,7 +145,7 @@ class Cache:
             try:
                 found = load(path, kind, sealed=True)
             except Exception as error:
-                # Whatever is in the file, the stage can be computed.
+                # Whatever the file contains, the stage can be computed again.
                 reason = error_line(error).removeprefix(f"{path}: ").rstrip(".")
                 log.warning("%s: not readable (%s); computed again", path, reason)
             else:
@@ -144,31 +154,31 @@ class Cache:
         result = compute()
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.source is not None:
-            (self.folder / _SOURCE).write_text(json.dumps(self.source))
+            (self.folder / _SOURCE_FILE).write_text(json.dumps(self.source))
         for old in self.folder.glob(f"{name}-*.npz"):
             if old.is_dir() and not old.is_symlink():
                 shutil.rmtree(old, ignore_errors=True)
             else:
-                old.unlink(missing_ok=True)  # another process may have
+                old.unlink(missing_ok=True)  # another process may have removed it
         save(path, result)
         return result
 
     def owner(self) -> dict[str, Any] | None:
-        """The description of the input for which the folder's results were computed.
+        """Returns the description of the input from which the results were computed.
 
         This is the `source` of the cache that wrote them; `None` if there is none.
         """
         if self.folder is None:
             return None
         try:
-            found = files.read_json(self.folder / _SOURCE)
+            found = files.read_json(self.folder / _SOURCE_FILE)
         except InputError:
             return None
         return found if isinstance(found, dict) else None
 
 
 def save(path: Path, value: Any) -> None:
-    """Writes a dataclass of arrays and plain values with a hash of them; atomic."""
+    """Writes a dataclass of arrays and plain values with their hash, atomically."""
     arrays: dict[str, np.ndarray] = {}
     header = _encode(value, "", arrays)
     arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -180,11 +190,11 @@ def load(path: Path, kind: type[T], *, sealed: bool = False) -> T:
     """Reads what `save` wrote, and checks types, shapes and finiteness of every field.
 
     Args:
-        sealed: whether a file without a hash of its content is refused; earlier
-            versions wrote none.
+        sealed: True to reject files without a hash of their content, as written by
+            earlier versions.
 
-    **Raises:** `InputError` if the file is not what was saved or if `kind` has other
-    fields now than then; other exceptions for what only a forger writes.
+    **Raises:** `InputError` if the content was changed or if `kind` had other fields
+    when it was saved; other exceptions for manipulated files.
     """
     archive = read_npz(path, "a stage of a run")
     arrays = {name: archive.raw(name) for name in archive.names}
@@ -196,7 +206,8 @@ def load(path: Path, kind: type[T], *, sealed: bool = False) -> T:
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """A hash of the arrays, their names, types and shapes, in any order."""
+    """Returns a hash of the arrays with names, types and shapes, independent of
+    order."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(name.encode())
@@ -205,6 +216,7 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _encode(value: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Returns the structure of a value for JSON, and moves its arrays to `arrays`."""
     if isinstance(value, np.ndarray):
         arrays[prefix or "value"] = value
         return {"array": prefix or "value"}
@@ -226,6 +238,7 @@ def _encode(value: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
+    """Inverts `_encode`, with checks of every field against its annotation."""
     if "array" in header:
         return archive[header["array"]]
     if "path" in header:
@@ -234,7 +247,7 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
         return tuple(_decode(item, None, archive) for item in header["tuple"])
     if "fields" in header:
         fields = header["fields"]
-        # A default of a new field need not be what was computed, so it does not count.
+        # A default of a new field may differ from what was computed, so it is no match.
         is_class = isinstance(kind, type) and dataclasses.is_dataclass(kind)
         if not is_class or fields.keys() != {f.name for f in dataclasses.fields(kind)}:
             raise InputError(f"fields {', '.join(fields)} of another version")
@@ -248,17 +261,17 @@ def _decode(header: dict[str, Any], kind: Any, archive: Any) -> Any:
 
 
 def _check_field(name: str, value: Any, annotation: Any) -> None:
-    """**Raises:** `InputError` for a value that the field cannot have."""
+    """**Raises:** `InputError` for a value of another type or shape, or not finite."""
     if not _fits(value, annotation):
         shape = f" {value.shape}" if isinstance(value, np.ndarray) else ""
         raise InputError(f"{name} is a {type(value).__name__}{shape}")
     is_real = isinstance(value, np.ndarray) and value.dtype.kind in "fc"
-    if is_real and name not in _MAY_BE_NAN and not np.isfinite(value).all():
+    if is_real and name not in _NAN_FIELDS and not np.isfinite(value).all():
         raise InputError(f"{name} is not finite")
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value is of the annotated type; shapes are bound by `jaxtyped`."""
+    """Returns True for a value of the annotated type; `jaxtyped` binds shapes."""
     options = typing.get_args(annotation)
     origin = typing.get_origin(annotation)
     if annotation is Any:
@@ -279,7 +292,7 @@ def _fits(value: Any, annotation: Any) -> bool:
 
 
 def _class(annotation: Any) -> Any:
-    """The dataclass in `Class | None`."""
+    """Returns the dataclass in `Class | None`."""
     for option in (annotation, *typing.get_args(annotation)):
         if dataclasses.is_dataclass(option):
             return option

@@ -1,4 +1,4 @@
-"""What the joint estimate started from, as a result to compare it with."""
+"""The initial values of the joint estimate as a `Result`, for comparison."""
 
 from pathlib import Path
 from typing import TypeVar
@@ -15,11 +15,11 @@ T = TypeVar("T")
 
 
 def start_of_joint(run: Path, result: Result, body: BodyModel) -> Result | None:
-    """Cameras and map of structure from motion and bodies of the people stage, placed
-    with the first scale, from the stages that a run folder keeps.
+    """Returns cameras and map of structure from motion and bodies of the people stage,
+    with the first scale, from the stages kept in a run folder.
 
-    The first located camera is where `result` has it. `None` where the folder keeps no
-    such stages, or those of another result.
+    The first located camera coincides with that of `result`. Returns `None` if the
+    folder keeps no such stages, or those of another result.
     """
     cameras = _stage(run, "cameras", SfmResult)
     bodies = _stage(run, "people", Bodies)
@@ -38,7 +38,7 @@ def start_of_joint(run: Path, result: Result, body: BodyModel) -> Result | None:
     landmarks = scale * cameras.landmarks @ move[:3, :3].T + move[:3, 3]
     poses = bodies.poses.copy()
     poses[..., :3] = so3.log(T_WC[:, :3, :3] @ so3.exp(poses[..., :3]))
-    # A person has one shape; where the people stage has one per frame, their median.
+    # A person has one shape: the median, as the people stage has one per frame.
     betas = np.stack(
         [
             np.median(beta[there], axis=0) if there.any() else np.zeros(10)
@@ -67,6 +67,7 @@ def start_of_joint(run: Path, result: Result, body: BodyModel) -> Result | None:
 
 
 def _stage(run: Path, name: str, kind: type[T]) -> T | None:
+    """Loads a stage from a run folder; `None` if there is none, or it is unreadable."""
     found = sorted((run / ".cache").glob(f"{name}-*.npz"))
     if len(found) != 1:
         return None

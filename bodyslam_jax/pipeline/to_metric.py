@@ -1,4 +1,4 @@
-"""The joint estimate as a result in metres, in a world whose y axis is up."""
+"""Converts the joint estimate to metres, in a world whose y axis is up."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def to_metric(
     joint: JointEstimate,
     edges: Edges | None = None,
 ) -> tuple[Result, Upright]:
-    """The optimum in a metric world whose y axis is up, and how up was found.
+    """Returns the result in a metric world whose y axis is up, and the estimate of up.
 
     Standing feet are at y = 0. `edges` are straight edges in the world of `joint`.
     """
@@ -87,7 +87,8 @@ def _placed(
     Float[np.ndarray, "h t 3"],
     Float[np.ndarray, "h t 24 3"],
 ]:
-    """Poses, `trans` and joints of people in the world of these cameras, low-passed."""
+    """Returns low-passed poses (rad), `trans` and joints (m) of people in the world of
+    the cameras `T_WC`."""
     T_WH = T_WC @ joint.roots
     root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
@@ -108,7 +109,8 @@ def floor_height(
     fps: float,
     standing: Bool[np.ndarray, "h t 2"] | None = None,
 ) -> float:
-    """Height of the floor under standing feet, m; if none stand, under the lowest.
+    """Returns the height of the floor under standing feet, m; if none stand, under the
+    lowest feet.
 
     `joints` are in a world whose y axis is up, m.
     """
@@ -122,7 +124,7 @@ def floor_height(
 
 
 def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
-    """Height of the toe joints above the sole of a standing body, m."""
+    """Returns the height of the toe joints above the sole of a standing body, m."""
     template = np.asarray(body.template, np.float64)[:, 1]
     skin = template + np.asarray(body.shape_dirs, np.float64)[:, 1] @ shape
     rest = np.asarray(body_.rest_joints(body, jnp.asarray(shape)))
@@ -130,7 +132,7 @@ def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float
 
 
 def _smoothed(sequence, config, present, poses, pelvis):
-    """People's rotations and paths in the world, low-passed at `smoothing_hz`."""
+    """Low-passes people's rotations and paths in the world at `smoothing_hz`."""
     if config.smoothing_hz is None:
         return poses, pelvis
     how = (sequence.fps, config.smoothing_hz)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.body import DEFAULT, BodyModel, load_body_model, search_paths
-from bodyslam_jax.body.files import VARIABLE, candidates, named_gender
+from bodyslam_jax.body.files import PATH_VARIABLE, candidates, named_gender
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.readers import read_groundtruth
 from bodyslam_jax.io.archive import Archive, read_npz
@@ -43,7 +43,7 @@ def body_for(
 
     **Raises:** `InputError` if there is no such body.
     """
-    is_found = body_model or os.environ.get(VARIABLE) or _is_installed(gender)
+    is_found = body_model or os.environ.get(PATH_VARIABLE) or _is_installed(gender)
     place = body_model if is_found else DEFAULT
     body, wrong = _load(place, gender, gender, (kind,))
     if wrong:
@@ -123,7 +123,7 @@ def _load(
 
     Falls back to another body, and returns what that is, for a warning.
     """
-    named = place or os.environ.get(VARIABLE) or Path()
+    named = place or os.environ.get(PATH_VARIABLE) or Path()
     files = candidates(place, available) if place else search_paths(available)
     order = lambda file: (not file.is_relative_to(named), _rank(file, kinds))
     files = sorted(filter(Path.is_file, files), key=order)

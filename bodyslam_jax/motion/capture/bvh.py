@@ -1,4 +1,4 @@
-"""BVH files with CMU's joint names, as SMPL rotations.
+"""Reads BVH files with CMU's joint names as SMPL rotations.
 
 As in the project's conversion of the CMU data, the global rotation of SMPL joint k is
 `G_j A_k`: `G_j` is the rotation of the capture's bone j from its rest pose, and `A_k`
@@ -26,7 +26,7 @@ from bodyslam_jax.motion.capture.clips import (
     rest_from_offsets,
 )
 
-_NAMES = (
+_JOINT_NAMES = (
     "Hips LeftUpLeg,LHip RightUpLeg,RHip LowerBack,Spine,Chest LeftLeg,LKnee "
     "RightLeg,RKnee Spine,Spine1,Chest LeftFoot,LAnkle RightFoot,RAnkle "
     "Spine1,Spine2,Spine,Chest LeftToeBase,LeftToe RightToeBase,RightToe "
@@ -34,8 +34,8 @@ _NAMES = (
     "RightArm,RShoulder LeftForeArm,LElbow RightForeArm,RElbow LeftHand,LWrist "
     "RightHand,RWrist"
 ).split()
-"""For each of SMPL's joints 0 to 21, names of the BVH joint whose rotation it takes; of
-several names, the first that the file has counts."""
+"""For each of SMPL's joints 0 to 21, names of the BVH joint whose rotation it takes;
+the first name that the file contains is used."""
 
 _REST_BONES = {
     1: (4, (0.08, -0.99, -0.01)),
@@ -54,22 +54,26 @@ are not listed (spine, neck, collars) need no alignment."""
 
 _POSITIONS = ("xposition", "yposition", "zposition")
 _ROTATIONS = ("xrotation", "yrotation", "zrotation")
-"""Names of channels in lower case; files differ in the case of letters."""
+"""Names of channels in lower case, as files differ in case."""
 
 _UNITS = (1.0, 0.01, 0.0254, 0.056444, 0.001)
 """Metres per unit of length: m, cm, inch, CMU's 1/0.45 inch, mm."""
 
 _MAX_JOINTS = 500
-"""Joints of a skeleton: with fingers and face it has some hundred."""
+"""Largest number of joints; a skeleton with fingers and face has some hundred."""
 
 
 @dataclasses.dataclass
 class _Joint:
+    """A joint of the hierarchy."""
+
     name: str
     parent: int
+    """Index of the parent; -1 for the root."""
     offset: np.ndarray
+    """Position relative to the parent in the rest pose, in the file's unit."""
     channels: list[str]
-    """In lower case."""
+    """Names of channels in the file's order, in lower case."""
 
 
 def read_bvh(path: Path) -> Clip:
@@ -85,12 +89,12 @@ def read_bvh(path: Path) -> Clip:
     index = {joint.name: i for i, joint in enumerate(joints)}
     source = [
         next((index[name] for name in names.split(",") if name in index), None)
-        for names in _NAMES
+        for names in _JOINT_NAMES
     ]
     for joint in (0, 1, 2, 4, 5, 7, 8):
         if source[joint] is None:
             raise InputError(
-                f"{path}: no joint {_NAMES[joint].replace(',', ' or ')}; found "
+                f"{path}: no joint {_JOINT_NAMES[joint].replace(',', ' or ')}; found "
                 f"{', '.join(list(index)[:8])}, ..."
             )
     global_rotation = padded(lambda rows: _forward(joints, jnp.asarray(rows)), values)
@@ -145,7 +149,7 @@ def read_bvh(path: Path) -> Clip:
 
 
 def _smallest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Smallest rotation matrix that takes one direction to another."""
+    """Returns the matrix of the smallest rotation from one direction to another."""
     start, end = start / np.linalg.norm(start), end / max(np.linalg.norm(end), 1e-9)
     axis, cosine = np.cross(start, end), float(start @ end)
     cross = np.array(
@@ -162,8 +166,8 @@ def _log(matrices: Float[Array, "t j 3 3"]) -> Float[Array, "t j 3"]:
 def _forward(
     joints: list[_Joint], rows: Float[Array, "t c"]
 ) -> Float[Array, "t j 3 3"]:
-    """Global rotations of all joints; the rotations of a joint's channels are composed
-    in the file's order."""
+    """Returns global rotations of all joints; rotations of a joint's channels are
+    composed in the file's order."""
     found, column = [], 0
     for joint in joints:
         rotation = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (len(rows), 3, 3))
@@ -179,6 +183,10 @@ def _forward(
 
 
 def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
+    """Returns joints, channel values and frame rate (1/s) of a BVH file.
+
+    **Raises:** as `read_bvh`.
+    """
     content = read_bytes(path, "a BVH file")
     words = content.decode("utf-8", errors="replace").split()
     try:
@@ -245,6 +253,6 @@ def _parse(path: Path) -> tuple[list[_Joint], Float[np.ndarray, "t c"], float]:
 
 
 def _numbers(words: list[str]) -> np.ndarray:
-    """Words as numbers, one after the other: NumPy would first make a table as wide as
-    the longest of them."""
+    """Converts words to numbers one by one: NumPy would first make an array of strings
+    as wide as the longest word."""
     return np.array([float(word) for word in words])

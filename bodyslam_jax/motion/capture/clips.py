@@ -1,8 +1,8 @@
 """Clips of motion capture as SMPL rotations, and their resampling.
 
-Axis-angle (rad) and metres. The root's rotation takes H (x left, y up, z forward) to
-the capture's world, whose heading and up axis do not matter: displacements are
-learnt in the body's frame.
+Units are axis-angle (rad) and metres. The root's rotation takes H (x left, y up, z
+forward) to the capture's world, whose heading and up axis do not matter, as
+displacements are learnt in the body's frame.
 """
 
 import dataclasses
@@ -15,11 +15,11 @@ from jaxtyping import Array, Float
 from bodyslam_jax.geometry import so3
 
 FPS = 30.0
-"""Rate of every motion model, 1/s."""
+"""Frame rate of every motion model, 1/s."""
 
 LEFT_RIGHT = ((1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21))
 LEFT_RIGHT = (*LEFT_RIGHT, (22, 23))
-"""SMPL's pairs of joints that mirroring swaps."""
+"""Pairs of SMPL joints that mirroring swaps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,26 +30,29 @@ class Clip:
     subject: str
     """Clips with the same subject are on the same side of every split."""
     motion: str
-    """Class, such as walk or run."""
+    """Class of motion, such as walk or run."""
     split: str
-    """`train`, `val` or `other` if the data define it, else empty."""
+    """Part of the data set, `train`, `val` or `other`; empty if the data define
+    none."""
     fps: float
+    """Frame rate, 1/s."""
     poses: Float[np.ndarray, "t 24 3"]
     """Axis-angle, rad; row 0 takes H to the world."""
     trans: Float[np.ndarray, "t 3"]
     """Pelvis joint in the world, m."""
     offsets: Float[np.ndarray, "24 3"] | None
-    """The subject's bones in the rest pose, parent to joint, m; if known."""
+    """The subject's bones in the rest pose, parent to joint, m; `None` if unknown."""
     leg_length: float
     """Hip to knee to ankle, mean of both sides, m: the unit of displacement."""
     phase: int = 0
-    """Which of the interleaved decimations of one recording this is."""
+    """Index of this clip among the interleaved decimations of one recording."""
     phases: int = 1
-    """How many of them there are, for `interleave`."""
+    """Number of these decimations, for `interleave`."""
 
 
 def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
-    """Hip to knee to ankle, mean of both sides, of joints in the rest pose (m)."""
+    """Returns the leg length (m) of joints in any pose: hip to knee to ankle, mean of
+    both sides."""
     rest = np.asarray(rest)
     bone = lambda j, i: np.linalg.norm(rest[..., j, :] - rest[..., i, :], axis=-1)
     return np.asarray((bone(4, 1) + bone(7, 4) + bone(5, 2) + bone(8, 5)) / 2)
@@ -58,7 +61,8 @@ def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
 def rest_from_offsets(
     offsets: Float[np.ndarray, "24 3"], parents: Sequence[int]
 ) -> Float[np.ndarray, "24 3"]:
-    """Adds bone vectors up the tree: rest joints with the pelvis at the origin."""
+    """Sums bone vectors along the tree; returns rest joints with the pelvis at the
+    origin."""
     rest = np.zeros_like(offsets)
     for joint in range(1, 24):
         rest[joint] = rest[parents[joint]] + offsets[joint]
@@ -66,10 +70,10 @@ def rest_from_offsets(
 
 
 def hip_centre(clip: Clip) -> Float[np.ndarray, "t 3"]:
-    """The middle of the hip joints in the world, m.
+    """Returns the midpoint of the hip joints in the world, m.
 
     Body models and captures differ in the height of the pelvis joint above the hips,
-    so a path is transferred from one to another by the hips.
+    so that paths are transferred between them by the hips.
     """
     if clip.offsets is None:  # SMPL's mean shape
         below = np.array([0.0, -0.086, -0.016]) * clip.leg_length / 0.82
@@ -79,7 +83,7 @@ def hip_centre(clip: Clip) -> Float[np.ndarray, "t 3"]:
 
 
 def root_matrices(clip: Clip) -> Float[np.ndarray, "t 3 3"]:
-    """`C_WH` of every frame."""
+    """Returns `C_WH` of every frame."""
     return padded(_matrix, clip.poses[:, 0])
 
 
@@ -89,7 +93,7 @@ def _matrix(angles: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
 
 
 def mirror(clip: Clip) -> Clip:
-    """The same motion with left and right exchanged; the world's x changes sign."""
+    """Exchanges left and right of a motion; the world's x changes sign."""
     order = np.arange(24)
     for left, right in LEFT_RIGHT:
         order[[left, right]] = right, left
@@ -107,7 +111,7 @@ def mirror(clip: Clip) -> Clip:
 def padded(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     """Calls a row-wise JAX function on a power-of-two number of rows.
 
-    Clips differ in length; without padding each length would be compiled.
+    Without padding, the function would be compiled for each length of clips.
     """
     rows = len(arrays[0])
     extra = (1 << max(rows - 1, 1).bit_length()) - rows
@@ -198,9 +202,9 @@ def interleave(clips: Sequence[Clip]) -> tuple[Clip, ...]:
 def split(
     clips: Sequence[Clip], share: float = 0.2, seed: int = 0
 ) -> tuple[tuple[Clip, ...], tuple[Clip, ...]]:
-    """Training and validation clips; no subject is in both.
+    """Splits clips into training and validation; no subject is in both.
 
-    Validation subjects are those named in the data; else a random `share` of the
+    Validation subjects are those that the data define; else a random `share` of the
     subjects, at least one, unless there is a single subject.
     """
     subjects = sorted({clip.subject for clip in clips})

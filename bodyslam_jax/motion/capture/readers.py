@@ -1,7 +1,8 @@
 """Readers of motion capture: the CMU archive, AMASS folders, BVH files.
 
-`read_motion` finds out which it was given. Every reader checks what it hands on:
-finite numbers, right widths, a rate; errors are one line that names the file.
+`read_motion` recognises the format. Every reader checks that numbers are finite, arrays
+have the expected shapes and the frame rate is plausible; errors are one line that names
+the file.
 """
 
 import dataclasses
@@ -24,17 +25,19 @@ _CMU_ARRAYS = (
     "poses trans fps parents seq_start seq_length seq_name seq_motion seq_subject "
     "seq_split seq_phase subjects subject_offsets"
 ).split()
-_RATES = ("mocap_framerate", "mocap_frame_rate")
+"""Arrays of the CMU archive."""
+_RATE_ARRAYS = ("mocap_framerate", "mocap_frame_rate")
+"""Names of the frame rate in AMASS files."""
 
 
 def read_motion(path: Path | str) -> tuple[Clip, ...]:
-    """Reads all motion under a file or folder; clips keep the rate they have.
+    """Reads all motion in a file or folder; clips keep their frame rate.
 
-    In a folder, `.npz` files of other things are passed over, and so, with a warning,
+    In a folder, `.npz` files with other content are skipped, and so, with a warning,
     are sequences without bone lengths in which nobody stands.
 
-    **Raises:** `InputError` if there is nothing at `path`, if a file is damaged
-    or if no file holds a usable sequence.
+    **Raises:** `InputError` if there is nothing at `path`, if a file is damaged or if
+    no file contains a usable sequence.
     """
     path = Path(path)
     if not path.exists():
@@ -78,6 +81,7 @@ def read_motion(path: Path | str) -> tuple[Clip, ...]:
 
 
 def _read_file(path: Path) -> tuple[Clip, ...]:
+    """Reads one file of any format; empty for `.npz` files with other content."""
     if path.suffix.lower() == ".bvh":
         return (read_bvh(path),)
     archive = read_npz(path, "motion (.npz)")
@@ -89,6 +93,10 @@ def _read_file(path: Path) -> tuple[Clip, ...]:
 
 
 def _rate(archive: Archive, name: str) -> float:
+    """Reads a frame rate (1/s).
+
+    **Raises:** `InputError` if it is not one number of 1 to 1000.
+    """
     fps = archive.array(name)
     if fps.size != 1 or not 1 <= fps.item() <= 1000:
         raise InputError(
@@ -99,6 +107,7 @@ def _rate(archive: Archive, name: str) -> float:
 
 
 def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
+    """**Raises:** `InputError` if lengths differ or numbers are not finite."""
     if len(poses) != len(trans):
         raise InputError(
             f"{path}: {name} has {len(poses)} poses but {len(trans)} positions."
@@ -113,7 +122,8 @@ def _check(path: Path, name: str, poses: np.ndarray, trans: np.ndarray) -> None:
 
 
 def _read_cmu(archive: Archive) -> tuple[Clip, ...]:
-    """The archive of CMU trials as SMPL rotations, one clip per trial and phase."""
+    """Reads the archive of CMU trials as SMPL rotations, one clip per trial and
+    phase."""
     path = archive.path
     archive.require(*_CMU_ARRAYS)
     poses = archive.array("poses", ("n", 24, 3), finite=False)
@@ -173,7 +183,7 @@ def _read_cmu(archive: Archive) -> tuple[Clip, ...]:
 
 
 def _words(archive: Archive, name: str) -> list[str]:
-    """The texts of an array."""
+    """Reads an array of texts."""
     found = archive.raw(name)
     if found.ndim != 1 or found.dtype.kind not in "SUiu":
         raise InputError(
@@ -184,15 +194,16 @@ def _words(archive: Archive, name: str) -> list[str]:
 
 
 def _read_amass(archive: Archive) -> Clip:
-    """One AMASS sequence, SMPL-H or SMPL-X release, or a body that this project wrote.
+    """Reads one AMASS sequence, of the SMPL-H or SMPL-X release, or a body written by
+    this project.
 
-    `reference.md` of nghorbani/amass: `poses` (t, 156) of SMPL-H, of which SMPL has
-    the first 66; `mocap_framerate` or `mocap_frame_rate`. The project's own files have
-    `joints` (t, 24, 3) besides, in the world, m.
+    By `reference.md` of nghorbani/amass, `poses` (t, 156) are of SMPL-H, and SMPL has
+    the first 66 of them; the rate is `mocap_framerate` or `mocap_frame_rate`. Files of
+    this project have `joints` (t, 24, 3) in addition, in the world, m.
     """
     path, names = archive.path, {*archive.names}
     number = lambda name: archive.array(name, finite=False)
-    rate = next((name for name in _RATES if name in names), None)
+    rate = next((name for name in _RATE_ARRAYS if name in names), None)
     if rate is None:
         raise InputError(f"{path}: no `mocap_framerate`; expected frames per second.")
     fps = _rate(archive, rate)
@@ -238,7 +249,7 @@ def _read_amass(archive: Archive) -> Clip:
 
 
 def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
-    """The longest run of frames in which the person is present."""
+    """Returns the longest run of frames in which the person is present."""
     flags = present.dtype.kind in "biu" and np.isin(present, (0, 1)).all()
     if present.shape != (num_frames,) or not flags or not present.any():
         raise InputError(
@@ -251,19 +262,21 @@ def _longest(path: Path, present: np.ndarray, num_frames: int) -> slice:
 
 
 def _rows(angles: np.ndarray) -> np.ndarray:
-    """A row per frame, also of angles that are stored joint by joint."""
+    """Flattens angles that are stored per joint to one row per frame."""
     if angles.ndim == 3:
         return angles.reshape(len(angles), angles.shape[1] * angles.shape[2])
     return angles
 
 
 def gender(path: Path) -> str:
-    """The gender that an AMASS file states, whether stored as text or as bytes."""
+    """Returns the gender stated in an AMASS file, stored as text or as bytes; `neutral`
+    if there is no other."""
     text = read_npz(path).text("gender").strip("b'\" ").lower()
     return text if text in ("female", "male", "neutral") else "neutral"
 
 
 def _motion_class(text: str) -> str:
+    """Returns the class of motion that a file name indicates."""
     text = text.lower()
     for word, kind in (("run", "run"), ("jog", "run"), ("walk", "walk")):
         if word in text:

@@ -1,1 +1,1 @@
-"""How a motion model is trained and judged."""
+"""Training and evaluation of motion models."""

@@ -1,4 +1,4 @@
-"""Training from files to files: what `bodyslam train-motion` does."""
+"""Trains from files to files, for `bodyslam train-motion`."""
 
 import dataclasses
 import json
@@ -24,15 +24,14 @@ def train_from_data(
     report: Callable[[int, int, dict[str, float]], None] | None = None,
     body_model: Path | None = None,
 ) -> None:
-    """Trains on the motion in `data` and writes weights, and a picture of how it went.
+    """Trains on the motion in `data` and writes weights and a plot of the training.
 
-    A checkpoint beside `out` is taken up again after an interruption; `report(epoch,
-    epochs, measures)` is called after each epoch. The model will know the skeleton of
-    `body_model`, by default the one that `load_body_model` finds, and no other.
+    Training resumes from a checkpoint beside `out` after an interruption;
+    `report(epoch, epochs, measures)` is called after each epoch. The model is trained
+    for the skeleton of `body_model` only, by default that of `load_body_model`.
 
-    **Raises:** `InputError` if there is no usable motion in
-    `data`, no usable body model, or if `out` does not end in `.npz` or cannot be
-    written.
+    **Raises:** `InputError` if there is no usable motion in `data`, no usable body
+    model, or if `out` does not end in `.npz` or cannot be written.
     """
     _check_writable(out)
     training, validation = split(read_motion(data))
@@ -54,16 +53,19 @@ def train_from_data(
     }
     save_motion_model(out, dataclasses.replace(model, about=json.dumps(about)))
     draw_history(history, out.with_suffix(".png"))
-    checkpoint.unlink(missing_ok=True)  # only now is nothing lost without it
+    checkpoint.unlink(missing_ok=True)  # not before the weights are written
 
 
 def _check_writable(out: Path) -> None:
-    """Fails before hours of training, not after them; leaves nothing behind."""
+    """Checks before hours of training that weights can be written; leaves no file.
+
+    **Raises:** `InputError` if they cannot.
+    """
     if out.suffix != ".npz":
         raise InputError(f"{out}: weights are an .npz file; name it so.")
     if out.is_dir():
         raise InputError(f"{out}: is a folder; expected a file to write weights to.")
-    # Folders that are missing will be made: what counts is where.
+    # Missing folders will be made in the nearest existing one.
     folder = next(p for p in out.parents if p.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):

@@ -1,7 +1,7 @@
-"""Training of the contact network on motion capture.
+"""Trains the contact network on motion capture.
 
-Postures get the errors that the motion model is trained with (`noise.py`), bodies are
-of random shape. Labels are those of the exact motion on the subject's own shape.
+Postures have the same simulated errors as for the motion model (`noise.py`), and bodies
+have random shapes. Labels are those of the exact motion on the subject's own shape.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,22 @@ from bodyslam_jax.motion.contact_network import (
 from bodyslam_jax.motion.network import normalisation
 from bodyslam_jax.motion.prediction import in_dtype, leg_length
 from bodyslam_jax.motion.training.noise import disturb
-from bodyslam_jax.motion.training.sampling import DENSE, mirrored, posture_errors
+from bodyslam_jax.motion.training.sampling import RATE_FACTOR, mirrored, posture_errors
 
-_FEET = np.array(BODY25_TOES_AND_HEELS)
-_MEASURED = 16
-"""Batches from which means and standard deviations are taken."""
+_FOOT_POINTS = np.array(BODY25_TOES_AND_HEELS)
+_NORMALISATION_BATCHES = 16
+"""Number of batches from which means and standard deviations are computed."""
 
 
 class ContactCorpus(eqx.Module):
-    """All training frames, and where a segment may begin."""
+    """All training frames, and the frames where a segment may begin."""
 
     poses: Float[Array, "n 24 3"]
+    """Axis-angle, rad."""
     stands: Float[Array, "n 4"]
-    """1 where a point stands, else 0."""
+    """1 for a point in contact, else 0."""
     start: Int[Array, " c"]
+    """Candidates for a segment's first frame."""
     last: Int[Array, " c"]
     """Last frame of the clip that a candidate belongs to."""
     cumulative: Float[Array, " c"]
@@ -48,7 +50,7 @@ class ContactCorpus(eqx.Module):
 
 
 def foot_points(body: BodyModel, trial: Trial) -> Float[np.ndarray, "t 4 3"]:
-    """Heels and toes of a captured motion on the body model, in leg lengths."""
+    """Returns toes and heels of a captured motion on the body model, leg lengths."""
     shape = np.asarray(trial.shape)
     origin = np.asarray(rest_joints(body, jnp.asarray(shape)))[0]
     wide = lambda poses, trans: keypoints(
@@ -61,16 +63,16 @@ def foot_points(body: BodyModel, trial: Trial) -> Float[np.ndarray, "t 4 3"]:
     points = padded(
         wide, trial.clip.poses.astype(dtype), np.asarray(trial.trans).astype(dtype)
     )
-    return points[:, _FEET] / float(leg_length(body, jnp.asarray(shape, dtype)))
+    return points[:, _FOOT_POINTS] / float(leg_length(body, jnp.asarray(shape, dtype)))
 
 
 def contact_corpus(
     clips: Sequence[Clip], body: BodyModel, settings: ContactTraining
 ) -> ContactCorpus:
-    """Gathers clips, at `DENSE` times the model's rate, with their labels."""
+    """Collects clips, at `RATE_FACTOR` times the model's rate, with their labels."""
     share = {"walk": 1.0, "run": settings.run_weight}
-    dense = resample(interleave(list(clips)), FPS * DENSE)
-    span = DENSE * (2 * settings.half + settings.steps)
+    dense = resample(interleave(list(clips)), FPS * RATE_FACTOR)
+    span = RATE_FACTOR * (2 * settings.half + settings.steps)
     poses, stands, starts, lasts, weights, offset = [], [], [], [], [], 0
     for trial in place(body, dense):
         t = len(trial.trans)
@@ -96,7 +98,7 @@ def contact_corpus(
 def draw_contacts(
     key: PRNGKeyArray, data: ContactCorpus, body: BodyModel, settings: ContactTraining
 ) -> tuple[Float[Array, "s l d"], Float[Array, "s l 4"], Float[Array, "s l"]]:
-    """Features, labels and weights of `s` segments of `l` windows."""
+    """Draws features, labels and weights of `s` segments of `l` windows."""
     s, l, half = settings.segments, settings.steps, settings.half
     noise = MotionTraining(
         drift_deg=settings.drift_deg, clean_share=settings.clean_share
@@ -122,7 +124,7 @@ def draw_contacts(
     joints = joints / leg_length(body, shape)[:, None, None, None]
     rows = np.arange(l)[:, None] + np.arange(2 * half + 1)
     rows = jnp.broadcast_to(jnp.asarray(rows, jnp.int32), (s, l, 2 * half + 1))
-    # Some windows end early, as at the first and last frames of a person.
+    # Some windows are truncated, as at the first and last frames of a person.
     cut = jax.random.randint(keys[8], (s, l, 2), 0, 4 * half, jnp.int32)
     cut = jnp.minimum(cut, half)
     middle = rows[..., half]
@@ -137,6 +139,7 @@ def draw_contacts(
 
 
 def _loss(model: ContactModel, batch) -> Float[Array, ""]:
+    """Returns the weighted mean cross-entropy of a batch."""
     features, stands, weight = batch
     logits = model.logits(features)
     entropy = optax.sigmoid_binary_cross_entropy(logits, stands).mean(-1)
@@ -149,10 +152,10 @@ def train_contact(
     settings: ContactTraining = ContactTraining(),
     report=None,
 ) -> ContactModel:
-    """A contact network for this body, trained on captured motion.
+    """Trains a contact network for this body on captured motion.
 
-    Takes some minutes on one processor; `report(step, loss)` is called now and then.
-    Clips are trained on as they are given: hold subjects out by `split`.
+    Training takes some minutes on one processor; `report(step, loss)` is called every
+    100 updates. All given clips are used: hold subjects out with `split`.
     """
     body32 = in_dtype(body, jnp.float32)
     data = contact_corpus(clips, body, settings)
@@ -161,7 +164,7 @@ def train_contact(
     sample = eqx.filter_jit(draw_contacts)
     samples = [
         np.asarray(sample(jax.random.fold_in(key, i), data, body32, settings)[0])
-        for i in range(_MEASURED)
+        for i in range(_NORMALISATION_BATCHES)
     ]
     flat = np.concatenate(samples).reshape(-1, samples[0].shape[-1])
     model = eqx.tree_at(lambda m: m.inputs, model, normalisation(flat))
@@ -187,18 +190,20 @@ def train_contact(
             return (layers, state, jax.tree.map(mix, average, layers)), value
 
         return jax.lax.scan(
-            step, (layers, state, average), first + jnp.arange(_CHUNK, dtype=jnp.int32)
+            step,
+            (layers, state, average),
+            first + jnp.arange(_REPORT_UPDATES, dtype=jnp.int32),
         )
 
     layers, average = model.layers, model.layers
-    for first in range(0, settings.updates, _CHUNK):
+    for first in range(0, settings.updates, _REPORT_UPDATES):
         (layers, state, average), values = run(
             layers, state, average, jnp.int32(first), data, body32, model.inputs
         )
         if report is not None:
-            report(first + _CHUNK, float(values.mean()))
+            report(first + _REPORT_UPDATES, float(values.mean()))
     return eqx.tree_at(lambda m: m.layers, model, average)
 
 
-_CHUNK = 100
-"""Updates between two reports."""
+_REPORT_UPDATES = 100
+"""Number of updates between two reports."""

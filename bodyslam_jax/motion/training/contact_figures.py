@@ -1,4 +1,4 @@
-"""Precision and recall of the contact network, beside a rule by height and speed."""
+"""Precision and recall of the contact network and of a rule by height and speed."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ from bodyslam_jax.motion.contact_network import ContactModel, predict_contact
 from bodyslam_jax.motion.prediction import in_dtype, leg_length
 from bodyslam_jax.motion.training.evaluation import disturbed
 
-_FEET = np.array(BODY25_TOES_AND_HEELS)
+_FOOT_POINTS = np.array(BODY25_TOES_AND_HEELS)
 
 
 def judge_contact(
@@ -30,16 +30,17 @@ def judge_contact(
     root_drift: float = 0.5,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Scores on clips whose postures have errors as in training.
+    """Evaluates a contact network on clips whose postures have errors as in training.
 
-    Noise is `drift_deg` of slow error per joint axis (half as much again at feet), and
-    0.4 degrees of white noise; the root's orientation errs by `root_drift` times that.
+    The standard deviation of slow errors is `drift_deg` per joint axis (1.5 times that
+    at hands and feet), that of white noise 0.4 degrees; errors of the root's
+    orientation are multiplied by `root_drift`.
 
     Returns `precision` and `recall` of points with a probability above one half,
-    `share` (of points that stand), `probability` (mean) and `slip`: root mean square
-    speed, in the exact motion, of the points taken to stand, leg lengths per second.
-    `rule_precision`, `rule_recall` and `rule_slip` are those of the rule of
-    `contact_labels` on the same postures and the exact path of the pelvis.
+    `share` (of points in contact), `probability` (mean) and `slip`: root mean square
+    speed, in the exact motion, of the points classified as in contact, leg lengths per
+    second. `rule_precision`, `rule_recall` and `rule_slip` are those of the rule of
+    `contact_labels`, applied to the same postures and the exact path of the pelvis.
     """
     clips = resample([clip for clip in dataset if clip.phase == 0], FPS)
     trials = place(body, clips)
@@ -85,10 +86,10 @@ def _points(
     trans: Float[Array, "c t 3"],
     shape: Float[Array, "c 10"],
 ) -> Float[Array, "c t 4 3"]:
-    """Toes and heels, in leg lengths."""
+    """Returns positions of toes and heels, leg lengths."""
     shift = trans - rest_joints(body, shape)[:, None, 0]
     flat = poses.reshape(*poses.shape[:2], 72)
-    points = keypoints(body, flat, shape[:, None], shift)[..., _FEET, :]
+    points = keypoints(body, flat, shape[:, None], shift)[..., _FOOT_POINTS, :]
     return points / leg_length(body, shape)[:, None, None, None]
 
 
@@ -100,6 +101,7 @@ def _contacts(
     shape: Float[Array, "c 10"],
     present: Bool[Array, "c t"],
 ) -> Float[Array, "c t 4"]:
+    """Returns the predicted contact probabilities of all clips."""
     one = lambda p, s, there: predict_contact(
         model, body, so3.exp(p[:, 0]), p[:, 1:], s, there
     )

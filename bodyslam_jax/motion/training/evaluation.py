@@ -28,6 +28,8 @@ def _steps(
     shape: Float[Array, "c 10"],
     present: Bool[Array, "c t"],
 ) -> tuple[Array, ...]:
+    """Returns the fields of `Steps`, predicted from the `estimated` postures."""
+
     def one(poses, estimated, trans, shape, present):
         frame = so3.exp(poses[:, 0])
         found: Prediction = predict(
@@ -78,9 +80,9 @@ def run_trials(
 ) -> Steps:
     """Predicts all trials from postures with errors of a given size.
 
-    `drift_deg` is the standard deviation of the slow error per joint axis (half as
-    much again at hands and feet); with it come `white_deg` of white noise. The root's
-    orientation errs by `root_drift` times as much.
+    `drift_deg` is the standard deviation of slow errors per joint axis (1.5 times that
+    at hands and feet); if it is positive, `white_deg` of white noise is added. Errors
+    of the root's orientation are multiplied by `root_drift`.
     """
     length = max(len(trial.trans) for trial in trials)
     length = -(-length // 64) * 64
@@ -120,6 +122,8 @@ def run_trials(
 
 @jax.jit
 def disturbed(poses, keys, sigma, white, root):
+    """Adds errors (rad) to postures of clips; those of the root are scaled by
+    `root`."""
     noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
     return disturb(poses, noise.at[:, :, 0].multiply(root))
 
@@ -135,14 +139,14 @@ def evaluate_model(
     skip: int = 0,
     constant: Float[np.ndarray, " 3"] | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Measures a model on clips, by motion class and over `all`, with the baselines.
+    """Evaluates a model on clips, per motion class and over `all`, and the baselines.
 
-    Clips of any rate; of interleaved phases only the first counts. Noise is drawn
-    `seeds` times. `skip` leaves out the first frames of every clip, so that models
-    with windows of different lengths are compared on the same steps. Keys of the
-    result: `all` and every class, then `constant velocity` (which knows the previous
-    displacement, as the model does not) over all, and `constant`, a displacement in
-    H_{k-1} (m) that is always predicted, if there is one.
+    Clips may have any rate; of interleaved phases only the first is used. Noise is
+    drawn `seeds` times. `skip` excludes the first frames of every clip, so that models
+    with windows of different lengths are compared on the same steps. Keys of the result
+    are `all` and every class, then `constant velocity` (which, unlike the model, is
+    given the previous displacement) over all clips, and `constant`, if given: a
+    displacement in H_{k-1} (m) that is predicted for every step.
 
     **Raises:** `InputError` if no clip is long enough for a prediction.
     """
@@ -177,7 +181,8 @@ def evaluate_model(
 
 
 def baseline_mean(dataset: Sequence[Clip]) -> Float[np.ndarray, " 3"]:
-    """Mean displacement of training clips in H_{k-1}, m a frame at 30 fps."""
+    """Returns the mean displacement of training clips in H_{k-1}, m per frame at 30
+    fps."""
     moves = []
     for clip in resample([clip for clip in dataset if clip.phase == 0], FPS):
         turn = np.asarray(so3.exp(jnp.asarray(clip.poses[:-1, 0])))

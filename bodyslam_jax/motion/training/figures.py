@@ -1,4 +1,4 @@
-"""Tables and pictures of how well motion models predict."""
+"""Tables and plots of the accuracy of motion models."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,12 +19,13 @@ from bodyslam_jax.motion.training.evaluation import (
     evaluate_model,
     run_trials,
 )
-from bodyslam_jax.motion.training.selection import DRIFTS, TARGETS
+from bodyslam_jax.motion.training.selection import DRIFTS_DEG, TARGET_RATIOS
 
 COLUMNS = (
     "error_mm step_mm ratio slope slope_30 spread nees coverage_95 corr_1 corr_30 "
     "posture_deg posture_mm"
 ).split()
+"""Measures that `write_table` prints."""
 
 
 def compare(
@@ -33,13 +34,14 @@ def compare(
     clips: Sequence[Clip],
     *,
     training: Sequence[Clip] = (),
-    drifts: Sequence[float] = DRIFTS,
+    drifts: Sequence[float] = DRIFTS_DEG,
     seeds: int = 3,
 ) -> list[dict[str, str | float]]:
-    """Measures several models on the same steps of the same clips, with baselines.
+    """Evaluates several models on the same steps of the same clips, with baselines.
 
-    One row per model, drift and motion class; constant velocity once; the mean
-    displacement of `training` clips, if given. `write_table` writes them.
+    Returns one row per model, drift (degrees) and motion class; one of constant
+    velocity; and one of the mean displacement of `training` clips, if given.
+    `write_table` formats them.
 
     **Raises:** `InputError` without models or drifts.
     """
@@ -89,7 +91,7 @@ def compare(
 
 
 def write_table(rows: Sequence[Mapping[str, str | float]]) -> str:
-    """Rows of `compare` as a Markdown table."""
+    """Formats the rows of `compare` as a Markdown table."""
     head = ["model", "drift °", "class", *COLUMNS]
     lines = [head]
     for row in rows:
@@ -108,9 +110,10 @@ def draw_errors(
     body: BodyModel,
     clips: Sequence[Clip],
     path: Path,
-    drifts: Sequence[float] = DRIFTS,
+    drifts: Sequence[float] = DRIFTS_DEG,
 ) -> None:
-    """Histograms of the translation error in x, y, z of H, as the paper's figure 7."""
+    """Draws histograms of the translation error in x, y, z of H, as figure 7 of the
+    paper, to an image file."""
     trials = place(body, resample([c for c in clips if c.phase == 0], FPS))
     from matplotlib.figure import Figure  # takes half a second to import
 
@@ -138,7 +141,8 @@ def draw_rollout(
     path: Path,
     every: int = 15,
 ) -> None:
-    """Stick figures of a motion, seen from its right and from above."""
+    """Draws stick figures of a motion, seen from its right and from above, to an image
+    file."""
     dtype = motion.body_pose.dtype
     local = local_joints(body, motion.body_pose, jnp.asarray(shape, dtype))
     world = jnp.einsum("tab,tjb->tja", motion.orientation, local)
@@ -175,7 +179,9 @@ def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
         left.set_yscale("log")
     judged = np.isfinite(history[:, 1])
     at, rows = epochs[judged], history[judged]
-    for i, (drift_deg, target) in enumerate(zip(DRIFTS, TARGETS, strict=True)):
+    for i, (drift_deg, target) in enumerate(
+        zip(DRIFTS_DEG, TARGET_RATIOS, strict=True)
+    ):
         (line,) = middle.plot(at, rows[:, 1 + i], label=f"{drift_deg:g}° drift")
         middle.axhline(target, color=line.get_color(), lw=0.7, ls=":")
         right.plot(at, rows[:, 4 + i], color=line.get_color())
@@ -185,7 +191,7 @@ def draw_history(history: Float[np.ndarray, "e 7"], path: Path) -> None:
     if len(rows):  # the first epochs may be far out
         middle.legend()
         late = rows[len(rows) // 5 :]
-        middle.set_ylim(0, 1.1 * max(*TARGETS, late[:, 1:4].max()))
+        middle.set_ylim(0, 1.1 * max(*TARGET_RATIOS, late[:, 1:4].max()))
         low, high = late[:, 4:].min(), late[:, 4:].max()
         right.set_ylim(min(low, 0.95) - 0.02, max(high, 1.05) + 0.02)
     figure.savefig(path, dpi=120)

@@ -1,10 +1,12 @@
 """Training losses.
 
-The paper's network: equation 1. The default network: the mean error norm (not squared,
-as errors have heavy tails) of single displacements and of their mean over a segment,
-and a penalty on the slope of predicted over true displacement, as a biased slope biases
-the scale; posture and covariance are learnt beside it. A user's function
-(`make_motion_model`): the negative log-likelihood of true displacements.
+- The paper's network is trained with equation 1.
+- The loss of the default network is the mean error norm (not squared, as errors have
+  heavy tails) of single displacements and of their mean over a segment, with a penalty
+  on the slope of predicted over true displacement, as a biased slope biases the scale.
+  Losses of posture and covariance are added.
+- A user's function (`make_motion_model`) is trained with the negative log-likelihood of
+  true displacements.
 """
 
 import jax
@@ -22,7 +24,7 @@ from bodyslam_jax.motion.training.sampling import Batch
 def loss(
     network: MotionNetwork, batch: Batch, settings: MotionTraining
 ) -> Float[Array, ""]:
-    """Mean loss of a batch; see the module's docstring."""
+    """Returns the mean loss of a batch; see the module's docstring."""
     if isinstance(network, PaperNetwork):
         return _paper_loss(network, batch)
     if isinstance(network, MetricNetwork):
@@ -31,8 +33,8 @@ def loss(
 
 
 def _likelihood(network: MotionNetwork, batch: Batch) -> Float[Array, ""]:
-    """Of a custom network: negative log-likelihood of displacements, squared errors
-    (rad²) of postures and of the root's rotation."""
+    """Returns the loss of a custom network: negative log-likelihood of displacements,
+    and squared errors (rad²) of postures and of the root's rotation."""
     guess = network(batch.window)
     error = guess.translation - batch.move * batch.window.leg[..., None]
     whitened = jax.scipy.linalg.solve_triangular(
@@ -46,7 +48,7 @@ def _likelihood(network: MotionNetwork, batch: Batch) -> Float[Array, ""]:
 
 
 def _paper_loss(network: PaperNetwork, batch: Batch) -> Float[Array, ""]:
-    """Equation 1: `c_p + λ c_θ`, λ = 1/24, of normalised quantities."""
+    """Returns equation 1, `c_p + λ c_θ` with λ = 1/24, of normalised quantities."""
     out = network.normalised(network.features(batch.window))
     move = batch.move * batch.window.leg[..., None]
     pose = batch.pose.reshape(*move.shape[:-1], 72)
@@ -58,6 +60,7 @@ def _paper_loss(network: PaperNetwork, batch: Batch) -> Float[Array, ""]:
 def _metric_loss(
     network: MetricNetwork, batch: Batch, settings: MotionTraining
 ) -> Float[Array, ""]:
+    """Returns the loss of the default network; see the module's docstring."""
     weight, window = batch.weight, batch.window
     total = weight.sum()
     moves, spreads = network.moves(window, network.features(window))
@@ -94,12 +97,12 @@ def _metric_loss(
 def apply_posture(
     network: MetricNetwork, features: Float[Array, "*b d"]
 ) -> Float[Array, "*b 72"]:
-    """Normalised change of posture."""
+    """Returns the predicted change of posture, normalised."""
     return apply_layers(network.posture, network.posture_inputs(features))
 
 
 def posture_goal(batch: Batch) -> Float[Array, "s l 24 3"]:
-    """The rotation that leads from the (noisy) last posture to the true next one."""
+    """Returns the rotations from the (noisy) last posture to the true next one, rad."""
     last = batch.window.body_pose[..., -2, :, :]
     turns = so3.between(last, batch.pose[..., 1:, :])
     return jnp.concatenate([batch.pose[..., :1, :], turns], -2)

@@ -1,7 +1,7 @@
 """Measures of predicted displacements: error, bias, spread, calibration, correlation.
 
-Slope is the projection of predicted on true displacement: 1 is unbiased, and its
-error becomes the error of a scale estimated with the model.
+The slope is the projection of predicted on true displacement: it is 1 without bias, and
+its relative error is that of a scale estimated with the model.
 """
 
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-WINDOW = 30
-"""Frames of the longer slope: one second."""
+SLOPE_FRAMES = 30
+"""Duration of the displacements of `slope_30`, frames: one second."""
 
-LAGS = (1, 2, 4, 8, 15, 30)
-"""Frames between two errors whose correlation is measured."""
+LAGS_FRAMES = (1, 2, 4, 8, 15, 30)
+"""Time lags at which the correlation of errors is measured, frames."""
 
 _CHI2_95 = 7.815
-"""95 % of a chi-square variable with 3 degrees of freedom lies below."""
+"""95 % quantile of the chi-square distribution with 3 degrees of freedom."""
 
 
 class Steps(NamedTuple):
@@ -25,32 +25,35 @@ class Steps(NamedTuple):
     predicted: Float[np.ndarray, "c t 3"]
     """Displacement in H_{k-1}, m."""
     true: Float[np.ndarray, "c t 3"]
-    """The same, from the capture."""
+    """True displacement, from the capture, in H_{k-1}, m."""
     previous: Float[np.ndarray, "c t 3"]
-    """The step before, in H_{k-2}: constant velocity."""
+    """True displacement of the previous step, in H_{k-2}, m: the prediction of constant
+    velocity."""
     covariance: Float[np.ndarray, "c t 3 3"]
+    """Covariance of `predicted`, m²."""
     frame: Float[np.ndarray, "c t 3 3"]
     """True C_{W H_{k-1}}."""
     angle: Float[np.ndarray, "c t"]
-    """Mean over joints of the predicted posture's error, rad."""
+    """Angular error of the predicted posture, mean over joints, rad."""
     root_angle: Float[np.ndarray, "c t"]
     """Error of the predicted root rotation, rad."""
     place: Float[np.ndarray, "c t"]
-    """Mean over joints of the predicted posture's error, m."""
+    """Position error of the predicted posture, mean over joints, m."""
     valid: Bool[np.ndarray, "c t"]
 
 
 def slope(
     predicted: Float[np.ndarray, "*n 3"], true: Float[np.ndarray, "*n 3"]
 ) -> float:
-    """Projection of predicted on true displacement."""
+    """Returns the projection of predicted on true displacement."""
     return float((predicted * true).sum() / max(float((true * true).sum()), 1e-12))
 
 
 def summary(
     steps: Steps, predicted: Float[np.ndarray, "c t 3"] | None = None
 ) -> dict[str, float]:
-    """The measures of displacement; `predicted` replaces the model's (baselines)."""
+    """Computes the measures of displacements; for baselines, `predicted` (m) replaces
+    those of the model."""
     valid = steps.valid
     guess = steps.predicted if predicted is None else predicted
     error = np.linalg.norm(guess - steps.true, axis=-1)[valid]
@@ -90,13 +93,14 @@ def summary(
 
 
 def error_correlation(steps: Steps) -> dict[str, float]:
-    """Correlation of errors in H_{k-1} that are `LAGS` frames apart, as `corr_<lag>`.
+    """Returns the correlation of errors in H_{k-1} at each of `LAGS_FRAMES`, as
+    `corr_<lag>`.
 
-    No mean is removed: what is constant over a sequence is an error like another.
+    No mean is subtracted: a constant error counts as much as a varying one.
     """
     error = np.where(steps.valid[..., None], steps.predicted - steps.true, 0.0)
     found = {}
-    for lag in LAGS:
+    for lag in LAGS_FRAMES:
         a, b = error[:, :-lag], error[:, lag:]
         both = steps.valid[:, :-lag] & steps.valid[:, lag:]
         a, b = a[both], b[both]
@@ -108,8 +112,11 @@ def error_correlation(steps: Steps) -> dict[str, float]:
 def _longer(
     moves: Float[np.ndarray, "c t 3"], steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
-    """Displacements over `WINDOW` frames in the world, wherever all steps are valid."""
+    """Returns the displacements over `SLOPE_FRAMES` frames in the world where all steps
+    are valid."""
     world = np.einsum("ctab,ctb->cta", steps.frame, moves)
-    sums = np.lib.stride_tricks.sliding_window_view(world, WINDOW, 1).sum(-1)
-    whole = np.lib.stride_tricks.sliding_window_view(steps.valid, WINDOW, 1).all(-1)
+    sums = np.lib.stride_tricks.sliding_window_view(world, SLOPE_FRAMES, 1).sum(-1)
+    whole = np.lib.stride_tricks.sliding_window_view(steps.valid, SLOPE_FRAMES, 1).all(
+        -1
+    )
     return sums[whole]

@@ -1,7 +1,7 @@
-"""What estimated postures look like: true ones with slowly varying errors.
+"""Simulates estimated postures: true ones with slowly varying errors.
 
-Regressors err by 10 to 20 degrees, almost all of it slowly (AR(1), rho 0.9 to 0.97 at
-30 fps), with a few tenths of a degree of white noise on top.
+Regressors err by 10 to 20 degrees. Almost all of the error varies slowly (AR(1), rho
+0.9 to 0.97 at 30 fps); white noise adds a few tenths of a degree.
 """
 
 import jax
@@ -13,17 +13,17 @@ from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
 from bodyslam_jax.geometry import so3
 
 CORRELATION = 0.96
-"""Correlation of the slow error from one frame at 30 fps to the next."""
+"""Correlation of the slow error between successive frames at 30 fps."""
 
 _EXTREMITIES = (*ANKLES, *FEET, *WRISTS, *HANDS)
 JOINT_FACTOR = np.where(np.isin(np.arange(24), _EXTREMITIES), 1.5, 1.0)
-"""Hands and feet err half as much again."""
+"""Factor on the error of each joint: 1.5 at hands and feet, else 1."""
 
 
 def drift(
     key: PRNGKeyArray, frames: int, sigma: Float[Array, ""], white: Float[Array, ""]
 ) -> Float[Array, "{frames} 24 3"]:
-    """A stationary AR(1) error of every joint angle plus white noise.
+    """Draws a stationary AR(1) error of every joint angle plus white noise.
 
     `sigma` and `white` are standard deviations per axis, in the unit of the result.
     """
@@ -43,5 +43,5 @@ def drift(
 def disturb(
     poses: Float[Array, "*b 24 3"], noise: Float[Array, "*b 24 3"]
 ) -> Float[Array, "*b 24 3"]:
-    """Turns each joint by a further small rotation, in its own frame (rad)."""
+    """Rotates each joint by a further small rotation in its own frame (rad)."""
     return so3.compose(poses, noise)

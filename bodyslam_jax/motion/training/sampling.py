@@ -1,10 +1,10 @@
 """Training data on the device, and random batches with simulated estimation errors.
 
-A batch has `s` segments of `n + l` frames, `n` past frames for the first of `l`
-windows. Each segment has its own random shape β, speed (stride) and mirroring, and
-posture errors of its own standard deviation: a share of segments has no correlated
-errors, the others have AR(1) errors. Errors are drawn once along a segment, so that its
-`l` overlapping windows share them as in a video.
+A batch has `s` segments of `n + l` frames: `l` windows, the first with `n` past frames.
+Each segment has its own random shape β, speed (stride) and mirroring, and its own
+standard deviation of posture errors: a share of segments has no correlated errors, the
+others have AR(1) errors. Errors are drawn once per segment, so that its `l` overlapping
+windows share them, as in a video.
 """
 
 from collections.abc import Sequence
@@ -31,12 +31,12 @@ from bodyslam_jax.motion.network import Window
 from bodyslam_jax.motion.prediction import leg_length
 from bodyslam_jax.motion.training.noise import disturb, drift
 
-DENSE = 4
-"""Training data are stored at this multiple of the model's frame rate, so that segments
-can start at any phase and have different speeds."""
+RATE_FACTOR = 4
+"""Ratio between the frame rates of stored training data and of the model, so that
+segments can start at any phase and have different speeds."""
 
-_ROOT_SHARE = 0.3
-"""Probability that a segment has errors of the root's orientation too."""
+_ROOT_ERROR_PROBABILITY = 0.3
+"""Probability that a segment also has errors of the root's orientation."""
 
 
 class Corpus(eqx.Module):
@@ -45,7 +45,7 @@ class Corpus(eqx.Module):
     poses: Float[Array, "n 24 3"]
     """Axis-angle, rad."""
     path: Float[Array, "n 3"]
-    """Middle of the hips in the capture's world, in leg lengths of the subject."""
+    """Midpoint of the hips in the capture's world, in leg lengths of the subject."""
     start: Int[Array, " c"]
     """Candidates for a segment's first frame."""
     last: Int[Array, " c"]
@@ -55,6 +55,7 @@ class Corpus(eqx.Module):
 
     @property
     def num_windows(self) -> int:
+        """Number of frames where a segment may begin."""
         return len(self.start)
 
 
@@ -65,18 +66,19 @@ class Batch(eqx.Module):
     move: Float[Array, "s l 3"]
     """True displacement in H_{k-1}, leg lengths per step."""
     frame: Float[Array, "s l 3 3"]
-    """True C_{H_0}^T C_{H_{k-1}}: rotates displacements in H_{k-1} into H_0, the root
-    frame before the segment's first step."""
+    """True C_{H_0}^T C_{H_{k-1}}, which rotates displacements from H_{k-1} into H_0,
+    the root frame before the segment's first step."""
     pose: Float[Array, "s l 24 3"]
-    """True posture of frame k; row 0 is the rotation vector from k-1 to k."""
+    """True posture of frame k, rad; row 0 is the root's rotation vector from k-1 to
+    k."""
     weight: Float[Array, "s l"]
-    """1, or 0 where the clip had ended."""
+    """Weight of each window: 1, or 0 beyond the end of the clip."""
 
 
 def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
-    """Gathers clips at `DENSE` times the model's rate.
+    """Collects clips at `RATE_FACTOR` times the model's rate.
 
-    **Raises:** `InputError` if no clip of a wanted class is as long as one window.
+    **Raises:** `InputError` if no clip of a trained class is as long as one window.
     """
     share = {"walk": 1.0, "run": settings.run_weight}
     share_of = lambda clip: share.get(clip.motion, settings.other_weight)
@@ -86,10 +88,10 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
             f"no usable sequence among {len(clips)}: none is named walk, run or jog; "
             "train on all motion with a positive `other_weight`."
         )
-    dense = resample(interleave(wanted), FPS * DENSE)
+    dense = resample(interleave(wanted), FPS * RATE_FACTOR)
     span = settings.past * max(settings.strides)
-    # A window holds its first and its last frame; the next begins a step later.
-    spacing = 1 if settings.sliding else span + DENSE
+    # A window includes its first and its last frame; the next begins a step later.
+    spacing = 1 if settings.sliding else span + RATE_FACTOR
     starts, lasts, weights, offset = [], [], [], 0
     for clip in dense:
         t = len(clip.poses)
@@ -103,7 +105,7 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
         longest = max(len(clip.poses) / clip.fps for clip in dense)
         raise InputError(
             f"no usable sequence among {len(clips)}: the longest lasts "
-            f"{longest:.2f} s; a window needs {span / DENSE / FPS:.2f} s."
+            f"{longest:.2f} s; a window needs {span / RATE_FACTOR / FPS:.2f} s."
         )
     path = [hip_centre(clip) / clip.leg_length for clip in dense]
     return Corpus(
@@ -119,7 +121,7 @@ def corpus(clips: Sequence[Clip], settings: MotionTraining) -> Corpus:
 def draw(
     key: PRNGKeyArray, data: Corpus, body: BodyModel, settings: MotionTraining
 ) -> Batch:
-    """Draws a batch."""
+    """Draws a random batch."""
     s, l, past = settings.segments, settings.steps, settings.past
     keys = jax.random.split(key, 8)
     row = jnp.searchsorted(
@@ -165,6 +167,7 @@ def draw(
 
 
 def _windows(rotation, joints, body_pose, past):
+    """Returns rotations, postures and joints of all windows of one segment."""
     turned = jnp.einsum("tab,tjb->tja", rotation, joints)
     rows = np.arange(len(rotation) - past)[:, None] + np.arange(past + 1)
     before = rotation[rows[:, -2]]
@@ -180,6 +183,7 @@ def mirrored(
     poses: Float[Array, "s f 24 3"],
     path: Float[Array, "s f 3"],
 ) -> tuple[Float[Array, "s f 24 3"], Float[Array, "s f 3"]]:
+    """Exchanges left and right in the segments of `which`, in poses and path."""
     order = np.arange(24)
     for left, right in LEFT_RIGHT:
         order[[left, right]] = right, left
@@ -194,13 +198,13 @@ def mirrored(
 def posture_errors(
     keys: Key[Array, " 4"], s: int, frames: int, settings: MotionTraining
 ) -> Float[Array, "s f 24 3"]:
-    """Errors of joint angles for `s` segments, rad.
+    """Draws errors of joint angles for `s` segments, rad.
 
     The first `clean_share` of the segments has no AR(1) error; in the others its
     standard deviation rises linearly with the segment's index, from 0 to nearly
-    `drift_deg`. White noise is added to all but the first 70 % of the former. As the
-    root's error in a video differs from that of the joints, it is a random share of
-    this error in some segments, and zero in the rest.
+    `drift_deg`. White noise is added to all but the first 70 % of the segments without
+    AR(1) error. As the root's error in a video differs from that of the joints, it is a
+    random share of this error in some segments, and zero in the others.
     """
     clean = settings.clean_share
     place = np.arange(s) / s
@@ -214,5 +218,7 @@ def posture_errors(
         jax.random.split(keys[1], s), frames, sigma, white
     )
     share = settings.root_drift * jax.random.uniform(keys[2], (s,), jnp.float32)
-    share = jnp.where(jax.random.bernoulli(keys[3], _ROOT_SHARE, (s,)), share, 0.0)
+    share = jnp.where(
+        jax.random.bernoulli(keys[3], _ROOT_ERROR_PROBABILITY, (s,)), share, 0.0
+    )
     return noise.at[:, :, 0].multiply(share[:, None, None])

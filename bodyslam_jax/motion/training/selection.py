@@ -1,4 +1,4 @@
-"""Selection of weights and calibration of covariances on validation subjects."""
+"""Selects weights and calibrates covariances on validation subjects."""
 
 from collections.abc import Sequence
 
@@ -9,45 +9,47 @@ from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion.capture.retarget import Trial
-from bodyslam_jax.motion.function_network import FunctionNetwork
+from bodyslam_jax.motion.own_model import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
 from bodyslam_jax.motion.training.evaluation import run_trials
 from bodyslam_jax.motion.training.measures import summary
 
-DRIFTS = (0.0, 5.0, 9.0)
-"""Slow joint-angle errors (degrees) at which a model is judged."""
+DRIFTS_DEG = (0.0, 5.0, 9.0)
+"""Standard deviations of slow joint-angle errors at which a model is evaluated,
+degrees."""
 
-TARGETS = (0.10, 0.13, 0.18)
-"""Target ratio of error to displacement at each of them."""
+TARGET_RATIOS = (0.10, 0.13, 0.18)
+"""Target ratio of error to displacement at each drift."""
 
 
 def validated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> Float[np.ndarray, " 6"]:
-    """Mean error over mean step length at each of `DRIFTS`, then the slope (projection
-    of predicted on true displacement) at each."""
-    runs = [summary(run_trials(model, body, trials, d)) for d in DRIFTS]
+    """Returns the mean error over the mean step length at each of `DRIFTS_DEG`, then
+    the slope (projection of predicted on true displacement) at each."""
+    runs = [summary(run_trials(model, body, trials, d)) for d in DRIFTS_DEG]
     return np.array([run[k] for k in ("ratio", "slope") for run in runs])
 
 
 def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
-    """The values that `validated` returns, by name."""
-    names = [f"{what} at {d:g}°" for what in ("ratio", "slope") for d in DRIFTS]
+    """Names the values that `validated` returns."""
+    names = [f"{what} at {d:g}°" for what in ("ratio", "slope") for d in DRIFTS_DEG]
     return dict(zip(names, map(float, row), strict=True))
 
 
 def kept(history: Float[np.ndarray, "e 7"], drift_deg: float) -> int | None:
-    """The epoch, from 0, whose weights were kept; `None` without validation."""
+    """Returns the epoch, from 0, whose weights were kept; `None` without validation."""
     scores = np.array([score(row, drift_deg) for row in history[:, 1:]])
     return None if np.isnan(scores).all() else int(np.nanargmin(scores))
 
 
 def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
-    """Lower is better: relative errors and slopes, at the drifts used in training."""
-    trained = np.array(DRIFTS) <= drift_deg
-    errors, bias = row[:3] / TARGETS, np.abs(row[3:] - 1)
+    """Returns the validation score, lower for better models, from errors relative to
+    their targets and from slopes, at the drifts used in training."""
+    trained = np.array(DRIFTS_DEG) <= drift_deg
+    errors, bias = row[:3] / TARGET_RATIOS, np.abs(row[3:] - 1)
     return float(np.mean(errors[trained]) + 5 * np.mean(bias[trained]))
 
 
@@ -55,12 +57,12 @@ def calibrated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> MotionModel:
     """Scales the predicted covariance so that the mean squared whitened error per axis
-    (NEES / 3) is 1 over `trials` at all `DRIFTS`.
+    (NEES / 3) is 1 over `trials` at all `DRIFTS_DEG`.
 
-    The paper's network predicts no covariance; the covariance of its errors is used as
-    a constant.
+    The paper's network predicts no covariance; that of its errors is used as a
+    constant.
     """
-    runs = [run_trials(model, body, trials, d) for d in DRIFTS]
+    runs = [run_trials(model, body, trials, d) for d in DRIFTS_DEG]
     error = np.concatenate([(r.predicted - r.true)[r.valid] for r in runs]).astype(
         float
     )

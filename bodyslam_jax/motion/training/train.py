@@ -1,10 +1,16 @@
-"""Training: one `lax.scan` per epoch; resumable and deterministic in the seed."""
+"""Trains a motion model: one `lax.scan` per epoch, resumable, deterministic in the
+seed.
+
+A checkpoint is written atomically after every epoch and is tied to its training run.
+"""
 
 import dataclasses
+import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -16,45 +22,81 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import atomic
+from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
-from bodyslam_jax.motion.function_network import FunctionNetwork
 from bodyslam_jax.motion.network import MotionNetwork, Normalisation, normalisation
+from bodyslam_jax.motion.own_model import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel, in_dtype
-from bodyslam_jax.motion.training.checkpoint import (
-    fingerprint,
-    load_checkpoint,
-    save_checkpoint,
-)
 from bodyslam_jax.motion.training.losses import loss, posture_goal
 from bodyslam_jax.motion.training.sampling import Batch, Corpus, corpus, draw
 from bodyslam_jax.motion.training.selection import calibrated, named, score, validated
 
 logger = logging.getLogger(__name__)
 
-_MEASURED = 20
-"""Batches from which means and standard deviations are taken."""
+Tree = TypeVar("Tree")
+
+_NORMALISATION_BATCHES = 20
+"""Number of batches from which means and standard deviations are computed."""
 
 
 class Progress(eqx.Module):
-    """The state of a training run, as checkpoints hold it."""
+    """The state of a training run, which checkpoints store."""
 
     network: MotionNetwork
     average: MotionNetwork
     """Running mean of the weights."""
     best: MotionNetwork
-    """The mean that did best on validation."""
+    """The running mean with the best validation score."""
     optimiser: optax.OptState
     history: Float[Array, "e 7"]
-    """Per epoch: training loss; validation error ratio, then slope, for `DRIFTS`, NaN
-    where it was not judged."""
+    """Per epoch: training loss; validation error ratio, then slope, for `DRIFTS_DEG`;
+    NaN without validation."""
     epoch: Float[Array, ""]
 
 
+def fingerprint(settings: MotionTraining, data: Corpus, body: BodyModel) -> str:
+    """Returns a hash of settings, data and body, by which a checkpoint of another run
+    is rejected."""
+    mark = hashlib.sha256(json.dumps(dataclasses.asdict(settings)).encode())
+    mark.update(body.kind.encode())
+    for array in (data.poses, data.path, data.start):
+        mark.update(np.asarray(array).tobytes())
+    return mark.hexdigest()
+
+
+def save_checkpoint(path: Path, progress: object, mark: str) -> None:
+    """Writes the arrays of `progress` and the fingerprint `mark`, atomically."""
+    leaves = {
+        f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(progress))
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_npz(path, {"mark": np.array(mark), **leaves}, compressed=False)
+
+
+def load_checkpoint(path: Path, like: Tree, mark: str) -> Tree:
+    """Reads a checkpoint with the structure of `like`.
+
+    **Raises:** `InputError` if it is damaged or its fingerprint is not `mark`.
+    """
+    archive = read_npz(path, "a training checkpoint")
+    if archive.text("mark") != mark:
+        raise InputError(
+            f"{path}: checkpoint of other settings or data; remove it to start anew."
+        )
+    leaves = [archive.raw(f"leaf_{i}") for i in range(len(archive.names) - 1)]
+    wanted = [np.shape(leaf) for leaf in jax.tree.leaves(like)]
+    if [leaf.shape for leaf in leaves] != wanted:
+        raise InputError(f"{path}: its arrays are not those of this training.")
+    return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, leaves))
+
+
 def trainable(network):
-    """What the optimiser may change: all arrays but normalisation and calibration."""
+    """Returns the mask of trained arrays: all but those of normalisation and
+    calibration."""
     frozen = lambda x: isinstance(x, Normalisation)
     mask = jax.tree.map(
         lambda x: jax.tree.map(lambda _: False, x) if frozen(x) else True,
@@ -71,7 +113,8 @@ def trainable(network):
 
 
 def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
-    """Sets normalisation from batches of training data; a custom network has none."""
+    """Sets the normalisation from batches of training data; a custom network has
+    none."""
     rows = lambda f: np.concatenate(
         [np.asarray(f(b)).reshape(b.weight.size, -1) for b in batches]
     )
@@ -96,7 +139,7 @@ def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
 
 
 def initial_network(key: PRNGKeyArray, settings: MotionTraining) -> MotionNetwork:
-    """An untrained network of the kind that `settings` asks for."""
+    """Returns an untrained network of the kind in `settings`."""
     if settings.network == "paper":
         return PaperNetwork.init(key, settings.past, settings.width[0])
     return MetricNetwork.init(
@@ -105,7 +148,7 @@ def initial_network(key: PRNGKeyArray, settings: MotionTraining) -> MotionNetwor
 
 
 def optimiser(settings: MotionTraining, steps: int) -> optax.GradientTransformation:
-    """AdamW; gradients' entries are kept below `clip`."""
+    """Returns AdamW, with entries of the gradient limited to `clip`."""
     rate = settings.learning_rate
     schedule = (
         optax.warmup_cosine_decay_schedule(0.0, rate, min(100, steps // 10 + 1), steps)
@@ -118,7 +161,7 @@ def optimiser(settings: MotionTraining, steps: int) -> optax.GradientTransformat
 
 
 def start(network: MotionNetwork, settings: MotionTraining) -> Progress:
-    """Before the first epoch."""
+    """Returns the state before the first epoch."""
     moving = eqx.filter(network, trainable(network))
     return Progress(
         network=network,
@@ -139,7 +182,7 @@ def run_epoch(
     steps: int,
     epochs: int,
 ) -> Progress:
-    """One epoch: draw, differentiate, update, `steps` times in one scan."""
+    """Trains for one epoch: draws a batch and updates, `steps` times in one scan."""
     update = optimiser(settings, steps * epochs)
     mask = trainable(progress.network)
     key = jax.random.fold_in(jax.random.key(settings.seed), 1)
@@ -187,12 +230,13 @@ def _validate(
     trials: Sequence[Trial],
     settings: MotionTraining,
 ) -> Progress:
-    """Notes how good the mean weights are; keeps them if none before were better."""
+    """Records the validation score of the mean weights; keeps them if it is the
+    best."""
     epoch = int(progress.epoch) - 1
     row = validated(model, body, trials)
     judged = lambda row: score(row, settings.drift_deg)
     before = [judged(r) for r in np.asarray(progress.history[:epoch, 1:])]
-    better = not any(value <= judged(row) for value in before)  # NaN: was not judged
+    better = not any(value <= judged(row) for value in before)  # NaN: not validated
     return dataclasses.replace(
         progress,
         history=progress.history.at[epoch, 1:].set(jnp.asarray(row, jnp.float32)),
@@ -214,11 +258,11 @@ def train(
     """Trains a motion model; returns it and the history that `draw_history` draws.
 
     `validation` clips (of other subjects) choose the epoch whose weights are kept and
-    give the covariance its size; without them the last epoch is kept. `checkpoint` is
-    a file that every epoch rewrites, from which the same call continues after a kill;
-    remove it when the weights are safe. `report(epoch, epochs, measures)` is called
-    after each epoch. The same seed gives the same weights on the same machine.
-    `network` is a custom one to be trained, in place of that which `settings` ask for.
+    calibrate the covariance; without them the last epoch is kept. `checkpoint` is a
+    file that every epoch rewrites, from which the same call resumes after an
+    interruption; remove it when the weights are saved. `report(epoch, epochs,
+    measures)` is called after each epoch. The same seed gives the same weights on the
+    same machine. `network` is a custom network, which replaces that of `settings`.
 
     **Raises:** `InputError` if no clip is long enough, if a checkpoint belongs to
     other settings or data, or if training diverges.
@@ -230,7 +274,7 @@ def train(
     key = jax.random.key(settings.seed)
     if network is None:
         network = initial_network(jax.random.fold_in(key, 0), settings)
-    keys = jax.random.split(jax.random.fold_in(key, 2), _MEASURED)
+    keys = jax.random.split(jax.random.fold_in(key, 2), _NORMALISATION_BATCHES)
     network = _measure(network, [draw(k, data, body, settings) for k in keys])
     progress = start(network, settings)
     mark = fingerprint(settings, data, body)
