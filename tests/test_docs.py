@@ -1,11 +1,15 @@
 """Code in README.md and docs/ runs: blocks of a page in order, in one program."""
 
+import importlib
+import inspect
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import bodyslam_jax
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -92,3 +96,35 @@ def test_files_named_in_the_architecture_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
     for name in re.findall(r"`(bodyslam_jax/[\w/]+(?:\.py|/)?)`", page):
         assert (ROOT / name).exists(), name
+
+
+REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.md"))
+ENTRY = re.compile(r"^::: bodyslam_jax\.([\w.]+)$", re.MULTILINE)
+
+
+def test_every_public_name_has_an_entry_in_the_reference():
+    entries = {
+        e.split(".")[-1] for page in REFERENCE for e in ENTRY.findall(page.read_text())
+    }
+    assert not set(bodyslam_jax.__all__) - entries
+
+
+@pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
+def test_entries_of_the_reference_are_documented(page):
+    entries = ENTRY.findall(page.read_text())
+    assert entries
+    for entry in entries:
+        home, _, name = f"bodyslam_jax.{entry}".rpartition(".")
+        try:
+            found = importlib.import_module(f"{home}.{name}")
+        except ImportError:
+            found = getattr(importlib.import_module(home), name)
+        assert inspect.getdoc(found), entry
+
+
+def test_every_page_is_in_the_navigation():
+    listed = set(
+        re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    )
+    pages = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").rglob("*.md")}
+    assert pages == listed
