@@ -11,7 +11,7 @@ from bodyslam_jax.batch.inputs import MARK, RUNS, is_file_name
 from bodyslam_jax.batch.table import Column, Row
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import ROWS
-from bodyslam_jax.evaluation.before_after import JOINT
+from bodyslam_jax.evaluation.before_after import JOINT_ESTIMATE
 from bodyslam_jax.io import files
 
 log = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ def _figures(name: str, summary: dict[str, Any]) -> Row:
             "stature_sigma": people[0].get("stature_sigma_m"),
             "speed": people[0].get("speed_m_s"),
         }
-    errors = (summary.get("errors") or {}).get(JOINT) or {}
+    errors = (summary.get("errors") or {}).get(JOINT_ESTIMATE) or {}
     # A word in place of a number says why there is none.
     numbers = {k: v for k, v in errors.items() if isinstance(v, (int, float))}
     return row | {_error_key(k): v for k, v in numbers.items() if k in _ERRORS}
