@@ -129,7 +129,8 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
         )
     found += [
         f"person {pair.truth} goes along a line, to {100 * STRAIGHT_PATH_RMS_M:.0f} "
-        "cm: alignment A1 does not determine the rotation about it, on which J-ATE depends."
+        "cm: alignment A1 does not determine the rotation about it, on which J-ATE "
+        "depends."
         for pair, straight in zip(scope.people, scope.straight)
         if straight
     ]
