@@ -1,4 +1,4 @@
-"""TRC: one person's joint centres as markers, as OpenSim reads them."""
+"""Writes TRC: one person's joint centres as markers, as OpenSim reads them."""
 
 from pathlib import Path
 
@@ -26,13 +26,12 @@ def write_trc(path: Path, result: Result, person: int = 0) -> None:
     for k in range(num):
         values = [f"{x:.3f}" for x in millimetres[k]]
         if not result.present[person, k]:
-            # OpenSim takes the end of a line for that of the last field, unless a tab
-            # ends that.
+            # OpenSim requires a tab after the last empty field of a line.
             values = [""] * 73
         rows.append([str(k + 1), f"{result.timestamps[k]:.6f}", *values])
     path.write_text("\n".join("\t".join(row) for row in rows) + "\n")
 
 
 def write(path: Path, scene: Scene) -> None:
-    """`write_trc` of the only person of a scene."""
+    """Writes the only person of a scene by `write_trc`."""
     write_trc(path, at_constant_rate(scene).result)
