@@ -31,7 +31,7 @@ from bodyslam_jax.pipeline.joint_stage import with_ground_of
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.simulation import sequences
-from bodyslam_jax.simulation.terrain import TREAD, Height, Terrain, lifted
+from bodyslam_jax.simulation.terrain import TILE_LENGTH_M, Height, Terrain, lifted
 
 UP = np.array([0.0, 1.0, 0.0])
 RISER = 0.17
@@ -41,7 +41,7 @@ DRIFT = 0.16
 FLOORS: dict[str, Height] = {
     "level": lambda at: np.zeros(at.shape[:-1]),
     "slope": lambda at: np.tan(np.radians(4.0)) * at[..., 0],
-    "stairs": lambda at: RISER * np.clip(np.floor(at[..., 0] / TREAD), 0, 5),
+    "stairs": lambda at: RISER * np.clip(np.floor(at[..., 0] / TILE_LENGTH_M), 0, 5),
     "uneven": lambda at: 0.06 * np.sin(2.1 * at[..., 0]) * np.sin(1.7 * at[..., 1]),
     "drift": lambda at: np.zeros(at.shape[:-1]),
 }

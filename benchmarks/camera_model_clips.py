@@ -211,7 +211,7 @@ def _write(film: Film, path: Path) -> Keypoints:
     grid = np.stack(np.meshgrid(*map(np.arange, SIZE)), axis=-1).astype(float)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE)
     last = scene.num_frames - 1
-    for k, image in enumerate(simulation.film.render(scene)):
+    for k, image in enumerate(simulation.render(scene)):
         size = film.zoom ** (k / last)
         q = (grid - centre) / focal / size / _stretch(film.aspect)
         q = _undistorted(q, film.k1)

@@ -110,7 +110,7 @@ def _observations(path: Path) -> Any:
 
 
 def _lock(path: Path) -> None:
-    lock.STALE = 0.02
+    lock.STALE_AFTER_S = 0.02
     with lock.locked(path.parent):
         pass
 

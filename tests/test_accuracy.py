@@ -70,7 +70,7 @@ def _cameras(kind: str = "moving") -> SfmResult:
 def test_cameras_alone_are_judged_without_their_scale_and_nothing_else_is():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
     found = before_after.errors(result, _cameras(), truth, BODY)
-    assert list(found) == [before_after.ALONE, before_after.JOINT]
+    assert list(found) == [before_after.CAMERAS_ALONE, before_after.JOINT_ESTIMATE]
     alone, joint = found.values()
     # In metres though the cameras are not: the truth's size is lent to them.
     assert alone["c_ate_sim3"] == pytest.approx(WOBBLE, rel=0.02)
@@ -94,7 +94,7 @@ def test_a_run_without_people_has_no_metres_to_be_judged():
     result, truth = _result(_path(SMALLER)), _result(_path(0.0))
     nobody = dataclasses.replace(result, present=np.zeros_like(result.present))
     assert list(before_after.errors(nobody, _cameras(), truth, BODY)) == [
-        before_after.ALONE
+        before_after.CAMERAS_ALONE
     ]
 
 
@@ -102,7 +102,7 @@ def test_a_run_without_people_has_no_metres_to_be_judged():
 def test_a_camera_without_a_path_is_not_judged_alone(kind):
     truth = _result(_path(0.0))
     assert list(before_after.errors(truth, _cameras(kind), truth, BODY)) == [
-        before_after.JOINT
+        before_after.JOINT_ESTIMATE
     ]
 
 
@@ -110,6 +110,6 @@ def test_a_truth_without_cameras_judges_people_only():
     result = _result(_path(0.0))
     truth = dataclasses.replace(result, summary={"has_camera": False})
     found = before_after.errors(result, _cameras(), truth, BODY)
-    assert list(found) == [before_after.JOINT]
+    assert list(found) == [before_after.JOINT_ESTIMATE]
     (line,) = before_after.headline(found)
     assert "C-ATE" not in line and "H-ATE" in line

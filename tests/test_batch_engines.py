@@ -171,7 +171,7 @@ def test_the_script_for_sbatch_is_a_job_array_with_what_was_asked_for(
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(programs), prepend=os.pathsep)
-    monkeypatch.setattr("bodyslam_jax.batch.slurm_engine._POLL", 0.01)
+    monkeypatch.setattr("bodyslam_jax.batch.slurm_engine._POLL_PERIOD_S", 0.01)
     parameters = {"slurm_partition": "gpu", "mem_gb": 8, "gpus_per_node": 1}
     engine = SlurmEngine(tmp_path, 4, minutes=90, parameters=parameters)
     found = engine.map(batch_stubs.twice, list(range(10)), batch_stubs.nothing)

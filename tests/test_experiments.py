@@ -33,7 +33,7 @@ from bodyslam_jax.experiments.plans import PLANS
 from bodyslam_jax.experiments.problems import with_scale
 from bodyslam_jax.experiments.row_cache import Journal, fits
 from bodyslam_jax.experiments.scenario import simulations
-from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBLE
+from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBILITY_FIGURES
 from bodyslam_jax.experiments.structural_landmarks import shake
 from bodyslam_jax.pipeline.case import trajectories
 
@@ -367,7 +367,7 @@ def _made_up(label):
     row |= {"status": "converged", "seconds": 9.0}
     for method in experiments.METHODS:
         row |= {f"{method}/{name}": 0.0125 for name in NAMES} | {f"{method}/scale": 0.8}
-    row |= {f"full/{name}": 0.5 for name in PLAUSIBLE}
+    row |= {f"full/{name}": 0.5 for name in PLAUSIBILITY_FIGURES}
     circle = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]]).tolist()
     names = ("truth", "no_mm", "full")
     paths = {f"{k}/{n}": circle for k in ("camera", "human") for n in names}

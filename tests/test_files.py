@@ -47,7 +47,7 @@ OWN_FILES = {
     "cli/main.py": "standard output",
     "cli/unexpected.py": "writes",
     "graph/memory.py": "the system's own files",
-    "batch/devices.py": "the system's own files",
+    "batch/local_engine.py": "the system's own files",
     "export/report.py": "ships with the package",
     "batch/index_page.py": "ships with the package",
     "view/scene_page.py": "ships with the package, and a run's page",

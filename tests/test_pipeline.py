@@ -60,7 +60,8 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "ok"
     alone, joint = (
-        summary["errors"][n] for n in (before_after.ALONE, before_after.JOINT)
+        summary["errors"][n]
+        for n in (before_after.CAMERAS_ALONE, before_after.JOINT_ESTIMATE)
     )
     assert alone["c_ate_sim3"] < 0.02 and alone["scale"] == "no scale"
     assert alone["c_ate_sim3"] != joint["c_ate_sim3"]

@@ -90,7 +90,7 @@ def test_another_machine_holds_as_long_as_its_file_changes(
     tmp_path, monkeypatch, shift
 ):
     """Where the file system does not pass locks on; whatever its clock says."""
-    monkeypatch.setattr(lock, "STALE", 0.3)
+    monkeypatch.setattr(lock, "STALE_AFTER_S", 0.3)
     file = tmp_path / ".lock"
     file.write_text(json.dumps({"host": "node17", "pid": 4}))
     date = time.time() + shift
@@ -131,7 +131,7 @@ def test_another_machine_holds_as_long_as_its_file_changes(
     ],
 )
 def test_a_lock_that_names_nobody_holds_nothing(tmp_path, monkeypatch, content, caplog):
-    monkeypatch.setattr(lock, "STALE", 0.05)
+    monkeypatch.setattr(lock, "STALE_AFTER_S", 0.05)
     (tmp_path / ".lock").write_text(content)
     with caplog.at_level("INFO"), export.locked(tmp_path):
         pass
@@ -159,7 +159,7 @@ def test_a_lock_that_leads_elsewhere_is_not_followed(tmp_path):
 
 
 def test_a_lock_is_renewed(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "RENEWED", 0.01)
+    monkeypatch.setattr(lock, "RENEWAL_PERIOD_S", 0.01)
     with export.locked(tmp_path):
         file = tmp_path / ".lock"
         os.utime(file, (0, 0))

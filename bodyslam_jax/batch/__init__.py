@@ -1,7 +1,7 @@
-"""Many clips on many cores or machines: `run_many`, engines, tables of the results.
+"""Runs many clips on many cores or machines: `run_many`, engines, tables of results.
 
 A clip is a job that depends on its input and settings only. An engine (`engine.py`)
-runs jobs somewhere; it knows nothing of clips, and jobs know nothing of engines. The
+runs jobs in other processes; engines are independent of clips, and jobs of engines. The
 names below are imported on first use, so that processes of an engine start quickly.
 """
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.batch.job import Job as Job
     from bodyslam_jax.batch.job import Outcome as Outcome
 
-_HOME = {
+_MODULES = {
     "Engine": "engine",
     "Failure": "engine",
     "Input": "inputs",
@@ -32,13 +32,15 @@ _HOME = {
     "run_many": "driver",
     "sweep": "grid_sweep",
 }
-__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = sorted(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module 'bodyslam_jax.batch' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"bodyslam_jax.batch.{_HOME[name]}"), name)
+    return getattr(
+        importlib.import_module(f"bodyslam_jax.batch.{_MODULES[name]}"), name
+    )
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,5 @@
-"""Runs the clips of a batch by an engine, in a folder that the same call continues."""
+"""Runs the clips of a batch by an engine; the same call resumes an interrupted
+batch."""
 
 import contextlib
 import dataclasses
@@ -11,8 +12,8 @@ from pathlib import Path
 from bodyslam_jax.batch import failures, record
 from bodyslam_jax.batch.engine import Engine, Failure, Setup, make_engine
 from bodyslam_jax.batch.inputs import (
-    MARK,
-    RUNS,
+    BATCH_FILE,
+    RUNS_FOLDER,
     Input,
     find_inputs,
     shard,
@@ -47,21 +48,22 @@ def run_many(
     """Runs many clips, each into its folder in `out`; yields outcomes as they finish.
 
     Clips that are finished there, with the same content, settings and version, are
-    yielded first and not run again. What goes wrong with a clip is its outcome, stops
-    no other, and is listed in `out/failed.jsonl`. The same call continues a batch that
-    was interrupted.
+    yielded first and not run again. An error becomes the outcome of its clip, does not
+    stop other clips, and is listed in `out/failed.jsonl`. The same call resumes a batch
+    that was interrupted.
 
     Args:
         inputs: clips, or folders, globs and manifests of clips (`find_inputs`).
+        config: settings of all clips, which the options of a clip override.
         engine: name of an engine, settings, or an `Engine`.
-        out: folder of the batch; all machines must see it under this path.
+        out: folder of the batch; all machines must access it under this path.
         part: `I/N`, to run every N-th clip only.
-        setup: prepares each process. Without it JAX is set as in this process, and
-            keeps compiled programs in the user's cache if it has none here.
-        estimate: in place of the pipeline, what computes a clip.
+        setup: prepares each process. By default JAX is configured as in this process,
+            and caches compiled programs in the user's cache unless it has another one.
+        estimate: function that computes a clip instead of the pipeline.
 
     **Raises:** `InputError`, before anything runs, if inputs or settings have mistakes,
-    a line for each.
+    with a line for each.
     """
     jobs = plan(inputs, config, Path(out), part)
     if isinstance(engine, str):
@@ -79,7 +81,7 @@ def plan(
     out: Path,
     part: str | None = None,
 ) -> list[Job]:
-    """The jobs of a batch; writes the mark of a batch into `out`.
+    """Returns the jobs of a batch, and writes `batch.json` into `out`.
 
     **Raises:** as `run_many`.
     """
@@ -96,7 +98,7 @@ def plan(
         except ValueError as error:
             mistakes.append(f"{one.name}: {error}")
             continue
-        jobs.append(Job(_absolute(one), settings, out / RUNS / one.name))
+        jobs.append(Job(_absolute(one), settings, out / RUNS_FOLDER / one.name))
     if mistakes:
         raise InputError(*mistakes)
     _mark(out, found)
@@ -109,7 +111,8 @@ def run_jobs(
     setup: Setup,
     estimate: Estimate | None = None,
 ) -> Iterator[Outcome]:
-    """Outcomes of jobs: those that are finished first, the others as they finish."""
+    """Yields the outcomes of jobs: first those that are finished, the others as they
+    finish."""
     missing = []
     folder = jobs[0].batch if jobs else None
     listed = {line["name"] for line in failures.read(folder)} if folder else set()
@@ -159,29 +162,30 @@ def _absolute(one: Input) -> Input:
 
 
 def _mark(out: Path, inputs: Sequence[Input]) -> None:
-    """Writes `batch.json`: the clips of the batch, which a folder shows to be one.
+    """Writes `batch.json`, which lists the clips and marks the folder as that of a
+    batch.
 
     **Raises:** `InputError` if the folder cannot be written.
     """
     clips = {one.name: str(one.path) for one in inputs}
     text = json.dumps({"clips": clips}, indent=0)
     try:
-        (out / RUNS).mkdir(parents=True, exist_ok=True)
-        if (out / MARK).is_file():
+        (out / RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
+        if (out / BATCH_FILE).is_file():
             _move_runs(out, clips)
-        atomic.write_text(out / MARK, text)
+        atomic.write_text(out / BATCH_FILE, text)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
 
 
 def _move_runs(out: Path, names: Iterable[str]) -> None:
-    """Moves run folders to where they belong: earlier versions had them beside the
+    """Moves run folders from the place at which earlier versions had them, beside the
     files of the batch."""
     for name in names:
-        old, new = out / name, out / RUNS / name
-        if name == RUNS:  # stays where it is, and is run again
+        old, new = out / name, out / RUNS_FOLDER / name
+        if name == RUNS_FOLDER:  # is not moved, but run again
             continue
         if record.is_begun(old) and not new.exists():
-            with contextlib.suppress(FileNotFoundError):  # another driver has
+            with contextlib.suppress(FileNotFoundError):  # another driver has moved it
                 old.rename(new)
                 log.info("%s: moved to %s", old, new)

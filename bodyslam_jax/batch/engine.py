@@ -1,6 +1,7 @@
-"""What an engine is: it runs a function on many items somewhere, and gives values back.
+"""Defines engines, which evaluate a function on many items in other processes.
 
-The function, the items and their values must pickle. An engine knows nothing of clips.
+The function, the items and their values must be picklable. An engine is independent of
+clips.
 """
 
 import dataclasses
@@ -17,15 +18,15 @@ Values = Generator[tuple[Any, Any], None, None]
 
 @dataclasses.dataclass(frozen=True)
 class Failure:
-    """Takes the place of a value: the function raised, or its process was lost more
-    often than the engine starts it again."""
+    """Takes the place of a value if the function raised, or its process was lost more
+    often than the engine retries."""
 
     message: str
 
 
 @runtime_checkable
 class Engine(Protocol):
-    """Runs a function on items, in other processes."""
+    """Evaluates a function on items in other processes."""
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
@@ -40,11 +41,11 @@ class Engine(Protocol):
 
 
 def make_engine(distribution: Distribution, folder: Any, gpu: bool) -> Engine:
-    """The engine that the settings name.
+    """Returns the engine that the settings name.
 
     Args:
-        folder: for the engine's own files, seen by all machines.
-        gpu: whether GPUs are used where there are any.
+        folder: folder for the engine's own files, accessible from all machines.
+        gpu: whether GPUs are used if there are any.
     """
     if distribution.engine == "ray":
         from bodyslam_jax.batch.ray_engine import RayEngine
@@ -68,7 +69,7 @@ def make_engine(distribution: Distribution, folder: Any, gpu: bool) -> Engine:
 
 
 def attempt(function: Callable[[Any], Any], item: Any) -> Any:
-    """The function's value, or a `Failure` with the error that it raised."""
+    """Returns the function's value, or a `Failure` with the error that it raised."""
     try:
         return function(item)
     except Exception as error:

@@ -1,4 +1,5 @@
-"""`failed.jsonl`: a line for each clip of a batch that has no result to be used.
+"""Reads and writes `failed.jsonl`: a line for each clip of a batch without a usable
+result.
 
 Several drivers (`--shard`) may write it: they hold a lock on `.failed.lock` meanwhile.
 """
@@ -22,13 +23,13 @@ except ImportError:  # Windows: shards of one folder must not run at once
     fcntl = None
 
 log = logging.getLogger(__name__)
-NAME = "failed.jsonl"
+FAILURES_FILE = "failed.jsonl"
 
 
 def read(folder: Path) -> list[dict[str, str]]:
-    """The lines of the file, of which name, status and message are text; others, such
-    as those that were cut by a killed process, are left out with a warning."""
-    path, found = folder / NAME, []
+    """Returns the lines of the file whose name, status and message are text; others,
+    such as those truncated by a killed process, are left out with a warning."""
+    path, found = folder / FAILURES_FILE, []
     if not path.exists():
         return []
     try:
@@ -65,11 +66,11 @@ def forget(folder: Path, names: Collection[str]) -> None:
         kept = [line for line in lines if line["name"] not in names]
         if len(kept) < len(lines):
             text = "".join(f"{json.dumps(line)}\n" for line in kept)
-            atomic.write_text(folder / NAME, text)
+            atomic.write_text(folder / FAILURES_FILE, text)
 
 
 def add(folder: Path, outcome: Outcome) -> None:
-    """Appends a line."""
+    """Appends the line of a failed clip."""
     line = {
         "name": outcome.name,
         "status": outcome.status,
@@ -77,13 +78,13 @@ def add(folder: Path, outcome: Outcome) -> None:
         "log": f"logs/{outcome.name}.txt",
         "machine": outcome.machine,
     }
-    with _locked(folder), (folder / NAME).open("a") as file:
+    with _locked(folder), (folder / FAILURES_FILE).open("a") as file:
         file.write(f"{json.dumps(line)}\n")
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    # Neither a link of this name is followed nor its target emptied.
+    # A symbolic link of this name is not followed.
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     with os.fdopen(os.open(folder / ".failed.lock", flags, 0o666), "r+b") as lock:
         if fcntl is not None:

@@ -1,9 +1,10 @@
-"""The axes of a sweep, `NAME=VALUE,VALUE,...`, and the points of their grid.
+"""Parses the axes of a sweep, `NAME=VALUE,VALUE,...`, and generates the points of the
+grid.
 
 `scale` multiplies the map that the joint solve starts from; `weights.TERM` is λ of a
 term of the cost, named as by `bs.weights`. The points of these two have the same shapes
 and are solved by one compiled program. Any other name is a setting (`structure.x`,
-`weights.pixel_sigma`), for each of whose values a problem is made anew.
+`weights.pixel_sigma`), for each of whose values a problem is built.
 """
 
 import dataclasses
@@ -15,12 +16,12 @@ from bodyslam_jax.config import Config, field_names, with_values
 from bodyslam_jax.config.errors import InputError
 
 SCALE = "scale"
-_WEIGHTS = "weights."
+_WEIGHTS_PREFIX = "weights."
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """A quantity and the values that it takes."""
+    """A quantity and its values."""
 
     name: str
     values: tuple[str, ...]
@@ -28,15 +29,17 @@ class Axis:
 
     @property
     def term(self) -> str | None:
-        """The term of the cost whose λ it is."""
-        return None if self.is_setting else self.name.partition(_WEIGHTS)[2] or None
+        """Name of the cost term whose λ the axis varies, else `None`."""
+        return (
+            None if self.is_setting else self.name.partition(_WEIGHTS_PREFIX)[2] or None
+        )
 
 
 def parse_axes(texts: Sequence[str], config: Config = Config()) -> list[Axis]:
-    """The axes that texts such as `weights.human_motion=10,100` describe.
+    """Parses axes such as `weights.human_motion=10,100`.
 
-    **Raises:** `InputError` for a name that is none, a value that cannot be, or an axis
-    that repeats.
+    **Raises:** `InputError` for an unknown name, an impossible value, or a repeated
+    axis.
     """
     if not texts:
         raise InputError("--grid: found none, expected NAME=VALUE,VALUE,...")
@@ -50,7 +53,7 @@ def parse_axes(texts: Sequence[str], config: Config = Config()) -> list[Axis]:
             raise InputError(f"--grid {text}: expected NAME=VALUE,VALUE,...")
         if name in (axis.name for axis in axes):
             raise InputError(f"--grid {name}: given twice.")
-        is_weight = name.startswith(_WEIGHTS) and name not in settings
+        is_weight = name.startswith(_WEIGHTS_PREFIX) and name not in settings
         axis = Axis(name, values, is_setting=not is_weight and name != SCALE)
         for value in values:
             _check(axis, value, config)
@@ -76,18 +79,18 @@ def _check(axis: Axis, value: str, config: Config) -> None:
 
 
 def settings_points(axes: Sequence[Axis]) -> list[dict[str, str]]:
-    """All combinations of values of settings."""
+    """Returns all combinations of values of settings."""
     return _product([axis for axis in axes if axis.is_setting])
 
 
 def mapped_points(axes: Sequence[Axis]) -> list[dict[str, float]]:
-    """All combinations of scale and weights."""
+    """Returns all combinations of scale and weights."""
     found = _product([axis for axis in axes if not axis.is_setting])
     return [{name: float(value) for name, value in point.items()} for point in found]
 
 
 def at_point(config: Config, point: Mapping[str, str]) -> Config:
-    """The settings at a point of `settings_points`."""
+    """Returns the settings at a point of `settings_points`."""
     return with_values(config, {name: value.split() for name, value in point.items()})
 
 

@@ -1,4 +1,5 @@
-"""`sweep`: the joint estimate over a grid of weights, start scales and settings."""
+"""Solves the joint estimate over a grid of weights, start scales and settings
+(`sweep`)."""
 
 import contextlib
 import hashlib
@@ -32,10 +33,11 @@ def sweep(
     setup: Setup,
 ) -> tuple[list[Path], list[str]]:
     """Solves every clip at every point, and writes `table.csv`, `.md`, `.tex` and
-    `plots.png`; returns their paths, and a line for each problem that was not solved.
+    `plots.png`.
 
-    A clip at one point of the settings is one job: its weights and scales are solved by
-    one program, and its rows are kept in `out/rows`, so that the same call continues.
+    Returns their paths, and a line for each problem that was not solved. A clip at one
+    point of the settings is one job: its weights and scales are solved by one program,
+    and its rows are cached in `out/rows`, so that the same call resumes.
 
     **Raises:** `InputError` if inputs have mistakes, or nothing could be solved.
     """
@@ -80,7 +82,8 @@ def _jobs(
 
 
 def _file(out: Path, job: SweepJob) -> Path:
-    """Where a job's rows are kept; the name has a hash of all that they depend on."""
+    """Returns the file of a job's rows; its name contains a hash of everything they
+    depend on."""
     parts = (
         record.source_hash(job.source, job.config),
         record.settings_hash(job.config),
@@ -106,7 +109,8 @@ def _kept(file: Path, job: SweepJob) -> list[Row] | None:
 
 
 def _are_rows(found: Any, job: SweepJob) -> bool:
-    """Whether they are those of a job: a row of plain values for each of its points."""
+    """Returns whether a value is the rows of a job: one row of plain values for each
+    point."""
     if not isinstance(found, list) or len(found) != len(job.points):
         return False
     plain = (str, int, float, bool, type(None))

@@ -1,7 +1,7 @@
-"""`index.html` of a batch: a sortable table with overlays, which links the reports.
+"""Writes `index.html` of a batch: a sortable table with overlays and links to reports.
 
-It opens from the disk, without network. Images and overlays are files beside it that
-the browser loads when they come into view or are pointed at.
+It opens from disk, without network. Images and overlays are files beside it that the
+browser loads when they come into view or are pointed at.
 """
 
 import html
@@ -12,7 +12,7 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
-from bodyslam_jax.batch.rows import ORDER
+from bodyslam_jax.batch.rows import STATUS_ORDER
 from bodyslam_jax.batch.table import Column, Row
 from bodyslam_jax.io import atomic
 
@@ -32,7 +32,9 @@ def write_index(
     heads = "".join(_head(column) for column in (first, *others))
     body = "\n".join(_row(folder, row, first, others, thumbnails) for row in rows)
     counts = Counter(str(row["status"]) for row in rows)
-    subtitle = ", ".join(f"{counts[name]} {name}" for name in ORDER if counts[name])
+    subtitle = ", ".join(
+        f"{counts[name]} {name}" for name in STATUS_ORDER if counts[name]
+    )
     template = resources.files("bodyslam_jax.batch").joinpath("index.html").read_text()
     parts = {
         "TITLE": html.escape(folder.resolve().name),
@@ -40,7 +42,7 @@ def write_index(
         "HEADS": heads,
         "ROWS": body,
     }
-    # In one pass: a name may be that of another part.
+    # In one pass, because a clip's name may contain the mark of another part.
     place = re.compile(f"<!--({'|'.join(parts)})-->")
     page = place.sub(lambda found: parts[found[1]], template)
     atomic.write_text(folder / "index.html", page)
@@ -73,7 +75,11 @@ def _row(
         if column.key == "status":
             kind = html.escape(str(value).replace(" ", "-"))
             text = f'<span class="badge {kind}">{text}</span>'
-            value = ORDER.index(value) if value in ORDER else len(ORDER)
+            value = (
+                STATUS_ORDER.index(value)
+                if value in STATUS_ORDER
+                else len(STATUS_ORDER)
+            )
         number = isinstance(value, (int, float))
         kind = ' class="number"' if number and column.key != "status" else ""
         key = "" if value is None else html.escape(str(value))
@@ -82,7 +88,7 @@ def _row(
 
 
 def _preview(row: Row, thumbnails: Mapping[str, str]) -> str:
-    """A still image; where there is an overlay, it plays while pointed at."""
+    """Returns a still image; an overlay, if there is one, plays while pointed at."""
     name = str(row["name"])
     image = thumbnails.get(name)
     if image is None:

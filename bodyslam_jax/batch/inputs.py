@@ -1,4 +1,5 @@
-"""What a batch runs on: folders, globs, files and manifests -> named inputs."""
+"""Finds the inputs of a batch: folders, globs, files and manifests become named
+inputs."""
 
 import dataclasses
 import glob
@@ -12,22 +13,22 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.io.video import VIDEO_SUFFIXES
 
-MARK = "batch.json"
-"""File by which the folder of a batch is recognised."""
-RUNS = "runs"
-"""Folder of a batch's run folders, apart from the batch's own files, so that clips may
-have any name."""
+BATCH_FILE = "batch.json"
+"""File that marks the folder of a batch."""
+RUNS_FOLDER = "runs"
+"""Folder with the run folders of a batch, separate from the batch's own files, so that
+clips may have any name."""
 _MAX_NAME_LETTERS = 120
-"""File systems allow 255 bytes with all suffixes."""
-_RUN = "summary.json"
+"""Maximal length of names; file systems allow 255 bytes including all suffixes."""
+_SUMMARY_FILE = "summary.json"
 
 
 @dataclasses.dataclass(frozen=True)
 class Input:
-    """One clip, and what is known about it."""
+    """A clip with its accompanying files and options."""
 
     name: str
-    """Of its run folder; unique in a batch."""
+    """Name of its run folder; unique in a batch."""
     path: Path
     """Sequence folder, video file or folder of images."""
     keypoints: Path | None = None
@@ -38,7 +39,7 @@ class Input:
     """Settings of this clip alone, as on the command line."""
 
     def settings(self, config: Config) -> Config:
-        """The settings of this clip.
+        """Returns the settings of this clip: `config` with its options applied.
 
         **Raises:** `InputError` for options that do not exist.
         """
@@ -48,7 +49,7 @@ class Input:
 def find_inputs(
     sources: Iterable[str | Path] | str | Path, config: Config = Config()
 ) -> list[Input]:
-    """All clips of these sources, in their order, each with a name of its own.
+    """Returns all clips of the sources in order, each with a unique name.
 
     A source is a sequence folder, a video, a folder of images, a folder of such, a glob
     pattern of such, or a manifest (`.csv`). Run folders and folders of batches are left
@@ -74,7 +75,8 @@ def find_inputs(
 
 
 def shard(inputs: Sequence[Input], which: str) -> list[Input]:
-    """Part `I/N` of the inputs, I from 1: every N-th, so that parts are alike.
+    """Returns part `I/N` of the inputs, I from 1: every N-th input, so that parts are
+    similar.
 
     **Raises:** `InputError` if it is no such part.
     """
@@ -86,14 +88,14 @@ def shard(inputs: Sequence[Input], which: str) -> list[Input]:
 
 
 def safe_name(path: Path) -> str:
-    """The name of a run folder for this input."""
+    """Returns the name of a run folder for this input."""
     name = path.resolve().name if path.is_dir() else path.stem
     name = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "clip"
     return name[:_MAX_NAME_LETTERS]
 
 
 def wrong_name(name: str) -> str | None:
-    """What is wrong with the name of a run folder; `None` if nothing is."""
+    """Returns what is wrong with the name of a run folder; `None` if nothing is."""
     if not re.fullmatch(r"[\w.+ -]+", name) or name.startswith("."):
         return f"{name!r}, expected letters, digits, _ - + . and spaces"
     if len(name) > _MAX_NAME_LETTERS:
@@ -102,8 +104,8 @@ def wrong_name(name: str) -> str | None:
 
 
 def is_file_name(name: str) -> bool:
-    """Whether a name that a file tells can be that of a folder; it is not looked for
-    elsewhere."""
+    """Returns whether a name that was read from a file is a valid name of a folder,
+    without a path."""
     size = len(name.encode(errors="replace"))
     signs = "/\\" if os.name == "nt" else "/"
     plain = name.isprintable() or not any(sign in name for sign in "\0\n\r")
@@ -129,7 +131,7 @@ def _matching(source: str | Path) -> list[Path]:
 
 
 def _clips(path: Path) -> list[Path]:
-    """The clip that a path is, or those in the folder that it is."""
+    """Returns the clip at a path, or those in the folder at that path."""
     if path.is_file() or _is_clip(path):
         return [path]
     children = sorted(p for p in path.iterdir() if not p.name.startswith("."))
@@ -144,7 +146,7 @@ def _clips(path: Path) -> list[Path]:
 
 
 def _is_result(folder: Path) -> bool:
-    return (folder / MARK).exists() or (folder / _RUN).exists()
+    return (folder / BATCH_FILE).exists() or (folder / _SUMMARY_FILE).exists()
 
 
 def _is_clip(folder: Path) -> bool:
@@ -157,7 +159,7 @@ def _is_clip(folder: Path) -> bool:
     if parts.footage is None or parts.tracks is not None:
         return parts.tracks is not None
     known = (parts.keypoints, parts.bodies, parts.camera, parts.groundtruth)
-    # One video of another name, and nothing about it, is a clip in a folder of clips.
+    # A lone video of another name, without other files, is a clip in a folder of clips.
     loose = parts.footage.is_file() and parts.footage.stem.lower() != "video"
     return not loose or any(part is not None for part in known)
 
@@ -167,7 +169,8 @@ def _is_video(path: Path) -> bool:
 
 
 def _distinct(inputs: list[Input]) -> list[Input]:
-    """The same with names that differ, also where the file system ignores case."""
+    """Returns the inputs with distinct names, also for file systems that ignore
+    case."""
     shared = _repeated(one.name for one in inputs)
     longer = []
     for one in inputs:

@@ -1,4 +1,4 @@
-"""A job: one clip and its settings, run into a folder; it depends on nothing else."""
+"""Runs a job, one clip with its settings, into a folder; it depends on nothing else."""
 
 import dataclasses
 import functools
@@ -18,20 +18,20 @@ from bodyslam_jax.io.error_line import error_line
 
 log = logging.getLogger(__name__)
 Status = Literal["ok", "doubtful", "failed", "error"]
-_PATIENCE, _PAUSE = 3600.0, 1.0
-"""Time to wait for another process that writes the same run folder, and between two
-attempts, s."""
+_MAX_WAIT_S, _POLL_PERIOD_S = 3600.0, 1.0
+"""Time to wait for another process that writes the same run folder, and time between
+two attempts."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What is computed, and where to."""
+    """A clip to be estimated, its settings, and its run folder."""
 
     source: Input
     config: Config
-    """With the options of this clip."""
+    """Settings, including the options of this clip."""
     out: Path
-    """Run folder, in the folder `RUNS` of the batch."""
+    """Run folder, in the folder `RUNS_FOLDER` of the batch."""
 
     @property
     def name(self) -> str:
@@ -45,7 +45,7 @@ class Job:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a job ended."""
+    """Result of a job: its status, with a message and measurements of the run."""
 
     name: str
     status: Status
@@ -54,11 +54,11 @@ class Outcome:
     folder: Path
     """Run folder."""
     message: str = ""
-    """What went wrong, or makes the result doubtful."""
+    """Reason why the job failed or its result is doubtful."""
     seconds: float = 0.0
     """Duration, s; 0 for a job that was finished before."""
     compilations: int = 0
-    """Programs that were compiled for it, not taken from the cache."""
+    """Number of programs that were compiled for it, not taken from the cache."""
     machine: str = ""
     was_finished: bool = False
     """Whether an earlier run had finished it."""
@@ -75,13 +75,14 @@ class Outcome:
 
 
 Estimate = Callable[[Job], dict[str, Any]]
-"""Runs a job and returns its summary, which is then in its run folder."""
+"""Runs a job, writes its run folder, and returns its summary."""
 
 
 def finished(job: Job) -> Outcome | None:
-    """The outcome of a job that is finished, if its files have not been touched since.
+    """Returns the outcome of a job that is finished and whose files are unchanged
+    since.
 
-    Reads the record and the dates of files, not their content.
+    Only the record and the dates of files are read, not their content.
     """
     found = record.read(job.out)
     if found is None or found.get("settings") != record.settings_hash(job.config):
@@ -96,9 +97,9 @@ def finished(job: Job) -> Outcome | None:
 def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
     """Runs a job unless its input and settings are those of the run in its folder.
 
-    Errors become the outcome's message, their traceback is in the log of the job,
-    `logs/NAME.txt` in the folder of the batch. If another process is running the job,
-    waits for it.
+    Errors become the outcome's message; their traceback is written to the log of the
+    job, `logs/NAME.txt` in the folder of the batch. If another process is running the
+    job, the function waits for it.
     """
     start, before = time.monotonic(), _compilations().count
     try:
@@ -125,7 +126,7 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
 
 
 def estimate_clip(job: Job) -> dict[str, Any]:
-    """The whole pipeline on the job's clip, as `bodyslam run`."""
+    """Runs the whole pipeline on the job's clip, as `bodyslam run` does."""
     from bodyslam_jax import io, pipeline
 
     source = job.source
@@ -143,14 +144,14 @@ def estimate_clip(job: Job) -> dict[str, Any]:
 
 
 def failure(job: Job, message: str) -> Outcome:
-    """The outcome of a job without a result."""
+    """Returns the outcome of a job without a result."""
     return Outcome(job.name, "error", job.out, message)
 
 
 def _run(job: Job, estimate: Estimate) -> Outcome:
     from bodyslam_jax import export
 
-    until = time.monotonic() + _PATIENCE
+    until = time.monotonic() + _MAX_WAIT_S
     source = record.source_hash(job.source, job.config)
     settings = record.settings_hash(job.config)
     hashes = {"source": source, "settings": settings}
@@ -170,7 +171,7 @@ def _run(job: Job, estimate: Estimate) -> Outcome:
         except export.FolderInUse:
             if time.monotonic() > until:
                 raise
-            time.sleep(_PAUSE)
+            time.sleep(_POLL_PERIOD_S)
             continue
         outcome = {
             "status": summary["status"],
@@ -198,14 +199,14 @@ def _compilations() -> Any:
 
 
 class _logged:
-    """Writes the package's log of a block to a file."""
+    """Writes the package's log messages during a block to a file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def __enter__(self) -> None:
         self.path.parent.mkdir(exist_ok=True)
-        # Opened with the first line: a job that is finished keeps its log.
+        # The file is opened at the first message, so that a finished job keeps its log.
         self.handler = logging.FileHandler(self.path, "w", "utf-8", delay=True)
         self.handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
         logging.getLogger("bodyslam_jax").addHandler(self.handler)

@@ -1,47 +1,53 @@
-"""Processes on this machine: each runs one item at a time and keeps its programs.
+"""Engine of processes on this machine, each of which runs one item at a time and keeps
+its compiled programs.
 
-A process that ends by itself is replaced and its item given to another. Processes end
-with the driver, however that ends.
+A process that ends unexpectedly is replaced, and its item is given to another.
+Processes end with the driver, however that ends.
 """
 
 import collections
 import contextlib
 import dataclasses
+import importlib.util
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
-from bodyslam_jax.batch.devices import cores, gpus, memory
 from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 from bodyslam_jax.config.errors import InputError
 
-MEMORY = 3 << 30
-"""Memory that a process may need, bytes; measured in benchmarks/batch.md."""
-_SPAWN = multiprocessing.get_context("spawn")
+WORKER_MEMORY_BYTES = 3 << 30
+"""Memory that a process may need; measured in benchmarks/batch.md."""
+_GPU_PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+_SPAWN_CONTEXT = multiprocessing.get_context("spawn")
 
 
 @dataclasses.dataclass(frozen=True)
 class LocalEngine:
-    """`Engine` of processes on this machine."""
+    """Engine of processes on this machine."""
 
     workers: int | None = None
-    """Without it one per GPU, else one per core as far as memory allows."""
+    """Number of processes; by default one per GPU, else one per core as far as memory
+    allows."""
     retries: int = 2
     gpu: bool = True
-    """Whether GPUs are used where there are any."""
+    """Whether GPUs are used if there are any."""
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
     ) -> Values:
-        """As `Engine.map`."""
-        devices = gpus() if self.gpu else []
-        most = len(devices) or max(1, min(len(cores()), memory() // MEMORY))
+        """Implements `Engine.map`."""
+        devices = _gpus() if self.gpu else []
+        most = len(devices) or max(
+            1, min(len(_cores()), _memory() // WORKER_MEMORY_BYTES)
+        )
         count = min(self.workers or most, len(items))
-        threads = max(1, len(cores()) // max(count, 1))
+        threads = max(1, len(_cores()) // max(count, 1))
         waiting = collections.deque((item, 0) for item in items)
         make = lambda k: _Worker(_environment(threads, devices, k), function, setup)
         workers = [make(k) for k in range(count)]
@@ -73,11 +79,11 @@ class LocalEngine:
 
 
 class _Ended(Exception):
-    """A worker's process has ended; the text says how."""
+    """Raised if a worker's process has ended; the text says how."""
 
 
 class _Worker:
-    """A process and what it is doing; started with its first item."""
+    """A process with its current item; it is started with the first item."""
 
     def __init__(
         self,
@@ -85,9 +91,9 @@ class _Worker:
         function: Callable[[Any], Any],
         setup: Setup,
     ) -> None:
-        self.connection, theirs = _SPAWN.Pipe()
+        self.connection, theirs = _SPAWN_CONTEXT.Pipe()
         self._theirs: Connection | None = theirs
-        self.process = _SPAWN.Process(
+        self.process = _SPAWN_CONTEXT.Process(
             target=_work, args=(theirs, dict(environment), function, setup), daemon=True
         )
         self.item: Any = None
@@ -100,13 +106,13 @@ class _Worker:
             self.process.start()
             self._theirs.close()
             self._theirs = None
-        with contextlib.suppress(OSError):  # It has ended: `receive` finds out.
+        with contextlib.suppress(OSError):  # the process has ended; `receive` notices
             self.connection.send(item)
 
     def receive(self) -> Any:
-        """The value of the item.
+        """Returns the value of the item.
 
-        **Raises:** `_Ended` if the process is no more; `ValueError` if it could not be
+        **Raises:** `_Ended` if the process has ended; `InputError` if it could not be
         set up.
         """
         try:
@@ -120,20 +126,20 @@ class _Worker:
         return value
 
     def close(self) -> None:
-        """Lets the process end; one that is busy is terminated."""
+        """Asks the process to end; a busy process is terminated."""
         self.connection.close()
         if self.busy:
             self.process.terminate()
 
     def join(self) -> None:
         if self.process.pid is not None:
-            self.process.join(_GRACE)
+            self.process.join(_SHUTDOWN_TIMEOUT_S)
             if self.process.is_alive():
                 self.process.kill()
 
 
-_GRACE = 2.0
-"""Time that an idle process has to end, s."""
+_SHUTDOWN_TIMEOUT_S = 2.0
+"""Time after which an idle process that has not ended is killed."""
 
 
 def _describe(code: int | None) -> str:
@@ -145,7 +151,7 @@ def _describe(code: int | None) -> str:
 
 
 def _environment(threads: int, devices: Sequence[str], number: int) -> dict[str, str]:
-    """Variables that give a process its share of the machine.
+    """Returns the environment variables that give a process its share of the machine.
 
     `NPROC` is read by XLA, the others by OpenMP and OpenCV.
     """
@@ -162,7 +168,8 @@ def _work(
     function: Callable[[Any], Any],
     setup: Setup,
 ) -> None:
-    """A worker's process: items in, values out, until the driver closes."""
+    """Runs in a worker's process: receives items and sends values until the driver
+    closes."""
     os.environ.update(environment)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
@@ -174,7 +181,7 @@ def _work(
         while True:
             connection.send(("value", attempt(function, connection.recv())))
     except (EOFError, OSError, KeyboardInterrupt):
-        # Closed or interrupted: the driver decides what becomes of the item.
+        # Closed or interrupted: the driver decides whether the item is run again.
         pass
 
 
@@ -183,3 +190,38 @@ def _end_with_parent() -> None:
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
+
+
+def _cores() -> list[int]:
+    """Returns the cores that this process may use; JAX, which would occupy them, is not
+    asked."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def _memory() -> int:
+    """Returns the memory of the machine, or of the container of this process, bytes."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+    except OSError:
+        return total
+    return min(total, int(limit)) if limit.isdigit() else total
+
+
+def _gpus() -> list[str]:
+    """Returns the names of GPUs for `CUDA_VISIBLE_DEVICES`; none if JAX has no build
+    for GPUs.
+
+    JAX is not asked, because it would occupy them.
+    """
+    if not any(importlib.util.find_spec(name) for name in _GPU_PLUGINS):
+        return []
+    if os.environ.get("JAX_PLATFORMS", "").startswith("cpu"):
+        return []
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name.strip() not in ("", "-1")]
+    found = Path("/dev").glob("nvidia[0-9]*")
+    return sorted(path.name.removeprefix("nvidia") for path in found)

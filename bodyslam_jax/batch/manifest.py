@@ -1,4 +1,4 @@
-"""A manifest: a table (`.csv`) of clips, checked whole before anything runs.
+"""Reads a manifest: a table (`.csv`) of clips, checked completely before anything runs.
 
 Columns: `video` (a video, a folder of images or a sequence folder), and where needed
 `name`, `keypoints`, `bodies`, `camera`, `height`, `groundtruth`, `options`. Paths are
@@ -25,14 +25,14 @@ COLUMNS = (
     *("name", "video", "keypoints", "bodies", "camera"),
     *("height", "groundtruth", "options"),
 )
-_TRUTH = ("camera.txt", "camera.tum", "body.npz", "body_*.npz", "result.npz")
-_WITHIN = ("", "groundtruth/")
+_TRUTH_FILES = ("camera.txt", "camera.tum", "body.npz", "body_*.npz", "result.npz")
+_TRUTH_FOLDERS = ("", "groundtruth/")
 
 Row = dict[str, str]
 
 
 def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
-    """The inputs that a manifest lists.
+    """Returns the inputs that a manifest lists.
 
     **Raises:** `InputError` with a line for each mistake: file, line, column, what was
     found, what was expected.
@@ -63,7 +63,8 @@ def read_manifest(path: Path, config: Config = Config()) -> list[Input]:
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and the other lines with their numbers; empty ones left out."""
+    """Returns the header, and the other lines with their numbers; empty lines are left
+    out."""
     text = read_text(path, "a manifest (CSV)")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[tuple[int, list[str]]] = []
@@ -99,7 +100,7 @@ def _wrong_header(header: list[str]) -> Iterator[str]:
 
 
 def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
-    """The input of a line, and what is wrong with it."""
+    """Returns the input of a line, and what is wrong with it."""
     wrong: list[str] = []
     at = lambda column: home / row[column] if row.get(column) else None
     video = at("video")
@@ -137,7 +138,7 @@ def _input(row: Row, home: Path, config: Config) -> tuple[Input, list[str]]:
 
 
 def _told(column: str, wrong: Iterator[str]) -> list[str]:
-    """What is wrong with a path; also that the system knows none of such a name."""
+    """Returns what is wrong with a path, including errors of the file system."""
     try:
         return list(wrong)
     except (OSError, ValueError) as error:
@@ -188,6 +189,8 @@ def _wrong_truth(path: Path | None) -> Iterator[str]:
         return
     yield from _wrong_file("groundtruth", path, folder=True)
     if path.is_dir() and not any(
-        any(path.glob(f"{within}{name}")) for name in _TRUTH for within in _WITHIN
+        any(path.glob(f"{within}{name}"))
+        for name in _TRUTH_FILES
+        for within in _TRUTH_FOLDERS
     ):
         yield f"groundtruth: {path}: neither camera.txt nor body.npz in this folder"

@@ -1,10 +1,10 @@
-"""Each program is compiled by one process of a machine; the others wait and load it.
+"""Cache of compiled programs in which one process compiles and the others wait.
 
-JAX's persistent cache lets processes that start together compile the same programs all
-at once, and a process that is killed while it writes leaves a damaged entry. The cache
-here is the same folder with the same entries: a process that misses an entry holds a
-lock on it until it is written, and entries are written whole or not at all. Locks are
-of byte ranges of one file, which the system releases with the process.
+With JAX's persistent cache, processes that start together all compile the same
+programs, and a process that is killed while it writes leaves a damaged entry. This
+cache is the same folder with the same entries: a process that misses an entry holds a
+lock on it until it is written, and entries are written atomically. Locks are on byte
+ranges of one file, which the system releases with the process.
 """
 
 import contextlib
@@ -25,16 +25,16 @@ except ImportError:  # Windows: programs may be compiled by several processes
     fcntl = None
 
 log = logging.getLogger(__name__)
-_LOCK = ".compiling"
-_COMPILED = "/jax/core/compile/backend_compile_duration"
-_MISS = "/jax/compilation_cache/cache_misses"
-_LONGEST_WAIT = 900.0
-"""Time after which a program is compiled although another process has begun it, s."""
-_RANGE = 1 << 60
+_LOCK_FILE = ".compiling"
+_COMPILED_EVENT = "/jax/core/compile/backend_compile_duration"
+_MISS_EVENT = "/jax/compilation_cache/cache_misses"
+_MAX_WAIT_S = 900.0
+"""Time after which a program is compiled although another process is compiling it."""
+_LOCK_RANGE_BYTES = 1 << 60
 
 
 def user_folder() -> Path:
-    """The folder of compiled programs that all runs of this user share."""
+    """Returns the folder of compiled programs that all runs of this user share."""
     home = os.environ.get("BODYSLAM_CACHE") or Path(
         os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "bodyslam_jax"
     )
@@ -42,7 +42,8 @@ def user_folder() -> Path:
 
 
 class Compilations:
-    """Counts the programs that this process compiled, not those that it loaded."""
+    """Counts the programs that this process compiled, excluding those that it
+    loaded."""
 
     def __init__(self) -> None:
         import jax
@@ -51,19 +52,21 @@ class Compilations:
         jax.monitoring.register_event_listener(self._on_event)
 
     def _on_event(self, event: str, **_: object) -> None:
-        self.count += event == _MISS
+        self.count += event == _MISS_EVENT
 
 
 class ProgramCache:
-    """JAX's persistent cache in `path`, with a lock on each entry that is missing.
+    """JAX's persistent cache in `path`, with a lock on each missing entry.
 
-    The interface is that of JAX's own caches: `get` of a key, and after a miss `put`.
+    The interface is that of JAX's own caches: `get` a key, and after a miss `put`.
     """
 
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
         self._path.mkdir(parents=True, exist_ok=True)
-        self._lock_file = os.open(self._path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        self._lock_file = os.open(
+            self._path / _LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666
+        )
         weakref.finalize(self, os.close, self._lock_file)
         self._held: dict[str, int] = {}
         """Keys whose lock this process has, and the thread that compiles them."""
@@ -79,14 +82,15 @@ class ProgramCache:
         return found
 
     def put(self, key: str, value: bytes) -> None:
-        # Also over an entry that is present: JAX compiles one that it cannot read.
+        # Existing entries are replaced: JAX compiles programs that it cannot read.
         try:
             atomic.write_bytes(self._file(key), value)
         finally:
             self._unlock(key)
 
     def release(self) -> None:
-        """Gives up the locks of what this thread compiled and did not store."""
+        """Releases the locks of programs that this thread compiled and did not
+        store."""
         me = threading.get_ident()
         for key in [key for key, thread in self._held.items() if thread == me]:
             self._unlock(key)
@@ -101,9 +105,10 @@ class ProgramCache:
             return None
 
     def _wait_for(self, key: str) -> None:
-        """Takes the lock of a key, unless there is no lock here or no end to it."""
+        """Acquires the lock of a key, unless locks are not supported or the wait is too
+        long."""
         self._held[key] = threading.get_ident()
-        until = time.monotonic() + _LONGEST_WAIT
+        until = time.monotonic() + _MAX_WAIT_S
         pause = 0.02
         while fcntl is not None and time.monotonic() < until:
             try:
@@ -114,7 +119,7 @@ class ProgramCache:
             except (BlockingIOError, PermissionError):
                 time.sleep(pause)
                 pause = min(2 * pause, 0.5)
-            except OSError:  # A file system without locks.
+            except OSError:  # a file system without locks
                 return
 
     def _unlock(self, key: str) -> None:
@@ -124,16 +129,18 @@ class ProgramCache:
 
 
 def _place(key: str) -> int:
-    """The byte of the lock file that stands for a key, which ends in its hash."""
+    """Returns the byte of the lock file that represents a key, which ends in its
+    hash."""
     text = key.encode()
-    return (zlib.crc32(text) << 28 | zlib.adler32(text) >> 4) % _RANGE
+    return (zlib.crc32(text) << 28 | zlib.adler32(text) >> 4) % _LOCK_RANGE_BYTES
 
 
 def share() -> None:
     """Makes JAX use `ProgramCache` in this process, in its folder of compiled programs.
 
-    Does nothing where JAX has no such folder, or limits its size. JAX has no public way
-    to replace its cache; of a version whose inner names differ, its own stays.
+    Does nothing if JAX has no such folder, or limits its size. JAX has no public way to
+    replace its cache; with a version whose internal names differ, JAX's own cache is
+    kept.
     """
     import jax
 
@@ -157,7 +164,7 @@ def share() -> None:
         return caches[-1], path
 
     def on_compiled(event: str, duration_secs: float, **_: str | int) -> None:
-        if event == _COMPILED:
+        if event == _COMPILED_EVENT:
             for cache in caches:
                 cache.release()
 

@@ -1,7 +1,9 @@
-"""Actors on a Ray cluster, one per GPU or core. Ray places them and starts them again.
+"""Engine of actors on a Ray cluster, one per GPU or core, which Ray places and
+restarts.
 
 An actor keeps its compiled programs from item to item. An actor whose process or node
-is lost is restarted by Ray where there is room; its item goes to the next free actor.
+is lost is restarted by Ray where resources are free; its item goes to the next idle
+actor.
 """
 
 import collections
@@ -13,26 +15,26 @@ from typing import Any
 from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 from bodyslam_jax.config.errors import InputError
 
-_READY = object()
-"""Stands for an item where an actor is being prepared."""
+_PREPARATION = object()
+"""Takes the place of an item while an actor is being prepared."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RayEngine:
-    """`Engine` on a Ray cluster."""
+    """Engine on a Ray cluster."""
 
     workers: int | None = None
-    """Number of actors; without it one per GPU, else one per core of the cluster."""
+    """Number of actors; by default one per GPU, else one per core of the cluster."""
     retries: int = 2
     address: str | None = None
-    """Of a running cluster; without it Ray is started on this machine."""
+    """Address of a running cluster; by default Ray is started on this machine."""
     gpu: bool = True
-    """Whether actors take GPUs, if the cluster has any."""
+    """Whether actors use GPUs, if the cluster has any."""
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
     ) -> Values:
-        """As `Engine.map`."""
+        """Implements `Engine.map`."""
         ray = _import_ray()
         started = not ray.is_initialized()
         if started:
@@ -58,7 +60,7 @@ class RayEngine:
         make = self._actor_class(ray)
         count = min(self.workers or _devices(ray, self.gpu), len(items))
         actors = [make.remote(function, setup) for _ in range(count)]
-        calls = {actor.prepare.remote(): (actor, _READY, 0) for actor in actors}
+        calls = {actor.prepare.remote(): (actor, _PREPARATION, 0) for actor in actors}
         waiting = collections.deque((item, 0) for item in items)
         idle: list[Any] = []
         left = len(items)
@@ -73,21 +75,21 @@ class RayEngine:
                     value = ray.get(reference)
                     idle.append(actor)
                 except ray.exceptions.RayTaskError as error:
-                    if item is _READY:
+                    if item is _PREPARATION:
                         raise InputError(str(error.cause)) from None
                     value = Failure(" ".join(str(error.cause).split()))
                     idle.append(actor)
                 except ray.exceptions.RayError as error:
-                    # Takes part again when Ray has restarted it.
-                    calls[actor.prepare.remote()] = (actor, _READY, 0)
-                    if item is _READY:
+                    # The actor is used again when Ray has restarted it.
+                    calls[actor.prepare.remote()] = (actor, _PREPARATION, 0)
+                    if item is _PREPARATION:
                         continue
                     if attempts < self.retries:
                         waiting.appendleft((item, attempts + 1))
                         continue
                     lost = f"its process was lost ({type(error).__name__})"
                     value = Failure(f"{lost}, {attempts + 1} times.")
-                if item is not _READY:
+                if item is not _PREPARATION:
                     left -= 1
                     yield item, value
         finally:
@@ -102,14 +104,15 @@ class RayEngine:
 
 
 class _Actor:
-    """A process of the cluster."""
+    """A process of the cluster that evaluates the function."""
 
     def __init__(self, function: Callable[[Any], Any], setup: Setup) -> None:
         self.function, self.setup = function, setup
         self.is_prepared = False
 
     def prepare(self) -> None:
-        """Not in `__init__`, after whose errors Ray does not restart an actor."""
+        """Calls the setup once. It is not part of `__init__`, after whose errors Ray
+        would not restart an actor."""
         if not self.is_prepared:
             self.setup()
             self.is_prepared = True
@@ -126,7 +129,7 @@ def _devices(ray: Any, gpu: bool) -> int:
 
 
 def _import_ray() -> Any:
-    # No report about this machine is sent to Ray's makers, unless asked for.
+    # Ray's usage reports are disabled unless the user enables them.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray  # pyright: ignore[reportMissingImports]

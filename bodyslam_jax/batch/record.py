@@ -1,8 +1,8 @@
-"""The record in a run folder by which a finished job is recognised.
+"""Reads and writes the record in a run folder that identifies a finished job.
 
 It has hashes of the input's content and of settings, models and the package's source,
-and a stamp: a hash of the names, sizes and dates of the input's files. Where the stamp
-is the same, the content is not read again.
+and a stamp: a hash of the names, sizes and dates of the input's files. If the stamp is
+unchanged, the content is not read again.
 """
 
 import contextlib
@@ -23,77 +23,80 @@ from bodyslam_jax.io.parts import find_parts
 from bodyslam_jax.pipeline.stage_cache import body_model_file, fingerprint
 
 log = logging.getLogger(__name__)
-_RECORD = ".job.json"
-_SUMMARY = "summary.json"
-_TEXTS = ("source", "settings", "stamp", "status", "message", "summary")
+_RECORD_FILE = ".job.json"
+_SUMMARY_FILE = "summary.json"
+_TEXT_FIELDS = ("source", "settings", "stamp", "status", "message", "summary")
 """Fields of the record of a finished run, all of them text."""
 STATUSES = ("ok", "doubtful", "failed")
-"""Of a run that left a result."""
+"""Statuses of a run that left a result."""
 
 
 def read(out: Path) -> dict[str, Any] | None:
-    """The record of a finished run that is as its job left it."""
+    """Reads the record of a finished run; `None` if there is none, or the summary has
+    changed since."""
     record = _load(out)
     try:
-        is_kept = record.get("summary") == _hash_of(out / _SUMMARY)
+        is_kept = record.get("summary") == _hash_of(out / _SUMMARY_FILE)
     except OSError:
         return None
     if not is_kept:
         return None
-    texts = all(isinstance(record.get(name), str) for name in _TEXTS)
+    texts = all(isinstance(record.get(name), str) for name in _TEXT_FIELDS)
     if not texts or record["status"] not in STATUSES:
-        log.warning("%s: not the record of a run; the clip is run again", out / _RECORD)
+        log.warning(
+            "%s: not the record of a run; the clip is run again", out / _RECORD_FILE
+        )
         return None
-    return {name: record[name] for name in _TEXTS}
+    return {name: record[name] for name in _TEXT_FIELDS}
 
 
 def is_begun(out: Path) -> bool:
-    """Whether a folder is that of a job."""
-    return (out / _RECORD).is_file()
+    """Returns whether a folder is that of a job."""
+    return (out / _RECORD_FILE).is_file()
 
 
 def finish(out: Path, record: dict[str, Any]) -> None:
     """Records that the run in `out` is finished."""
-    record = record | {"summary": _hash_of(out / _SUMMARY)}
-    atomic.write_text(out / _RECORD, json.dumps(record))
+    record = record | {"summary": _hash_of(out / _SUMMARY_FILE)}
+    atomic.write_text(out / _RECORD_FILE, json.dumps(record))
 
 
 @contextlib.contextmanager
 def begun(out: Path, source: str) -> Iterator[None]:
-    """Records the input of a run before it is finished. A run that leaves nothing else
-    leaves no folder."""
+    """Records the input of a run before it is finished. If the run fails and leaves
+    nothing else, the folder is removed."""
     if _load(out).get("source") != source:
         out.mkdir(exist_ok=True)
-        atomic.write_text(out / _RECORD, json.dumps({"source": source}))
+        atomic.write_text(out / _RECORD_FILE, json.dumps({"source": source}))
     try:
         yield
     except Exception:
-        if [entry.name for entry in out.iterdir()] == [_RECORD]:
-            (out / _RECORD).unlink(missing_ok=True)
+        if [entry.name for entry in out.iterdir()] == [_RECORD_FILE]:
+            (out / _RECORD_FILE).unlink(missing_ok=True)
             with contextlib.suppress(OSError):
                 out.rmdir()
         raise
 
 
 def begun_for(out: Path) -> str | None:
-    """The hash of the input that the run in `out` is of; `None` if there is none."""
+    """Returns the hash of the input of the run in `out`; `None` if there is none."""
     source = _load(out).get("source")
     return source if isinstance(source, str) else None
 
 
 def source_hash(source: Input, config: Config) -> str:
-    """Of the content of the input's files, and its name."""
+    """Returns the hash of the content of the input's files, and of its name."""
     return fingerprint(source.name, _files(source, config))
 
 
 @functools.lru_cache(maxsize=256)
 def settings_hash(config: Config) -> str:
-    """Of settings, models and the package's source."""
+    """Returns the hash of settings, models and the package's source."""
     return fingerprint(config, body_model_file(config.body_model))
 
 
 def stamp(source: Input, config: Config) -> str:
-    """Of names, sizes and dates of the input's files."""
+    """Returns the hash of names, sizes and dates of the input's files."""
     digest = hashlib.sha256()
     for path in _files(source, config):
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
@@ -105,7 +108,7 @@ def stamp(source: Input, config: Config) -> str:
 
 
 def _files(source: Input, config: Config) -> list[Path]:
-    """The files and folders that a job reads, but for models."""
+    """Returns the files and folders that a job reads, except models."""
     parts = find_parts(source.path)
     camera = source.camera or parts.camera
     if camera is not None:
@@ -125,10 +128,10 @@ def _files(source: Input, config: Config) -> list[Path]:
 
 
 def _load(out: Path) -> dict[str, Any]:
-    if not (out / _RECORD).exists():
+    if not (out / _RECORD_FILE).exists():
         return {}
     try:
-        found = files.read_json(out / _RECORD, "the record of a run")
+        found = files.read_json(out / _RECORD_FILE, "the record of a run")
     except InputError as error:
         log.warning("%s The clip is run again.", error)
         return {}
@@ -136,7 +139,7 @@ def _load(out: Path) -> dict[str, Any]:
 
 
 def _hash_of(file: Path) -> str:
-    if not file.is_file():  # a pipe would be waited for
+    if not file.is_file():  # reading a pipe would block
         raise FileNotFoundError(file)
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""A row of figures for each run folder, from its `summary.json`."""
+"""Reads a row of figures for each run folder from its `summary.json`."""
 
 import logging
 from collections.abc import Collection
@@ -7,27 +7,27 @@ from typing import Any
 
 from bodyslam_jax import evaluation
 from bodyslam_jax.batch import failures
-from bodyslam_jax.batch.inputs import MARK, RUNS, is_file_name
+from bodyslam_jax.batch.inputs import BATCH_FILE, RUNS_FOLDER, is_file_name
 from bodyslam_jax.batch.table import Column, Row
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation import ROWS
-from bodyslam_jax.evaluation.before_after import JOINT
+from bodyslam_jax.evaluation.before_after import JOINT_ESTIMATE
 from bodyslam_jax.io import files
 
 log = logging.getLogger(__name__)
-_ERRORS = (
+_ERROR_NAMES = (
     *("c_ate_se3", "c_ate_sim3", "h_ate_se3", "j_ate_se3", "scale"),
     *("w_mpjpe", "wa_mpjpe", "pa_mpjpe", "rte", "gravity_error"),
 )
-ERROR = "error"
+ERROR_STATUS = "error"
 """Status of a clip without a result."""
-MISSING = "not run"
+MISSING_STATUS = "not run"
 """Status of a clip that a batch has not run yet."""
-ORDER = ("ok", "doubtful", "failed", ERROR, MISSING)
+STATUS_ORDER = ("ok", "doubtful", "failed", ERROR_STATUS, MISSING_STATUS)
 
 
 def error_columns(names: Collection[str]) -> list[Column]:
-    """Columns of errors, by their names in `evaluation`."""
+    """Returns the columns of errors, by their names in `evaluation`."""
     return [
         Column(
             _error_key(key), f"{label}, {unit}".rstrip(", "), 1 if unit else 3, factor
@@ -38,7 +38,8 @@ def error_columns(names: Collection[str]) -> list[Column]:
 
 
 def columns() -> list[Column]:
-    """All columns; errors are against a ground truth, of the joint estimate."""
+    """Returns all columns; errors are those of the joint estimate against a ground
+    truth."""
     return [
         Column("name", "clip"),
         Column("status", "status"),
@@ -51,27 +52,29 @@ def columns() -> list[Column]:
         Column("stature", "stature of the first, cm", 1, 100.0),
         Column("stature_sigma", "its standard error, cm", 1, 100.0),
         Column("speed", "speed of the first, m/s", 2),
-        *error_columns(_ERRORS),
+        *error_columns(_ERROR_NAMES),
         Column("seconds", "computed in, s", 0),
         Column("reasons", "reasons", is_wide=True),
     ]
 
 
 def _error_key(name: str) -> str:
-    """`scale` of the truth per estimate is not the scale of a run."""
+    """Returns the key of an error: `scale` (truth per estimate) must not be confused
+    with the scale of a run."""
     return f"error.{name}"
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """Rows of all clips of a batch, or of all run folders in a folder, by name.
+    """Returns the rows of all clips of a batch, or of all run folders in a folder, by
+    name.
 
     **Raises:** `InputError` if there are none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder.")
     found: dict[str, Row] = {}
-    # Run folders of a batch are in one of its own, apart from the batch's files.
-    for home in (folder, folder / RUNS):
+    # The run folders of a batch are in a separate folder.
+    for home in (folder, folder / RUNS_FOLDER):
         for summary in sorted(home.glob("*/summary.json")):
             row = _row(folder, summary)
             if row is not None:
@@ -82,21 +85,21 @@ def read_rows(folder: Path) -> list[Row]:
             "status": line["status"],
             "reasons": line["message"],
         }
-        if line["name"] not in found or line["status"] == ERROR:
+        if line["name"] not in found or line["status"] == ERROR_STATUS:
             found[line["name"]] = found.get(line["name"], {}) | row
     for name in _planned(folder):
-        found.setdefault(name, {"name": name, "status": MISSING})
+        found.setdefault(name, {"name": name, "status": MISSING_STATUS})
     if not found:
         raise InputError(
             f"{folder}: no run folders in it (no */summary.json that can be read)."
         )
     for name, row in found.items():
-        row.setdefault("folder", str(Path(RUNS, name)))
+        row.setdefault("folder", str(Path(RUNS_FOLDER, name)))
     return [found[name] for name in sorted(found)]
 
 
 def _row(folder: Path, file: Path) -> Row | None:
-    """The row of a run, with its place from the folder that is collected."""
+    """Returns the row of a run, with its path relative to the collected folder."""
     try:
         row = _figures(file.parent.name, evaluation.read_summary(file))
     except InputError as error:
@@ -132,10 +135,10 @@ def _figures(name: str, summary: dict[str, Any]) -> Row:
             "stature_sigma": people[0].get("stature_sigma_m"),
             "speed": people[0].get("speed_m_s"),
         }
-    errors = (summary.get("errors") or {}).get(JOINT) or {}
-    # A word in place of a number says why there is none.
+    errors = (summary.get("errors") or {}).get(JOINT_ESTIMATE) or {}
+    # Text in place of a number gives the reason for which there is none.
     numbers = {k: v for k, v in errors.items() if isinstance(v, (int, float))}
-    return row | {_error_key(k): v for k, v in numbers.items() if k in _ERRORS}
+    return row | {_error_key(k): v for k, v in numbers.items() if k in _ERROR_NAMES}
 
 
 def _reason(reason: Any) -> str:
@@ -143,16 +146,18 @@ def _reason(reason: Any) -> str:
 
 
 def _planned(folder: Path) -> list[str]:
-    """The names of a batch's clips."""
-    if not (folder / MARK).exists():
+    """Returns the names of a batch's clips."""
+    if not (folder / BATCH_FILE).exists():
         return []
     try:
-        found = files.read_json(folder / MARK, "the clips of a batch")
+        found = files.read_json(folder / BATCH_FILE, "the clips of a batch")
     except InputError as error:
         log.warning("%s Clips that have not been run are left out.", error)
         return []
     clips = found.get("clips") if isinstance(found, dict) else None
     if not isinstance(clips, (dict, list)):
-        log.warning("%s: no clips in it; those not run are left out.", folder / MARK)
+        log.warning(
+            "%s: no clips in it; those not run are left out.", folder / BATCH_FILE
+        )
         return []
     return [name for name in clips if isinstance(name, str) and is_file_name(name)]

@@ -1,9 +1,9 @@
-"""Job arrays on a SLURM cluster, through submitit.
+"""Engine of job arrays on a SLURM cluster, through submitit.
 
-The items are dealt out to the tasks of one array. A task works on its share, and
+The items are distributed over the tasks of one array. A task works on its share, and
 appends each value to a file of the shared folder, which the driver follows. A task that
 reaches its time limit or is preempted is requeued and continues its share; the rest of
-a share whose task is lost goes into another array.
+a lost task's share is submitted in another array.
 """
 
 import contextlib
@@ -21,33 +21,35 @@ from bodyslam_jax.batch.engine import Failure, Setup, Values, attempt
 from bodyslam_jax.config.errors import InputError
 
 log = logging.getLogger(__name__)
-TASKS = 16
-"""Tasks of an array, if the number is not given."""
-_POLL = 2.0
-"""Period of looking for new values, s."""
+DEFAULT_TASKS = 16
+"""Number of tasks of an array, if it is not given."""
+_POLL_PERIOD_S = 2.0
+"""Period at which new values are read."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SlurmEngine:
-    """`Engine` of job arrays."""
+    """Engine of job arrays."""
 
     folder: Path
-    """Seen by all machines; scripts, logs and values are in `.slurm` there."""
+    """Folder that all machines can access; scripts, logs and values are in its
+    `.slurm`."""
     workers: int | None = None
-    """Tasks of an array; `TASKS` without it."""
+    """Number of tasks of an array; `DEFAULT_TASKS` by default."""
     retries: int = 2
-    """How often a task is requeued, and an item given to another array."""
+    """Number of times that a task is requeued, and an item given to another array."""
     minutes: int = 240
     """Time limit of a task, min."""
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Of submitit: `slurm_partition`, `mem_gb` ..."""
+    """Parameters of submitit: `slurm_partition`, `mem_gb` ..."""
     cluster: str = "slurm"
-    """`local` runs the tasks as processes of this machine, to try things out."""
+    """Kind of cluster; `local` runs the tasks as processes of this machine, for
+    tests."""
 
     def map(
         self, function: Callable[[Any], Any], items: Sequence[Any], setup: Setup
     ) -> Values:
-        """As `Engine.map`."""
+        """Implements `Engine.map`."""
         todo = [(number, 0) for number in range(len(items))]
         home = Path(self.folder, ".slurm", uuid.uuid4().hex[:8])
         while todo:
@@ -66,7 +68,7 @@ class SlurmEngine:
             for number, before in attempts.items():
                 if number in done:
                     continue
-                # What the task was working on when it was lost has had its attempt.
+                # The item that a lost task was working on has used up an attempt.
                 after = before + (number in first_left)
                 if after <= self.retries:
                     todo.append((number, after))
@@ -86,7 +88,7 @@ class SlurmEngine:
         """Submits an array for these items; yields values by number, and `_LOST` for
         the item that a lost task was working on."""
         executor = self._executor(home)
-        count = min(self.workers or TASKS, len(numbers))
+        count = min(self.workers or DEFAULT_TASKS, len(numbers))
         files = [home / f"{uuid.uuid4().hex[:8]}.values" for _ in range(count)]
         shares = [
             Share(function, setup, [(n, items[n]) for n in numbers[k::count]], file)
@@ -113,7 +115,7 @@ class SlurmEngine:
                         _raise_setup_error(job)
                         yield left[0], _LOST
                 if open_:
-                    time.sleep(_POLL if self.cluster == "slurm" else 0.1)
+                    time.sleep(_POLL_PERIOD_S if self.cluster == "slurm" else 0.1)
         finally:
             for job, _ in open_.values():
                 with contextlib.suppress(OSError):
@@ -151,7 +153,7 @@ _LOST = object()
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """What one task of an array does."""
+    """The items that one task of an array works on."""
 
     function: Callable[[Any], Any]
     setup: Setup
@@ -162,11 +164,12 @@ class Share:
 
 
 class SetupError(RuntimeError):
-    """The process could not be prepared."""
+    """Raised if the process could not be prepared."""
 
 
 class _Runner:
-    """Runs a share; what a requeued task had finished before is not run again."""
+    """Runs a share; items that a requeued task had finished before are not run
+    again."""
 
     def __call__(self, share: Share) -> None:
         try:
@@ -176,7 +179,7 @@ class _Runner:
         begun, end = read_values(share.values, 0)
         done = {number for number, _ in begun}
         with share.values.open("ab") as file:
-            file.truncate(end)  # what a killed task wrote in part
+            file.truncate(end)  # drops what a killed task wrote incompletely
             for number, item in share.items:
                 if number not in done:
                     value = attempt(share.function, item)
@@ -184,7 +187,8 @@ class _Runner:
                     file.flush()
 
     def checkpoint(self, share: Share) -> Any:
-        """What submitit submits again after a time-out or preemption."""
+        """Returns the call that submitit submits again after a time-out or
+        preemption."""
         return _import_submitit().helpers.DelayedSubmission(self, share)
 
 
@@ -192,7 +196,7 @@ run_share = _Runner()
 
 
 def read_values(file: Path, start: int) -> tuple[list[tuple[int, Any]], int]:
-    """The values after byte `start` that are complete, and the byte behind them."""
+    """Returns the complete values after byte `start`, and the position behind them."""
     found: list[tuple[int, Any]] = []
     with contextlib.suppress(FileNotFoundError), file.open("rb") as stream:
         stream.seek(start)
@@ -204,10 +208,13 @@ def read_values(file: Path, start: int) -> tuple[list[tuple[int, Any]], int]:
 
 
 def _raise_setup_error(job: Any) -> None:
-    """**Raises:** `InputError` if the task ended because it could not be prepared."""
+    """Checks whether the task ended because it could not be prepared.
+
+    **Raises:** `InputError` if so.
+    """
     try:
         text = str(job.exception())
-    except Exception:  # Lost without a result.
+    except Exception:  # lost without a result
         return
     lines = [line for line in text.splitlines() if SetupError.__name__ in line]
     if lines:

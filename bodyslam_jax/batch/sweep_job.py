@@ -1,4 +1,5 @@
-"""The joint solve of one clip at many weights and start scales, in one program."""
+"""Solves the joint problem of one clip for many weights and start scales, in one
+program."""
 
 import dataclasses
 from pathlib import Path
@@ -29,14 +30,14 @@ from bodyslam_jax.types import Sequence as Clip
 
 @dataclasses.dataclass(frozen=True)
 class SweepJob:
-    """A clip, settings, and the points at which its joint problem is solved."""
+    """A clip, its settings, and the points at which its joint problem is solved."""
 
     source: Input
     config: Config
     setting: dict[str, str]
     """The point of the grid of settings, for the rows."""
     points: tuple[dict[str, float], ...]
-    """Of `scale` and `weights.TERM`."""
+    """Values of `scale` and `weights.TERM` at each point."""
     stages: Path
     """Folder for the stages before the joint estimate."""
 
@@ -47,7 +48,7 @@ class SweepJob:
 
 
 def run_sweep(job: SweepJob) -> list[Row]:
-    """A row for each point: cost, scale, and errors where there is a truth.
+    """Returns a row for each point: cost, scale, and errors if there is a truth.
 
     **Raises:** `ValueError` as the pipeline does, and for a term that the clip's
     problem does not have.
@@ -101,7 +102,7 @@ _solve_all = solver.vmap_over_devices(_solve_one, (None, None, None, 0, 0))
 
 
 def _prepared(job: SweepJob) -> tuple[Clip, SfmResult, BodyModel, Prepared]:
-    """The joint problem as in `pipeline.run`."""
+    """Builds the joint problem as `pipeline.run` does."""
     source, config = job.source, job.config
     clip = io.read_sequence(
         source.path,

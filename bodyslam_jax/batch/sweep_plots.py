@@ -1,4 +1,4 @@
-"""Figures of a sweep: over each axis, and as maps over the first two."""
+"""Plots a sweep: over each axis, and as maps over the first two."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,29 +8,29 @@ import numpy as np
 from bodyslam_jax.batch.grid import Axis
 from bodyslam_jax.batch.table import Column, Row
 
-_PANEL = (3.2, 2.4)
-"""Size of a panel, inch."""
-_CLIPS = 8
-"""Number of clips that are drawn apart; more are drawn by their median."""
-_DRAWN = 4
-"""Largest number of figures."""
+_PANEL_SIZE_IN = (3.2, 2.4)
+"""Width and height of a panel."""
+_MAX_SEPARATE_CLIPS = 8
+"""Number of clips up to which each is drawn; more are represented by their median."""
+_MAX_FIGURES = 4
+"""Number of figures that are drawn at most."""
 
 
 def draw(
     path: Path, rows: Sequence[Row], axes: Sequence[Axis], columns: Sequence[Column]
 ) -> None:
-    """A row of panels for each axis, with the other axes at their medians; then maps
-    over the first two axes, of the median over clips."""
+    """Draws a row of panels for each axis, with the medians over the other axes; then
+    maps over the first two axes, of the median over clips."""
     from matplotlib.figure import Figure  # takes half a second to import
 
     names = {axis.name for axis in axes}
     drawn = [c for c in columns if c.digits is not None and c.key not in names]
     drawn = [c for c in drawn if c.key != "iterations"]
     # Cost, scale and camera path, and the first error.
-    drawn = drawn[:_DRAWN]
+    drawn = drawn[:_MAX_FIGURES]
     several = [axis for axis in axes if len(axis.values) > 1] or list(axes[:1])
     down = len(several) + (len(several) > 1)
-    size = (_PANEL[0] * len(drawn), _PANEL[1] * down)
+    size = (_PANEL_SIZE_IN[0] * len(drawn), _PANEL_SIZE_IN[1] * down)
     figure = Figure(size, layout="constrained")
     panels = figure.subplots(down, len(drawn), squeeze=False)
     for line, axis in zip(panels, several, strict=False):
@@ -43,9 +43,9 @@ def draw(
 
 
 def _lines(panel, rows: Sequence[Row], axis: Axis, column: Column) -> None:
-    """A line for each clip, through the medians over all other axes."""
+    """Draws a line for each clip, through the medians over all other axes."""
     clips = list(dict.fromkeys(str(row["name"]) for row in rows))
-    apart = clips if len(clips) <= _CLIPS else [None]
+    apart = clips if len(clips) <= _MAX_SEPARATE_CLIPS else [None]
     places = _places(axis)
     for clip in apart:
         chosen = [row for row in rows if clip in (None, row["name"])]
@@ -93,7 +93,7 @@ def _median(column: Column, rows: Sequence[Row]) -> float:
 
 
 def _places(axis: Axis) -> list[float]:
-    """Values as numbers; their ranks, if one is none."""
+    """Returns the values as numbers; their ranks, if a value is not a number."""
     try:
         return [float(value) for value in axis.values]
     except ValueError:

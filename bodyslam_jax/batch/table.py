@@ -1,4 +1,4 @@
-"""Rows of figures as CSV, Markdown and LaTeX."""
+"""Formats rows of figures as CSV, Markdown and LaTeX."""
 
 import dataclasses
 import math
@@ -17,14 +17,14 @@ class Column:
     key: str
     title: str
     digits: int | None = None
-    """Behind the decimal point; `None` for text and whole numbers."""
+    """Number of decimal places; `None` for text and whole numbers."""
     factor: float = 1.0
-    """From the row's unit (SI) to that of the title."""
+    """Factor from the row's unit (SI) to that of the title."""
     is_wide: bool = False
-    """Whether it is left out of LaTeX: text of any length."""
+    """Whether the column has text of any length, and is left out of LaTeX."""
 
     def value(self, row: Row) -> Any:
-        """In the unit of the title; `None` if the row has none."""
+        """Returns the value in the unit of the title; `None` if the row has none."""
         found = row.get(self.key)
         if isinstance(found, (int, float)) and not isinstance(found, bool):
             if not math.isfinite(found):
@@ -42,19 +42,20 @@ class Column:
 
 
 def present(columns: Sequence[Column], rows: Sequence[Row]) -> list[Column]:
-    """The columns for which a row has a value."""
+    """Returns the columns for which any row has a value."""
     return [c for c in columns if any(c.value(row) is not None for row in rows)]
 
 
 def to_csv(columns: Sequence[Column], rows: Sequence[Row]) -> str:
-    """All digits; columns have their keys as names, and the unit of the title."""
+    """Returns CSV with all digits; columns have their titles as names."""
     titles = [column.title for column in columns]
     cells = ([column.value(row) for column in columns] for row in rows)
     return csv_table([titles, *cells])
 
 
 def to_markdown(columns: Sequence[Column], rows: Sequence[Row]) -> str:
-    """A table with numbers to the right, and the median of each below."""
+    """Returns a Markdown table with numbers aligned to the right, and the medians as
+    last line."""
     cells = ([column.text(row) for column in columns] for row in rows)
     return markdown_table(
         [[column.title for column in columns], *cells],
@@ -64,7 +65,7 @@ def to_markdown(columns: Sequence[Column], rows: Sequence[Row]) -> str:
 
 
 def to_latex(columns: Sequence[Column], rows: Sequence[Row]) -> str:
-    """A `tabular` with rules of the package booktabs."""
+    """Returns a `tabular` with rules of the package booktabs."""
     columns = [column for column in columns if not column.is_wide]
     form = "".join("r" if column.digits is not None else "l" for column in columns)
     line = lambda cells: " & ".join(map(latex_text, cells)) + r" \\"

@@ -1,4 +1,4 @@
-"""How the processes of an engine are prepared."""
+"""Prepares the processes of an engine."""
 
 import dataclasses
 import functools
@@ -9,7 +9,7 @@ from typing import Any
 from bodyslam_jax.batch import program_cache
 from bodyslam_jax.batch.engine import Setup
 
-_COPIED = (
+_JAX_OPTIONS = (
     "jax_enable_x64",
     "jax_platforms",
     "jax_compilation_cache_dir",
@@ -20,16 +20,17 @@ _COPIED = (
 
 @dataclasses.dataclass(frozen=True)
 class CallersJax:
-    """A `Setup` that sets JAX as it is set in the process that read it."""
+    """A `Setup` that configures JAX as in the process that called `read`."""
 
     settings: dict[str, Any]
 
     @classmethod
     def read(cls, device: str | None = None) -> "CallersJax":
-        """The settings of this process, for processes that compute on `device`."""
+        """Reads JAX's configuration of this process, for processes that compute on
+        `device`."""
         import jax
 
-        found = {name: getattr(jax.config, name) for name in _COPIED}
+        found = {name: getattr(jax.config, name) for name in _JAX_OPTIONS}
         if not found["jax_compilation_cache_dir"]:
             found["jax_compilation_cache_dir"] = str(program_cache.user_folder())
             found["jax_persistent_cache_min_compile_time_secs"] = 0.0
@@ -45,7 +46,7 @@ class CallersJax:
 
 
 def prepared(settings: Setup, each_core_a_device: bool = False) -> Setup:
-    """A `Setup`: settings of JAX, and the cache that processes share.
+    """Returns a `Setup` that configures JAX and the cache that processes share.
 
     Args:
         each_core_a_device: whether mapped solves use all cores that the process has.

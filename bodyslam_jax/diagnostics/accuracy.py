@@ -1,4 +1,4 @@
-"""How well each kind of length is known, by what it depends on.
+"""Uncertainty of lengths by direction: across the view, along it, and over the ground.
 
 The size of people gives the size of everything (`sizes`). Lengths across the view at
 their distance follow from it alone; their distance from the camera, and motion along
@@ -19,9 +19,9 @@ from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result, Sequence, SfmResult
 
-_TOLD_APART = 0.05
-"""Relative standard deviation of the focal length from which it is named: below, it is
-no more than that of the size of people."""
+_MIN_REPORTED_FOCAL_SIGMA = 0.05
+"""Relative standard deviation of the focal length from which a warning names it. Below,
+it does not exceed that of the size of people."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,31 +29,36 @@ class PersonAccuracy:
     """Relative standard deviations of a person's lengths; NaN where unknown."""
 
     across: float
-    """Of stature and motion across the view."""
+    """Relative standard deviation of stature and of motion across the view."""
     along: float
-    """Of the distance from the camera and of motion along the view."""
+    """Relative standard deviation of the distance from the camera and of motion along
+    the view."""
     speed: float
-    """Of way and speed over the ground, by their direction."""
+    """Relative standard deviation of path length and speed over the ground, for the
+    direction of that path."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Accuracy:
-    """What the lengths of a result depend on, and how well each is known."""
+    """Standard deviations of the focal length, of up, and of the lengths of each
+    person."""
 
     focal: float
-    """Relative standard deviation of the focal length; 0 of a calibration."""
+    """Relative standard deviation of the focal length; 0 for a calibrated camera."""
     up: float
-    """Standard deviation of up, rad."""
+    """Standard deviation of the vertical, rad."""
     people: tuple[PersonAccuracy, ...]
 
     @property
     def across(self) -> float:
-        """Of lengths across the view, by the person who is known best."""
+        """Relative standard deviation of lengths across the view, of the most accurate
+        person."""
         return min((p.across for p in self.people if p.across > 0), default=np.nan)
 
     @property
     def along(self) -> float:
-        """Of distances from the camera, by the person who is known best."""
+        """Relative standard deviation of distances from the camera, of the most
+        accurate person."""
         return min((p.along for p in self.people if p.along > 0), default=np.nan)
 
 
@@ -65,7 +70,7 @@ def accuracy(
     sizes: Many[float],
     structure: Structure,
 ) -> Accuracy:
-    """How well the lengths of a result are known.
+    """Returns the standard deviations of the lengths of a result.
 
     Args:
         sizes: relative standard deviation of the size of each person.
@@ -88,8 +93,8 @@ def accuracy(
 def focal_uncertainty(
     sequence: Sequence, cameras: SfmResult, structure: Structure
 ) -> float:
-    """Relative standard deviation of the focal length that the result has; 0 of a
-    calibration."""
+    """Returns the relative standard deviation of the focal length of the result; 0 for
+    a calibrated camera."""
     lens = sequence.intrinsics
     if not lens.is_refined:
         return 0.0
@@ -101,9 +106,9 @@ def focal_uncertainty(
 
 
 def guess_warning(sequence: Sequence, cameras: SfmResult, found: Accuracy) -> list[str]:
-    """A line on what a focal length that is a guess makes uncertain, if anybody is
-    there to be at a distance."""
-    if not found.people or not found.focal > _TOLD_APART:
+    """Returns a warning that names the lengths affected by an uncertain focal length;
+    an empty list if it is known well or there are no people."""
+    if not found.people or not found.focal > _MIN_REPORTED_FOCAL_SIGMA:
         return []
     lens = sequence.intrinsics
     origin = "as given" if not lens.is_guess else "guessed"
@@ -124,8 +129,8 @@ def _percent(share: float) -> str:
 
 
 def _view(result: Result, person: int) -> tuple[float, float]:
-    """Share of a person's squared motion over the ground that is along the view, and
-    the angle by which the camera looks down at the person, rad."""
+    """Returns the share of a person's squared motion over the ground that is along the
+    view, and the angle by which the camera looks down at the person, rad."""
     share = total = 0.0
     gaze: list[Float[np.ndarray, "n 3"]] = []
     for run in runs(result.present[person]):

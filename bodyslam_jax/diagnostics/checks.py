@@ -1,4 +1,4 @@
-"""Rules by which a result is doubted: checks of figures, reasons, the status.
+"""Rules by which a result is doubted: checks of figures, reasons, and the status.
 
 A result is `failed` if a reason is fatal, `doubtful` if there is any reason, else `ok`.
 """
@@ -19,24 +19,25 @@ class Check:
 
     name: str
     what: str
-    """What the figure is, as the subject of a sentence."""
+    """The figure as the subject of a sentence."""
     unit: str
     limit: float
     advice: str
-    """What to do."""
+    """Advice to the user if the check fails."""
     source: str
     """Where the threshold comes from."""
     below: bool = False
     """Whether the limit is a lower bound."""
 
     def fails(self, figure: float) -> bool:
-        """Whether the figure is beyond the limit; NaN never is."""
+        """Returns whether the figure is beyond the limit; False for NaN."""
         return figure < self.limit if self.below else figure > self.limit
 
 
 @dataclasses.dataclass(frozen=True)
 class Reason:
-    """Why a result is doubtful or failed: an entry of `reasons` in `summary.json`."""
+    """A reason why a result is doubtful or failed: an entry of `reasons` in
+    `summary.json`."""
 
     name: str
     message: str
@@ -49,12 +50,12 @@ class Reason:
     frames: tuple[int, int] | None = None
     """The first and the last frame to look at."""
     seconds: tuple[float, float] | None = None
-    """The same, s from the first frame."""
+    """Times of these frames, s from the first frame of the video."""
     fatal: bool = False
     """Whether the result as a whole is unusable."""
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry as written; fields that do not apply are left out."""
+        """Returns the entry as written; fields that do not apply are left out."""
         plain = dataclasses.asdict(self)
         plain["status"] = "failed" if plain.pop("fatal") else "doubtful"
         return {k: v for k, v in plain.items() if v is not None and v != ""}
@@ -68,10 +69,10 @@ def judge(
     moments: Mapping[str, tuple[int, int] | None] | None = None,
     times: Float[np.ndarray, " t"] | None = None,
 ) -> list[Reason]:
-    """A reason for each figure beyond its limit.
+    """Returns a reason for each figure that is beyond its limit.
 
-    Figures that are missing or NaN are not judged; `person` is named in the messages,
-    and so are the first and last frame of `moments` and their `times`, s.
+    Figures that are missing or NaN are not judged. The messages name the `person`, if
+    any, and the first and last frame of `moments` with their `times` (s).
     """
     found = []
     for check in checks:
@@ -108,7 +109,7 @@ def judge(
 
 
 def status_of(reasons: list[Reason]) -> Status:
-    """The status of a result with these reasons."""
+    """Returns the status of a result with these reasons."""
     if any(reason.fatal for reason in reasons):
         return "failed"
     return "doubtful" if reasons else "ok"

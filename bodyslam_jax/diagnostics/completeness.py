@@ -5,12 +5,13 @@ import numpy as np
 from bodyslam_jax.diagnostics.checks import Reason
 from bodyslam_jax.types import Result, ScaleStart, SfmResult
 
-_LEAST_SHARE = 0.5
-"""Share of the video's frames that have to be used for a result of that video."""
+_MIN_FRAMES_SHARE = 0.5
+"""Share of the video's frames that must be used for a result to represent that
+video."""
 
 
 def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
-    """Reasons to doubt or reject a result that is missing or partial.
+    """Returns the reasons to doubt or reject a result that is missing or partial.
 
     These are values that are not finite, a camera motion that was not found, no people
     (and no metric camera path), and fewer than half of the video's frames used.
@@ -49,13 +50,13 @@ def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
             )
         )
     within = cameras.within
-    if within.mean() < _LEAST_SHARE:
+    if within.mean() < _MIN_FRAMES_SHARE:
         used = np.flatnonzero(within)
         found.append(
             Reason(
                 "frames_used",
                 f"only frames {used[0]} to {used[-1]} of {len(within)} are used.",
-                f"at least {100 * _LEAST_SHARE:.0f} % of the frames",
+                f"at least {100 * _MIN_FRAMES_SHARE:.0f} % of the frames",
                 "cut the video where the shot changes and run the parts",
                 figure=float(within.mean()),
             )
@@ -66,7 +67,8 @@ def incomplete(result: Result, cameras: SfmResult) -> list[Reason]:
 def scale_undetermined(
     result: Result, cameras: SfmResult, start: ScaleStart, *, legs_hidden: bool = False
 ) -> list[Reason]:
-    """Reasons to doubt or reject the scale of a moving camera that sees people.
+    """Returns the reasons to doubt or reject the scale of a moving camera that sees
+    people.
 
     Either no cue determines the scale, or the estimated scale is not positive. With
     `legs_hidden` nobody's legs are seen in any frame.

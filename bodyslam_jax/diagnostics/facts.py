@@ -1,4 +1,4 @@
-"""What a user gave, compared with the estimate that was made without it.
+"""Comparison of what a user gave with the estimate that was made without it.
 
 A fact is a measurement with a standard deviation, and so is the estimate that the rest
 of the input gives. Where they are apart by more than two combined standard deviations
@@ -30,51 +30,52 @@ from bodyslam_jax.diagnostics.gait import WALK_RATIO_SPREAD, Gait
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Sequence, SfmResult
 
-WARNED, DOUBTED = 2.0, 3.0
-"""Combined standard deviations from which there is a warning; a doubt: by chance in 5 %
-and in 0.3 % of right facts."""
+WARNING_SIGMAS, DOUBT_SIGMAS = 2.0, 3.0
+"""Distance in combined standard deviations from which a warning, and a doubt, is
+raised: by chance in 5 % and in 0.3 % of correct facts."""
 CENTRE_SIGMA = 0.01
-"""Standard deviation of a calibrated principal point, of the image's longer side: what
-focus, temperature and a stabiliser's crop move it by. Assumed."""
-STILL_SIGMA = 0.6
-"""Standard deviation of how far the points of a still background wander by errors of
-tracking, px of an image 640 px wide: the limit below which structure from motion takes
-a camera to stand still."""
-_OF_WIDTH = 640.0
+"""Standard deviation of a calibrated principal point, as a share of the image's longer
+side: displacement by focus, temperature and a stabiliser's crop. Assumed."""
+STILL_CAMERA_SIGMA_PX = 0.6
+"""Standard deviation of the apparent motion of a static background due to tracking
+errors, px at an image width of 640 px: the limit below which structure from motion
+classifies a camera as static."""
+_REFERENCE_WIDTH_PX = 640.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """A quantity that was given, and the estimate of it without that."""
+    """A given quantity with its standard deviation, and its estimate made without
+    it."""
 
     name: str
-    """As in `Reason.name`."""
+    """Name of the reason that it may become (`Reason.name`)."""
     what: str
-    """What the quantity is, as a noun."""
+    """The quantity as a noun phrase."""
     unit: str
     given: float
     given_sigma: float
     found: float
     found_sigma: float
     why: str
-    """The likely reasons of a difference."""
+    """Likely reasons for a difference."""
     advice: str
     digits: int = 0
     person: int | None = None
     words: str = ""
-    """What was given and found, where "given as ..., without it ..." does not say
-    it."""
+    """Text with both values, if other than the default "... was given as ...; without
+    it ... would be found"."""
 
     @property
     def sigmas(self) -> float:
-        """Distance in combined standard deviations; 0 where nothing is known."""
+        """Distance in combined standard deviations; 0 if either value is unknown."""
         sigma = np.hypot(self.given_sigma, self.found_sigma)
         apart = abs(self.given - self.found)
         return float(apart / sigma) if np.isfinite(apart) and sigma < np.inf else 0.0
 
     @property
     def message(self) -> str:
-        """The line with both figures and the likely reason."""
+        """Sentence with both values, their distance and the likely reason."""
         places = f".{self.digits}f"
         figure = lambda x, s: f"{x:{places}} ± {s:{places}}" if s else f"{x:{places}}"
         unit = self.unit and f" {self.unit}"
@@ -88,7 +89,8 @@ class Fact:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry of `given` in `summary.json`; unknown numbers are `None`."""
+        """Returns the entry of `given` in `summary.json`; unknown numbers are
+        `None`."""
         known = lambda x: float(x) if np.isfinite(x) else None
         return {
             "name": self.name,
@@ -103,29 +105,29 @@ class Fact:
 
 
 def contradictions(facts: Many[Fact]) -> tuple[list[str], list[Reason]]:
-    """Warnings of facts that are beyond two standard deviations from the estimate
-    without them, and reasons to doubt the result for those beyond three."""
+    """Returns warnings for facts beyond two combined standard deviations from the
+    estimate without them, and reasons to doubt the result for those beyond three."""
     warnings, reasons = [], []
     for fact in facts:
-        if fact.sigmas > DOUBTED:
+        if fact.sigmas > DOUBT_SIGMAS:
             reasons.append(
                 Reason(
                     name=fact.name,
                     message=fact.message,
-                    expected=f"at most {DOUBTED:g} standard deviations",
+                    expected=f"at most {DOUBT_SIGMAS:g} standard deviations",
                     advice=fact.advice,
                     figure=fact.sigmas,
                     unit="standard deviations",
                     person=fact.person,
                 )
             )
-        elif fact.sigmas > WARNED:
+        elif fact.sigmas > WARNING_SIGMAS:
             warnings.append(fact.message)
     return warnings, reasons
 
 
 def misfits_of_own_factors(joint: JointEstimate) -> tuple[list[str], list[Reason]]:
-    """Warnings of a user's own factors whose residuals are beyond two standard
+    """Returns warnings for the user's own factors whose residuals exceed two standard
     deviations (rms), and reasons to doubt the result for those beyond three."""
     warnings, reasons = [], []
     for factor in joint.own_factors:
@@ -133,7 +135,7 @@ def misfits_of_own_factors(joint: JointEstimate) -> tuple[list[str], list[Reason
             f"the residuals of the factor {factor.name} are {factor.rms:.1f} of its "
             f"standard deviations (rms of {factor.residuals})."
         )
-        if factor.rms > DOUBTED:
+        if factor.rms > DOUBT_SIGMAS:
             reasons.append(
                 Reason(
                     name="own_factor",
@@ -145,7 +147,7 @@ def misfits_of_own_factors(joint: JointEstimate) -> tuple[list[str], list[Reason
                     unit="standard deviations",
                 )
             )
-        elif factor.rms > WARNED:
+        elif factor.rms > WARNING_SIGMAS:
             warnings.append(message)
     return warnings, reasons
 
@@ -159,7 +161,7 @@ def given_facts(
     gaits: Many[Gait | None],
     length_error: float,
 ) -> list[Fact]:
-    """Everything that was given and can be compared.
+    """Returns a fact for each given quantity that can be compared with an estimate.
 
     Args:
         length_error: relative standard error of all lengths; NaN counts as 0.
@@ -240,12 +242,12 @@ def _calibration(sequence: Sequence, cameras: SfmResult) -> list[Fact]:
             strict=True,
         )
     ]
-    # The coordinate that is farther off stands for both.
+    # The coordinate with the larger deviation represents both.
     return [facts[0], max(facts[1:], key=lambda fact: fact.sigmas)]
 
 
 def _gravity(known: Known, up: Upright, gaits: Many[Gait | None]) -> list[Fact]:
-    # Who does not walk may lie or hang, which is what gravity is given for.
+    # People who do not walk may lie or hang, which is why gravity is given.
     walking = any(steps is not None for steps in gaits)
     if not known.gravity or not (walking or np.isfinite(up.edges)):
         return []
@@ -275,7 +277,9 @@ def _standing_camera(
     if not known.static_camera:
         return []
     lens = sequence.intrinsics
-    sigma = STILL_SIGMA * max(max(lens.width, lens.height) / _OF_WIDTH, 1.0)
+    sigma = STILL_CAMERA_SIGMA_PX * max(
+        max(lens.width, lens.height) / _REFERENCE_WIDTH_PX, 1.0
+    )
     return [
         Fact(
             name="given_static",

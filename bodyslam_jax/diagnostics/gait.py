@@ -1,4 +1,4 @@
-"""Gait: cadence and step length, and whether the frame rate is plausible for them.
+"""Cadence and step length of a walk, and whether the frame rate is plausible for them.
 
 In walking, step length over cadence (the walk ratio) is about constant at all speeds:
 0.0065 m per step a minute (Sekiya et al., 1997). In leg lengths L, with time in units
@@ -15,10 +15,10 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
-_GRAVITY = 9.81
+_GRAVITY_M_S2 = 9.81
 _UP = np.array([0.0, 1.0, 0.0])
-_PLAN = [0, 2]
-_LEGS = ([1, 4, 7], [2, 5, 8])
+_HORIZONTAL_AXES = [0, 2]
+_LEG_JOINTS = ([1, 4, 7], [2, 5, 8])
 """Hip, knee and ankle of either side."""
 _WALK_RATIO = 1.7
 """Dimensionless walk ratio, the median of 85 walks and runs of the CMU archive, of
@@ -26,28 +26,29 @@ which nine of ten have 1.4 to 2.2."""
 WALK_RATIO_SPREAD = 0.14
 """Standard deviation of the logarithm of the walk ratio: half of log(2.2 / 1.4), which
 nine of ten are within, over 1.645."""
-_SLOW = 1.6
-"""Factor on the walk ratio from which it is slow motion: of those 85 two exceed it,
-with strides that are exaggerated on purpose."""
-_OFTEN = 2.6
-"""Cadence that exceeds any walk, steps a second."""
-_SELDOM = 1.2
-"""Cadence below any usual walk, steps a second: of 76 walks and runs of the CMU archive
-one has less (0.97), the next 1.28."""
-_STRIDES = 1.5
-"""Least number of strides (two steps each) in a stretch."""
-_ALIKE, _REGULAR = 0.2, 0.6
-"""Autocorrelation of a candidate for the period, and of an accepted one."""
-_STEP = 0.35
-"""Step length, in leg lengths, below which the frame rate is not judged."""
+_SLOW_MOTION_FACTOR = 1.6
+"""Ratio of the walk ratio to the usual one from which a walk is slow motion: two of
+those 85 exceed it, with strides that are exaggerated on purpose."""
+_MAX_WALKING_CADENCE_HZ = 2.6
+"""Cadence that no walk exceeds, steps per second."""
+_MIN_WALKING_CADENCE_HZ = 1.2
+"""Cadence below that of usual walks, steps per second: of 76 walks and runs of the CMU
+archive one has less (0.97), the next 1.28."""
+_MIN_STRIDES = 1.5
+"""Number of strides (two steps each) from which a stretch is analysed."""
+_MIN_PEAK_CORRELATION, _MIN_PERIOD_CORRELATION = 0.2, 0.6
+"""Autocorrelation from which a lag is a candidate for the period, and from which the
+first candidate is accepted."""
+_MIN_STEP_LEGS = 0.35
+"""Step length from which the frame rate is judged, leg lengths."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """A person's steps, where the legs swing regularly."""
+    """Regular gait of one person: cadence, step length, leg length and reach."""
 
     frequency: float
-    """Steps a second."""
+    """Cadence, steps per second."""
     step: float
     """Step length, in lengths of the leg from hip to ankle."""
     leg: float
@@ -66,37 +67,39 @@ class Gait:
 
     @property
     def slowness(self) -> float:
-        """Walk ratio over the usual one: the factor by which the motion is too slow.
+        """Walk ratio divided by the usual one: the factor by which the motion is too
+        slow.
 
         It is proportional to the frame interval, and to the inverse root of scale.
         """
-        swing = self.frequency * np.sqrt(self.leg / _GRAVITY)
+        swing = self.frequency * np.sqrt(self.leg / _GRAVITY_M_S2)
         return float(self.step / swing / _WALK_RATIO)
 
     def is_slow_motion(self, unsure: float = 0.0) -> bool:
-        """Whether the walk is implausibly slow, even if lengths are too large by the
-        relative error `unsure`."""
-        return self.strides and self.slowness > _SLOW * (1 + unsure)
+        """Returns whether the walk is implausibly slow even if lengths are
+        overestimated by the relative error `unsure`."""
+        return self.strides and self.slowness > _SLOW_MOTION_FACTOR * (1 + unsure)
 
     @property
     def strides(self) -> bool:
-        """Whether steps are long enough that the frame rate can be judged by them."""
-        return self.step > _STEP
+        """Whether the steps are long enough to judge the frame rate by them."""
+        return self.step > _MIN_STEP_LEGS
 
     def has_low_cadence(self) -> bool:
-        """Whether steps are taken more rarely than in nearly all walks, whatever the
+        """Returns whether the cadence is below that of nearly all walks, at any
         scale."""
-        return self.strides and self.frequency < _SELDOM
+        return self.strides and self.frequency < _MIN_WALKING_CADENCE_HZ
 
     def is_fast_motion(self, unsure: float = 0.0) -> bool:
-        """Whether the walk is implausibly quick, even if lengths are too small by the
-        relative error `unsure`."""
-        quick = self.slowness * _SLOW * (1 + unsure) < 1
-        return self.strides and quick and self.frequency > _OFTEN
+        """Returns whether the walk is implausibly fast even if lengths are
+        underestimated by the relative error `unsure`."""
+        quick = self.slowness * _SLOW_MOTION_FACTOR * (1 + unsure) < 1
+        return self.strides and quick and self.frequency > _MAX_WALKING_CADENCE_HZ
 
 
 def gait(result: Result, person: int) -> Gait | None:
-    """A person's gait in the longest stretch in which they are present.
+    """Returns a person's gait in the longest stretch of frames in which they are
+    present.
 
     `None` where the legs do not swing for at least one and a half strides.
     """
@@ -109,7 +112,7 @@ def gait(result: Result, person: int) -> Gait | None:
 
 
 def gait_of_joints(joints: Float[np.ndarray, "t 24 3"], fps: float) -> Gait | None:
-    """The gait of joints in m, y up.
+    """Returns the gait of joint positions in m, y up.
 
     Forward is perpendicular to the line from the right hip to the left one. `None` as
     for `gait`.
@@ -124,10 +127,10 @@ def _steps(
     period = _period(spread)
     if period is None:
         return None
-    bones = [np.diff(joints[:, leg], axis=1) for leg in _LEGS]
+    bones = [np.diff(joints[:, leg], axis=1) for leg in _LEG_JOINTS]
     leg = float(np.linalg.norm(bones, axis=-1).sum(axis=-1).mean())
     frequency = 2 * fps / period
-    place = joints[:, 0, _PLAN]
+    place = joints[:, 0, _HORIZONTAL_AXES]
     gone = np.linalg.norm(place[period:] - place[:-period], axis=1).mean()
     reach = float(np.ptp(np.percentile(spread, [5, 95])) / 2)
     return Gait(frequency, float(gone / 2 / leg), leg, reach / leg)
@@ -136,23 +139,28 @@ def _steps(
 def _spread(
     joints: Float[np.ndarray, "t 24 3"], ahead: Float[np.ndarray, "t 3"]
 ) -> Float[np.ndarray, " t"]:
-    """Distance along the ground by which the left ankle is ahead of the right, m."""
+    """Returns the distance along the ground by which the left ankle is ahead of the
+    right, m."""
     ahead = ahead - (ahead @ _UP)[:, None] * _UP
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     return ((joints[:, 7] - joints[:, 8]) * ahead).sum(axis=1)
 
 
 def _period(signal: Float[np.ndarray, " t"]) -> int | None:
-    """Period of a signal in frames, by the first peak of its autocorrelation; `None`
-    where that is low."""
+    """Returns the period of a signal in frames, by the first peak of its
+    autocorrelation, or `None` if that is low."""
     t = len(signal)
     signal = signal - signal.mean()
-    longest = int(t / _STRIDES)
+    longest = int(t / _MIN_STRIDES)
     if t < 8 or signal.std() < 1e-9:
         return None
     like = np.correlate(signal, signal, "full")[t - 1 :] / np.arange(t, 0, -1)
     like = like[: longest + 1] / like[0]
     peaks = 1 + np.flatnonzero((like[1:-1] > like[:-2]) & (like[1:-1] >= like[2:]))
     peaks = peaks[peaks > np.argmax(like < 0)] if (like < 0).any() else peaks[:0]
-    peaks = peaks[like[peaks] > _ALIKE]
-    return int(peaks[0]) if len(peaks) and like[peaks[0]] > _REGULAR else None
+    peaks = peaks[like[peaks] > _MIN_PEAK_CORRELATION]
+    return (
+        int(peaks[0])
+        if len(peaks) and like[peaks[0]] > _MIN_PERIOD_CORRELATION
+        else None
+    )

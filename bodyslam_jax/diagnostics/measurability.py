@@ -1,4 +1,4 @@
-"""Figures of whether a person can be measured, and how much of them was.
+"""Figures that tell whether a person can be measured, and which share was measured.
 
 People who are small in the image, or far and seen briefly, have no speed and no path in
 metres; of people whose legs are hidden the posture is inferred.
@@ -15,20 +15,21 @@ from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, DETECTOR_FLOOR
 from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence
 
-_PLAN = [0, 2]
-_FEWEST = 3
-"""Keypoints by whose spread in the image a depth is measured."""
-_PIECE = 1.0
-"""s: in a shorter stretch most frames have no prediction by the motion model, which
-reads the half second before."""
-_WALKING = 1.25
-"""m/s: a walker's speed."""
+_HORIZONTAL_AXES = [0, 2]
+_MIN_KEYPOINTS = 3
+"""Number of keypoints from whose spread in the image a depth is measured."""
+_MIN_STRETCH_S = 1.0
+"""In a shorter stretch, s, most frames have no prediction by the motion model, which
+reads the preceding half second."""
+_WALKING_SPEED_M_S = 1.25
+"""Typical walking speed."""
 
 
 def inferred_legs(
     found: Measured, person: int, present: Bool[np.ndarray, " t"], fps: float
 ) -> Bool[np.ndarray, " t"]:
-    """Frames about which a person's legs were mostly inferred (`people.legs_shown`)."""
+    """Returns the frames in which a person's legs were mostly inferred
+    (`people.legs_shown`)."""
     shown = people.legs_shown(found.keypoint[person][None], present[None], fps)
     return present & ~shown[0]
 
@@ -36,9 +37,12 @@ def inferred_legs(
 def measurement_figures(
     sequence: Sequence, found: Measured, result: Result
 ) -> list[dict[str, float]]:
-    """For each person the figures that `PERSON_CHECKS` judge beside those of motion:
-    frames with inferred legs and in short pieces, speed across gaps, appearance within
-    others."""
+    """Returns, for each person, the figures of measurability that `PERSON_CHECKS`
+    judge.
+
+    They are the shares of frames with inferred legs and in short stretches (%), the
+    speed across gaps (m/s), and the overlap with others at the first appearance (%).
+    """
     within = _appears_within(sequence.keypoints, result.present)
     out = []
     for h, present in enumerate(result.present):
@@ -57,7 +61,8 @@ def measurement_figures(
 
 
 def leg_in_image(joint: JointEstimate, result: Result, person: int) -> float:
-    """Length of a stretched leg at the person's depth, px (median over frames)."""
+    """Returns the length of a stretched leg at the person's depth, px (median over
+    frames)."""
     present = result.present[person]
     if not present.any():
         return np.nan
@@ -69,19 +74,20 @@ def leg_in_image(joint: JointEstimate, result: Result, person: int) -> float:
 def speed_noise(
     sequence: Sequence, found: Measured, joint: JointEstimate, person: int
 ) -> float:
-    """Standard deviation of a person's mean speed along the view by noise, m/s.
+    """Returns the standard deviation, due to keypoint noise, of a person's mean speed
+    along the view, m/s.
 
-    It is that of the slope of a line through the depths of the person's longest
-    stretch. A depth is measured by the spread of keypoints in the image, with the usual
-    error of detectors, at least a pixel, which stays the same for 0.15 s. NaN without
-    keypoints.
+    It is the standard error of the slope of a line through the depths of the person's
+    longest stretch. A depth is measured by the spread of the keypoints in the image;
+    their error is the usual one of detectors, at least a pixel, and correlated over
+    0.15 s. NaN without keypoints, infinite where too few are visible.
     """
     if sequence.keypoints is None or not joint.present[person].any():
         return np.nan
     stretch = max(runs(joint.present[person]), key=lambda run: run.stop - run.start)
     here = found.keypoint[person, stretch]
     here = here & (sequence.keypoints.confidence[person, stretch] > 0)
-    enough = here.sum(axis=1) >= _FEWEST
+    enough = here.sum(axis=1) >= _MIN_KEYPOINTS
     if not enough.any():
         return np.inf
     pixels = pixels_per_metre(joint, person)[stretch][enough]
@@ -99,8 +105,9 @@ def speed_noise(
 
 
 def relative_speed_error(sigma: float, speed: float) -> float:
-    """The standard deviation of a speed, % of the speed, at least a walker's."""
-    return 100 * sigma / max(speed, _WALKING)
+    """Returns the standard deviation of a speed in % of that speed, or of a typical
+    walking speed if the person is slower."""
+    return 100 * sigma / max(speed, _WALKING_SPEED_M_S)
 
 
 def _speed_across_gaps(
@@ -108,11 +115,11 @@ def _speed_across_gaps(
     present: Bool[np.ndarray, " t"],
     times: Float[np.ndarray, " t"],
 ) -> float:
-    """Greatest speed over the ground from the end of a stretch to the start of the
-    next, m/s; NaN where there is one stretch only."""
+    """Returns the greatest speed over the ground from the end of a stretch to the start
+    of the next, m/s; NaN where there is one stretch only."""
     stretches = runs(present)
     speeds = [
-        np.linalg.norm((pelvis[b.start] - pelvis[a.stop - 1])[_PLAN])
+        np.linalg.norm((pelvis[b.start] - pelvis[a.stop - 1])[_HORIZONTAL_AXES])
         / (times[b.start] - times[a.stop - 1])
         for a, b in zip(stretches[:-1], stretches[1:], strict=True)
     ]
@@ -120,20 +127,20 @@ def _speed_across_gaps(
 
 
 def _in_pieces(present: Bool[np.ndarray, " t"], fps: float) -> float:
-    """Share of the frames in stretches of less than a second, %; 0 for somebody who is
-    seen once."""
+    """Returns the share of the frames that lie in stretches shorter than a second, %; 0
+    if there is only one stretch."""
     lengths = np.array([run.stop - run.start for run in runs(present)])
     if len(lengths) < 2:
         return 0.0
-    return 100 * float(lengths[lengths < _PIECE * fps].sum() / lengths.sum())
+    return 100 * float(lengths[lengths < _MIN_STRETCH_S * fps].sum() / lengths.sum())
 
 
 def _appears_within(
     keypoints: Keypoints | None, present: Bool[np.ndarray, "h t"]
 ) -> list[float]:
-    """Share of each person's region of the image that another person covers who was
-    there before, in the frame in which the person first appears, %; NaN if that is the
-    first frame."""
+    """Returns the share of each person's region of the image that another person covers
+    who was there before, in the frame in which the person first appears, %; NaN if that
+    is the first frame."""
     if keypoints is None:
         return [np.nan] * len(present)
     detected = (keypoints.confidence > 0)[..., None]

@@ -1,8 +1,8 @@
-"""Which parts of people were measured, which were inferred, and how sure joints are.
+"""Which parts of people were measured, which inferred, and the expected joint errors.
 
-A keypoint is measured where something in the image shows it (`people.shown`). What
-nothing shows, hidden limbs and those out of the image, is inferred: from priors of
-posture and motion, or by a regressor, whose bodies are whole in any case.
+A keypoint is measured where it is visible in the image (`people.shown`). Hidden limbs
+and those outside the image are inferred: by priors of posture and motion, or by a
+regressor, whose bodies are complete in any case.
 """
 
 import dataclasses
@@ -23,10 +23,11 @@ LIMBS: dict[str, tuple[int, ...]] = {
     "legs": _points("knee", "ankle"),
     "feet": _points("big_toe", "heel"),
 }
-"""Keypoints of BODY_25 by which a limb is measured."""
+"""Keypoints of BODY_25 whose visibility means that the limb is measured."""
 
-_TRUNK, _TRUNK_GIVEN = 0.03, 0.016
-_OF_JOINT: dict[str, tuple[tuple[int, int], float, float, float]] = {
+_TRUNK_SIGMA_M, _TRUNK_SIGMA_WITH_BODY_M = 0.03, 0.016
+"""RMS error of the joints of the trunk, from keypoints and with a regressor's body."""
+_JOINT_ERRORS_M: dict[str, tuple[tuple[int, int], float, float, float]] = {
     "hip": ((1, 2), 0.040, 0.05, 0.019),
     "knee": ((4, 5), 0.072, 0.14, 0.026),
     "ankle": ((7, 8), 0.095, 0.19, 0.028),
@@ -36,37 +37,41 @@ _OF_JOINT: dict[str, tuple[tuple[int, int], float, float, float]] = {
     "wrist": ((20, 21), 0.093, 0.12, 0.039),
     "hand": ((22, 23), 0.12, 0.14, 0.053),
 }
-"""Joints (left, right); RMS error where measured; what is added (in squares) where the
-joint is hidden for long; RMS error with a regressor's body. All in m, of 28 rendered
-sequences, after alignment of the body (`benchmarks/video.md`); bodies there were
-simulated without regard to what hides a limb, so that what is added is that of bodies
-fitted to keypoints."""
-_BY_KEYPOINT = {"foot": ("ankle", "big_toe", "heel"), "hand": ("wrist",)}
-"""Keypoints any of which measures a joint, where it is not the one of its name."""
-_FORGETS = 0.1
-"""s: time constant with which the error of a hidden joint grows to its full size, to
-the nearest frame in which it is measured."""
-_USUAL = 0.028
-"""m: a detector's error of a knee or an ankle of large people (`KEYPOINT_SIGMA`)."""
+"""For each joint: its indices (left, right); the RMS error where it is measured; the
+error added in squares where it is hidden for long; the RMS error with a regressor's
+body. All are in m, from 28 rendered sequences, after alignment of the body
+(`benchmarks/video.md`). Bodies there were simulated without regard to occlusion, so the
+added error is that of bodies fitted to keypoints."""
+_JOINT_KEYPOINTS = {"foot": ("ankle", "big_toe", "heel"), "hand": ("wrist",)}
+"""Keypoints any of which measures a joint, where their names differ from the
+joint's."""
+_ERROR_GROWTH_TIME_S = 0.1
+"""Time constant with which the error of a hidden joint grows to its full size, with the
+time to the nearest frame in which the joint is measured."""
+_KEYPOINT_ERROR_M = 0.028
+"""Detection error of a knee or an ankle of a person who is large in the image
+(`KEYPOINT_SIGMA`)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What was measured of `h` people in `t` frames."""
+    """Visibility of keypoints, frames with bodies, and joint errors of `h` people in
+    `t` frames."""
 
     keypoint: Bool[np.ndarray, "h t 25"]
-    """Keypoints of BODY_25 that something in the image shows."""
+    """Keypoints of BODY_25 that are visible in the image."""
     body: Bool[np.ndarray, "h t"]
-    """Frames with a body of a regressor, or that was given."""
+    """Frames with a body of a regressor, or given by the user."""
     joint_sigma: Float[np.ndarray, "h t 24"]
     """Expected error (RMS distance) of each joint within the body, m; 0 where the
-    person is absent. Errors of the body's place and size are not in it."""
+    person is absent. It excludes errors of the body's position and size."""
 
     def shares(self, person: int, present: Bool[np.ndarray, " t"]) -> dict[str, float]:
-        """Share of a person's frames and keypoints in which each limb was not measured.
+        """Returns the share of a person's frames and keypoints, by limb, that were not
+        measured.
 
-        A limb is left out where the detector knows none of its keypoints. Empty for
-        somebody who is in no frame.
+        Feet are left out if the detector provides none of their keypoints. Empty for a
+        person who is in no frame.
         """
         if not present.any():
             return {}
@@ -79,7 +84,8 @@ class Measured:
 
 
 def measured(sequence: Sequence, joint: JointEstimate, body: BodyModel) -> Measured:
-    """What of the people of `joint` was measured, and how sure their joints are."""
+    """Returns which parts of the people of `joint` were measured, and the expected
+    errors of their joints."""
     h, t = joint.present.shape
     keypoint, given = np.zeros((h, t, 25), bool), np.zeros((h, t), bool)
     if h:
@@ -100,29 +106,34 @@ def joint_sigma(
     pixels: Float[np.ndarray, " t"],
     fps: float,
 ) -> Float[np.ndarray, "t 24"]:
-    """Expected error of a person's joints within the body, m.
+    """Returns the expected error of a person's joints within the body, m.
 
     Args:
-        keypoint: those that were measured.
+        keypoint: keypoints of BODY_25 that were measured.
         given: frames with a regressor's body.
-        pixels: of one metre at the person's depth; the error of small people is that
-            of the detector's pixels.
+        pixels: pixels per metre at the person's depth. For people who are small in the
+            image, the detector's error in pixels dominates.
     """
-    small = np.hypot(1.0, DETECTOR_FLOOR / (_USUAL * np.maximum(pixels, 1e-3)))
-    sigma = np.where(given, _TRUNK_GIVEN, _TRUNK * small)[:, None].repeat(24, axis=1)
-    for name, (joints, usual, hidden, with_body) in _OF_JOINT.items():
+    small = np.hypot(
+        1.0, DETECTOR_FLOOR / (_KEYPOINT_ERROR_M * np.maximum(pixels, 1e-3))
+    )
+    sigma = np.where(given, _TRUNK_SIGMA_WITH_BODY_M, _TRUNK_SIGMA_M * small)[
+        :, None
+    ].repeat(24, axis=1)
+    for name, (joints, usual, hidden, with_body) in _JOINT_ERRORS_M.items():
         for joint, side in zip(joints, _SIDES, strict=True):
-            names = _BY_KEYPOINT.get(name, (name,))
+            names = _JOINT_KEYPOINTS.get(name, (name,))
             points = [BODY25[f"{side}_{one}"] for one in names]
             here = np.asarray(keypoint[:, points].any(axis=1))
-            grown = 1 - np.exp(-_time_to_nearest(here, fps) / _FORGETS)
+            grown = 1 - np.exp(-_time_to_nearest(here, fps) / _ERROR_GROWTH_TIME_S)
             known = np.where(given, with_body, usual * small)
             sigma[:, joint] = np.sqrt(known**2 + hidden**2 * grown)
     return sigma
 
 
 def pixels_per_metre(joint: JointEstimate, person: int) -> Float[np.ndarray, " t"]:
-    """Pixels of a metre at the depth of a person's pelvis, in each frame."""
+    """Returns the number of pixels per metre at the depth of a person's pelvis, in each
+    frame."""
     depth = np.maximum(joint.roots[person, :, 2, 3], 1e-3)
     return float(np.mean(joint.intrinsics[:2])) / depth
 
@@ -130,8 +141,8 @@ def pixels_per_metre(joint: JointEstimate, person: int) -> Float[np.ndarray, " t
 def _time_to_nearest(
     here: Bool[np.ndarray, " t"], fps: float
 ) -> Float[np.ndarray, " t"]:
-    """Time from each frame to the nearest one of `here`, s; infinite if there is
-    none."""
+    """Returns the time from each frame to the nearest frame marked by `here`, s;
+    infinite if there is none."""
     frames = np.flatnonzero(here)
     if not len(frames):
         return np.full(len(here), np.inf)

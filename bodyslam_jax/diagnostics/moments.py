@@ -1,7 +1,7 @@
-"""Where in a video a figure is at its worst, so that a reason says where to look.
+"""Frames in which a figure is worst, so that a reason can say where to look.
 
-First and last frame by the name of the check, of figures that one moment decides; a
-figure of the whole video is of the frames in which its person is seen.
+Frames are first and last frame by the name of the check, for figures that one moment
+decides. A figure of the whole video refers to all frames in which the person is seen.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from bodyslam_jax.geometry.runs import runs
 Frames = tuple[int, int]
 """First and last frame."""
 
-MOMENT = 0.2
-"""Interval, s, in which nobody turns round or reverses a run."""
-_PLAN = [0, 2]
+MOMENT_S = 0.2
+"""Interval within which nobody turns round or reverses a run."""
+_HORIZONTAL_AXES = [0, 2]
 
 
 def of_person(
@@ -25,19 +25,21 @@ def of_person(
     inferred: Bool[np.ndarray, " t"],
     fps: float,
 ) -> dict[str, Frames]:
-    """Frames of one person's fastest turn and change of speed, of the first appearance,
-    of the gap that is crossed fastest, of inferred legs, and of short pieces.
+    """Returns the frames of one person's fastest turn and change of speed, first
+    appearance, fastest gap, longest stretch of inferred legs, and shortest piece.
 
-    `inferred` are the frames whose legs were mostly inferred.
+    `inferred` marks the frames whose legs were mostly inferred.
     """
     stretches = _runs(present)
     found: dict[str, Frames] = {}
     if not stretches:
         return found
-    n = max(1, round(MOMENT * fps))
-    turn = _worst(stretches, lambda x: posture.turning_rate(x, fps, MOMENT), joints, n)
+    n = max(1, round(MOMENT_S * fps))
+    turn = _worst(
+        stretches, lambda x: posture.turning_rate(x, fps, MOMENT_S), joints, n
+    )
     jump = _worst(
-        stretches, lambda x: posture.speed_change(x, fps, MOMENT), joints, 2 * n
+        stretches, lambda x: posture.speed_change(x, fps, MOMENT_S), joints, 2 * n
     )
     if turn is not None:
         found |= {"turn": turn, "turn_of_walker": turn}
@@ -47,7 +49,7 @@ def of_person(
     found["appears_within"] = (first, min(first + n, stretches[0].stop - 1))
     gaps = list(zip(stretches[:-1], stretches[1:], strict=True))
     if gaps:
-        place = joints[:, PELVIS][:, _PLAN]
+        place = joints[:, PELVIS][:, _HORIZONTAL_AXES]
         rate = [
             np.linalg.norm(place[b.start] - place[a.stop - 1]) / (b.start - a.stop + 1)
             for a, b in gaps
@@ -66,7 +68,8 @@ def of_person(
 def of_camera(
     T_WC: Float[np.ndarray, "t 4 4"], within: Bool[np.ndarray, " t"], fps: float
 ) -> dict[str, Frames]:
-    """Frames in which the camera moves, accelerates and turns most."""
+    """Returns the frames of the camera's greatest speed, acceleration and rotation
+    rate."""
     frames = np.flatnonzero(within)
     n = max(1, round(0.1 * fps))
     if len(frames) <= 2 * n:
@@ -85,18 +88,20 @@ def of_camera(
 
 
 def seen(present: Bool[np.ndarray, " t"]) -> Frames | None:
-    """The first and the last frame of these; `None` if there is none."""
+    """Returns the first and the last frame that `present` marks; `None` if there is
+    none."""
     where = np.flatnonzero(present)
     return (int(where[0]), int(where[-1])) if len(where) else None
 
 
 def _runs(where: Bool[np.ndarray, " t"]) -> list[slice]:
-    """Runs of frames, in Python's numbers, as JSON knows them."""
+    """Returns the runs of frames as slices of Python integers, which JSON can
+    represent."""
     return [slice(int(run.start), int(run.stop)) for run in runs(where)]
 
 
 def _worst(stretches, figure, joints, length) -> Frames | None:
-    """The frames over which a figure of consecutive joints is greatest."""
+    """Returns the frames over which a figure of consecutive joints is greatest."""
     best, where = -np.inf, None
     for run in stretches:
         values = figure(joints[run])

@@ -1,4 +1,4 @@
-"""One person's part of the verdict: figures, status and reasons."""
+"""Verdict on one person: figures, status and reasons."""
 
 import dataclasses
 from typing import Literal
@@ -21,13 +21,13 @@ from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import JointEstimate, Result, Sequence
 
 PersonStatus = Literal["ok", "doubtful", "not_measurable", "absent"]
-"""Of one person. Who is `not_measurable` is too small or too far away for a speed, a
-path or a size in metres; `absent` is who is in no frame."""
+"""Status of one person. `not_measurable`: too small or too far away for a speed, path
+or size in metres; `absent`: in no frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PersonVerdict:
-    """One person's figures."""
+    """Figures of one person, with status and reasons."""
 
     frames: int
     """Frames in which the person is present."""
@@ -40,16 +40,17 @@ class PersonVerdict:
     """Standard deviation, m; NaN if uncertainty was not computed."""
     status: PersonStatus
     reasons: tuple[Reason, ...]
-    """Why it is not `ok`."""
+    """Reasons for which the status is not `ok`."""
     not_measured: dict[str, float]
-    """Share of the frames in which arms, legs, feet were not measured."""
+    """Share of the frames in which arms, legs and feet were not measured, 0 to 1, by
+    limb."""
     inferred_frames: tuple[tuple[int, int], ...]
-    """First and last frames of the stretches whose legs were mostly inferred."""
+    """First and last frame of each stretch in which the legs were mostly inferred."""
     leg_px: float
-    """Length of a leg in the image, px."""
+    """Median length of a leg in the image, px."""
     speed_noise: float
-    """Standard deviation of the mean speed along the view by noise of the keypoints
-    alone, m/s; NaN if unknown."""
+    """Standard deviation of the mean speed along the view due to keypoint noise alone,
+    m/s; NaN if unknown."""
 
 
 def assess_person(
@@ -61,7 +62,8 @@ def assess_person(
     steps: Gait | None,
     found: Measured,
 ) -> PersonVerdict:
-    """A person's figures, and whether they can be measured at all."""
+    """Returns a person's figures, and the status that they imply: `ok`,
+    `not_measurable` or `absent`."""
     stature, sigma = None, None
     present = result.present[person]
     path = person_statistics(result, person)
@@ -101,7 +103,8 @@ def assess_person(
 
 
 def with_doubts(people: list[PersonVerdict], doubts: Doubts) -> list[PersonVerdict]:
-    """The people, those with reasons to doubt them `doubtful`."""
+    """Returns the people; those whom `doubts` names are `doubtful`, with the
+    reasons."""
     return [
         dataclasses.replace(person, status="doubtful", reasons=reasons)
         if reasons
@@ -113,8 +116,10 @@ def with_doubts(people: list[PersonVerdict], doubts: Doubts) -> list[PersonVerdi
 def with_more_doubts(
     people: list[PersonVerdict], reasons: list[Reason]
 ) -> tuple[list[PersonVerdict], list[Reason]]:
-    """The people, doubtful where a reason is about somebody who can be measured, and
-    the reasons that are about nobody of them."""
+    """Adds reasons to the measurable people they are about, who become `doubtful`.
+
+    Returns these people, and the reasons that are about none of them.
+    """
     found, rest = list(people), []
     for reason in reasons:
         h = reason.person
@@ -127,8 +132,8 @@ def with_more_doubts(
 
 
 def reasons_of_people(people: list[PersonVerdict]) -> list[Reason]:
-    """Reasons to doubt the whole result: those about people who can be measured, or,
-    where nobody can, why not."""
+    """Returns the reasons to doubt the whole result: those about measurable people, or,
+    if nobody is measurable, those why not."""
     somebody = any(person.status in ("ok", "doubtful") for person in people)
     return [
         reason
@@ -139,8 +144,8 @@ def reasons_of_people(people: list[PersonVerdict]) -> list[Reason]:
 
 
 def warnings_of_people(people: list[PersonVerdict]) -> list[str]:
-    """A line for each person who cannot be measured, and for frames that were inferred
-    without making the person doubtful."""
+    """Returns a warning for each person who cannot be measured, and for each whose legs
+    are inferred in frames too few to make the person doubtful."""
     lines = []
     for h, person in enumerate(people):
         if person.status == "not_measurable":

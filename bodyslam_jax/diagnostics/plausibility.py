@@ -1,4 +1,4 @@
-"""Whether a result can be true: its figures, judged by the table of thresholds."""
+"""Plausibility of a result: its figures, judged by the table of thresholds."""
 
 import dataclasses
 
@@ -15,10 +15,11 @@ from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
 from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
-_ADULT = 1.7
-"""Stature, m, of the people whose cadence the limit of quick steps is from."""
-_LEAST_CONFIDENCE = 0.3
-"""Of keypoints that are compared with the body."""
+_ADULT_STATURE_M = 1.7
+"""Typical stature of the people from whose cadence the limit of quick steps was
+derived."""
+_MIN_CONFIDENCE = 0.3
+"""Confidence from which keypoints are compared with the body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +27,9 @@ class Doubts:
     """Reasons to doubt a result."""
 
     of_person: tuple[tuple[Reason, ...], ...]
-    """Those about each person."""
+    """Reasons about each person."""
     of_whole: tuple[Reason, ...]
-    """Those about the camera, the ground and the scale."""
+    """Reasons about the camera, the ground and the scale."""
 
 
 def implausible(
@@ -46,17 +47,18 @@ def implausible(
     measurable: Bool[np.ndarray, " h"],
     inferred: Bool[np.ndarray, "h t"],
 ) -> Doubts:
-    """Reasons where people, camera or ground are beyond what there is.
+    """Returns the reasons for which people, camera or ground are implausible.
 
     Args:
-        scale_sigma: m per unit of the map.
+        up: the vertical, and the cues that determined it.
+        scale_sigma: standard deviation of the scale, m per unit of the map.
         ground_factor: factor, 1 or more, between the size of the map and that of the
             people on its ground.
-        statures: of each person, m; `None` if unknown.
+        statures: stature of each person, m; `None` if unknown.
         of_measurement: figures of `measurability.measurement_figures` of each person.
-        measurable: people who are judged, and who count as people in the world.
-        inferred: frames in which a person's legs were mostly inferred; their feet and
-            steps are not judged.
+        measurable: people who are judged, and who are used to judge the world.
+        inferred: frames in which a person's legs were mostly inferred; feet and steps
+            are not judged there.
     """
     fps, of_people = sequence.fps, []
     walking = False
@@ -85,9 +87,9 @@ def implausible(
             if misfit is not None:
                 own["keypoint_misfit"] = misfit
             if joint.statures is not None and np.isfinite(joint.statures[h, 0]):
-                # Of a child of known stature, the cadence of an adult who walks alike:
-                # times of steps are as the root of legs' lengths.
-                pace = min(float(np.sqrt(joint.statures[h, 0] / _ADULT)), 1.0)
+                # A child's cadence is converted to that of an adult with the same
+                # gait: step durations are proportional to the root of leg length.
+                pace = min(float(np.sqrt(joint.statures[h, 0] / _ADULT_STATURE_M)), 1.0)
                 of_person["quick_steps"] = pace * of_person.get("quick_steps", np.nan)
         whole = moments.seen(there)
         where = {name: own.get(name, whole) for name in of_person}
@@ -114,7 +116,8 @@ def implausible(
 
 
 def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> float:
-    """Angle between a person and the given body, degrees; NaN without one."""
+    """Returns the angle between the orientations of a person and of the given body,
+    degrees; NaN without a given body."""
     if sequence.bodies is None:
         return np.nan
     both = sequence.bodies.present[person] & joint.present[person]
@@ -126,13 +129,14 @@ def _turned_from_body(sequence: Sequence, joint: JointEstimate, person: int) -> 
 def _misfits(
     sequence: Sequence, body: BodyModel, joint: JointEstimate
 ) -> list[tuple[float, moments.Frames | None]]:
-    """Greatest distance of each person's keypoints from the body, % of the person's
-    size in the image, and where; NaN without keypoints."""
+    """Returns, for each person, the greatest distance of keypoints from the body, % of
+    the person's size in the image, and the frames in which it occurs; NaN without
+    keypoints."""
     if sequence.keypoints is None or not joint.present.any():
         return [(np.nan, None)] * len(joint.present)
     uv = projected_keypoints(body, joint)
     error = np.linalg.norm(uv - sequence.keypoints.uv, axis=-1)
-    valid = sequence.keypoints.confidence > _LEAST_CONFIDENCE
+    valid = sequence.keypoints.confidence > _MIN_CONFIDENCE
     error = np.where(valid & joint.present[..., None], error, np.nan)
     size = np.linalg.norm(np.ptp(uv, axis=2), axis=-1)
     return [

@@ -1,4 +1,4 @@
-"""Figures of one person's posture, feet and motion, from the joints alone.
+"""Figures of one person's posture, feet and motion, computed from the joints alone.
 
 All functions take SMPL's joints (t, 24, 3) in consecutive frames, in metres, in a world
 frame whose y axis is up. "Horizontal" is the plane of x and z.
@@ -9,26 +9,29 @@ from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import ANKLES, FEET, HIPS, KNEES, NECK, PELVIS
 
-_PLAN = (0, 2)
-RUNNING = 2.2
-"""m/s. Faster than this no foot need be on the ground half of the time."""
+_HORIZONTAL_AXES = (0, 2)
+RUNNING_SPEED_M_S = 2.2
+"""Speed above which neither foot need be on the ground for half of the time."""
 
 
 def knee_flexion(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, "t 2"]:
-    """Angle between thigh and shin, left and right; 0 is straight; degrees."""
+    """Returns the angle between thigh and shin, left and right; 0 is straight;
+    degrees."""
     hip, knee, ankle = (joints[:, list(of)] for of in (HIPS, KNEES, ANKLES))
     return _angle(knee - hip, ankle - knee)
 
 
 def hip_over_ankle(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
-    """Height of the hips over the lower ankle, as a share of the leg's length."""
+    """Returns the height of the hips over the lower ankle, as a share of the leg's
+    length."""
     hip = joints[:, list(HIPS), 1].mean(axis=1)
     leg = _length(joints[:, 1] - joints[:, 4]) + _length(joints[:, 4] - joints[:, 7])
     return (hip - joints[:, list(ANKLES), 1].min(axis=1)) / np.maximum(leg, 1e-6)
 
 
 def trunk_lean(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
-    """Angle of the line from the pelvis to the neck with the vertical, degrees."""
+    """Returns the angle of the line from the pelvis to the neck with the vertical,
+    degrees."""
     trunk = joints[:, NECK] - joints[:, PELVIS]
     return _angle(trunk, np.broadcast_to([0.0, 1.0, 0.0], trunk.shape))
 
@@ -36,25 +39,28 @@ def trunk_lean(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
 def lower_foot_speed(
     joints: Float[np.ndarray, "t 24 3"], fps: float
 ) -> Float[np.ndarray, " u"]:
-    """Horizontal speed of the lower foot's toe joint, frame by frame, m/s."""
+    """Returns the horizontal speed of the lower foot's toe joint, frame by frame,
+    m/s."""
     feet = joints[:, list(FEET)]
-    moved = _length(np.diff(feet[..., _PLAN], axis=0)) * fps
+    moved = _length(np.diff(feet[..., _HORIZONTAL_AXES], axis=0)) * fps
     return moved[np.arange(len(moved)), feet[:-1, :, 1].argmin(axis=1)]
 
 
 def slower_foot_speed(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """Horizontal speed (mean over `over` seconds) of the slower toe joint, m/s."""
+    """Returns the horizontal speed (mean over `over` seconds) of the slower toe joint,
+    m/s."""
     n = max(1, min(round(over * fps), len(joints) - 1))
-    feet = joints[:, list(FEET)][..., _PLAN]
+    feet = joints[:, list(FEET)][..., _HORIZONTAL_AXES]
     return _length(feet[n:] - feet[:-n]).min(axis=1) * fps / n
 
 
 def joint_acceleration(
     joints: Float[np.ndarray, "t 24 3"], fps: float
 ) -> Float[np.ndarray, " u"]:
-    """Magnitude of the acceleration of each joint by second differences, m/s².
+    """Returns the magnitude of the acceleration of each joint by second differences,
+    m/s².
 
     One flat array over frames and joints, `u = 24 (t - 2)`.
     """
@@ -64,7 +70,7 @@ def joint_acceleration(
 def turning_rate(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """Absolute yaw rate of the line between the hips, degrees/s.
+    """Returns the absolute yaw rate of the line between the hips, degrees/s.
 
     It is the difference of yaw over an interval of `over` seconds, wrapped to at most
     180 degrees, divided by the length of the interval.
@@ -82,12 +88,12 @@ def turning_rate(
 def speed_change(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float
 ) -> Float[np.ndarray, " u"]:
-    """Magnitude of the change of the pelvis' horizontal velocity, m/s.
+    """Returns the magnitude of the change of the pelvis' horizontal velocity, m/s.
 
     Velocities are means over two successive intervals of `over` seconds.
     """
     n = max(1, round(over * fps))
-    place = joints[:, PELVIS][:, _PLAN]
+    place = joints[:, PELVIS][:, _HORIZONTAL_AXES]
     if len(place) <= 2 * n:
         return np.zeros(0)
     return _length(place[2 * n :] - 2 * place[n:-n] + place[: -2 * n]) * fps / n
@@ -96,8 +102,8 @@ def speed_change(
 def pelvis_speed(
     joints: Float[np.ndarray, "t 24 3"], fps: float, over: float = 0.5
 ) -> Float[np.ndarray, " u"]:
-    """Horizontal speed of the pelvis, mean over `over` seconds, m/s."""
-    place = joints[:, PELVIS][:, _PLAN]
+    """Returns the horizontal speed of the pelvis, mean over `over` seconds, m/s."""
+    place = joints[:, PELVIS][:, _HORIZONTAL_AXES]
     n = max(1, min(round(over * fps), len(place) - 1))
     return _length(place[n:] - place[:-n]) * fps / n
 

@@ -14,8 +14,11 @@ from bodyslam_jax.types import JointEstimate, Sequence, SfmResult
 def per_frame(
     sequence: Sequence, body: BodyModel, cameras: SfmResult, joint: JointEstimate
 ) -> dict[str, list[float | None]]:
-    """Tracks and inliers of each frame (counts), mean reprojection errors of landmarks
-    and of keypoints (px); `None` where a frame has none."""
+    """Returns figures of each frame by name; `None` where a frame has none.
+
+    They are the numbers of tracks and inliers, and the mean reprojection errors of
+    landmarks and of keypoints (px).
+    """
     t = sequence.num_frames
     tracks, keep = cameras.tracks, cameras.keep
     count = np.bincount(tracks.frame, minlength=t)
@@ -41,7 +44,7 @@ def per_frame(
 def projected_keypoints(
     body: BodyModel, joint: JointEstimate
 ) -> Float[np.ndarray, "h t 25 2"]:
-    """Keypoints of the estimated bodies, projected into the images, px."""
+    """Returns the keypoints of the estimated bodies, projected into the images, px."""
     shapes = jnp.asarray(joint.shapes)[:, None]
     frames = joint.poses.shape[1]
     poses = lengthened(joint.poses, padded_length(frames), axis=1)
@@ -56,7 +59,7 @@ _keypoints = eqx.filter_jit(local_keypoints)
 
 
 def _means(frame: np.ndarray, value: np.ndarray, num_frames: int) -> list[float | None]:
-    """Mean of `value` in each frame; `None` where there is none."""
+    """Returns the mean of `value` in each frame; `None` where there is none."""
     total = np.bincount(frame, value, num_frames)
     count = np.bincount(frame, minlength=num_frames)
     return [float(x / n) if n else None for x, n in zip(total, count, strict=True)]

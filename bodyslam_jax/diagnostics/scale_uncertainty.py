@@ -1,4 +1,4 @@
-"""How well the scale, and so every length in metres, is known.
+"""Uncertainty of the scale, and so of every length in metres.
 
 Three contributions, in this order:
 
@@ -18,12 +18,13 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.motion import leg_length
 from bodyslam_jax.types import ScaleStart
 
-_LEAST_FACTOR = 1.25
-"""Factor between the scales of two cues below which they are taken to agree."""
+_MIN_CONTRADICTION_FACTOR = 1.25
+"""Factor between the scales of two cues below which they are considered to agree."""
 
 
 def covariance_sigma(variance: float, *, moving: bool, metric: bool) -> float:
-    """Standard deviation of the scale by the joint problem, m per unit of the map.
+    """Returns the standard deviation of the scale by the joint problem, m per unit of
+    the map.
 
     Infinite where neither people's steps and feet nor a metric camera path determine
     metres (`metric` is false): the scale is held at 1 then, or what smooth motion makes
@@ -44,7 +45,8 @@ def inflate_fitted_shapes(
     shape_sigma: Float[np.ndarray, " h"],
     present: Bool[np.ndarray, " h"],
 ) -> tuple[Float[Array, ""], Float[Array, "h 10 10"]]:
-    """Variances of scale and shapes, re-inflated where bodies were fitted to keypoints.
+    """Returns the variances of scale and shapes, re-inflated where bodies were fitted
+    to keypoints.
 
     Errors of a detector are correlated over time, so that keypoints of many frames
     determine a shape hardly better than those of a few. The graph treats them as
@@ -71,22 +73,26 @@ def inflate_fitted_shapes(
 
 
 def cue_discrepancy(start: ScaleStart) -> float:
-    """Logarithm of the ratio of the scales by people's motion and by the ground.
+    """Returns the absolute logarithm of the ratio of two scales: by people's motion,
+    and by the ground.
 
-    0 where they agree within their errors, or one is missing.
+    It is 0 where they agree within their errors, or one is missing.
     """
     sigma = np.hypot(
         start.motion_error / start.motion, start.ground_error / start.ground
     )
     ratio = abs(np.log(start.motion / start.ground))
     # A missing cue has an infinite error.
-    if not np.isfinite(sigma) or np.exp(ratio) < max(_LEAST_FACTOR, 1 + 2 * sigma):
+    if not np.isfinite(sigma) or np.exp(ratio) < max(
+        _MIN_CONTRADICTION_FACTOR, 1 + 2 * sigma
+    ):
         return 0.0
     return float(ratio)
 
 
 def reported_sigma(scale: float, sigma: float, start: ScaleStart) -> float:
-    """Standard deviation of the scale that is reported, m per unit of the map.
+    """Returns the standard deviation of the scale that is reported, m per unit of the
+    map.
 
     `sigma` is that of the covariance; NaN, where it was not computed, stays NaN. Where
     two cues contradict each other, half their difference is a lower bound: the standard
@@ -97,7 +103,8 @@ def reported_sigma(scale: float, sigma: float, start: ScaleStart) -> float:
 
 
 def discrepancy_warning(start: ScaleStart) -> list[str]:
-    """A line where people's motion and the ground contradict each other."""
+    """Returns a warning if people's motion and the ground contradict each other, else
+    an empty list."""
     discrepancy = cue_discrepancy(start)
     if not discrepancy:
         return []

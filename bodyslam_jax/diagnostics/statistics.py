@@ -10,24 +10,24 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
-_UP = 1
+_UP_AXIS = 1
 """The y axis of a result's world points up."""
-_PLAN = [0, 2]
+_HORIZONTAL_AXES = [0, 2]
 _FEET = list(FEET)
-_SMOOTHING = 0.5
-"""Window of a moving average, s, so that jitter does not count as distance."""
+_SMOOTHING_WINDOW_S = 0.5
+"""Window of the moving average that keeps jitter from counting as distance, s."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PathStatistics:
-    """The path of the camera, or of a person's pelvis."""
+    """Statistics of the path of the camera or of a person's pelvis."""
 
     seconds: float
-    """Total time in which it is present."""
+    """Total time in which the camera or person is present, s."""
     distance: float
-    """Length of the smoothed path on the ground, m."""
+    """Length of the smoothed path projected onto the horizontal plane, m."""
     speed: Float[np.ndarray, " t"]
-    """Of the smoothed path, m/s; NaN where absent."""
+    """Horizontal speed of the smoothed path, m/s; NaN where absent."""
     height: float
     """Mean height above y = 0, m."""
 
@@ -40,14 +40,16 @@ class PathStatistics:
 def camera_statistics(
     result: Result, used: Bool[np.ndarray, " t"] | None = None
 ) -> PathStatistics:
-    """The camera's path in the frames `used`, by default those that are located."""
+    """Returns the statistics of the camera's path in the frames `used`, by default
+    those with a located camera."""
     if used is None:
         used = result.located
     return _path_statistics(result, result.T_WC[:, :3, 3], used)
 
 
 def person_statistics(result: Result, person: int) -> PathStatistics:
-    """A person's path: that of the pelvis joint, where the person is present."""
+    """Returns the statistics of the path of a person's pelvis joint, where the person
+    is present."""
     return _path_statistics(result, result.joints[person, :, 0], result.present[person])
 
 
@@ -58,20 +60,24 @@ def _path_statistics(
     speed = np.full(len(t), np.nan)
     distance, seconds = 0.0, 0.0
     for run in runs(present):
-        smooth = smoothed(points[run][:, _PLAN], fps)
+        smooth = smoothed(points[run][:, _HORIZONTAL_AXES], fps)
         steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
         distance += float(steps.sum())
         seconds += float(t[run][-1] - t[run][0])
         if len(steps):
             rate = steps / np.maximum(np.diff(t[run]), 1e-9)
             speed[run] = np.append(rate, rate[-1])
-    height = float(points[present, _UP].mean()) if present.any() else 0.0
+    height = float(points[present, _UP_AXIS].mean()) if present.any() else 0.0
     return PathStatistics(seconds, distance, speed, height)
 
 
 def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, "t d"]:
-    """Moving average; straight lines at the ends, where an average would lag."""
-    size = min(int(_SMOOTHING * fps) | 1, len(points) - 1 + len(points) % 2)
+    """Returns the moving average of points.
+
+    The ends are extrapolated by point reflection, so that a straight path stays
+    straight.
+    """
+    size = min(int(_SMOOTHING_WINDOW_S * fps) | 1, len(points) - 1 + len(points) % 2)
     if size < 3:
         return points
     # Without `scipy.signal`, whose import would delay every command.
@@ -81,15 +87,15 @@ def smoothed(points: Float[np.ndarray, "t d"], fps: float) -> Float[np.ndarray, 
 
 
 def foot_skating(result: Result, person: int) -> float:
-    """Median horizontal speed of the lower foot, m/s.
+    """Returns the median horizontal speed of the lower foot, m/s.
 
-    About 0.1 for a real walk, not 0, as the lower foot changes.
+    It is about 0.1 m/s for real walks, not 0, because the lower foot alternates.
     """
     speeds = [np.zeros(0)]
     for run in runs(result.present[person]):
         feet = result.joints[person, run][:, _FEET]
-        moved = np.linalg.norm(np.diff(feet[..., _PLAN], axis=0), axis=-1)
-        lower = np.argmin(feet[:-1, :, _UP], axis=1)
+        moved = np.linalg.norm(np.diff(feet[..., _HORIZONTAL_AXES], axis=0), axis=-1)
+        lower = np.argmin(feet[:-1, :, _UP_AXIS], axis=1)
         chosen = moved[np.arange(len(moved)), lower]
         speeds.append(chosen / np.maximum(np.diff(result.timestamps[run]), 1e-9))
     every = np.concatenate(speeds)
@@ -97,7 +103,7 @@ def foot_skating(result: Result, person: int) -> float:
 
 
 def distance_to_camera(result: Result, person: int) -> tuple[float, float]:
-    """Least and greatest distance of the pelvis from the camera, m."""
+    """Returns the least and the greatest distance of the pelvis from the camera, m."""
     present = result.present[person]
     if not present.any():
         return 0.0, 0.0
@@ -107,9 +113,9 @@ def distance_to_camera(result: Result, person: int) -> tuple[float, float]:
 
 
 def stature(body: BodyModel, betas: Float[np.ndarray, " 10"]) -> float:
-    """Height of the body's mesh at rest for SMPL β, m."""
-    template = np.asarray(body.template, np.float64)[:, _UP]
-    tall = template + np.asarray(body.shape_dirs, np.float64)[:, _UP] @ betas
+    """Returns the height of the body's mesh at rest for SMPL β, m."""
+    template = np.asarray(body.template, np.float64)[:, _UP_AXIS]
+    tall = template + np.asarray(body.shape_dirs, np.float64)[:, _UP_AXIS] @ betas
     return float(tall.max() - tall.min())
 
 
@@ -118,7 +124,7 @@ def stature_and_sigma(
     betas: Float[np.ndarray, " 10"],
     covariance: Float[np.ndarray, "10 10"],
 ) -> tuple[float, float]:
-    """`stature` and its standard deviation for the covariance of β, m."""
+    """Returns `stature` and its standard deviation from the covariance of β, m."""
     height = stature(body, betas)
     slope = np.array([stature(body, betas + e) - height for e in np.eye(10)])
     return height, float(np.sqrt(slope @ covariance @ slope))

@@ -8,25 +8,25 @@ them.
 
 from bodyslam_jax.diagnostics.checks import Check
 
-_FIT = (
+_FIT_ADVICE = (
     "look at the overlay there: if keypoints are not on the person, give better ones; "
     "if they are and the body is not, give the focal length (--focal)"
 )
 _MOCAP = "motion capture"
-_GROUND = (
+_GROUND_ADVICE = (
     "if the ground is not like that, sizes and depths are off: give the focal length "
     "(--focal), or better keypoints where feet are beside the person's in the overlay"
 )
-_IDENTITY = (
+_IDENTITY_ADVICE = (
     "look at the overlay there: keypoints may jump from one person to another, or "
     "front and back be confused; give keypoints with track ids, or cut the video there"
 )
-_CAMERA = (
+_CAMERA_ADVICE = (
     "if no vehicle carries the camera, look at the scene there: tracks follow moving "
     "things, or scale is off; give person masks, cut the video there (--start, --end), "
     "or take one with more texture"
 )
-_CARRIED = (
+_CARRIED_ADVICE = (
     "on wheels, on skates, on a moving walkway or carried, a person's motion tells no "
     "size: name the people whose steps do (--person, which leaves the others out), or "
     "take lengths as unknown where there is nobody else. If nothing carries the "
@@ -47,7 +47,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "speed of the foot that should stand, while the person advances,",
         "% of the person's",
         50.0,
-        _CARRIED,
+        _CARRIED_ADVICE,
         _MOCAP + " of people who advance: at most 19",
     ),
     Check(
@@ -65,7 +65,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "distance that a step carries the person, over how far it reaches,",
         "",
         1.4,
-        _CARRIED,
+        _CARRIED_ADVICE,
         _MOCAP + " of people who walk: at most 1.23",
     ),
     Check(
@@ -73,7 +73,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "distance that a runner's step carries the person, over how far it reaches,",
         "",
         2.2,
-        _CARRIED,
+        _CARRIED_ADVICE,
         _MOCAP + " of people who run: 1.6 to 1.86",
     ),
     Check(
@@ -101,7 +101,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "range of heights at which standing feet are, beside a slope",
         "m",
         0.12,
-        "the person floats or sinks: " + _GROUND,
+        "the person floats or sinks: " + _GROUND_ADVICE,
         _MOCAP + " of people who walk: 99 % below 0.07, on uneven terrain 0.15",
     ),
     Check(
@@ -109,7 +109,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "slope of the ground under standing feet",
         "degrees",
         6.0,
-        "the person rises or sinks along the path: " + _GROUND,
+        "the person rises or sinks along the path: " + _GROUND_ADVICE,
         _MOCAP + " of people who walk: at most 5; streets rarely exceed 6",
     ),
     Check(
@@ -117,7 +117,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "bend of both knees while walking (mean)",
         "degrees",
         52.0,
-        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
+        "legs are too long for the keypoints, or the fit is wrong: " + _FIT_ADVICE,
         _MOCAP + " of people who walk: 98 % below 48, soccer 51",
     ),
     Check(
@@ -125,7 +125,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "bend of the straighter knee while walking (mean)",
         "degrees",
         44.0,
-        "legs are too long for the keypoints, or the fit is wrong: " + _FIT,
+        "legs are too long for the keypoints, or the fit is wrong: " + _FIT_ADVICE,
         _MOCAP + " of people who walk: 98 % below 40, soccer 43",
     ),
     Check(
@@ -133,7 +133,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "height of the hips over the ankle, of the leg's length, while walking",
         "",
         0.84,
-        "people crouch who do not: " + _FIT,
+        "people crouch who do not: " + _FIT_ADVICE,
         _MOCAP + " of people who walk: at least 0.85",
         below=True,
     ),
@@ -142,7 +142,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "lean of the trunk while walking (mean)",
         "degrees",
         18.0,
-        "nobody walks so: " + _FIT,
+        "nobody walks so: " + _FIT_ADVICE,
         _MOCAP + " of people who walk: below 15, but for basketball (19 and 32)",
     ),
     Check(
@@ -150,7 +150,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "fastest turn of somebody who walks",
         "degrees/s within 0.2 s",
         500.0,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         _MOCAP + " of people who walk: at most 170; dancing on the way 500",
     ),
     Check(
@@ -158,7 +158,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "fastest turn",
         "degrees/s within 0.2 s",
         600.0,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         _MOCAP + ": at most 500, in a pirouette",
     ),
     Check(
@@ -166,7 +166,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "greatest change of speed of somebody who walks",
         "m/s within 0.2 s",
         1.8,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         _MOCAP + " of people who walk: at most 1.4",
     ),
     Check(
@@ -174,7 +174,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "greatest change of speed",
         "m/s within 0.2 s",
         2.8,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         _MOCAP + ": at most 1.9, in a jump",
     ),
     Check(
@@ -182,7 +182,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "acceleration of joints (median)",
         "m/s²",
         22.0,
-        "the person trembles: " + _FIT,
+        "the person trembles: " + _FIT_ADVICE,
         _MOCAP + ": at most 18, in a run",
     ),
     Check(
@@ -216,7 +216,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "greatest distance of keypoints from the body, for a third of a second",
         "% of the person's size in the image",
         3.5,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         "simulated sequences: at most 2.4, nowhere twice as large as mostly",
     ),
     Check(
@@ -259,7 +259,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "speed across a gap in which the person is not seen",
         "m/s",
         10.0,
-        _IDENTITY,
+        _IDENTITY_ADVICE,
         "sprinters reach 10 to 12 m/s",
     ),
 )
@@ -332,7 +332,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "speed of the camera (95th percentile)",
         "m/s",
         10.0,
-        _CAMERA,
+        _CAMERA_ADVICE,
         "nobody runs as fast; simulated cameras at most 2.6",
     ),
     Check(
@@ -340,7 +340,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "acceleration of the camera over 0.1 s (greatest)",
         "m/s²",
         30.0,
-        _CAMERA,
+        _CAMERA_ADVICE,
         "simulated hand-held cameras: at most 7",
     ),
     Check(
@@ -348,7 +348,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "turning of the camera over 0.1 s (fastest)",
         "degrees/s",
         600.0,
-        _CAMERA,
+        _CAMERA_ADVICE,
         "simulated hand-held cameras: at most 70; whipping pans 400",
     ),
     Check(

@@ -1,4 +1,5 @@
-"""The verdict on a result: its status with reasons, warnings, and people's figures."""
+"""Verdict on a result: its status with reasons, warnings, and the figures of its
+people."""
 
 import dataclasses
 
@@ -19,7 +20,6 @@ from bodyslam_jax.diagnostics.facts import (
     misfits_of_own_factors,
 )
 from bodyslam_jax.diagnostics.gait import Gait, gait
-from bodyslam_jax.diagnostics.ground_scale import ground_scale
 from bodyslam_jax.diagnostics.measured import measured
 from bodyslam_jax.diagnostics.person_verdict import (
     PersonVerdict,
@@ -35,6 +35,7 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
     discrepancy_warning,
     reported_sigma,
 )
+from bodyslam_jax.diagnostics.standing_height import ground_scale
 from bodyslam_jax.diagnostics.statistics import (
     PathStatistics,
     camera_statistics,
@@ -43,37 +44,37 @@ from bodyslam_jax.geometry.gravity import Upright
 from bodyslam_jax.people.stature import SIZE_STEP, stature_range
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
-_GROUND_WARNING = 1.15
-"""Factor between the size of the map and that of the people on its ground from which
-there is a warning."""
+_GROUND_WARNING_FACTOR = 1.15
+"""Factor between the size of the map and that of the people on its ground from which a
+warning is given."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What is made of a result."""
+    """Status, reasons, warnings and figures of a result."""
 
     status: Status
     reasons: tuple[Reason, ...]
-    """Why it is not `ok`."""
+    """Reasons for which the status is not `ok`."""
     warnings: tuple[str, ...]
     scale_sigma: float
     """Standard deviation of the scale as reported, m per unit of the map; infinite or
     NaN as in `scale_uncertainty.covariance_sigma`."""
     ground_factor: float | None
-    """Factor by which the map would have to grow for its ground to be under people's
-    feet; `None` where no ground is found."""
+    """Factor by which the map would have to grow for its ground to lie under people's
+    feet (`ground_scale`); `None` where no ground is found."""
     camera: PathStatistics
     people: tuple[PersonVerdict, ...]
     per_frame: dict[str, list[float | None]]
-    """As of `reprojection.per_frame`."""
+    """Figures of each frame (`reprojection.per_frame`)."""
     joint_sigma: Float[np.ndarray, "h t 24"]
-    """As of `measured.Measured`."""
+    """Expected error of each joint within the body, m (`measured.Measured`)."""
     up: Upright
-    """How the vertical was found."""
+    """The vertical, and the cues that determined it."""
     accuracy: Accuracy
-    """How well each kind of length is known."""
+    """Standard deviations of the focal length, of up, and of people's lengths."""
     given: tuple[Fact, ...] = ()
-    """What was given, and the estimates without it."""
+    """Quantities that the user gave, with the estimates made without them."""
 
 
 def assess(
@@ -88,13 +89,13 @@ def assess(
     """Judges a result.
 
     Args:
-        config: has what the user gave.
+        config: settings, with the quantities that the user gave.
         joint: the optimum of which `result` is the metric, upright version.
-        up: how the vertical of the result was found.
+        up: the vertical of the result, and the cues that determined it.
     """
     scale_sigma = reported_sigma(result.scale, joint.scale_sigma, joint.start)
     found = measured(sequence, joint, body)
-    # Feet and steps of legs that nothing shows are a guess, which is not judged.
+    # Feet and steps of hidden legs are guesses, which are not judged.
     legs = people_.legs_shown(found.keypoint, result.present, sequence.fps)
     stepping = dataclasses.replace(result, present=result.present & legs)
     ground_factor = ground_scale(stepping) if cameras.kind == "moving" else None
@@ -178,7 +179,8 @@ def assess(
 
 
 def _resized(body: BodyModel, joint: JointEstimate) -> list[Reason]:
-    """A reason for each person of a stature that no shape of the body model has."""
+    """Returns a reason for each person whose given stature lies outside the range of
+    the body model's shapes."""
     if not body.sized or joint.statures is None:
         return []
     low, high = stature_range(body)
@@ -210,7 +212,8 @@ def _warnings(
     joint: JointEstimate,
     ground_factor: float | None,
 ) -> list[str]:
-    """Warnings of the stages, and what limits the result without making it doubtful."""
+    """Returns the warnings of the stages, and those of limits that do not make the
+    result doubtful."""
     warnings = [*sequence.warnings, *cameras.warnings, *joint.unobserved]
     if cameras.kind != "moving" and joint.present.any():
         warnings.append(
@@ -230,7 +233,7 @@ def _warnings(
             f"frames {used[0]} to {used[-1]} of {len(within)} are used: the camera was "
             "not located in the others."
         )
-    if ground_factor and max(ground_factor, 1 / ground_factor) > _GROUND_WARNING:
+    if ground_factor and max(ground_factor, 1 / ground_factor) > _GROUND_WARNING_FACTOR:
         warnings.append(
             f"the ground of the map would be under the people's feet if the map were "
             f"{ground_factor:.2f} times as large: scale, postures or focal length are "
@@ -240,7 +243,8 @@ def _warnings(
 
 
 def _assumed_shown(sequence: Sequence, result: Result) -> list[str]:
-    """A line for people without keypoints: what hides them is not known."""
+    """Returns a warning for people with bodies but no keypoints, of whom hidden limbs
+    cannot be told from visible ones."""
     lone = people_.without_keypoints(sequence) & result.present.any(axis=1)
     if not lone.any():
         return []
@@ -257,7 +261,8 @@ def _assumed_shown(sequence: Sequence, result: Result) -> list[str]:
 def cadence_warning(
     person: int, steps: Gait | None, length_error: float, fps: float
 ) -> list[str]:
-    """A line where steps are so slow, or so quick, that the frame rate must be wrong.
+    """Returns a warning if the steps are so slow or so quick that the frame rate is
+    probably wrong, else an empty list.
 
     `length_error` is the relative standard error of all lengths; NaN counts as 0.
     """

@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth: alignments, errors, readers of both."""
+"""Compares estimates with the truth: alignments, errors, and readers of both."""
 
 from bodyslam_jax.evaluation.alignment import Alignment as Alignment
 from bodyslam_jax.evaluation.alignment import Similarity as Similarity
@@ -40,6 +40,8 @@ from bodyslam_jax.evaluation.metrics import trajectory_error as trajectory_error
 from bodyslam_jax.evaluation.metrics import world_mpjpe as world_mpjpe
 from bodyslam_jax.evaluation.padding import pad_frames as pad_frames
 from bodyslam_jax.evaluation.plausibility import FIGURES as FIGURES
+from bodyslam_jax.evaluation.readers import body_of_run as body_of_run
+from bodyslam_jax.evaluation.readers import check_body as check_body
 from bodyslam_jax.evaluation.readers import read_groundtruth as read_groundtruth
 from bodyslam_jax.evaluation.readers import read_result as read_result
 from bodyslam_jax.evaluation.readers import read_tum as read_tum
@@ -49,6 +51,4 @@ from bodyslam_jax.evaluation.report import gaps as gaps
 from bodyslam_jax.evaluation.report import to_json as to_json
 from bodyslam_jax.evaluation.report import to_rows as to_rows
 from bodyslam_jax.evaluation.report import to_table as to_table
-from bodyslam_jax.evaluation.run_body import body_of_run as body_of_run
-from bodyslam_jax.evaluation.run_body import check_body as check_body
 from bodyslam_jax.evaluation.run_summary import read_summary as read_summary

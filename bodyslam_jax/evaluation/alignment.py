@@ -18,28 +18,29 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 
 Alignment = Literal["A1", "A2", "A3", "A4"]
-"""The appendix's alignments: A1 camera and person each on its own (the paper's tables),
-A2 the camera's for both, A3 one for camera and person together, A4 the first camera
-pose set to the truth (shows drift)."""
+"""Alignments of the paper's appendix: A1 aligns camera and person independently (the
+paper's tables), A2 applies the camera's alignment to both, A3 is one alignment for
+camera and person together, A4 sets the first camera pose to the truth (shows drift)."""
 
 
 class Similarity(eqx.Module):
-    """`x -> s R x + t`, from the estimate's world to the truth's."""
+    """Similarity `x -> s R x + t`, from the estimate's world to the truth's."""
 
     scale: Float[Array, "*b"]
-    """Truth per estimate; 1 in SE(3)."""
+    """Scale of the truth relative to the estimate; 1 in SE(3)."""
     rotation: Float[Array, "*b 3 3"]
     translation: Float[Array, "*b 3"]
     """m"""
 
     def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
-        """Moves points by one transformation (`*b` empty)."""
+        """Transforms points by a single similarity (`*b` empty)."""
         return self.scale * points @ self.rotation.T + self.translation
 
 
 @jax.custom_jvp
 def nearest_rotation(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """The rotation `R` that maximises `tr(Rᵀ M)`; some maximiser where several do.
+    """Returns the rotation `R` that maximises `tr(Rᵀ M)`; one of the maximisers if
+    there are several.
 
     The derivative is that of the optimality condition (`Rᵀ M` is symmetric), damped
     along rotations that `M` does not determine, hence finite everywhere.
@@ -48,7 +49,7 @@ def nearest_rotation(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     xx, xy, xz = m[..., 0, 0], m[..., 0, 1], m[..., 0, 2]
     yx, yy, yz = m[..., 1, 0], m[..., 1, 1], m[..., 1, 2]
     zx, zy, zz = m[..., 2, 0], m[..., 2, 1], m[..., 2, 2]
-    # Order x y z w: of equal eigenvalues the last stands for no rotation.
+    # Order x y z w: with equal eigenvalues, the last eigenvector is the identity.
     davenport = jnp.stack(
         [
             jnp.stack([xx - yy - zz, xy + yx, zx + xz, yz - zy], -1),
@@ -98,7 +99,7 @@ def similarity_from_moments(
     variance: Float[Array, "*b"],
     with_scale: bool,
 ) -> Similarity:
-    """Umeyama's solution from centred moments.
+    """Returns Umeyama's solution from centred moments.
 
     `covariance` is the mean of `(y - μ_y)(x - μ_x)ᵀ`, `variance` that of `|x - μ_x|²`;
     source points that coincide leave the scale at 1.
@@ -117,8 +118,8 @@ def similarity_from_moments(
 def is_point(
     variance: Float[Array, "*b"], mean: Float[Array, "*b 3"]
 ) -> Bool[Array, "*b"]:
-    """Whether points that vary so little about their mean coincide: what there is may
-    be the mean's own rounding."""
+    """Returns whether points with this variance about their mean coincide, that is,
+    whether the variance may be rounding of the mean."""
     info = jnp.finfo(variance.dtype)
     rounding = (32 * float(info.eps)) ** 2 * jnp.sum(
         jax.lax.stop_gradient(mean) ** 2, -1
@@ -132,7 +133,8 @@ def umeyama(
     weights: Float[Array, "*b n"] | None = None,
     with_scale: bool = False,
 ) -> Similarity:
-    """The SE(3), or with `with_scale` Sim(3), that minimises `Σ w |y - s R x - t|²`.
+    """Returns the SE(3), or with `with_scale` the Sim(3), that minimises
+    `Σ w |y - s R x - t|²`.
 
     Points of weight zero are ignored, even if they are NaN. With fewer than three
     points, or collinear ones, it is one of many minimisers; if all weights are zero,
@@ -159,7 +161,7 @@ def align_first(
     source: Float[Array, "t 4 4"],
     valid: Float[Array, " t"],
 ) -> Similarity:
-    """The SE(3) that puts the first valid camera pose onto the truth (A4)."""
+    """Returns the SE(3) that maps the first valid camera pose onto the truth (A4)."""
     first = jnp.argmax(valid > 0)
     rotation = target[first, :3, :3] @ source[first, :3, :3].T
     translation = target[first, :3, 3] - rotation @ source[first, :3, 3]
@@ -176,7 +178,7 @@ def align(
     centre_weights: Float[Array, " t"],
     with_scale: bool = False,
 ) -> tuple[Similarity, Similarity]:
-    """Alignments of the camera trajectory and of one person's centres to the truth.
+    """Aligns the camera trajectory, and the centres of one person, to the truth.
 
     `alignment` is `"A1"` to `"A4"`, methods 1 to 4 of Henning et al., ECCV 2022,
     appendix B. Frames of weight 0 are ignored; the others have weight 1. A4 aligns a

@@ -1,4 +1,4 @@
-"""Two results on common frames and people; their errors."""
+"""Associates two results in time and person, and computes their errors."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.alignment import align
 from bodyslam_jax.evaluation.errors import (
     NOBODY,
-    STRAIGHT,
+    STRAIGHT_PATH_RMS_M,
     Evaluation,
     Pair,
     Scope,
@@ -41,13 +41,13 @@ def evaluate(
     body: BodyModel | None = None,
     offset: float = 0.0,
 ) -> Evaluation:
-    """Every error of `result` against `truth`, in m, rad and s.
+    """Computes every error of `result` against `truth`, in m, rad and s.
 
-    Two `Result`s are first associated in time and person, by `associate` and with its
-    arguments `body` and `offset` (s). Two `Trajectories` are associated already; with
-    those this function jits, vmaps and differentiates:
+    Two `Result`s are first associated in time and person by `associate`, with its
+    arguments `body` and `offset` (s). Two `Trajectories` are compared as they are; for
+    these the function can be jitted, vmapped and differentiated:
     `jax.jit(jax.vmap(evaluate))(*stack_pairs(pairs))`. Lengths are padded to a few
-    (`padding.bucket`), each compiled once.
+    (`padding.bucket`), each of which is compiled once.
 
     **Raises:** `InputError` if no frame of one is at the time of a frame of the other,
     or the two are of different kinds.
@@ -72,14 +72,15 @@ def stack_pairs(
     pairs: Iterable[tuple[Result, Result] | tuple[Trajectories, Trajectories]],
     body: BodyModel | None = None,
 ) -> tuple[Trajectories, Trajectories]:
-    """Estimates and truths of pairs, associated, padded and stacked.
+    """Returns the estimates and the truths of pairs, associated, padded and stacked.
 
-    Pairs with fewer frames or people than others get masked ones; errors of people whom
-    a pair lacks are NaN. `Trajectories` are compared frame by frame and person by
-    person as they are, such as `case.trajectories(state)` and `case.truth`.
+    Pairs with fewer frames or people than others are padded with masked ones; the
+    errors of the people who were added are NaN. `Trajectories` are compared frame by
+    frame and person by person as they are, such as `case.trajectories(state)` and
+    `case.truth`.
 
-    **Raises:** `InputError` if there is no pair, if two `Trajectories` have not the
-    same frames and people, and as `associate`.
+    **Raises:** `InputError` if there is no pair, if two `Trajectories` differ in frames
+    or people, and as `associate`.
     """
     associated = [_associated(*pair, body) for pair in pairs]
     if not associated:
@@ -90,7 +91,7 @@ def stack_pairs(
         [pad_people(pad_frames(x, frames), people) for x in side]
         for side in zip(*associated, strict=True)
     )
-    # Stacked on the host: nothing is compiled for a number of pairs.
+    # NumPy stacks them, so that nothing is compiled for a number of pairs.
     stack = lambda *x: jnp.asarray(np.stack([np.asarray(one) for one in x]))
     return jax.tree.map(stack, *estimates), jax.tree.map(stack, *truths)
 
@@ -116,22 +117,22 @@ def _associated(
 def associate(
     result: Result, truth: Result, body: BodyModel | None = None, offset: float = 0.0
 ) -> tuple[Trajectories, Trajectories]:
-    """Estimate and truth on common frames and people.
+    """Returns estimate and truth on common frames and people.
 
     Time: `offset` (s) is added to the result's timestamps. The frames are those of the
     slower of the two; the faster is interpolated (positions linearly, rotations on the
     geodesic) across at most one and a half of its own frames. At its ends and gaps the
-    nearest frame within half a frame is taken; other frames are dropped or masked. Gaps
+    nearest frame within half a frame is used; other frames are dropped or masked. Gaps
     are filled with masked frames, so that no difference is taken across them.
 
     People: the assignment with the least total loss. The loss of a pair is the mean
     over the truth's frames of `e / (e + 1 m)`, with `e` the frame's H-ATE under
     alignment A3 (A1 without a camera), and 1 where the estimate lacks the person, so
-    that a fragment of a track does not win over the whole. People without a partner are
-    left out and listed in `Evaluation.scope`.
+    that a complete track is preferred to a fragment. People without a partner are left
+    out and listed in `Evaluation.scope`.
 
-    Feet: toes and heels of `body` if both sides' joints are that body's, else the ankle
-    and foot joints.
+    Feet: toes and heels of `body` if the joints of both sides are that body's, else the
+    ankle and foot joints.
 
     **Raises:** `InputError` if no frame of one is at the time of a frame of the other.
     """
@@ -146,16 +147,17 @@ class _Associated:
     estimate: Samples
     truth: Samples
     fps: float
-    """1/s"""
+    """Frame rate, 1/s."""
     feet: str
-    """The kind of foot points, in words."""
+    """The kind of foot points, as text."""
     scope: Scope
 
 
 def _associate(
     result: Result, truth: Result, body: BodyModel | None, offset: float
 ) -> _Associated:
-    """`associate`, on the host: nothing is compiled for a number of frames."""
+    """Implements `associate` in NumPy: nothing is compiled for a particular number of
+    frames."""
     times = result.timestamps + offset
     slower = interval_of(times) >= 0.999 * interval_of(truth.timestamps)
     at = without_holes(times if slower else truth.timestamps)
@@ -185,10 +187,10 @@ def _scope(
     partner: dict[int, int],
     rate: float,
 ) -> Scope:
-    """How much of the truth is compared, in frames of the comparison.
+    """Returns the extent of the comparison, in frames of the comparison.
 
     `rate` is their number per frame of the truth. Frames of the truth outside the
-    result's time count as not compared.
+    result's time span count as not compared.
     """
     found, true = pair
 
@@ -207,7 +209,7 @@ def _scope(
             someone = NOBODY if who is None or not compared else who
             people.append(Pair(i, someone, compared, of))
             path = true.joints[i, both, PELVIS]
-            straight.append(bool(compared) and _from_a_line(path) < STRAIGHT)
+            straight.append(bool(compared) and _from_a_line(path) < STRAIGHT_PATH_RMS_M)
     matched = sum(pair.estimate != NOBODY for pair in people)
     return Scope(
         *counts(found.camera_valid & true.camera_valid, everywhere),
@@ -218,7 +220,8 @@ def _scope(
 
 
 def _from_a_line(points: Float[np.ndarray, "t 3"]) -> float:
-    """RMS distance from the best-fitting line, m; NaN if a point is not finite."""
+    """Returns the RMS distance from the best-fitting line, m; NaN if a point is not
+    finite."""
     if not np.isfinite(points).all():
         return np.nan
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -230,8 +233,8 @@ def _span(times: Float[np.ndarray, " t"]) -> str:
 
 
 def _match(found: Samples, true: Samples, fps: float) -> tuple[list[int], list[int]]:
-    """Indices of the estimate's and the truth's person of each pair, in the truth's
-    order."""
+    """Returns the indices of the estimate's and of the truth's person of each pair, in
+    the truth's order."""
     num, num_true = len(found.present), len(true.present)
     if num <= 1 and num_true <= 1:
         both = list(range(min(num, num_true)))
@@ -281,7 +284,7 @@ def _loss_of_all_pairs(
 def _feet(
     result: Result, truth: Result, body: BodyModel | None
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Foot points of both sides (h, t, 4, 3; m), and their kind in words."""
+    """Returns the foot points of both sides (h, t, 4, 3; m), and their kind as text."""
     if body is not None:
         feet, true_feet = (_feet_of(x, body) for x in (result, truth))
         if feet is not None and true_feet is not None:
@@ -291,17 +294,19 @@ def _feet(
 
 
 def _feet_of(result: Result, body: BodyModel) -> np.ndarray | None:
-    """Toes and heels, if the joints are this body's, to a centimetre."""
+    """Returns the toes and heels if the joints are this body's, to a centimetre, else
+    `None`."""
     joints, feet = _joints_and_feet(result, body)
     apart = np.max(np.abs(joints - result.joints), (-2, -1))
     return feet if np.all(apart[result.present] < 0.01) else None
 
 
 def _joints_and_feet(result: Result, body: BodyModel) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (h, t, 24, 3) and toes and heels (h, t, 4, 3) of the posed body, m."""
+    """Returns the joints (h, t, 24, 3), and the toes and heels (h, t, 4, 3), of the
+    posed body, m."""
     people, frames = result.present.shape
     betas = np.broadcast_to(result.betas[:, None], (people, frames, 10))
-    # One row a person and frame, and masked rows: few lengths are compiled.
+    # One row per person and frame, padded, so that few lengths are compiled.
     rows = np.zeros((bucket(people * frames), 72 + 10 + 3))
     rows[: people * frames] = np.concatenate(
         [result.poses, betas, result.trans], axis=-1

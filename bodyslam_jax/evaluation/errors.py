@@ -1,4 +1,4 @@
-"""All errors of an estimate at once, as a pure function of associated trajectories."""
+"""Computes all errors of an estimate, as a pure function of associated trajectories."""
 
 from collections.abc import Iterator
 
@@ -12,11 +12,11 @@ from bodyslam_jax.evaluation import metrics, plausibility
 from bodyslam_jax.evaluation.alignment import Alignment, align, is_point
 
 NOBODY = -1
-STILL = 0.01
-"""m; a camera with a smaller RMS distance from its mean position stands still."""
-STRAIGHT = 0.1
-"""m; RMS distance from a line below which a person's path does not determine the
-rotation about it in alignment A1, on which J-ATE then depends."""
+STATIC_CAMERA_RMS_M = 0.01
+"""RMS distance of a camera from its mean position below which it counts as static."""
+STRAIGHT_PATH_RMS_M = 0.1
+"""RMS distance from a line below which a person's path does not determine the rotation
+about it in alignment A1, on which J-ATE then depends."""
 
 
 class Trajectories(eqx.Module):
@@ -31,17 +31,17 @@ class Trajectories(eqx.Module):
     camera_valid: Bool[Array, "*b t"]
     """Frames in which the camera is known."""
     joints: Float[Array, "*b h t 24 3"]
-    """m, world."""
+    """Joints, m, world frame."""
     present: Bool[Array, "*b h t"]
     """Frames in which the person is known."""
     feet: Float[Array, "*b h t f 3"]
-    """Points of the feet for `foot_sliding`, m, world."""
+    """Points of the feet for `foot_sliding`, m, world frame."""
     fps: Float[Array, "*b"]
-    """1/s"""
+    """Frame rate, 1/s."""
 
 
 class Pair(eqx.Module):
-    """A person of the truth, and the person of the estimate assigned to them."""
+    """A person of the truth and the person of the estimate assigned to them."""
 
     truth: int
     """Index in the truth."""
@@ -54,36 +54,38 @@ class Pair(eqx.Module):
 
 
 class Scope(eqx.Module):
-    """How much of a truth is compared."""
+    """Extent of a comparison: the frames and people of the truth that are compared."""
 
     cameras: int
     """Frames in which both cameras are known."""
     of_cameras: int
     """Frames in which the true camera is known."""
     people: tuple[Pair, ...]
-    """One for each person of the truth."""
+    """A pair for each person of the truth."""
     others: int
-    """People of the estimate who are assigned to nobody of the truth."""
+    """Number of people of the estimate who are assigned to nobody of the truth."""
     straight: tuple[bool, ...] = ()
-    """For each of `people`: whether the true pelvis stays within `STRAIGHT` of a line,
-    in the frames compared."""
+    """For each of `people`: whether the true pelvis stays within `STRAIGHT_PATH_RMS_M`
+    of a line in the frames compared."""
 
 
 class Evaluation(eqx.Module):
     """Errors by name in m, rad, s: `found["c_ate_se3"]` is a mean, `..._rmse` its RMSE.
 
-    A mapping: `keys`, `items`, `in` and `len` work. An error is NaN if the truth or the
-    estimate lacks what it needs, or if a frame that counts is not finite.
+    It is a mapping: `keys`, `items`, `in` and `len` work. An error is NaN if the truth
+    or the estimate lacks what it needs, or if a value in a compared frame is not
+    finite.
     """
 
     values: dict[str, Float[Array, "*b"]]
-    """Errors of the camera, and means over people of theirs."""
+    """Errors of the camera, and the errors of people averaged over people."""
     people: dict[str, Float[Array, "*b h"]]
     """Errors of each assigned person, in the truth's order."""
     feet: str = eqx.field(static=True, default="the points given")
-    """The points that `foot_sliding` is of, in words."""
+    """The points that `foot_sliding` is computed from, as text."""
     scope: Scope | None = None
-    """How much was compared; `None` for `Trajectories`, which are compared entirely."""
+    """Extent of the comparison; `None` for `Trajectories`, which are compared
+    entirely."""
 
     def __getitem__(self, name: str) -> Float[Array, "*b"]:
         return self.values[name]
@@ -105,17 +107,23 @@ class Evaluation(eqx.Module):
 
 
 def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evaluation:
-    """Every error of module `metrics`; a pure function to jit, vmap and differentiate.
+    """Computes every error of module `metrics`; can be jitted, vmapped and
+    differentiated.
 
-    `c_` is the camera, `h_` the human centre, `j_` the joints. `_se3` and `_sim3` are
-    alignment A1 (camera and person each on its own), `_a2`, `_a3`, `_a4` the other
-    three in SE(3). `scale` is that of the camera's Sim(3) alignment (paper: "scale
-    error", best 1), `scale_error` is `|1 - scale|`. A true camera that stays within
-    `STILL` determines neither scale nor rotation: `scale`, `_sim3` and `_a2` are NaN.
-    So are `scale` and `_sim3` for an estimated camera that does not move at all.
+    The prefix `c_` denotes the camera, `h_` the human centre, `j_` the joints. `_se3`
+    and `_sim3` are alignment A1 (camera and person aligned independently), `_a2`,
+    `_a3`, `_a4` the other three in SE(3). `scale` is that of the camera's Sim(3)
+    alignment (paper: "scale error", best 1), `scale_error` is `|1 - scale|`. A true
+    camera that stays within `STATIC_CAMERA_RMS_M` determines neither scale nor
+    rotation: `scale`, `_sim3` and `_a2` are NaN. `scale` and `_sim3` are also NaN if
+    the estimated camera does not move at all.
 
     `gravity_error` and the figures of module `plausibility` assume that y is up in the
     estimate, as in a `Result`.
+
+    Args:
+        estimate: with the same frames and people as `truth`.
+        truth: true trajectories.
     """
     camera_valid = estimate.camera_valid & truth.camera_valid
     values = _camera_errors(estimate, truth, camera_valid)
@@ -142,7 +150,7 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
         for side in (estimate, truth):
             broken |= _is_broken(side.T_WC, camera_valid)
             broken |= jax.vmap(_is_broken)(side.joints, counts)
-        # Also C-ATE under A3 and A4, which would exist by the camera alone.
+        # This includes C-ATE under A3 and A4, which the camera alone would determine.
         absent = ~jnp.any(estimate.present | truth.present, 1)
         people = {k: jnp.where(absent, jnp.nan, x) for k, x in people.items()}
         mean = lambda value: _mean_over_people(value, broken)
@@ -151,30 +159,32 @@ def evaluate_trajectories(estimate: Trajectories, truth: Trajectories) -> Evalua
 
 
 def _is_broken(x: Float[Array, "t ..."], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether a value in a frame that counts is not finite."""
+    """Returns whether a value in a valid frame is not finite."""
     return jnp.any(valid & ~jnp.all(jnp.isfinite(x), tuple(range(1, x.ndim))))
 
 
 def _mean_over_people(
     value: Float[Array, " h"], broken: Bool[Array, " h"]
 ) -> Float[Array, ""]:
-    """Mean over the people for whom the error exists; NaN if a person is `broken`, that
-    is, if an input of that person is not finite."""
+    """Returns the mean over the people for whom the error exists.
+
+    It is NaN if an input of any person is not finite (`broken`).
+    """
     exists = ~jnp.isnan(value) | broken
     return metrics.Errors(value, exists).mean()
 
 
 def _moves(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether the camera moves: whether the RMS distance of its centres from their mean
-    is above `STILL` (m)."""
+    """Returns whether the RMS distance of the camera centres from their mean exceeds
+    `STATIC_CAMERA_RMS_M`."""
     (centre,) = metrics.only(valid, T_WC[:, :3, 3])
     count = jnp.maximum(jnp.sum(valid), 1).astype(centre.dtype)
     (apart,) = metrics.only(valid, centre - jnp.sum(centre, 0) / count)
-    return jnp.sum(apart**2) / count > STILL**2
+    return jnp.sum(apart**2) / count > STATIC_CAMERA_RMS_M**2
 
 
 def _stands(T_WC: Float[Array, "t 4 4"], valid: Bool[Array, " t"]) -> Bool[Array, ""]:
-    """Whether all camera centres coincide up to rounding errors.
+    """Returns whether all camera centres coincide up to rounding errors.
 
     The tolerance is relative to the centres' mean, so the unit of length is irrelevant.
     """
@@ -296,7 +306,7 @@ def _person_errors(
     )
     values |= _both("jitter", metrics.jitter(joints, valid, estimate.fps))
     values |= _both("jitter_of_truth", metrics.jitter(true_joints, valid, truth.fps))
-    up = jnp.asarray(plausibility.Y, dtype)
+    up = jnp.asarray(plausibility.UP, dtype)
     own = plausibility.posture_figures(joints, valid, up, estimate.fps)
     theirs = plausibility.posture_figures(true_joints, valid, true_up, truth.fps)
     values |= own | {f"{name}_of_truth": value for name, value in theirs.items()}

@@ -1,10 +1,11 @@
 """Errors of cameras and people, each with its exact definition and its source.
 
-Arrays of one person and one camera over `t` frames; `valid` marks the frames that
-count, and values in others are ignored. An error is an array with a mask of its own
-(`Errors`), which has a `mean` and an `rmse`. SI units: m, rad, s. Estimate first, truth
-second. Differences in time are taken between neighbouring valid frames, never across a
-gap; RTE and the 100-frame chunks drop invalid frames first, as their sources do.
+Arrays are those of one person and one camera over `t` frames; `valid` marks the frames
+that are evaluated, and values in others are ignored. An error is an array with a mask
+of its own (`Errors`), which has a `mean` and an `rmse`. Units are SI: m, rad, s. The
+estimate is the first argument, the truth the second. Differences in time are taken
+between neighbouring valid frames, never across a gap; RTE and the 100-frame chunks drop
+invalid frames first, as their sources do.
 """
 
 from typing import Literal
@@ -24,22 +25,22 @@ from bodyslam_jax.evaluation.alignment import (
 from bodyslam_jax.geometry import so3
 
 Chunking = Literal["wham", "tram"]
-CHUNK = 100
+CHUNK_FRAMES = 100
 """Frames per chunk of W-MPJPE and WA-MPJPE."""
 
 
 class Errors(eqx.Module):
-    """One error per frame (and joint), and a mask of those that exist."""
+    """Errors, one per frame (and joint), with a mask of those that exist."""
 
     value: Float[Array, "*n"]
     valid: Bool[Array, "*n"]
 
     def mean(self) -> Float[Array, ""]:
-        """Mean over the errors that exist; NaN without any."""
+        """Returns the mean over the errors that exist; NaN without any."""
         return self._average(self.value)
 
     def rmse(self) -> Float[Array, ""]:
-        """Root of the mean square over the errors that exist; NaN without any."""
+        """Returns the root mean square of the errors that exist; NaN without any."""
         return _sqrt(self._average(self.value**2))
 
     def _average(self, value: Float[Array, "*n"]) -> Float[Array, ""]:
@@ -49,24 +50,25 @@ class Errors(eqx.Module):
 
 
 def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-    """Length of each vector, with derivative 0 where it is zero."""
-    # Written out: XLA on CPU does not vectorise a sum over so short an axis.
+    """Returns the length of each vector, with derivative 0 where it is zero."""
+    # The sum is written out: XLA on CPU does not vectorise it over so short an axis.
     square = sum((x[..., k] ** 2 for k in range(1, x.shape[-1])), x[..., 0] ** 2)
     return _sqrt(square)
 
 
 def _sqrt(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The square root, with a derivative of 0 at 0; NaN stays NaN.
+    """Returns the square root, with a derivative of 0 at 0; NaN stays NaN.
 
-    XLA may compute `square` twice and round differently. Of `where(square == 0, ...)`
-    inside and outside of the root, one could then find 0 and the other not.
+    `where(square == 0, ...)` inside and outside of the root is not safe: XLA may
+    compute `square` twice with different rounding, so that one finds 0 and the other
+    does not.
     """
     tiny = jnp.finfo(square.dtype).tiny
     return jnp.sqrt(square + tiny) - np.sqrt(tiny)
 
 
 def only(valid: Bool[Array, " t"], *arrays: Float[Array, "t ..."]) -> list[Array]:
-    """The arrays with zeros in frames that do not count, so that NaN there does not
+    """Returns the arrays with zeros in invalid frames, so that NaN there does not
     propagate."""
     shaped = lambda x: valid.reshape(valid.shape + (1,) * (x.ndim - 1))
     return [jnp.where(shaped(x), x, 0) for x in arrays]
@@ -78,10 +80,10 @@ def trajectory_error(
     valid: Bool[Array, " t"],
     alignment: Similarity,
 ) -> Errors:
-    """Distance of each aligned position from the truth, m.
+    """Returns the distance of each aligned position from the truth, m.
 
-    C-ATE with camera centres, H-ATE with the pelvis joint (origin of H); Henning et
-    al., ECCV 2022, section 4. "ATE" is the RMSE of these distances in Sturm et al.,
+    With camera centres it is C-ATE, with the pelvis joint (origin of H) H-ATE; Henning
+    et al., ECCV 2022, section 4. "ATE" is the RMSE of these distances in Sturm et al.,
     IROS 2012, and their mean in TRAM (in evo: `mean`). ATE-S (TRAM) is the mean of
     C-ATE after SE(3) alignment.
     """
@@ -95,7 +97,7 @@ def joint_trajectory_error(
     valid: Bool[Array, " t"],
     alignment: Similarity,
 ) -> Errors:
-    """J-ATE: distance of every joint from the truth, m.
+    """Returns J-ATE: the distance of every aligned joint from the truth, m.
 
     Henning et al., ECCV 2022, table 1. They do not state how joints are aligned; here
     `alignment` is that of the human centres (pelvis joints).
@@ -111,10 +113,11 @@ def relative_pose_errors(
     valid: Bool[Array, " t"],
     step: int = 1,
 ) -> tuple[Errors, Errors]:
-    """RPE over `step` frames: translation, m, and rotation, rad, of the relative pose.
+    """Returns the RPE over `step` frames: translation, m, and rotation, rad, of the
+    relative pose.
 
-    `E_i = (Q_i⁻¹ Q_{i+step})⁻¹ (P_i⁻¹ P_{i+step})` for every `i` (Sturm et al., IROS
-    2012, eq. 2; evo's `RPE` with `all_pairs`). No alignment: none is needed.
+    It is `E_i = (Q_i⁻¹ Q_{i+step})⁻¹ (P_i⁻¹ P_{i+step})` for every `i` (Sturm et al.,
+    IROS 2012, eq. 2; evo's `RPE` with `all_pairs`), and needs no alignment.
     """
 
     def relative(T):
@@ -135,12 +138,12 @@ def relative_pose_errors(
 def camera_frame(
     joints: Float[Array, "t j 3"], T_WC: Float[Array, "t 4 4"]
 ) -> Float[Array, "t j 3"]:
-    """Joints in each frame's camera frame, m."""
+    """Returns the joints in each frame's camera frame, m."""
     return jnp.einsum("tji,tnj->tni", T_WC[:, :3, :3], joints - T_WC[:, None, :3, 3])
 
 
 def hip_centred(joints: Float[Array, "t j 3"]) -> Float[Array, "t j 3"]:
-    """Joints relative to the mean of the hips (joints 1 and 2), m."""
+    """Returns the joints relative to the mean of the hips (joints 1 and 2), m."""
     return joints - jnp.mean(joints[:, 1:3], 1, keepdims=True)
 
 
@@ -149,7 +152,7 @@ def mpjpe(
     truth: Float[Array, "t j 3"],
     valid: Bool[Array, " t"],
 ) -> Errors:
-    """MPJPE in the camera frame, m: both centred at the mean of the hips (joints 1, 2).
+    """Returns MPJPE in the camera frame, m, with both centred at the mean of the hips.
 
     EMDB's evaluation (`eth-ait/emdb`), where the pelvis is the middle of the hips.
     """
@@ -163,7 +166,8 @@ def pa_mpjpe(
     truth: Float[Array, "t j 3"],
     valid: Bool[Array, " t"],
 ) -> Errors:
-    """PA-MPJPE, m: after the best Sim(3) of each frame on its own (Procrustes)."""
+    """Returns PA-MPJPE, m: the error after the best Sim(3) of each frame
+    (Procrustes)."""
     estimate, truth = only(valid, estimate, truth)
     found = umeyama(truth, estimate, with_scale=True)
     value = norm(jax.vmap(Similarity.apply)(found, estimate) - truth)
@@ -171,19 +175,21 @@ def pa_mpjpe(
 
 
 def _chunks(valid: Bool[Array, " t"], chunking: Chunking):
-    """Chunk of each frame, its index within the chunk counting valid frames only, and
-    whether it belongs to a chunk at all: TRAM drops some."""
+    """Returns the chunk of each frame, its index within the chunk counting valid frames
+    only, and whether it belongs to a chunk at all: TRAM drops some."""
     rank = jnp.cumsum(valid) - 1
     if chunking == "wham":
-        return rank // CHUNK, rank % CHUNK, valid
+        return rank // CHUNK_FRAMES, rank % CHUNK_FRAMES, valid
     if chunking != "tram":
         raise InputError(f"Chunking {chunking!r}, not 'wham' or 'tram'.")
     num_valid = jnp.sum(valid)
-    num_chunks = (num_valid - 1) // CHUNK
-    end = jnp.where(num_valid % CHUNK == 0, num_chunks * CHUNK, num_valid - 1)
+    num_chunks = (num_valid - 1) // CHUNK_FRAMES
+    end = jnp.where(
+        num_valid % CHUNK_FRAMES == 0, num_chunks * CHUNK_FRAMES, num_valid - 1
+    )
     short = num_chunks < 1
-    chunk = jnp.where(short, 0, jnp.minimum(rank // CHUNK, num_chunks - 1))
-    return chunk, rank - chunk * CHUNK, valid & (short | (rank < end))
+    chunk = jnp.where(short, 0, jnp.minimum(rank // CHUNK_FRAMES, num_chunks - 1))
+    return chunk, rank - chunk * CHUNK_FRAMES, valid & (short | (rank < end))
 
 
 def world_mpjpe(
@@ -193,20 +199,23 @@ def world_mpjpe(
     align_with: Literal["all", "first"] = "first",
     chunking: Chunking = "wham",
 ) -> Errors:
-    """W-MPJPE₁₀₀ (`"first"`) or WA-MPJPE₁₀₀ (`"all"`): mean over joints per frame, m.
+    """Returns W-MPJPE₁₀₀ (`"first"`) or WA-MPJPE₁₀₀ (`"all"`): the mean over joints per
+    frame, m.
 
-    The valid frames are cut in chunks of 100; in each, one Sim(3) is fitted to all
+    The valid frames are cut into chunks of 100. In each, one Sim(3) is fitted to all
     joints of its first two frames (W) or of all its frames (WA), and applied to the
-    chunk. The scale is aligned, too: WHAM `lib/eval/eval_utils.py`
-    (`first_align_joints`, `global_align_joints`). `"wham"`: the last chunk is what
-    remains, 1 to 99 frames. `"tram"` (`scripts/emdb/run_eval.py`): starts at
-    `range(0, n - 100, 100)`, the last chunk runs on to frame `n - 2` unless `n` is a
-    multiple of 100, when the last 100 frames are in no chunk. TRAM has no chunk at all
-    for `n <= 100`; here that is one chunk of all frames.
+    chunk; the scale is aligned, too (WHAM `lib/eval/eval_utils.py`,
+    `first_align_joints`, `global_align_joints`). With `"wham"`, the last chunk is the
+    remainder, 1 to 99 frames. With `"tram"` (`scripts/emdb/run_eval.py`), chunks start
+    at `range(0, n - 100, 100)`, and the last one extends to frame `n - 2` unless `n` is
+    a multiple of 100, when the last 100 frames are in no chunk. TRAM has no chunk at
+    all for `n <= 100`; here that is one chunk of all frames.
+
+    **Raises:** `InputError` for another `chunking`.
     """
     estimate, truth = only(valid, estimate, truth)
     chunk, place, used = _chunks(valid, chunking)
-    num_chunks = (len(valid) + CHUNK - 1) // CHUNK
+    num_chunks = (len(valid) + CHUNK_FRAMES - 1) // CHUNK_FRAMES
     chunk = jnp.clip(chunk, 0, num_chunks - 1)
     fits = used & (place < 2) if align_with == "first" else used
     weight = fits.astype(truth.dtype)
@@ -236,11 +245,12 @@ def root_trajectory_error(
     truth: Float[Array, "t 3"],
     valid: Bool[Array, " t"],
 ) -> Errors:
-    """RTE: error of the root after one SE(3), as a fraction of the path's length.
+    """Returns RTE: the error of the root after one SE(3) alignment, as a fraction of
+    the path's length.
 
-    WHAM `compute_rte` (there × 100, of SMPL's `trans`; here of the pelvis joint, as in
-    GVHMR and TRAM). Invalid frames are dropped first. A truth that moves less than 1 mm
-    in all counts as one that moved 1 mm, so that the figure stays finite.
+    WHAM's `compute_rte` (there × 100, of SMPL's `trans`; here of the pelvis joint, as
+    in GVHMR and TRAM). Invalid frames are dropped first. A true path shorter than 1 mm
+    counts as 1 mm, so that the figure stays finite.
     """
     estimate, truth = only(valid, estimate, truth)
     order = jnp.argsort(~valid, stable=True)
@@ -257,7 +267,7 @@ def acceleration_error(
     valid: Bool[Array, " t"],
     fps: Float[Array, ""],
 ) -> Errors:
-    """`|Δ²x - Δ²x̂| fps²` per joint, m/s² (Kanazawa et al., CVPR 2019).
+    """Returns `|Δ²x - Δ²x̂| fps²` per joint, m/s² (Kanazawa et al., CVPR 2019).
 
     WHAM takes hip-centred joints of the camera frame and leaves out the first and the
     last value; all are kept here.
@@ -270,10 +280,10 @@ def acceleration_error(
 def jitter(
     joints: Float[Array, "t j 3"], valid: Bool[Array, " t"], fps: Float[Array, ""]
 ) -> Errors:
-    """Third difference of the joints in the world × fps³, m/s³.
+    """Returns the norm of the joints' third difference in the world times fps³, m/s³.
 
-    WHAM and GVHMR print a tenth of it ("10 m/s³"). EMDB's own jitter is something
-    else (reference frame, and joints set to zero).
+    WHAM and GVHMR print a tenth of it ("10 m/s³"). EMDB's jitter has another definition
+    (reference frame, and joints set to zero).
     """
     (joints,) = only(valid, joints)
     value = norm(jnp.diff(joints, n=3, axis=0)) * fps**3
@@ -285,7 +295,7 @@ def foot_sliding(
     truth: Float[Array, "t f 3"],
     valid: Bool[Array, " t"],
 ) -> Errors:
-    """How far foot points move per frame while the truth's stand, m.
+    """Returns the displacement of foot points per frame while the true points stand, m.
 
     A point stands where the truth moves less than 1 cm from one frame to the next.
     WHAM `compute_foot_sliding`, with SMPL's vertices 3216, 3387, 6617, 6787 (big toes
@@ -297,7 +307,7 @@ def foot_sliding(
 
 
 def _run(valid: Bool[Array, " t"], order: int) -> Bool[Array, " u"]:
-    """Where `order + 1` valid frames follow one another."""
+    """Returns where `order + 1` consecutive frames are valid."""
     for _ in range(order):
         valid = valid[1:] & valid[:-1]
     return valid

@@ -1,6 +1,7 @@
-"""Trajectories of equal shapes, so that lengths share compiled programs and stack.
+"""Pads trajectories to equal shapes, so that they share compiled programs and can be
+stacked.
 
-What is added is masked: errors are those of the unpadded trajectories, to rounding.
+Padding is masked: errors equal those of the unpadded trajectories up to rounding.
 """
 
 from typing import Any, Literal
@@ -12,23 +13,23 @@ import numpy as np
 
 from bodyslam_jax.evaluation.errors import Trajectories
 
-_SMALLEST = 64
-_GROWTH = 4
+_MIN_BUCKET_FRAMES = 64
+_BUCKET_GROWTH_FACTOR = 4
 
 
 def bucket(num_frames: int) -> int:
-    """The length to pad to: 64, 256, 1024, ...
+    """Returns the length to pad to: 64, 256, 1024, ...
 
     Compiling takes seconds, evaluating masked frames milliseconds: hence few buckets.
     """
-    size = _SMALLEST
+    size = _MIN_BUCKET_FRAMES
     while size < num_frames:
-        size *= _GROWTH
+        size *= _BUCKET_GROWTH_FACTOR
     return size
 
 
 def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
-    """The same with masked frames added at the end, up to `num_frames`."""
+    """Returns the trajectories with masked frames appended, up to `num_frames`."""
     t = trajectories
     if num_frames == t.T_WC.shape[0]:
         return t
@@ -42,7 +43,8 @@ def pad_frames(trajectories: Trajectories, num_frames: int) -> Trajectories:
 
 
 def padded_frames(arrays: tuple[Any, ...], num_frames: int) -> tuple[Any, ...]:
-    """The same arrays of `Trajectories`, `T_WC` to `feet`, with masked frames added."""
+    """Returns the arrays of `Trajectories`, `T_WC` to `feet`, with masked frames
+    appended."""
     T_WC, camera_valid, joints, present, feet = arrays
     missing = num_frames - len(T_WC)
     return (
@@ -55,9 +57,10 @@ def padded_frames(arrays: tuple[Any, ...], num_frames: int) -> tuple[Any, ...]:
 
 
 def pad_people(trajectories: Trajectories, num_people: int) -> Trajectories:
-    """The same with people who are never present added, up to `num_people`.
+    """Returns the trajectories with people appended who are never present, up to
+    `num_people`.
 
-    Their own errors are NaN, and means over people leave them out.
+    The errors of these are NaN, and means over people leave them out.
     """
     missing = num_people - trajectories.present.shape[0]
     if not missing:
@@ -73,7 +76,7 @@ def pad_people(trajectories: Trajectories, num_people: int) -> Trajectories:
 
 
 def to_bucket(trajectories: Trajectories) -> Trajectories:
-    """`pad_frames` up to `bucket`."""
+    """Returns the trajectories padded by `pad_frames` to the length `bucket`."""
     return pad_frames(trajectories, bucket(trajectories.T_WC.shape[0]))
 
 
@@ -83,5 +86,5 @@ def _pad(
     widths = [(0, missing * (i == axis)) for i in range(x.ndim)]
     if isinstance(x, jax.core.Tracer):
         return jnp.pad(x, widths, mode)
-    # On the host: `jnp.pad` would be compiled for each shape.
+    # NumPy is used because `jnp.pad` would be compiled for each shape.
     return np.pad(np.asarray(x), widths, mode)

@@ -1,4 +1,4 @@
-"""Plausibility of one side, estimate or truth: gravity, feet, knees, acceleration.
+"""Plausibility of an estimate or a truth: gravity, feet, knees, acceleration.
 
 Errors of trajectories do not show that a person slides, floats or crouches. These are
 the quantities by which `bodyslam_jax.diagnostics` judges a result, as functions that
@@ -21,17 +21,18 @@ from bodyslam_jax.body.skeleton import (
 from bodyslam_jax.evaluation.metrics import norm, only
 
 _HIPS, _KNEES, _ANKLES, _FEET = map(np.array, (HIPS, KNEES, ANKLES, FEET))
-_LOWEST = np.array(ANKLES_AND_FEET)
-_UPRIGHT = float(np.cos(np.radians(35.0)))
-"""Cosine of the angle between people's mean trunk and the up axis, at least."""
-Y = np.array([0.0, 1.0, 0.0])
+_ANKLES_AND_FEET = np.array(ANKLES_AND_FEET)
+_MIN_TRUNK_COSINE = float(np.cos(np.radians(35.0)))
+"""Cosine of the angle between people's mean trunk and the up axis from which that axis
+is known: cos 35°."""
+UP = np.array([0.0, 1.0, 0.0])
 """Up in a result."""
 
 
 def up_axis(
     joints: Float[Array, "h t 24 3"], present: Bool[Array, "h t"]
 ) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
-    """The axis of the world that is up, and whether it is known.
+    """Returns the world axis that points up, and whether it is known.
 
     It is the axis nearest to the mean direction of people's trunks, and known if that
     is within 35 degrees.
@@ -43,7 +44,7 @@ def up_axis(
     largest = jnp.argmax(jnp.abs(total))
     sign = jnp.where(total[largest] < 0, -1, 1).astype(joints.dtype)
     axis = jnp.zeros(3, joints.dtype).at[largest].set(sign)
-    known = jnp.abs(total[largest]) > _UPRIGHT * norm(total)
+    known = jnp.abs(total[largest]) > _MIN_TRUNK_COSINE * norm(total)
     return axis, known
 
 
@@ -53,15 +54,15 @@ def gravity_error(
     valid: Bool[Array, " t"],
     true_up: Float[Array, " 3"],
 ) -> Float[Array, ""]:
-    """Mean angle between the up directions of estimate (y) and truth in the camera's
-    frame, rad, which needs no alignment. NaN without cameras."""
+    """Returns the mean angle between the up directions of estimate (y) and truth in the
+    camera frame, rad; it needs no alignment. NaN without cameras."""
     T, true_T = (
         jnp.where(valid[:, None, None], x, jnp.eye(4, dtype=x.dtype))
         for x in (T_WC, true_T_WC)
     )
     up = T[:, 1, :3]
     true_up_C = jnp.einsum("tji,j->ti", true_T[:, :3, :3], true_up)
-    # By sine and cosine: the arc cosine is inaccurate at small angles.
+    # The arc cosine is inaccurate at small angles.
     angle = jnp.arctan2(norm(jnp.cross(up, true_up_C)), jnp.sum(up * true_up_C, -1))
     return _mean(angle, valid)
 
@@ -72,7 +73,7 @@ def posture_figures(
     up: Float[Array, " 3"],
     fps: Float[Array, ""],
 ) -> dict[str, Float[Array, ""]]:
-    """Quantities of one person's posture and motion, in rad, m, s.
+    """Returns figures of one person's posture and motion, in rad, m, s.
 
     `knee`, `straighter_knee`: mean angle between thigh and shin, of both and of the
     straighter leg. `feet_low`, `feet_high`: 5th and 95th percentile of the height of
@@ -84,7 +85,7 @@ def posture_figures(
     thigh = joints[:, _KNEES] - joints[:, _HIPS]
     shin = joints[:, _ANKLES] - joints[:, _KNEES]
     knee = jnp.arctan2(norm(jnp.cross(thigh, shin)), jnp.sum(thigh * shin, -1))
-    lowest = jnp.min(joints[:, _LOWEST] @ up, 1)
+    lowest = jnp.min(joints[:, _ANKLES_AND_FEET] @ up, 1)
     feet = joints[:, _FEET]
     step = jnp.diff(feet, axis=0)
     flat = norm(step - (step @ up)[..., None] * up) * fps
@@ -111,7 +112,7 @@ FIGURES = (
     "foot_speed",
     "joint_acceleration",
 )
-"""Names of `posture_figures`; with `_of_truth` they are the truth's."""
+"""Names of `posture_figures`; those of the truth have the suffix `_of_truth`."""
 
 
 def _mean(x: Float[Array, " n"], valid: Bool[Array, " n"]) -> Float[Array, ""]:
@@ -123,7 +124,8 @@ def _mean(x: Float[Array, " n"], valid: Bool[Array, " n"]) -> Float[Array, ""]:
 def _quantile(
     x: Float[Array, "*n"], valid: Bool[Array, "*#n"], share: float
 ) -> Float[Array, ""]:
-    """Quantile of the valid values; NaN without any, or if one of them is NaN."""
+    """Returns a quantile of the valid values; NaN without any, or if one of them is
+    NaN."""
     if not x.size:  # differences of one frame or two
         return jnp.full((), jnp.nan, x.dtype)
     broken = jnp.any(jnp.isnan(x) & valid)

@@ -1,4 +1,4 @@
-"""Run folders and ground truths, read into one `Result` each."""
+"""Reads run folders and ground truths into one `Result` each."""
 
 import logging
 from pathlib import Path
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.body import BodyModel, joints
+from bodyslam_jax.body import BodyModel, joints, load_body_model
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.resampling import bracket, interpolate_poses
 from bodyslam_jax.evaluation.run_summary import read_summary
@@ -19,6 +19,10 @@ from bodyslam_jax.io.declared import as_array, as_number
 from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
+
+_MAX_OFFSET_M = 0.01
+"""Distance between a result's joints and those of a body model from which the model
+cannot be the one that the result was estimated with."""
 
 _RUN_FIELDS = {
     "timestamps": ("t",),
@@ -65,11 +69,14 @@ def read_result(path: Path) -> Result:
 
 
 _ROTATION_TOLERANCE = 0.01
-"""Distance of `RᵀR` from the identity: rounding to float16 is below 0.002."""
+"""Largest entry of `RᵀR - 1` of a rotation: rounding to float16 stays below 0.002."""
 
 
 def _check_rigid(file: Path, T_WC: Float[np.ndarray, "t 4 4"]) -> None:
-    """**Raises:** `InputError` for a pose whose 3x3 block is no rotation."""
+    """Checks that the 3x3 block of every pose is a rotation.
+
+    **Raises:** `InputError` if one is not.
+    """
     R = np.clip(T_WC[:, :3, :3], -10, 10)
     away = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     wrong = (away > _ROTATION_TOLERANCE) | (np.linalg.det(R) < 0)
@@ -138,7 +145,8 @@ def read_groundtruth(path: Path, body: BodyModel) -> Result:
 def _timeline(
     camera: tuple[np.ndarray, np.ndarray] | None, people: list[dict[str, Any]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Timestamps of the denser of camera and bodies, and the camera's poses there."""
+    """Returns the timestamps (s) of the denser of camera and bodies, and the camera's
+    poses at these."""
     longest = max(people, key=lambda p: len(p["poses"]), default=None)
     if camera is None:
         assert longest is not None
@@ -154,7 +162,7 @@ def _timeline(
 
 
 def _warn_of_rest(file: Path, person: dict[str, Any], times: np.ndarray) -> None:
-    """Warns of bodies after the last true camera, which are left out."""
+    """Warns of bodies after the last true camera, which are dropped."""
     num, fps = len(person["poses"]), person["fps"]
     beyond = times[0] + (num - 1) / fps - times[-1]
     if num != len(times) and beyond > 1.5 / fps:
@@ -168,7 +176,7 @@ def _warn_of_rest(file: Path, person: dict[str, Any], times: np.ndarray) -> None
 def _at(
     person: dict[str, Any], times: np.ndarray, has_camera: bool
 ) -> dict[str, np.ndarray]:
-    """One person at the given timestamps."""
+    """Resamples one person to the given timestamps (s)."""
     num, fps = len(person["poses"]), person["fps"]
     own = times[0] + np.arange(num) / fps
     if (
@@ -194,12 +202,16 @@ def _at(
 
 
 def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
-    """AMASS style: SMPL-H poses keep their 22 body joints, betas their first 10.
+    """Reads a body in the style of AMASS; of SMPL-H poses the 22 body joints are kept,
+    of betas the first 10.
 
-    An optional `present` (t,) marks the frames in which the person is known.
+    An optional `present` (t,) marks the frames in which the person is known. Joints are
+    posed with `body` unless the file has them.
+
+    **Raises:** `InputError` that names the file, and what was found and expected.
     """
     archive = read_npz(path, "a true body (.npz)")
-    rate = next((n for n in _RATES if n in archive), _RATES[0])
+    rate = next((n for n in _FRAME_RATE_KEYS if n in archive), _FRAME_RATE_KEYS[0])
     archive.require("poses", "trans", "betas", rate)
     poses, trans = archive.array("poses", ("t", None)), archive.array("trans", ("t", 3))
     betas = np.ravel(archive.array("betas"))
@@ -216,7 +228,7 @@ def read_body(path: Path, body: BodyModel) -> dict[str, Any]:
         found = archive.array("joints", ("t", 24, 3))
     else:
         found = posed_joints(body, poses, betas, trans)
-        # Angles and shapes beyond any body.
+        # Extreme angles and shapes may overflow.
         found = as_array(path, "joints of its poses and betas", found)
     present = np.ones(num, bool)
     if "present" in archive:
@@ -237,25 +249,73 @@ def posed_joints(
     betas: Float[np.ndarray, " 10"],
     trans: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "t 24 3"]:
-    """Joints of a body model, m, in padded chunks: one compilation for all lengths."""
+    """Returns the joints of a posed body model, m.
+
+    Frames are processed in padded chunks, so that one compilation serves all lengths.
+    """
     found = []
-    for start in range(0, len(poses), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        missing = _CHUNK - len(poses[part])
+    for start in range(0, len(poses), _CHUNK_FRAMES):
+        part = slice(start, start + _CHUNK_FRAMES)
+        missing = _CHUNK_FRAMES - len(poses[part])
         pose, place = (np.pad(x[part], ((0, missing), (0, 0))) for x in (poses, trans))
         as_body = [jnp.asarray(x, body.dtype) for x in (pose, betas, place)]
         posed = np.asarray(_joints(body, *as_body), np.float64)
-        found.append(posed[: _CHUNK - missing])
+        found.append(posed[: _CHUNK_FRAMES - missing])
     return np.concatenate(found)
 
 
-_CHUNK = 256
+_CHUNK_FRAMES = 256
 _joints = eqx.filter_jit(joints)
 
-_RATES = ("mocap_framerate", "mocap_frame_rate")
+_FRAME_RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")
 
 
 def _landmarks(path: Path | None) -> np.ndarray:
     if path is None or not path.exists():
         return np.zeros((0, 3))
     return as_array(path, "landmarks", read_npy(path), (None, 3))
+
+
+def body_of_run(result: Result) -> BodyModel:
+    """Returns the body model of this machine, if the result was estimated with it.
+
+    The file that `settings.body_model` of the summary names is not opened: a run folder
+    is untrusted and may name any file.
+
+    **Raises:** `InputError`, one line that asks for `--body-model`, if the result has
+    another body model.
+    """
+    body = load_body_model()
+    check_body(result, body)
+    return body
+
+
+def check_body(result: Result, body: BodyModel) -> None:
+    """Checks that the joints of each person, in two frames, are those of `body`.
+
+    **Raises:** `InputError` if `body` is not the body model of the result.
+    """
+    for h, there in enumerate(result.present):
+        if not there.any():
+            continue
+        k = np.flatnonzero(there)[[0, -1]]
+        cast = lambda x: jnp.asarray(x, body.dtype)
+        posed = joints(
+            body, *map(cast, (result.poses[h, k], result.betas[h], result.trans[h, k]))
+        )
+        away = np.linalg.norm(np.asarray(posed) - result.joints[h, k], axis=-1).max()
+        if not away < _MAX_OFFSET_M:
+            raise InputError(
+                f"body model {body.name}: its joints are {100 * away:.0f} cm off the "
+                f"run's, expected the body model of the run{_named(result)}; give it "
+                "by --body-model."
+            )
+
+
+def _named(result: Result) -> str:
+    """Returns text on the body model that the summary names, which may be anything."""
+    settings = result.summary.get("settings")
+    named = settings.get("body_model") if isinstance(settings, dict) else None
+    if not isinstance(named, str):
+        return ""
+    return f" ({named[:200]!r}, which is not opened unless it is given)"

@@ -1,4 +1,4 @@
-"""Errors as rows, a table or JSON; and what was compared, in words."""
+"""Formats errors as rows, a table or JSON, and describes what was compared."""
 
 import json
 import math
@@ -9,13 +9,13 @@ from jaxtyping import Array
 
 from bodyslam_jax.evaluation.errors import (
     NOBODY,
-    STRAIGHT,
+    STRAIGHT_PATH_RMS_M,
     Evaluation,
     Scope,
 )
 
-_FEW = 3
-"""Poses from which an alignment leaves errors."""
+_MIN_ALIGNED_POSES = 3
+"""Number of poses from which an alignment leaves errors that mean something."""
 
 _MM, _PERCENT, _DEGREES = 1e3, 100.0, 180 / math.pi
 ROWS: tuple[tuple[str, str, str, float], ...] = (
@@ -60,11 +60,11 @@ ROWS: tuple[tuple[str, str, str, float], ...] = (
         for of, whose in (("", ""), ("_of_truth", ", truth"))
     ),
 )
-"""Name, label, unit of the report, factor from SI."""
+"""Rows of the report: name, label, unit, and factor from SI to that unit."""
 
 
 def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
-    """Label, mean, RMSE and unit of every error that exists, as text."""
+    """Returns label, mean, RMSE and unit, as text, of every error that exists."""
 
     def cell(name: str, factor: float) -> str:
         value = float(evaluation[name]) * factor if name in evaluation else math.nan
@@ -84,8 +84,8 @@ def to_rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
 
 
 def to_table(evaluation: Evaluation) -> str:
-    """The errors as aligned text: mean and RMSE, in mm and degrees where customary;
-    above them what was compared, if it is known."""
+    """Returns the errors as aligned text: mean and RMSE, in mm and degrees where
+    customary, below a line on what was compared, if that is known."""
     rows = [("", "mean", "RMSE", "unit"), *to_rows(evaluation)]
     width = max(len(row[0]) for row in rows)
     lines = [f"{a:<{width}}  {b:>9}  {c:>9}  {d}".rstrip() for a, b, c, d in rows]
@@ -94,7 +94,8 @@ def to_table(evaluation: Evaluation) -> str:
 
 
 def describe(scope: Scope) -> str:
-    """What was compared, in a line: frames of the camera, and pairs of people."""
+    """Returns a line on what was compared: frames of the camera, and pairs of
+    people."""
     parts = [f"cameras in {scope.cameras} of {scope.of_cameras} frames"]
     if not scope.of_cameras:
         parts = ["no true cameras"]
@@ -111,7 +112,7 @@ def describe(scope: Scope) -> str:
 
 
 def gaps(scope: Scope, least: float = 0.9) -> list[str]:
-    """Warnings about parts of the truth that the errors leave out, a line each.
+    """Returns warnings about parts of the truth that the errors leave out.
 
     `least` is the share of frames below which a comparison is incomplete.
     """
@@ -121,14 +122,15 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
             f"cameras are compared in {scope.cameras} of {scope.of_cameras} frames of "
             "the ground truth only."
         )
-    if 0 < scope.cameras < _FEW:
+    if 0 < scope.cameras < _MIN_ALIGNED_POSES:
         found.append(
             f"cameras are compared in {scope.cameras} frames only, which alignment "
             "brings together: their errors are meaningless."
         )
     found += [
-        f"person {pair.truth} goes along a line, to {100 * STRAIGHT:.0f} cm: alignment "
-        "A1 does not determine the rotation about it, on which J-ATE depends."
+        f"person {pair.truth} goes along a line, to {100 * STRAIGHT_PATH_RMS_M:.0f} "
+        "cm: alignment A1 does not determine the rotation about it, on which J-ATE "
+        "depends."
         for pair, straight in zip(scope.people, scope.straight)
         if straight
     ]
@@ -144,7 +146,8 @@ def gaps(scope: Scope, least: float = 0.9) -> list[str]:
 
 
 def _compared(scope: Scope) -> dict[str, Any]:
-    """As dictionaries; the number of a person who is not found is `None`."""
+    """Returns the scope as dictionaries; the index of a person who is not found is
+    `None`."""
     people = [
         {**vars(pair), "estimate": None if pair.estimate == NOBODY else pair.estimate}
         for pair in scope.people
@@ -153,7 +156,7 @@ def _compared(scope: Scope) -> dict[str, Any]:
 
 
 def to_json(evaluation: Evaluation) -> str:
-    """The errors as JSON in SI units; `null` where one does not exist."""
+    """Returns the errors as JSON in SI units; `null` where an error does not exist."""
 
     def plain(value: Array) -> Any:
         array = np.asarray(value, np.float64)

@@ -1,4 +1,5 @@
-"""Results at other timestamps: positions linearly, rotations on the geodesic."""
+"""Resamples results to other timestamps: positions linearly, rotations on the
+geodesic."""
 
 import dataclasses
 
@@ -12,29 +13,29 @@ from bodyslam_jax.evaluation.padding import padded_frames
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Result
 
-_MAX_FILLED = 101
-"""Steps that a gap in the timestamps is filled with, at most."""
-_ROUNDING = 1e-3
-"""Part of a frame's interval by which timestamps are rounded in files."""
+_MAX_FILLED_FRAMES = 101
+"""Number of steps that a gap in the timestamps is divided into at most."""
+_TIMESTAMP_ROUNDING_FRAMES = 1e-3
+"""Rounding of timestamps in files, in frame intervals."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """Cameras and people of one side at `t` moments, on the host."""
+    """Cameras and people of an estimate or a truth at `t` times, as NumPy arrays."""
 
     T_WC: Float[np.ndarray, "t 4 4"]
     """Camera to world, m."""
     camera_valid: Bool[np.ndarray, " t"]
     joints: Float[np.ndarray, "h t 24 3"]
-    """m, world."""
+    """Joints, m, world frame."""
     present: Bool[np.ndarray, "h t"]
     feet: Float[np.ndarray, "h t f 3"]
-    """m, world."""
+    """Points of the feet, m, world frame."""
     available: Bool[np.ndarray, " t"]
-    """Moments at which there was a frame, or two to interpolate between."""
+    """Times at which there was a frame, or two to interpolate between."""
 
     def cut(self, frames: slice, people: list[int] | None = None) -> "Samples":
-        """A range of frames, and some people in a given order."""
+        """Returns a range of frames, and, if given, some people in that order."""
         everybody = list(range(len(self.present)))
         who = everybody if people is None else people
         return Samples(
@@ -47,7 +48,8 @@ class Samples:
         )
 
     def trajectories(self, fps: float, num_frames: int | None = None) -> Trajectories:
-        """As JAX arrays, padded with masked frames up to `num_frames`; `fps` in 1/s."""
+        """Returns the samples as JAX arrays, padded with masked frames up to
+        `num_frames`; `fps` is in 1/s."""
         arrays = (self.T_WC, self.camera_valid, self.joints, self.present, self.feet)
         if num_frames is not None:
             arrays = padded_frames(arrays, num_frames)
@@ -56,7 +58,7 @@ class Samples:
 
 
 def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:
-    """A result at its own timestamps, with the given points of the feet."""
+    """Returns a result at its own timestamps, with the given points of the feet (m)."""
     has_camera = bool(result.summary.get("has_camera", True))
     every = np.ones(len(result.timestamps), bool)
     camera = result.located & has_camera
@@ -64,17 +66,18 @@ def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:
 
 
 def interval_of(times: Float[np.ndarray, " t"]) -> float:
-    """Median time between frames, s; 1/30 for a single frame."""
+    """Returns the median time between frames, s; 1/30 for a single frame."""
     return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
 
 
 def without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:
-    """The timestamps, with moments added where frames are missing, at most 100 a gap.
+    """Returns the timestamps (s), with times added where frames are missing, at most
+    100 per gap.
 
-    Nothing is known at the added ones, so that no difference is taken across a gap.
+    The added frames are masked, so that no difference is taken across a gap.
     """
     interval = interval_of(times)
-    count = lambda gap: min(max(round(gap / interval), 1), _MAX_FILLED)
+    count = lambda gap: min(max(round(gap / interval), 1), _MAX_FILLED_FRAMES)
     filled = [
         np.linspace(a, b, count(b - a), endpoint=False)
         for a, b in zip(times[:-1], times[1:], strict=True)
@@ -84,26 +87,28 @@ def without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:
 
 @dataclasses.dataclass(frozen=True)
 class Brackets:
-    """The two frames around each of `u` moments."""
+    """The two frames that enclose each of `u` times."""
 
     before: Int[np.ndarray, " u"]
     after: Int[np.ndarray, " u"]
     weight: Float[np.ndarray, " u"]
-    """Of `after`, 0 to 1. Strictly between only where frames are interpolated, which is
-    never across a gap of more than one and a half frames."""
+    """Weight of `after`, 0 to 1. It is strictly between 0 and 1 only where frames are
+    interpolated, which is never across a gap of more than one and a half frames."""
     available: Bool[np.ndarray, " u"]
-    """Where there are frames to interpolate, or one within half a frame."""
+    """Whether there are frames to interpolate, or one within half a frame."""
 
 
 def bracket(times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]) -> Brackets:
-    """The frames (at `times`, s) around each moment of `at` (s)."""
+    """Finds the frames (at `times`, s) that enclose each time of `at` (s)."""
     interval = interval_of(times)
     after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
     before = np.maximum(after - 1, 0)
     gap = np.maximum(times[after] - times[before], 1e-12)
     weight = np.clip((at - times[before]) / gap, 0, 1)
     nearest = np.round(weight)
-    blend = (abs(weight - nearest) > _ROUNDING) & (gap <= 1.5 * interval)
+    blend = (abs(weight - nearest) > _TIMESTAMP_ROUNDING_FRAMES) & (
+        gap <= 1.5 * interval
+    )
     distance = np.minimum(abs(at - times[before]), abs(at - times[after]))
     available = blend | (distance <= 0.5001 * interval)
     return Brackets(before, after, np.where(blend, weight, nearest), available)
@@ -112,11 +117,12 @@ def bracket(times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]) -> Brac
 def interpolate_poses(
     T: Float[np.ndarray, "t 4 4"], between: Brackets
 ) -> Float[np.ndarray, "u 4 4"]:
-    """Poses between frames: centres linearly, rotations on the geodesic."""
+    """Interpolates poses between frames: centres linearly, rotations on the
+    geodesic."""
     weight = between.weight
     w = weight[:, None, None]
     found = (1 - w) * T[between.before] + w * T[between.after]
-    # What is not finite stays NaN.
+    # Values that are not finite stay NaN.
     blend = (weight > 0) & (weight < 1) & np.isfinite(found).all(axis=(1, 2))
     if blend.any():
         rotation = T[:, :3, :3]
@@ -128,7 +134,7 @@ def interpolate_poses(
 def resample(
     samples: Samples, times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]
 ) -> Samples:
-    """The samples, which are at `times` (s), at the moments of `at` (s).
+    """Returns the samples, given at `times` (s), at the times `at` (s).
 
     **Raises:** `InputError` if there is no frame.
     """

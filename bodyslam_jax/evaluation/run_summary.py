@@ -1,4 +1,4 @@
-"""`summary.json` of a run folder, which anybody may have written."""
+"""Reads and validates `summary.json` of a run folder, which is untrusted input."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,11 @@ from bodyslam_jax.io import files
 
 _MAX_LETTERS = 10_000
 _MAX_NUMBER = 1e15
-"""Above all that is counted or measured; products of two are finite."""
-_REASON = {"message": str, "advice": str, "status": str}
-_FORM: dict[str, Any] = {
+"""Above everything that is counted or measured; products of two are finite."""
+_REASON_SCHEMA = {"message": str, "advice": str, "status": str}
+_SCHEMA: dict[str, Any] = {
     "status": str,
-    "reasons": [(str, _REASON)],
+    "reasons": [(str, _REASON_SCHEMA)],
     "headline": [str],
     "warnings": [str],
     "input": (
@@ -28,7 +28,7 @@ _FORM: dict[str, Any] = {
     "people": [
         {
             "status": str,
-            "reasons": [(str, _REASON)],
+            "reasons": [(str, _REASON_SCHEMA)],
             "stature_m": float,
             "stature_sigma_m": float,
             "speed_m_s": float,
@@ -39,13 +39,12 @@ _FORM: dict[str, Any] = {
     "errors": {"*": {"*": (float, str, bool, {}, [])}},
     "has_camera": bool,
 }
-"""The parts that readers of run folders use, and their types. Any may be missing or
-null; `*` is every name, and a tuple has alternatives."""
+"""Types of the entries that readers of run folders use. Any may be missing or null; `*`
+is any name, and a tuple lists alternatives."""
 
 
 def read_summary(file: Path) -> dict[str, Any]:
-    """Reads a `summary.json`; what readers of run folders use of it has the types that
-    they expect.
+    """Reads a `summary.json` and checks the types of the entries that readers use.
 
     **Raises:** `InputError`, one line that names the file, the place, what was found
     and what was expected.
@@ -53,14 +52,15 @@ def read_summary(file: Path) -> dict[str, Any]:
     found = files.read_json(file, "the summary of a run")
     if not isinstance(found, dict):
         raise InputError(f"{file}: {type(found).__name__}, expected an object.")
-    for name, form in _FORM.items():
+    for name, form in _SCHEMA.items():
         if wrong := _misfit(name, found.get(name), form):
             raise InputError(f"{file}: {wrong}.")
     return found
 
 
 def _misfit(place: str, value: Any, form: Any) -> str:
-    """What is wrong with a value, empty if nothing is."""
+    """Returns the error message for a value that does not fit the schema, or "" if it
+    does."""
     if value is None:
         return ""
     if isinstance(form, tuple):
@@ -101,7 +101,7 @@ def _misfit(place: str, value: Any, form: Any) -> str:
 
 
 def _wrong(place: str, value: Any, expected: str) -> str:
-    """The last words of a message about a value, which may be of any size."""
+    """Returns the error message for a value, which may be of any size."""
     kinds = {dict: "an object", list: "a list", bool: "true or false"}
     found = kinds.get(type(value))
     if found is None:

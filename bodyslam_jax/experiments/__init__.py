@@ -1,4 +1,4 @@
-"""The paper's experiments, and some of its own, on simulated sequences.
+"""The paper's experiments, and additional ones, on simulated sequences.
 
 `bodyslam experiment NAME --out FOLDER` calls `run_experiment`: inputs are the settings
 of `config.Experiment` and `Config`; outputs are tables and figures in the folder, rows
@@ -15,7 +15,6 @@ from bodyslam_jax.experiments.command import run_experiment as run_experiment
 from bodyslam_jax.experiments.comparison import METHODS as METHODS
 from bodyslam_jax.experiments.comparison import compare_methods as compare_methods
 from bodyslam_jax.experiments.comparison import depth_scale as depth_scale
-from bodyslam_jax.experiments.learning import judge as judge
 from bodyslam_jax.experiments.problems import without_map as without_map
 from bodyslam_jax.experiments.scale import PERTURBATIONS as PERTURBATIONS
 from bodyslam_jax.experiments.scale import ScaleRecovery as ScaleRecovery
@@ -31,6 +30,7 @@ from bodyslam_jax.experiments.weights import WEIGHTS as WEIGHTS
 from bodyslam_jax.experiments.weights import Learned as Learned
 from bodyslam_jax.experiments.weights import Trial as Trial
 from bodyslam_jax.experiments.weights import error_and_gradient as error_and_gradient
+from bodyslam_jax.experiments.weights import judge as judge
 from bodyslam_jax.experiments.weights import learn_weights as learn_weights
 from bodyslam_jax.experiments.weights import make_trial as make_trial
 from bodyslam_jax.experiments.weights import names_of as names_of

@@ -1,7 +1,8 @@
-"""Rows of `bodyslam experiment ablation`: what each part of the estimate contributes.
+"""Computes the rows of `bodyslam experiment ablation`: the effect of each part of the
+estimate.
 
-Input is a `Case` with its prepared problem; output the errors against the truth, the
-solver's status, steps and processor time.
+The input is a `Case` with its prepared problem; the output are the errors against the
+truth, and the solver's status, steps and processor time.
 """
 
 import dataclasses
@@ -19,29 +20,32 @@ from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 
-INDEPENDENT = {
+INDEPENDENT_ERRORS = {
     "motion_correlation": 0.0,
     "posture_correlation": 0.0,
     "root_correlation": 0.0,
 }
 """Weights that model the errors of different frames as independent."""
 SETTINGS: dict[str, GraphWeights] = {
-    "errors of frames independent": dataclasses.replace(GraphWeights(), **INDEPENDENT),
+    "errors of frames independent": dataclasses.replace(
+        GraphWeights(), **INDEPENDENT_ERRORS
+    ),
     "β measured anew in every frame": GraphWeights(shape_each_frame=True),
     "the paper's weights": GraphWeights.paper(),
 }
-"""Other weights; scale and bodies are initialised with them, too."""
+"""Alternative weights, with which scale and bodies are initialised, too."""
 PUBLISHED = "as published"
-"""The paper's weights, its motion network and its first-order schedule together."""
+"""Label of the paper's weights, motion network and first-order schedule together."""
 ORDERS = ("second order", "first order, as long", "first order, 200 + 100 steps")
-_TRIAL = 20
-"""Number of steps over which the time of one is measured."""
+_TIMED_STEPS = 20
+"""Number of steps over which the time of one step is measured."""
 
 
 def ablate(case: Case, prepared: Prepared, variant: str) -> dict[str, float | str]:
-    """Errors of one of `VARIANTS`, solved from the start of the full problem, m.
+    """Returns the errors (m) of one of `VARIANTS`, solved from the start of the full
+    problem.
 
-    Nothing is solved if the problem lacks the factor; `status` then is `no such term`.
+    If the problem lacks the factor, nothing is solved, and `status` is `no such term`.
     """
     problem, start = VARIANTS[variant](prepared.problem, prepared.state)
     if variant == FULL:
@@ -52,20 +56,21 @@ def ablate(case: Case, prepared: Prepared, variant: str) -> dict[str, float | st
 
 
 def with_weights(case: Case, weights: GraphWeights) -> dict[str, float | str]:
-    """Errors with other weights in all stages, m."""
+    """Returns the errors (m) with other weights in all stages."""
     config = dataclasses.replace(case.config, weights=weights)
     return _solved(case, case.prepare(config), config)
 
 
 def with_motion_model(case: Case, file: str) -> dict[str, float | str]:
-    """Errors with another motion model, such as one with fewer past frames."""
+    """Returns the errors (m) with another motion model, such as one with fewer past
+    frames."""
     config = dataclasses.replace(case.config, motion_model=file)
     return _past(config) | _solved(case, case.prepare(config), config)
 
 
 def as_published(case: Case) -> dict[str, float | str]:
-    """Errors with the paper's weights, network and schedule, m; NaN for a body that the
-    network was not trained on.
+    """Returns the errors (m) with the paper's weights, network and schedule; NaN for a
+    body that the network was not trained on.
 
     Cameras, map and regressed bodies are the start values of all methods.
     """
@@ -80,7 +85,8 @@ def as_published(case: Case) -> dict[str, float | str]:
 
 
 def compare_orders(case: Case, prepared: Prepared) -> dict[str, dict[str, float | str]]:
-    """The structured solver against Adam: at equal processor time, and as in the paper.
+    """Compares the structured solver with Adam: at equal processor time, and as in the
+    paper.
 
     Times are without compilation. Adam has the same start, the paper's learning rate
     and, at equal time, all variables free from the first step.
@@ -91,7 +97,7 @@ def compare_orders(case: Case, prepared: Prepared) -> dict[str, dict[str, float 
     solution, seconds = _timed(run)
     rows = {ORDERS[0]: _row(case, prepared, solution.state, {}, solution, seconds)}
     per_step = _time_of_gradient(problem, state)
-    count = max(int(seconds / per_step), _TRIAL)
+    count = max(int(seconds / per_step), _TIMED_STEPS)
     equal = (solver.Stage(max_steps=count),)
     paper = solver.paper_schedule("adam")
     for name, stages in zip(ORDERS[1:], (equal, paper), strict=True):
@@ -103,7 +109,7 @@ def compare_orders(case: Case, prepared: Prepared) -> dict[str, dict[str, float 
 
 
 def _past(config: Config) -> dict[str, float | str]:
-    """Number of past frames that the motion model takes."""
+    """Returns the number of past frames that the motion model reads."""
     return {"past": float(motion.load_motion_model(config.motion_model).past)}
 
 
@@ -113,14 +119,16 @@ def _solved(
     config: Config,
     start: tuple[graph.Problem, graph.State] | None = None,
 ) -> dict[str, float | str]:
-    """The row of a solution from `start`, by default that of the prepared problem."""
+    """Returns the row of a solution from `start`, by default that of the prepared
+    problem."""
     problem, state = start or (prepared.problem, prepared.state)
     solution, stage = solve_stage(problem, state, config, "joint")
     return _row(case, prepared, solution.state, stage)
 
 
 def _timed(run) -> tuple[solver.Solution, float]:
-    """The second run's processor time: the first one compiles."""
+    """Returns the result and the processor time (s) of a second run; the first one
+    compiles."""
     jax.block_until_ready(run())
     start = time.process_time()
     solution = jax.block_until_ready(run())
@@ -128,7 +136,8 @@ def _timed(run) -> tuple[solver.Solution, float]:
 
 
 def _time_of_gradient(problem: graph.Problem, state: graph.State) -> float:
-    """Processor time of one gradient of the cost, s: what a first-order step takes."""
+    """Returns the processor time of one gradient of the cost, s, which is that of a
+    first-order step."""
     zero = state.zero_step()
 
     @eqx.filter_jit
@@ -139,12 +148,12 @@ def _time_of_gradient(problem: graph.Problem, state: graph.State) -> float:
             gradient = jax.grad(cost)(step)
             return jax.tree.map(lambda x, g: x - 1e-12 * g, step, gradient), None
 
-        return jax.lax.scan(one, zero, length=_TRIAL)[0]
+        return jax.lax.scan(one, zero, length=_TIMED_STEPS)[0]
 
     jax.block_until_ready(many(problem, state))
     start = time.process_time()
     jax.block_until_ready(many(problem, state))
-    return (time.process_time() - start) / _TRIAL
+    return (time.process_time() - start) / _TIMED_STEPS
 
 
 def _row(case, prepared, state, stage, solution=None, seconds=None):

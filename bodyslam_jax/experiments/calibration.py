@@ -1,21 +1,21 @@
-"""`bodyslam experiment calibration`: errors over claimed standard deviations.
+"""Measures the calibration of uncertainties, for `bodyslam experiment calibration`.
 
-A claim of uncertainty is right if errors divided by it have a root mean square of 1 and
-lie within it as often as a normal distribution says. It is measured here on people,
-motions, cameras, floors and errors that are drawn from distributions which no prior of
-the estimator knows:
+A claimed standard deviation is right if the errors divided by it have a root mean
+square of 1 and lie within it as often as a normal distribution predicts. This is
+measured on people, motions, cameras, floors and errors that are drawn from
+distributions unknown to all priors of the estimator:
 
 - statures of a population (`POPULATION`), a third of the other components of shape
-  beyond one standard deviation of the prior, and limbs that are longer or shorter by
-  themselves (`LIMB_SPREAD`), which no β of the body model can follow;
-- errors of keypoints and bodies of other strength and other correlation in time, of
-  another share of outliers and of exchanged sides, and keypoints between SMPL's and
+  beyond one standard deviation of the prior, and individual limb lengths
+  (`LIMB_SPREAD`), which no β of the body model can represent;
+- errors of keypoints and bodies of other magnitude and other correlation in time, of
+  other shares of outliers and of exchanged sides, and keypoints between SMPL's and
   COCO's definition;
 - floors that are level (half), slope by up to 4 degrees, or are uneven by 3 cm;
 - any of the ten kinds of camera and motion, both families, 90 to 210 frames.
 
-Seeds start at `FIRST_SEED`, apart from all that anything was fitted to. The inputs are
-a regressor's bodies, keypoints, or rendered images alone, in turn.
+Seeds start at `FIRST_SEED`, so that nothing was fitted to these people. The inputs are
+a regressor's bodies, keypoints, or rendered images alone.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, io, pipeline, simulation
 from bodyslam_jax.body.skeleton import PARENTS
 from bodyslam_jax.config import Config, Experiment, Simulation
-from bodyslam_jax.experiments.jobs import COMPILE, Job
+from bodyslam_jax.experiments.jobs import COMPILATION_S, Job
 from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.tables import (
     Column,
@@ -48,7 +48,7 @@ from bodyslam_jax.simulation.terrain import Height, Terrain, lifted
 from bodyslam_jax.types import Result
 
 COUNTS = {"bodies": 35, "keypoints": 35, "pixels": 30}
-"""People by input."""
+"""Number of people for each input."""
 FIRST_SEED = 7_000_000
 POPULATION = ((1.754, 0.075), (1.613, 0.071))
 """Mean and standard deviation of the statures of men and women, m: adults of NHANES
@@ -57,15 +57,15 @@ LIMB_SPREAD = 0.035
 """Standard deviation of a limb's length over that of a person of this stature: the
 coefficient of variation of thigh, shin, upper arm and forearm within a stature in
 ANSUR II is 3 to 4 % (Gordon et al., 2014)."""
-SLOPE = math.radians(4.0)
-UNEVEN = 0.03
-"""m"""
+MAX_SLOPE_RAD = math.radians(4.0)
+UNEVENNESS_M = 0.03
+"""Amplitude of uneven floors."""
 LIMBS = (
     *((1, 4, 7), (2, 5, 8), (4, 7, 10), (5, 8, 11)),
     *((16, 18, 20), (17, 19, 21), (18, 20, 22), (19, 21, 23)),
 )
-"""Joint, the next joint on the limb, and the one after it: thighs, shins, upper arms,
-forearms; left and right of a person are alike."""
+"""Start joint, end joint and next joint of thighs, shins, upper arms and forearms; a
+person's left and right limbs are equal."""
 QUANTITIES = {
     "scale": "scale",
     "stature": "stature",
@@ -73,18 +73,18 @@ QUANTITIES = {
     "joints": "joints within the body",
 }
 """Claimed quantities by the field of a row; roots and heights have no claim yet."""
-COVERED = {68: (0.989, 3.506), 95: (3.841, 7.815)}
+CHI2_QUANTILES = {68: (0.989, 3.506), 95: (3.841, 7.815)}
 """Quantiles of χ² at 68 and 95 % for one coordinate and for three."""
 FORM: dict[str, Any] = {
     **{f"z_{name}": float for name in QUANTITIES},
-    **{f"joints_within_{share}": float for share in COVERED},
+    **{f"joints_within_{share}": float for share in CHI2_QUANTILES},
     "input": str,
     "status": str,
 }
 
 
 def jobs(experiment: Experiment, config: Config, stages: Path) -> list[Job]:
-    """One row for each person; the families and sequences that are asked for."""
+    """Returns one row for each person, of the requested families and sequences."""
     found, seed = [], FIRST_SEED + 1000 * (experiment.seed or 0)
     for which, count in COUNTS.items():
         for number in range(count):
@@ -94,7 +94,7 @@ def jobs(experiment: Experiment, config: Config, stages: Path) -> list[Job]:
             compute = lambda s=settings, f=floor, w=which: person_row(
                 s, f, w, config, stages
             )
-            seconds = COMPILE + 0.4 * (settings.length or 0)
+            seconds = COMPILATION_S + 0.4 * (settings.length or 0)
             key = (settings, floor, which, config)
             found.append(Job(label, key, seconds, compute, {"sequence": str, **FORM}))
     return found
@@ -103,7 +103,8 @@ def jobs(experiment: Experiment, config: Config, stages: Path) -> list[Job]:
 def drawn(
     seed: int, experiment: Experiment, which: str
 ) -> tuple[Simulation, tuple[str, float, float]]:
-    """Settings of one simulation, and its floor: kind, size (rad, m), direction."""
+    """Draws the settings of one simulation, and its floor: kind, size (rad or m),
+    direction (rad)."""
     rng = np.random.default_rng([seed, 1])
     strength = lambda spread: float(np.exp(spread * rng.standard_normal()))
     names = experiment.sequences or sequences.LENGTH
@@ -126,12 +127,16 @@ def drawn(
         render=which == "pixels",
     )
     kind = str(rng.choice(["level", "level", "slope", "uneven"]))
-    size = {"level": 0.0, "slope": SLOPE * rng.uniform(), "uneven": UNEVEN}[kind]
+    size = {
+        "level": 0.0,
+        "slope": MAX_SLOPE_RAD * rng.uniform(),
+        "uneven": UNEVENNESS_M,
+    }[kind]
     return settings, (kind, float(size), float(rng.uniform(0, 2 * np.pi)))
 
 
 def floor_of(floor: tuple[str, float, float]) -> Height:
-    """The height of a floor, m, at places (x, z)."""
+    """Returns the function that maps places (x, z) to the height of a floor, m."""
     kind, size, direction = floor
     along = np.array([np.cos(direction), np.sin(direction)])
     if kind == "slope":
@@ -143,11 +148,14 @@ def floor_of(floor: tuple[str, float, float]) -> Height:
 
 
 def of_population(person: Person, rng: np.random.Generator) -> Person:
-    """A person of a stature of the population, with limbs of their own lengths."""
+    """Draws a person whose stature is of the population, with individual limb
+    lengths."""
     mean, spread = POPULATION[int(rng.integers(2))]
     stature = mean + spread * rng.standard_normal()
     shape = 1.3 * rng.standard_normal(10)
-    for _ in range(2):  # the height of the mesh is linear but for its highest vertex
+    for _ in range(
+        2
+    ):  # the height of the mesh is linear in β except where its highest vertex changes
         there = person.of_shape(shape)
         height = np.ptp(there.skin[:, 1])
         more = [person.of_shape(shape + 0.1 * np.eye(10)[i]) for i in range(10)]
@@ -157,13 +165,13 @@ def of_population(person: Person, rng: np.random.Generator) -> Person:
 
 
 def with_limbs(person: Person, factors: Float[np.ndarray, "4"]) -> Person:
-    """The person with thighs, shins, upper arms and forearms of `factors` times their
-    length; the skin of a limb stretches along with it."""
+    """Returns the person with thighs, shins, upper arms and forearms scaled by
+    `factors`; the skin of a limb is stretched with it."""
     rest, skin = person.rest.copy(), person.skin.copy()
     for k, (start, end, _) in enumerate(LIMBS):
         grown = (factors[k // 2] - 1) * (rest[end] - rest[start])
         axis = rest[end] - rest[start]
-        # Everything beyond the limb moves along, the limb's own skin in proportion.
+        # Everything beyond the limb moves with it, the limb's own skin in proportion.
         beyond = sorted(_descendants(end))
         share = np.clip((skin - rest[start]) @ axis / (axis @ axis), 0.0, 1.0)
         own = person.weights[:, start] * share
@@ -175,7 +183,7 @@ def with_limbs(person: Person, factors: Float[np.ndarray, "4"]) -> Person:
 
 
 def _descendants(joint: int) -> set[int]:
-    """The joint and all that hang on it."""
+    """Returns the joint and all joints below it in the kinematic tree."""
     found = {joint}
     for child, parent in enumerate(PARENTS):
         if parent in found:
@@ -186,14 +194,14 @@ def _descendants(joint: int) -> set[int]:
 def scene_of(
     settings: Simulation, floor: tuple[str, float, float], body: Any
 ) -> sequences.SimulatedSequence:
-    """The simulated sequence with another person and floor."""
+    """Simulates the sequence with another person and floor."""
     flat = simulation.simulate(settings, body)
     rng = np.random.default_rng([settings.seed or 0, 2])
     leg = lambda p: np.linalg.norm(p.rest[[4, 7]] - p.rest[[1, 4]], axis=1).sum()
     person = of_population(flat.person, rng)
     ratio = leg(person) / leg(flat.person)
     height = floor_of(floor)
-    # Legs of another length take other steps, with the pelvis at another height.
+    # Step length and height of the pelvis are scaled with leg length.
     middle = flat.walk.pelvis.mean(axis=0) * [1, 0, 1]
     pelvis = middle + (flat.walk.pelvis - middle) * ratio
     walk = dataclasses.replace(flat.walk, pelvis=pelvis)
@@ -216,7 +224,8 @@ def person_row(
     config: Config,
     stages: Path,
 ) -> Row:
-    """Errors over claims of one person's estimate."""
+    """Returns the errors of one person's estimate divided by their claimed standard
+    deviations."""
     body = body_.load_body_model(config.body_model)
     scene = scene_of(settings, floor, body)
     config = dataclasses.replace(config, overlay=False)
@@ -233,10 +242,11 @@ def person_row(
 
 
 def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row:
-    """z values (error over claimed sigma) of a result; `None` where nothing is claimed.
+    """Returns z values (error over claimed sigma) of a result; `None` where nothing is
+    claimed.
 
-    `z_up` and `z_joints` are root mean squares of a coordinate: an angle has two, a
-    joint's place three.
+    `z_up` and `z_joints` are root mean squares per coordinate: an angle has two, a
+    joint position three.
     """
     pair = evaluation.associate(result, simulation.as_truth(scene), body)
     errors = evaluation.evaluate(*pair)
@@ -247,7 +257,7 @@ def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row
     claimed = summary["scale"]["sigma"]
     relative = claimed / result.scale if known(claimed) else None
     row["z_scale"] = ratio(-math.log(float(errors["scale"])), relative)
-    # The person whom the camera films is the one nearest to the truth in the pairing.
+    # The first person is the one whom the camera films.
     person = summary["people"][0] if summary["people"] else {}
     stature = float(np.ptp(scene.person.skin[:, 1]))
     row["z_stature"] = ratio(
@@ -261,9 +271,9 @@ def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row
 
 
 def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
-    """Of joints after alignment of the body in each frame, as `joint_sigma` is claimed:
-    the root mean square distance within the body."""
-    none = {"z_joints": None, **{f"joints_within_{s}": None for s in COVERED}}
+    """Returns the z value and the coverage of joints, after alignment of the body in
+    each frame, as `joint_sigma` (RMS distance within the body) is defined."""
+    none = {"z_joints": None, **{f"joints_within_{s}": None for s in CHI2_QUANTILES}}
     if result.joint_sigma is None or not len(result.joints):
         return none
     mine, theirs = pair
@@ -276,7 +286,7 @@ def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
     use = sigma > 0
     squares = (error[use] / sigma[use]) ** 2
     row: Row = {"z_joints": float(np.sqrt(squares.mean()))}
-    for share, (_, of_three) in COVERED.items():
+    for share, (_, of_three) in CHI2_QUANTILES.items():
         row[f"joints_within_{share}"] = float((3 * squares < of_three).mean())
     return row
 
@@ -284,7 +294,8 @@ def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
 def _claimed_there(
     result: Result, mine: Any, present: np.ndarray
 ) -> Float[np.ndarray, "f 24"]:
-    """`joint_sigma` at the frames of a pairing, which may be cut to common times."""
+    """Returns `joint_sigma` at the frames of a pairing, which may be cut to common
+    times."""
     sigma = np.asarray(result.joint_sigma)[0]
     frames = np.flatnonzero(present)
     return sigma[frames[frames < len(sigma)]]
@@ -293,7 +304,7 @@ def _claimed_there(
 def _aligned(
     x: Float[np.ndarray, "f 24 3"], y: Float[np.ndarray, "f 24 3"]
 ) -> Float[np.ndarray, "f 24 3"]:
-    """x after a similarity to y in each frame (Umeyama, 1991)."""
+    """Returns x aligned to y by a similarity in each frame (Umeyama, 1991)."""
     mx, my = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
     a, b = x - mx, y - my
     U, D, Vt = np.linalg.svd(np.einsum("fja,fjb->fab", b, a))
@@ -305,8 +316,8 @@ def _aligned(
 
 
 def write_calibration(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """`calibration.md`, `calibration.csv`: root mean square of errors over claims, and
-    how many lie within them."""
+    """Writes `calibration.md` and `calibration.csv`: root mean square of errors over
+    claims, and the share of errors within the claims."""
     text = intro(
         "Errors over claimed standard deviations",
         about,
@@ -341,7 +352,7 @@ def _summaries(rows: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
                 continue
             row: Row = {"what": title, "input": which, "count": len(z)}
             row["rms"] = _with_error(z**2, math.sqrt)
-            for share, (limit, _) in COVERED.items():
+            for share, (limit, _) in CHI2_QUANTILES.items():
                 if name == "joints":
                     inside = np.array([r[f"joints_within_{share}"] for r in own])
                 elif name == "up":
@@ -354,7 +365,8 @@ def _summaries(rows: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
 
 
 def _with_error(values: np.ndarray, root: Callable[[float], float]) -> str:
-    """A mean, or its root, with the standard error over people."""
+    """Returns a mean, or its square root, with the standard error over people, as
+    text."""
     mean = float(values.mean())
     error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0
     if root is math.sqrt:

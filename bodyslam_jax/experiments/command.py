@@ -1,4 +1,4 @@
-"""`bodyslam experiment`: computes the rows that are missing and writes the report."""
+"""Runs `bodyslam experiment`: computes the missing rows and writes the report."""
 
 import functools
 import logging
@@ -22,12 +22,13 @@ def run_experiment(
     engine: Engine | None = None,
     setup: Setup | None = None,
 ) -> list[Path]:
-    """Computes the rows that `out` lacks and writes tables and figures; their paths.
+    """Computes the rows that `out` lacks, writes tables and figures, and returns their
+    paths.
 
-    Rows are kept in `out/rows` under a fingerprint of their inputs, stages before the
+    Rows are cached in `out/rows` under a fingerprint of their inputs, stages before the
     joint estimate in `out/stages`. Tables are written after every row, so that an
-    interrupted experiment leaves those that are finished. A row that cannot be computed
-    is left out with a warning.
+    interrupted experiment leaves those of the finished rows. A row that cannot be
+    computed is left out with a warning.
 
     Args:
         engine: computes the rows elsewhere, in processes that `setup` prepares; `out`
@@ -92,14 +93,15 @@ def run_experiment(
 def compute_row(
     name: str, out: Path, experiment: Experiment, config: Config, number: int
 ) -> None:
-    """Computes one row of an experiment into `out/rows`, in whichever process."""
+    """Computes one row of an experiment into `out/rows`, in any process."""
     job = _plan(name, out, experiment, config).jobs[number]
     Journal(out / "rows").row(name, job.label, job.key, job.compute, job.form)
 
 
 @functools.lru_cache(maxsize=1)
 def _plan(name: str, out: Path, experiment: Experiment, config: Config) -> Plan:
-    """The plan, kept for further rows, which share what its jobs have made."""
+    """Returns the plan, cached so that further rows share what its jobs have
+    computed."""
     return PLANS[name](experiment, config, out / "stages")
 
 

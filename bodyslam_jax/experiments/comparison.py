@@ -1,7 +1,8 @@
-"""Rows of `bodyslam experiment table1`: the full estimate against simpler methods.
+"""Computes the rows of `bodyslam experiment table1`: the full estimate against simpler
+methods.
 
-Input is a `Case`; output the errors of all `METHODS` from the same tracks, keypoints
-and regressed bodies.
+The input is a `Case`; the output are the errors of all `METHODS` from the same tracks,
+keypoints and regressed bodies.
 """
 
 from typing import Any
@@ -30,18 +31,21 @@ METHODS = {
     "published": "as published: the paper's weights, network and first-order steps",
     "full": "the full estimate",
 }
-"""What is compared, from the same tracks, keypoints and regressed bodies."""
-_EVERY = 3
-"""Frames from one drawn point of a path to the next."""
-_NEAR = 5
-"""Number of landmarks near the ankles whose depth stands for the person's."""
+"""Methods that are compared, with the same tracks, keypoints and regressed bodies."""
+_PATH_STEP_FRAMES = 3
+"""Interval between drawn points of a path."""
+_NEAREST_LANDMARKS = 5
+"""Number of landmarks near the ankles whose depth represents the person's."""
 
 
 def compare_methods(case: Case) -> dict[str, Any]:
-    """Errors of all `METHODS` on one sequence: `full/c_ate_se3` and so on, m.
+    """Returns the errors (m) of all `METHODS` on one sequence, by keys such as
+    `full/c_ate_se3`.
 
-    Also the true properties of the sequence, estimated over true scale at the start
-    (`start_ratio`) and at the end (`scale_ratio`), steps and status.
+    Also returned are properties of the true sequence, the estimated over the true scale
+    at the start (`start_ratio`) and at the end (`scale_ratio`), steps and status.
+
+    **Raises:** `InputError` if the camera does not move.
     """
     prepared = case.prepare()
     alone = prepared.state
@@ -89,7 +93,8 @@ def compare_methods(case: Case) -> dict[str, Any]:
 
 
 def _paths(case: Case, states: dict[str, graph.State], present: np.ndarray) -> dict:
-    """Camera and human centre from above (x, z, m), each aligned by SE(3) (A1)."""
+    """Returns camera and human centre from above (x, z, m), each aligned by SE(3)
+    (A1)."""
     truth = case.truth
     found = {
         "camera/truth": truth.T_WC[:, :3, 3],
@@ -111,15 +116,18 @@ def _paths(case: Case, states: dict[str, graph.State], present: np.ndarray) -> d
         )
         found[f"camera/{name}"] = camera.apply(estimate.T_WC[:, :3, 3])
         found[f"human/{name}"] = human.apply(estimate.joints[0, :, 0])
-    thin = lambda x: np.round(np.asarray(x)[::_EVERY, ::2], 4).tolist()
+    thin = lambda x: np.round(np.asarray(x)[::_PATH_STEP_FRAMES, ::2], 4).tolist()
     return {name: thin(path) for name, path in found.items()}
 
 
 def depth_scale(case: Case) -> float:
-    """Metres per unit of the map if landmarks at the feet are at the person's depth.
+    """Returns metres per unit of the map, assuming that landmarks at the feet have the
+    person's depth.
 
-    The median over frames of the regressed depth of the pelvis over the median depth
-    of the landmarks that are nearest to the ankles in the image.
+    It is the median over frames of the regressed depth of the pelvis divided by the
+    median depth of the landmarks that are nearest to the ankles in the image.
+
+    **Raises:** `InputError` without keypoints.
     """
     cameras, keypoints = case.cameras, case.sequence.keypoints
     if keypoints is None:
@@ -130,10 +138,14 @@ def depth_scale(case: Case) -> float:
     for k in np.flatnonzero(case.bodies.present[0] & cameras.registered):
         sure = keypoints.confidence[0, k, list(BODY25_ANKLES)] > 0.3
         rows = np.flatnonzero((tracks.frame == k) & cameras.keep)
-        if not sure.any() or len(rows) < _NEAR:
+        if not sure.any() or len(rows) < _NEAREST_LANDMARKS:
             continue
         feet = keypoints.uv[0, k, list(BODY25_ANKLES)][sure].mean(axis=0)
-        near = rows[np.argsort(np.linalg.norm(tracks.uv[rows] - feet, axis=1))[:_NEAR]]
+        near = rows[
+            np.argsort(np.linalg.norm(tracks.uv[rows] - feet, axis=1))[
+                :_NEAREST_LANDMARKS
+            ]
+        ]
         offset = cameras.landmarks[tracks.landmark[near]] - T_WC[k, :3, 3]
         depth = float(np.median(offset @ T_WC[k, :3, 2]))
         if depth > 0:

@@ -1,4 +1,4 @@
-"""Errors of detected keypoints of rendered people, whose joints are known."""
+"""Measures errors of detected keypoints of rendered people, whose joints are known."""
 
 from typing import Any
 
@@ -11,27 +11,29 @@ from bodyslam_jax.simulation import SimulatedSequence
 from bodyslam_jax.simulation.point_tracks import is_behind
 from bodyslam_jax.types import Keypoints, Sequence
 
-_TALLEST = 60.0
-"""Height in the image, px, above which a person counts as detectable."""
-_GROSS = 0.1
-"""Error, in statures, beyond which a keypoint is an outlier."""
-_NAMES = KEYPOINT_NAMES["body25"]
+_MIN_HEIGHT_PX = 60.0
+"""Height in the image from which a person counts as detectable."""
+_OUTLIER_ERROR_STATURES = 0.1
+"""Error, in statures, from which a keypoint is an outlier."""
+_KEYPOINT_NAMES = KEYPOINT_NAMES["body25"]
 
 
 def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str, Any]:
-    """Detection rate of the first person, and errors of each keypoint.
+    """Returns the detection rate of the first person, and the errors of each keypoint.
 
-    `found` is the detection rate over the frames in which the person is larger than 60
-    px and half of the joints are visible. `keypoints` has for each name:
-    `offset`, the mean error in the frame of the joint that it moves with (x to the left
-    on the left side, mirrored on the right, y up and z forward at rest), a constant
-    fitted to the errors in the image at the true depth; `spread`, the standard
-    deviation of what remains in the image; both in statures; `seen`, the share of the
-    frames in which the person is found and the point is visible in which it is
-    detected; `gross`, the share of outliers among these.
+    `found` is the detection rate over the frames in which the person is taller than 60
+    px and half of the joints are visible. `keypoints` has for each name: `offset`, the
+    mean error in the frame of the joint that the keypoint moves with (x to the left on
+    the left side, mirrored on the right, y up and z forward at rest), a constant fitted
+    to the errors in the image at the true depth; `spread`, the standard deviation of
+    the residuals in the image; both in statures; `seen`, the detection rate of the
+    keypoint in the frames in which the person is found and the point is visible;
+    `gross`, the share of outliers among these detections.
     """
     exact, depth, R_CJ, inside = _truth(simulated)
-    wanted = (np.ptp(exact[:, :15, 1], axis=1) > _TALLEST) & (inside.mean(axis=1) > 0.5)
+    wanted = (np.ptp(exact[:, :15, 1], axis=1) > _MIN_HEIGHT_PX) & (
+        inside.mean(axis=1) > 0.5
+    )
     if found.keypoints is None or not wanted.any():
         return {"found": 0.0, "keypoints": {}}
     uv, valid, number = _nearest(found.keypoints, exact)
@@ -44,14 +46,15 @@ def detection_figures(simulated: SimulatedSequence, found: Sequence) -> dict[str
                 error[:, k], R_CJ[:, k], valid[:, k], inside[:, k], number & wanted,
                 mirrored=name.startswith("right"),
             )
-            for k, name in enumerate(_NAMES)
+            for k, name in enumerate(_KEYPOINT_NAMES)
         },
     }  # fmt: skip
 
 
 def _truth(simulated: SimulatedSequence):
-    """Pixels and depths of BODY_25, frames of its joints in the camera, and which of
-    its points are in the image with neither furniture nor others in front."""
+    """Returns pixels and depths of BODY_25, the orientations of its joints in the
+    camera frame, and which points are in the image and not occluded by furniture or
+    others."""
     person, walk = simulated.person, simulated.walk
     G, joints = person.joints(walk.poses, walk.pelvis)
     points = person.keypoints(G, joints)
@@ -68,12 +71,12 @@ def _truth(simulated: SimulatedSequence):
         off = other.joints - simulated.T_WC[:, None, :3, 3]
         q = np.einsum("tab,tjb->tja", R_CW, off)
         free &= ~is_behind(p, q, simulated.intrinsics)
-    leads = [_leader(name) for name in _NAMES]
+    leads = [_leader(name) for name in _KEYPOINT_NAMES]
     return uv, depth, R_CW[:, None] @ G[:, leads], free
 
 
 def _leader(name: str) -> int:
-    """The joint that a keypoint moves with."""
+    """Returns the joint that a keypoint moves with."""
     if name not in SURFACE_POINTS:
         return KEYPOINT_JOINT[name]
     if "toe" in name or "heel" in name:
@@ -86,8 +89,8 @@ def _nearest(
 ) -> tuple[
     Float[np.ndarray, "t 25 2"], Bool[np.ndarray, "t 25"], Bool[np.ndarray, " t"]
 ]:
-    """The detection in each frame that is of the person, if any: within a quarter of
-    the height in the median."""
+    """Returns, for each frame, the detection that belongs to the person, if any: its
+    median distance is within a quarter of the person's height."""
     uv, valid = found.uv, found.confidence > 0
     away = np.linalg.norm(uv - exact, axis=-1)
     few = valid.sum(axis=-1) < 5
@@ -99,9 +102,10 @@ def _nearest(
 
 
 def _offset(error, R_CJ, given, in_view, counted, *, mirrored: bool) -> dict[str, Any]:
-    """`detection_figures` of one keypoint; `error` in the image, of the stature."""
+    """Returns the `detection_figures` of one keypoint; `error` is in the image, in
+    statures."""
     detected = given & in_view & counted
-    good = detected & (np.linalg.norm(error, axis=1) < _GROSS)
+    good = detected & (np.linalg.norm(error, axis=1) < _OUTLIER_ERROR_STATURES)
     row: dict[str, Any] = {
         "seen": float(detected.sum() / max((counted & in_view).sum(), 1)),
         "gross": float(1 - good.sum() / detected.sum()) if detected.any() else np.nan,
@@ -109,7 +113,7 @@ def _offset(error, R_CJ, given, in_view, counted, *, mirrored: bool) -> dict[str
     if good.sum() < 10:
         return {**row, "offset": [np.nan] * 3, "spread": np.nan}
     A, b = R_CJ[good, :2].reshape(-1, 3), error[good].reshape(-1)
-    # A view that never changes does not determine depth, which a prior keeps small.
+    # A constant view does not determine the offset in depth: a ridge keeps it small.
     ridge = 1e-3 * len(A) * np.eye(3)
     offset = np.linalg.solve(A.T @ A + ridge, A.T @ b)
     rest = b - A @ offset

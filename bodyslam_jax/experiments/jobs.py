@@ -1,4 +1,5 @@
-"""Experiments as plans: rows that are computed one by one and cached, and a report."""
+"""Represents experiments as plans: rows that are computed one by one and cached, and a
+report."""
 
 import dataclasses
 import functools
@@ -15,14 +16,14 @@ from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.pipeline.case import Case, simulate_case
 from bodyslam_jax.simulation import LENGTH
 
-FRONT, SOLVE, COMPILE = 0.15, 0.08, 25.0
-"""Processor time on a 2.5 GHz core: the stages before the joint estimate, s a frame; a
-solve of everything, s a frame; a problem of new shapes, s."""
+FRONT_END_S_PER_FRAME, SOLVE_S_PER_FRAME, COMPILATION_S = 0.15, 0.08, 25.0
+"""Processor time on a 2.5 GHz core: of the stages before the joint estimate, of a solve
+of all variables, and of compiling a problem of new shapes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One row: its inputs, its cost, and the function that computes it."""
+    """A row: its inputs, its cost, and the function that computes it."""
 
     label: str
     key: tuple[Any, ...]
@@ -30,19 +31,20 @@ class Job:
     """Estimated processor time, s."""
     compute: Callable[[], Row]
     form: Any
-    """What a kept row must have for the report, as for `row_cache.fits`."""
+    """Form that a cached row must have for the report (`row_cache.fits`)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """An experiment: its rows in their order, and the report on those that are done."""
+    """An experiment: its rows in order, and the function that reports on the finished
+    ones."""
 
     jobs: list[Job]
     write: Callable[[Path, list[Row]], list[Path]]
 
 
 def check_files(experiment: Experiment, config: Config) -> None:
-    """Reads the files that rows will need, before minutes are spent on other rows.
+    """Reads the files that rows will need, before any row is computed.
 
     **Raises:** `InputError`, naming the file or the option.
     """
@@ -52,7 +54,7 @@ def check_files(experiment: Experiment, config: Config) -> None:
         )
     if experiment.motion is not None:
         source = Path(experiment.motion)
-        if not source.is_dir():  # which may be large, and is read when it is needed
+        if not source.is_dir():  # a folder may be large, and is read when it is needed
             motion.read_motion(source)
     body = body_.load_body_model(config.body_model)
     for file in (config.motion_model, *experiment.motion_models):
@@ -64,19 +66,24 @@ def check_files(experiment: Experiment, config: Config) -> None:
 
 
 def named(settings: Simulation) -> str:
-    """The name of a sequence and its family, such as `M2-room`."""
+    """Returns the name of a sequence and its family, such as `M2-room`."""
     return f"{settings.sequence}-{settings.family}"
 
 
 def cost(settings: Simulation, solves: float, shapes: float) -> float:
-    """Processor time of so many solves, of so many kinds, on one sequence, s."""
+    """Returns the processor time, s, of `solves` solves on one sequence, with problems
+    of `shapes` different shapes."""
     own = LENGTH[settings.sequence]
     frames = own if settings.length is None else settings.length
-    return frames * (FRONT + SOLVE * solves) + COMPILE * shapes
+    return (
+        frames * (FRONT_END_S_PER_FRAME + SOLVE_S_PER_FRAME * solves)
+        + COMPILATION_S * shapes
+    )
 
 
 def cases(config: Config, stages: Path) -> Callable[[Simulation], Case]:
-    """Makes cases, and keeps the last one: rows of one sequence follow one another."""
+    """Returns a function that makes cases and caches the last one, because the rows of
+    one sequence follow one another."""
 
     @functools.lru_cache(maxsize=1)
     def case(settings: Simulation) -> Case:
@@ -95,7 +102,8 @@ def by_sequence(
     effort: tuple[float, float],
     form: dict[str, Any],
 ) -> list[Job]:
-    """One row per sequence; `effort` are numbers of solves and of compiled problems.
+    """Returns one row per sequence; `effort` is the number of solves and of compiled
+    problems.
 
     `form` lists the fields of a row beside its sequence.
     """

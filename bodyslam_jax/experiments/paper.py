@@ -1,7 +1,7 @@
 """Results published in the paper, on its own recordings, which were not released.
 
-Henning, Laidlow, Leutenegger, "BodySLAM", ECCV 2022: table 1 and the appendix. Other
-data than ours: in our tables they indicate the order of magnitude only.
+Henning, Laidlow, Leutenegger, "BodySLAM", ECCV 2022: table 1 and the appendix. The data
+differ from ours: in our tables the values indicate the order of magnitude only.
 """
 
 _ROWS = """
@@ -20,8 +20,8 @@ TABLE1 = {
     name: tuple(map(float, values))
     for name, *values in (line.split() for line in _ROWS.split("\n") if line)
 }
-"""C-ATE, H-ATE, J-ATE in mm, each: SE(3) no motion model, SE(3) ours, Sim(3) no motion
-model, Sim(3) ours; then the scale of both."""
+"""For each of C-ATE, H-ATE and J-ATE, mm: SE(3) without motion model, SE(3) full,
+Sim(3) without motion model, Sim(3) full; then the scale of both."""
 
 SCALE = {
     5.0: (3.673, 26.5),
@@ -43,7 +43,7 @@ STRUCTURE = {
 """C-ATE SE(3) in mm: original, perturbed, without and with landmarks (appendix C)."""
 
 MOTION = (3.4, 18.4)
-"""Mean error of the predicted translation and mean step, mm a frame (section 4.4)."""
+"""Mean error of the predicted translation and mean step, mm per frame (section 4.4)."""
 
 OTHER_DATA = (
     "Ours: simulated sequences. The paper's: its own recordings, which were never "
@@ -52,7 +52,7 @@ OTHER_DATA = (
 
 
 def table1_row(sequence: str) -> dict[str, float]:
-    """The paper's row in the keys of `compare_methods`, in SI units."""
+    """Returns the paper's row with the keys of `compare_methods`, in SI units."""
     names = [
         f"{method}/{error}_{group}"
         for error in ("c_ate", "h_ate", "j_ate")

@@ -1,6 +1,7 @@
-"""The experiments of `bodyslam experiment NAME`, each as a plan of rows and a report.
+"""Defines the experiments of `bodyslam experiment NAME`, each as a plan of rows and a
+report.
 
-Inputs are the settings of `config.Experiment`; outputs are those of the report, in
+Inputs are the settings of `config.Experiment`; outputs are those of the reports in
 `experiments.reports`, `table1` and `video_table`.
 """
 
@@ -19,7 +20,6 @@ from bodyslam_jax.experiments.calibration import jobs as calibration_jobs
 from bodyslam_jax.experiments.calibration import write_calibration
 from bodyslam_jax.experiments.comparison import compare_methods
 from bodyslam_jax.experiments.jobs import Job, Plan, by_sequence, cases, cost, named
-from bodyslam_jax.experiments.learning import described, judge
 from bodyslam_jax.experiments.paper import STRUCTURE
 from bodyslam_jax.experiments.provenance import about
 from bodyslam_jax.experiments.row_cache import Row
@@ -29,25 +29,32 @@ from bodyslam_jax.experiments.structural_landmarks import landmark_ablation
 from bodyslam_jax.experiments.table1 import FORM, write_table1
 from bodyslam_jax.experiments.variants import FULL, VARIANTS
 from bodyslam_jax.experiments.video_table import write_video
-from bodyslam_jax.experiments.weights import Learned, Trial, learn_weights, make_trial
+from bodyslam_jax.experiments.weights import (
+    Learned,
+    Trial,
+    described,
+    judge,
+    learn_weights,
+    make_trial,
+)
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 
-ALL = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
+ALL_SEQUENCES = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 NOISE_LEVELS = ("none", "low", "real")
 LEARNING_STEPS = 12
-DERIVATIVE = 240.0
-"""Processor time of compiling the solver's derivative, s, which dominates where
-sequences are few and short."""
+DERIVATIVE_COMPILATION_S = 240.0
+"""Processor time of compiling the solver's derivative, which dominates for few and
+short sequences."""
 
 
 def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """All methods on all ten sequences, both families."""
+    """Plans table 1: all methods on all ten sequences, both families."""
     jobs = by_sequence(
         experiment,
         config,
         stages,
-        ALL,
+        ALL_SEQUENCES,
         ("room", "follow"),
         compare_methods,
         (3.0, 6.0),
@@ -57,7 +64,8 @@ def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Recovery of the scale from six perturbations, mapped."""
+    """Plans the recovery of the scale from six perturbations, in one vectorised
+    solve."""
 
     def compute(case: Case) -> Row:
         found = scale_recovery(case)
@@ -75,15 +83,15 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         compute,
         (len(PERTURBATIONS) * 1.5, 3.0),
-        reports.SCALE,
+        reports.SCALE_FORM,
     )
     data = about(experiment, config)
     return Plan(jobs, functools.partial(reports.write_scale, about=data))
 
 
 def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Perturbed cameras, optimised with and without landmarks: the paper's five
-    sequences."""
+    """Plans the optimisation of perturbed cameras with and without landmarks, on the
+    paper's five sequences."""
     jobs = by_sequence(
         experiment,
         config,
@@ -92,15 +100,16 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         functools.partial(landmark_ablation, seed=experiment.seed or 0),
         (2.5, 4.0),
-        reports.STRUCTURE,
+        reports.STRUCTURE_FORM,
     )
     data = about(experiment, config)
     return Plan(jobs, functools.partial(reports.write_structure, about=data))
 
 
 def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Prediction errors of the motion model on clips that it was not trained on."""
-    source = experiment.motion or str(reports.CLIPS)
+    """Plans the prediction errors of the motion model on clips it was not trained
+    on."""
+    source = experiment.motion or str(reports.CLIPS_FILE)
 
     def compute() -> Row:
         model = motion.load_motion_model(config.motion_model)
@@ -115,11 +124,12 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
     model = config.motion_model and Path(config.motion_model)
     key = (Path(source), model, body_model_file(config.body_model))
-    return Plan([Job("motion", key, 60.0, compute, reports.MOTION)], write)
+    return Plan([Job("motion", key, 60.0, compute, reports.MOTION_FORM)], write)
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Disabled and added factors, other weights, noise levels, solvers compared."""
+    """Plans the ablations: disabled and added factors, other weights, noise levels,
+    solvers."""
     case = cases(config, stages)
 
     @functools.lru_cache(maxsize=1)
@@ -134,7 +144,7 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         row = lambda: {"sequence": name, "label": label, **compute()}
         seconds = cost(settings, solves, solves)
         if settings in begun:
-            seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are kept
+            seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are cached
         begun.add(settings)
         key = (settings, config, *extra)
         form = {"sequence": name, "label": label, "status": str}
@@ -164,10 +174,11 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Weights learnt on some sequences, and what each of all sequences gains.
+    """Plans the learning of weights on some sequences, and their effect on all
+    sequences.
 
-    Cameras and map are held as bundle adjustment left them, which takes landmarks out
-    of the problem: only weights of people's factors are learnt.
+    Cameras and map are held as bundle adjustment left them, which eliminates landmarks
+    from the problem: only weights of people's factors are learnt.
     """
     chosen = simulations(
         experiment, ("E1", "M1", "M4", "D2", "E2", "M2", "D1"), ("room",)
@@ -193,14 +204,14 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
         )
         return Cache(folder).stage("learned", mark, Learned, learn)
 
-    seconds = DERIVATIVE + sum(cost(s, 8.0, 1.0) for s in training)
+    seconds = DERIVATIVE_COMPILATION_S + sum(cost(s, 8.0, 1.0) for s in training)
     learnt = lambda: described(learned())
-    jobs = [Job("learnt", key, seconds, learnt, reports.LEARNT)]
+    jobs = [Job("learnt", key, seconds, learnt, reports.LEARNT_FORM)]
     for group, settings in (("training", training), ("test", test)):
         for s in settings:
             labels = {"sequence": named(s), "set": group}
             row = lambda s=s, labels=labels: {**labels, **judge(trial(s), learned())}
-            form = {**labels, **reports.JUDGED}
+            form = {**labels, **reports.JUDGED_FORM}
             label = f"{group}-{named(s)}"
             jobs.append(Job(label, (s, *key), cost(s, 2.0, 1.0), row, form))
     write = functools.partial(reports.write_weights, about=about(experiment, config))
@@ -208,13 +219,14 @@ def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """From pixels alone, and with simulated keypoints and bodies, on all sequences."""
-    jobs = video_.jobs(experiment, config, stages, ALL)
+    """Plans estimates from pixels alone, and with simulated keypoints and bodies, on
+    all sequences."""
+    jobs = video_.jobs(experiment, config, stages, ALL_SEQUENCES)
     return Plan(jobs, functools.partial(write_video, about=about(experiment, config)))
 
 
 def calibration(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Errors over claims, on people whom no prior knows."""
+    """Plans the calibration of claimed uncertainties, on people whom no prior knows."""
     write = functools.partial(write_calibration, about=about(experiment, config))
     return Plan(calibration_jobs(experiment, config, stages), write)
 

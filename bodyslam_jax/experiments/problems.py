@@ -16,7 +16,7 @@ def rebuild(
     factors: list[graph.Factor],
     free: graph.Step | None = None,
 ) -> graph.Problem:
-    """A problem of other `factors`, with the predictor of this one."""
+    """Returns a problem with other `factors` and the motion predictor of this one."""
     return graph.make_problem(
         factors,
         state,
@@ -29,8 +29,8 @@ def rebuild(
 def without_map(
     problem: graph.Problem, state: graph.State, *, hold_cameras: bool
 ) -> tuple[graph.Problem, graph.State]:
-    """The problem without landmarks, their factors, and ground contact, which rests on
-    them; with `hold_cameras` the cameras move through s only.
+    """Returns the problem without landmarks, their factors, and ground contact, which
+    depends on them; with `hold_cameras` the cameras move through s only.
 
     Section 4.2 of the paper: people alone determine scale or cameras.
     """
@@ -44,10 +44,10 @@ def without_map(
 
 
 def with_scale(state: graph.State, scale: Float[Array, ""] | float) -> graph.State:
-    """The same state with this s."""
+    """Returns the state with scale s replaced."""
     return eqx.tree_at(lambda s: s.scale, state, jnp.asarray(scale, state.scale.dtype))
 
 
 def stacked(states: list[graph.State]) -> graph.State:
-    """States of one shape, stacked along a new leading axis."""
+    """Returns states of equal shapes stacked along a new leading axis."""
     return jax.tree.map(lambda *x: jnp.stack(x), *states)

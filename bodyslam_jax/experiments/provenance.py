@@ -1,4 +1,4 @@
-"""The data behind a table, in words: noise level, and settings that are not default."""
+"""Describes the data behind a table: noise level, and settings that are not default."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -9,16 +9,18 @@ from bodyslam_jax.pipeline.stage_cache import body_model_file
 
 
 def about(experiment: Experiment, config: Config) -> str:
-    """Simulation and settings of the rows of an experiment, in a sentence or two."""
+    """Returns a sentence or two on simulation and settings of the rows of an
+    experiment."""
     first = f"Simulated sequences, noise level `{experiment.noise}`."
     return f"{first} {deviations(experiment, config)}".rstrip()
 
 
 def deviations(experiment: Experiment, config: Config) -> str:
-    """Seed, length, motion, models and settings that differ from the defaults, if any.
+    """Returns text on seed, length, motion, models and settings that differ from the
+    defaults.
 
-    Settings are compared with the preset that they are nearest to. A body model found
-    on this machine counts as named by the user.
+    Settings are compared with the nearest preset. A body model that is installed on
+    this machine counts as named by the user. The text is empty if nothing differs.
     """
     parts = []
     if experiment.seed is not None:
@@ -42,7 +44,8 @@ def deviations(experiment: Experiment, config: Config) -> str:
 
 
 def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting under its name on the command line: `weights.pixel_sigma`."""
+    """Yields every setting with its name on the command line, such as
+    `weights.pixel_sigma`."""
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if dataclasses.is_dataclass(value):

@@ -1,4 +1,4 @@
-"""Reports of the experiments on scale, landmarks, motion, ablation and weights.
+"""Writes reports of the experiments on scale, landmarks, motion, ablation and weights.
 
 Inputs are finished rows; each report is written as Markdown, CSV and PNG.
 """
@@ -21,40 +21,40 @@ from bodyslam_jax.experiments.tables import (
     write_text,
 )
 
-CLIPS = Path(simulation.__file__).parent / "assets" / "walking.npz"
-"""The clips that are part of the package."""
-SCALE = {
+CLIPS_FILE = Path(simulation.__file__).parent / "assets" / "walking.npz"
+"""File of the clips that are part of the package."""
+SCALE_FORM = {
     **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
     **dict.fromkeys(("history", "h_ate"), [[float]]),
     "spread": float,
 }
-_STAGES = ("original", "start", "perturbed", "no_landmarks", "landmarks")
-STRUCTURE = {
-    **dict.fromkeys(_STAGES, float),
-    **{f"{stage}/scale": float for stage in _STAGES},
+_STAGE_NAMES = ("original", "start", "perturbed", "no_landmarks", "landmarks")
+STRUCTURE_FORM = {
+    **dict.fromkeys(_STAGE_NAMES, float),
+    **{f"{stage}/scale": float for stage in _STAGE_NAMES},
     **dict.fromkeys(("status", "status_no_landmarks"), str),
 }
-MOTION = {
+MOTION_FORM = {
     "rows": [{"model": str, "drift": float, "class": str, "error_mm": float}],
     "clips": int,
     "held_out": bool,
 }
-LEARNT = {
+LEARNT_FORM = {
     "names": [str],
     "path": [[float]],
     **dict.fromkeys(("log", "factor", "history"), [float]),
 }
-JUDGED = {
+JUDGED_FORM = {
     f"{when}/{name}": float
     for when in ("before", "after")
     for name in ("error", "scale", "j_ate_se3")
 }
-"""Fields that cached rows must have for the reports below, as for the other constants
-above; see `row_cache.fits`."""
+"""Fields, with their types, that cached rows must have for the reports below, as for
+the other forms above (`row_cache.fits`)."""
 
 
 def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Writes the scale recovery experiment.
+    """Writes the report on scale recovery.
 
     A table has the deviation of the estimated scale for each perturbation of the
     cameras' scale; a figure shows convergence.
@@ -144,7 +144,7 @@ def write_structure(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> list[Path]:
-    """The motion model's errors in the paper's form, and their histograms."""
+    """Writes the motion model's errors in the paper's form, and their histograms."""
     found = rows[0]
     error, step = paper.MOTION
     nan = float("nan")
@@ -172,7 +172,7 @@ def write_motion(out: Path, rows: list[Row], source: str, config: Config) -> lis
 
 
 def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Writes the errors of each variant: one table and one figure per sequence."""
+    """Writes the errors of each variant, with one table and one figure per sequence."""
     number = functools.partial(
         Column, average=False
     )  # a mean over variants is meaningless

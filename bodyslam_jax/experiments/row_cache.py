@@ -1,4 +1,4 @@
-"""Finished rows on disk, so that an interrupted experiment resumes."""
+"""Caches finished rows on disk, so that an interrupted experiment can be resumed."""
 
 import json
 import logging
@@ -18,7 +18,8 @@ Row = dict[str, Any]
 
 
 class Journal:
-    """A folder with one JSON file per row, named by a fingerprint of its inputs."""
+    """Cache of rows: a folder with one JSON file per row, named by a fingerprint of its
+    inputs."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -32,7 +33,8 @@ class Journal:
     def kept(
         self, name: str, label: str, key: Sequence[Any], form: Any = dict
     ) -> Row | None:
-        """The row of this `key` if it is on disk and of that `form`, see `fits`."""
+        """Returns the row of this `key` if it is on disk and has that `form` (`fits`),
+        else `None`."""
         path = self.path(name, label, *key)
         if not path.exists():
             return None
@@ -50,7 +52,8 @@ class Journal:
         compute: Callable[[], Row],
         form: Any = dict,
     ) -> Row:
-        """The row of this `key`, from disk if present; `label` is for the log."""
+        """Returns the row of this `key`, from disk if present; `label` is used in the
+        log."""
         found = self.kept(name, label, key, form)
         if found is not None:
             log.info("%s %s: taken from an earlier run", name, label)
@@ -68,10 +71,11 @@ class Journal:
 
 
 def fits(value: Any, form: Any) -> bool:
-    """Whether JSON is of a form: a type, a text that it must be, or parts of forms.
+    """Returns whether a JSON value has a form: a type, a fixed text, or parts with
+    forms.
 
     `{"a": float}` has at least an `a`, `[float]` any number of items. A number that was
-    not finite is `None`, and fits `float`.
+    not finite is stored as `None`, which fits `float`.
     """
     if isinstance(form, dict):
         return isinstance(value, dict) and all(
@@ -88,7 +92,8 @@ def fits(value: Any, form: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays as lists, what is not finite as null: JSON that others can read."""
+    """Converts arrays to lists and numbers that are not finite to null, as standard
+    JSON requires."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

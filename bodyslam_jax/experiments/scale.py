@@ -1,7 +1,8 @@
-"""Rows of `bodyslam experiment scale`: recovery of a perturbed scale (section 4.2).
+"""Computes the rows of `bodyslam experiment scale`: recovery of a perturbed scale
+(section 4.2).
 
-Input is a `Case`; output, for each perturbation, s and H-ATE after each iteration of a
-solve in which people alone determine the scale (appendix D).
+The input is a `Case`; the output are, for each perturbation, s and H-ATE after each
+iteration of a solve in which people alone determine the scale (appendix D).
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from bodyslam_jax.experiments.problems import with_scale, without_map
 from bodyslam_jax.pipeline.case import Case, trajectories
 
 PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
-"""The paper's 1/s', which the estimated s should reach."""
+"""The paper's values of 1/s', which the estimated s should reach."""
 SCHEDULE = (
     solver.Stage(("scale", "roots"), max_steps=5, rtol=1e-4),
     solver.Stage(max_steps=30),
@@ -25,12 +26,13 @@ SCHEDULE = (
 
 @dataclasses.dataclass(frozen=True)
 class ScaleRecovery:
-    """`p` perturbations of one sequence, solved together; `n` iterations."""
+    """Result for `p` perturbations of one sequence, solved together in `n`
+    iterations."""
 
     perturbation: Float[np.ndarray, " p"]
-    """1/s': the s that undoes it."""
+    """1/s': the scale s that undoes the perturbation."""
     scale: Float[np.ndarray, " p"]
-    """Estimated s, for the unit of the perturbed map."""
+    """Estimated s, relative to the unit of the perturbed map."""
     history: Float[np.ndarray, "p n"]
     """s after each iteration, the start included."""
     h_ate: Float[np.ndarray, "p n"]
@@ -38,12 +40,13 @@ class ScaleRecovery:
 
     @property
     def deviation(self) -> Float[np.ndarray, " p"]:
-        """`s / (1/s') - 1`: the paper's deviation, signed."""
+        """Signed deviation `s / (1/s') - 1`, as in the paper."""
         return self.scale / self.perturbation - 1
 
     @property
     def spread(self) -> float:
-        """Range of the estimates over their mean; 0 if the start does not matter."""
+        """Range of the estimates over their mean; 0 if the result is independent of the
+        start."""
         answer = self.scale / self.perturbation
         return float(np.ptp(answer) / answer.mean())
 
@@ -55,12 +58,13 @@ def scale_recovery(
     schedule: tuple[solver.Stage, ...] = SCHEDULE,
     prepared: tuple[graph.Problem, graph.State] | None = None,
 ) -> ScaleRecovery:
-    """Cameras of the true size, made `1/p` as large and held; s starts at 1.
+    """Estimates s, starting at 1, for cameras of the true size that are scaled by `1/p`
+    and held.
 
-    Only s and people are free, without landmarks. All perturbations are one solve,
-    mapped over its first states and distributed over JAX's devices. The cameras are
-    those of the pipeline (the paper takes the motion capture's), scaled to their true
-    size by Sim(3).
+    Only s and people are free, without landmarks. All perturbations are one solve that
+    is mapped over start states and distributed over JAX's devices. The cameras are
+    those of the pipeline (the paper uses motion capture), aligned to their true size by
+    Sim(3).
     """
     if prepared is None:
         found = case.prepare()

@@ -1,4 +1,4 @@
-"""Simulations of an experiment, and errors of states on a simulated case."""
+"""Selects the simulations of an experiment, and computes errors of states on them."""
 
 import zlib
 from collections.abc import Sequence as Ordered
@@ -12,19 +12,19 @@ from bodyslam_jax.pipeline.case import Case
 
 
 def score_of(case: Case, state: graph.State, present: np.ndarray) -> dict[str, float]:
-    """Errors of a state against the truth: `scoring.NAMES`, m."""
+    """Returns the errors (m) of a state against the truth, by `scoring.NAMES`."""
     return score(state, case.truth, case.body, present, case.cameras.registered)
 
 
 def simulations(
     experiment: Experiment, sequences: Ordered[str], families: Ordered[str]
 ) -> list[Simulation]:
-    """Simulations of an experiment: its default sequences unless others are requested.
+    """Returns the simulations of an experiment: its default sequences unless others are
+    requested.
 
-    A seed that is given changes every sequence differently, as it is combined with the
-    sequence's name.
+    A given seed is combined with each sequence's name, so that sequences differ.
     """
-    chosen = dict.fromkeys(experiment.sequences or sequences)  # each once
+    chosen = dict.fromkeys(experiment.sequences or sequences)  # removes duplicates
     kinds = families
     if experiment.family is not None:
         kinds = (

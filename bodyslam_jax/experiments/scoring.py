@@ -1,4 +1,4 @@
-"""Errors of a state against the truth, as a function that jit, vmap and grad take."""
+"""Errors of a state against the truth, as a function for jit, vmap and grad."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,17 +23,19 @@ NAMES = (
     "scale",
 )
 """Errors of the paper's table 1: mean over frames, m; `scale` is truth per estimate."""
-PLAUSIBLE = (
+PLAUSIBILITY_FIGURES = (
     "gravity_error",
     *(f"{name}{whose}" for name in evaluation.FIGURES for whose in ("", "_of_truth")),
 )
-"""Figures of gravity, feet and posture, rad, m, s; without the result's low pass."""
-_FRAMES = 100
-"""Numbers of frames are padded to multiples of this, so that lengths share programs."""
+"""Figures of gravity, feet and posture, rad, m, s; without the low-pass filter that is
+applied to results."""
+_FRAMES_MULTIPLE = 100
+"""Numbers of frames are padded to multiples of this, so that lengths share compiled
+programs."""
 
 
 def errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
-    """The errors in `NAMES`; people are paired in the order in which they come."""
+    """Returns the errors in `NAMES`; people are paired by index."""
     found = evaluation.evaluate_trajectories(estimate, truth)
     return {name: found[name] for name in NAMES}
 
@@ -45,12 +47,12 @@ def score(
     present: Bool[Array | np.ndarray, "h t"],
     registered: Bool[Array | np.ndarray, " t"],
 ) -> dict[str, float]:
-    """`errors` of one state as plain numbers, compiled once for many lengths.
+    """Returns `errors` of one state as plain numbers, compiled once for many lengths.
 
-    `leg_ratio` is estimated over true leg length of the first person; the figures named
-    in `PLAUSIBLE` are added.
+    `leg_ratio`, the estimated over the true leg length of the first person, and the
+    figures named in `PLAUSIBILITY_FIGURES` are added.
     """
-    frames = -(-len(state.cameras) // _FRAMES) * _FRAMES
+    frames = -(-len(state.cameras) // _FRAMES_MULTIPLE) * _FRAMES_MULTIPLE
     estimate = trajectories(state, body, present, registered, truth.fps)
     estimate = _upright(estimate, state, body)
     found = _errors(
@@ -63,7 +65,8 @@ def score(
 
 
 def leg_of(people: Trajectories) -> Float[Array, ""]:
-    """Hip to knee to ankle of the first person, m: a pose does not change it."""
+    """Returns the length from hip over knee to ankle of the first person, m, which is
+    independent of pose."""
     first = people.joints[0, 0]
     bones = first[np.array([4, 5, 7, 8])] - first[np.array([1, 2, 4, 5])]
     return jnp.sqrt((bones**2).sum(-1)).sum() / 2
@@ -72,7 +75,8 @@ def leg_of(people: Trajectories) -> Float[Array, ""]:
 def _upright(
     estimate: Trajectories, state: graph.State, body: BodyModel
 ) -> Trajectories:
-    """The same in a world whose y axis is up and whose floor is at y = 0."""
+    """Returns the trajectories in a world whose y axis is up and whose floor is at y =
+    0."""
     present, fps = np.asarray(estimate.present), float(estimate.fps)
     if not present.any():
         return estimate
@@ -102,4 +106,4 @@ def _upright(
 @eqx.filter_jit
 def _errors(estimate: Trajectories, truth: Trajectories) -> dict[str, Float[Array, ""]]:
     found = evaluation.evaluate_trajectories(estimate, truth)
-    return {name: found[name] for name in (*NAMES, *PLAUSIBLE)}
+    return {name: found[name] for name in (*NAMES, *PLAUSIBILITY_FIGURES)}

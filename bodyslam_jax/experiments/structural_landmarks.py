@@ -1,7 +1,8 @@
-"""Rows of `bodyslam experiment landmarks`: what structural landmarks add (appendix C).
+"""Computes the rows of `bodyslam experiment landmarks`: the effect of structural
+landmarks (appendix C).
 
-Input is a `Case` and the seed of the perturbation; output C-ATE, m, of the perturbed
-cameras and after optimisation with and without landmarks.
+The inputs are a `Case` and the seed of the perturbation; the output are C-ATE, m, of
+the perturbed cameras and after optimisation with and without landmarks.
 """
 
 import jax
@@ -14,8 +15,8 @@ from bodyslam_jax.experiments.scenario import score_of
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 
-SHIFT, TURN = 0.1, 0.01
-"""The paper's uniform perturbation of each coordinate, m and rad."""
+SHIFT_M, TURN_RAD = 0.1, 0.01
+"""The paper's bounds of the uniform perturbation of each coordinate."""
 
 
 def shake(
@@ -23,12 +24,13 @@ def shake(
     free: graph.Step,
     key: PRNGKeyArray,
     *,
-    shift: float = SHIFT,
-    turn: float = TURN,
+    shift: float = SHIFT_M,
+    turn: float = TURN_RAD,
 ) -> graph.State:
     """Moves every camera by up to `shift` m and `turn` rad in each coordinate.
 
-    Coordinates that fix the gauge stay; `shift` is in metres by the state's s.
+    Coordinates that fix the gauge are unchanged; the state's s converts `shift` from
+    metres.
     """
     low, high = -jnp.ones(6), jnp.ones(6)
     draw = jax.random.uniform(
@@ -40,7 +42,8 @@ def shake(
 
 
 def landmark_ablation(case: Case, *, seed: int = 0) -> dict[str, float | str]:
-    """C-ATE, m, of the perturbed cameras, and optimised with and without landmarks.
+    """Returns the C-ATE, m, of the perturbed cameras, and after optimisation with and
+    without landmarks.
 
     `original` is that of bundle adjustment in the map's own unit (the paper's first
     column, of arbitrary scale); all others have s from the motion model.

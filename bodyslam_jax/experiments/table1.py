@@ -1,4 +1,5 @@
-"""The report of `bodyslam experiment table1`: our rows beside the paper's values."""
+"""Writes the report of `bodyslam experiment table1`: our rows beside the paper's
+values."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +8,7 @@ from typing import Any
 
 from bodyslam_jax.experiments import figures, paper
 from bodyslam_jax.experiments.comparison import METHODS
-from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBLE
+from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBILITY_FIGURES
 from bodyslam_jax.experiments.tables import (
     MM,
     Column,
@@ -19,26 +20,33 @@ from bodyslam_jax.experiments.tables import (
 )
 
 _GROUPS = {"se3": "SE(3)", "sim3": "Sim(3)"}
-_PAIR = {"no_mm": "no MM", "full": "full"}
+_PAPER_METHODS = {"no_mm": "no MM", "full": "full"}
 """The methods that the paper compares."""
-_PAPER = "paper:"
+_PAPER_PREFIX = "paper:"
 """Prefix of the keys of the paper's values in our rows."""
-_NUMBERS = ("frames", "radius", "start_ratio", "start_sigma", "scale_ratio", "steps")
-_PATH = [[float]]
+_NUMBER_FIELDS = (
+    "frames",
+    "radius",
+    "start_ratio",
+    "start_sigma",
+    "scale_ratio",
+    "steps",
+)
+_PATH_FORM = [[float]]
 FORM: dict[str, Any] = {
-    **dict.fromkeys(_NUMBERS, float),
+    **dict.fromkeys(_NUMBER_FIELDS, float),
     **{f"{method}/{name}": float for method in METHODS for name in NAMES},
-    **{f"full/{name}": float for name in PLAUSIBLE},
+    **{f"full/{name}": float for name in PLAUSIBILITY_FIGURES},
     "status": str,
     "paths": {
-        f"{what}/{name}": _PATH
+        f"{what}/{name}": _PATH_FORM
         for what in ("camera", "human")
-        for name in ("truth", *_PAIR)
+        for name in ("truth", *_PAPER_METHODS)
     },
 }
-"""Fields of a cached row beside its sequence."""
-_SEQUENCE = Column("sequence", "sequence")
-_BEHIND = [
+"""Fields of a cached row beside its sequence, and their types (`row_cache.fits`)."""
+_SEQUENCE_COLUMN = Column("sequence", "sequence")
+_DETAIL_COLUMNS = [
     Column("frames", "frames", digits=0),
     Column("camera's RMS radius, m", "radius", digits=2),
     Column("C-ATE SE(3), % of it", "share", 100.0, 2),
@@ -51,7 +59,7 @@ _BEHIND = [
     Column("status", "status"),
 ]
 _DEGREES = 180 / math.pi
-_PLAUSIBLE = [
+_PLAUSIBILITY_COLUMNS = [
     Column("gravity error, degrees", "full/gravity_error", _DEGREES, 2),
     *(
         Column(f"{title}{of}", f"full/{name}{whose}", factor, digits)
@@ -70,20 +78,21 @@ _PLAUSIBLE = [
 
 
 def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Table 1, details of its rows, and the baselines; all in one CSV."""
+    """Writes table 1, details of its rows, and the baselines; the CSV contains all of
+    them."""
     papers = [paper.table1_row(row["sequence"].split("-")[0]) for row in rows]
     rows = [_completed(*both) for both in zip(rows, papers, strict=True)]
-    baselines = {name: METHODS[name] for name in METHODS if name not in _PAIR}
+    baselines = {name: METHODS[name] for name in METHODS if name not in _PAPER_METHODS}
     parts = []
     for family in dict.fromkeys(row["sequence"].split("-")[1] for row in rows):
         own = [row for row in rows if row["sequence"].endswith(family)]
         add = lambda what, columns, f=family, own=own: parts.append(
-            (f"Family `{f}`{what}", [_SEQUENCE, *columns], own)
+            (f"Family `{f}`{what}", [_SEQUENCE_COLUMN, *columns], own)
         )
         add(", after SE(3)", [*_beside("se3"), *_scales()])
         add(", after Sim(3)", _beside("sim3"))
-        add(": behind it", _BEHIND)
-        add(": gravity, feet and knees, before smoothing", _PLAUSIBLE)
+        add(": behind it", _DETAIL_COLUMNS)
+        add(": gravity, feet and knees, before smoothing", _PLAUSIBILITY_COLUMNS)
         for method, meaning in baselines.items():
             add(f": {meaning}", [*_errors(method), _scale(method)])
     head = intro(
@@ -96,11 +105,12 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         + ".",
     )
     written = write_tables(out, "table1", head, parts, about)
-    columns = [_SEQUENCE, *_beside("se3"), *_beside("sim3"), *_scales()]
+    columns = [_SEQUENCE_COLUMN, *_beside("se3"), *_beside("sim3"), *_scales()]
     for method in baselines:
         columns += [*_errors(method, f" {method}"), _scale(method, f" {method}")]
     write_text(
-        out / "table1.csv", to_csv([*columns, *_BEHIND, *_PLAUSIBLE], rows, about)
+        out / "table1.csv",
+        to_csv([*columns, *_DETAIL_COLUMNS, *_PLAUSIBILITY_COLUMNS], rows, about),
     )
     figures.draw_table(out / "table1.png", rows, papers, about)
     figures.draw_paths(out / "table1_paths.png", rows, about)
@@ -108,22 +118,23 @@ def write_table1(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 
 
 def _completed(row: Row, theirs: Row) -> Row:
-    """A row with derived values and those of the paper."""
+    """Returns a row with derived values and the paper's values added."""
     scale, error = row["full/scale"], row["full/c_ate_se3"]  # `None`: not finite
     return {
         **row,
         "scale_error": None if scale is None else abs(1 - scale),
         "share": None if error is None or not row["radius"] else error / row["radius"],
-        **{_PAPER + name: value for name, value in theirs.items()},
+        **{_PAPER_PREFIX + name: value for name, value in theirs.items()},
     }
 
 
 def _beside(group: str) -> list[Column]:
-    """C-, H- and J-ATE without a motion model and with it, each by the paper's, mm."""
+    """Returns the columns of C-, H- and J-ATE without and with a motion model, each
+    beside the paper's, mm."""
     return [
         Column(f"{whose}{error.upper()}-ATE {_GROUPS[group]} {short}, mm", key, MM)
         for error in "chj"
-        for method, short in _PAIR.items()
+        for method, short in _PAPER_METHODS.items()
         for whose, key in _ours_and_theirs(f"{method}/{error}_ate_{group}")
     ]
 
@@ -131,13 +142,13 @@ def _beside(group: str) -> list[Column]:
 def _scales() -> list[Column]:
     return [
         Column(f"{whose}scale {short}", key, digits=3)
-        for method, short in _PAIR.items()
+        for method, short in _PAPER_METHODS.items()
         for whose, key in _ours_and_theirs(f"{method}/scale")
     ]
 
 
 def _ours_and_theirs(key: str) -> tuple[tuple[str, str], tuple[str, str]]:
-    return ("", key), ("the paper's ", _PAPER + key)
+    return ("", key), ("the paper's ", _PAPER_PREFIX + key)
 
 
 def _errors(method: str, label: str = "") -> Sequence[Column]:

@@ -11,21 +11,21 @@ from bodyslam_jax.io.markup import csv_table, markdown_table
 
 Row = dict[str, Any]
 MM = 1e3
-"""From a row's metres to a table's millimetres."""
+"""Factor from a row's metres to a table's millimetres."""
 Cell = str | float | int | None
 
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A column: its key in the rows, unit and format."""
+    """A column of a table: its key in the rows, unit and format."""
 
     title: str
     key: str
     factor: float = 1.0
-    """From the row's unit (SI) to the table's."""
+    """Factor from the row's unit (SI) to the table's."""
     digits: int = 1
     average: bool = True
-    """Whether the last row holds its mean."""
+    """Whether the last row of the table holds the mean."""
 
     def value(self, row: dict[str, Any]) -> Cell:
         found = row.get(self.key)
@@ -42,7 +42,8 @@ class Column:
 def markdown(
     columns: Sequence[Column], rows: Sequence[dict[str, Any]], *, mean: bool = False
 ) -> str:
-    """A Markdown table, with the mean over rows at its end if it is wanted."""
+    """Returns a Markdown table, with the mean over rows as the last line if `mean` is
+    set."""
     lines, total = [[column.title for column in columns]], []
     lines += [[c.text(c.value(row)) for c in columns] for row in rows]
     if mean and rows:
@@ -60,7 +61,8 @@ def markdown(
 def to_csv(
     columns: Sequence[Column], rows: Sequence[dict[str, Any]], about: str = ""
 ) -> str:
-    """A CSV table with values in full precision, in the units of the columns' titles.
+    """Returns a CSV table with values in full precision, in the units of the columns'
+    titles.
 
     If `about`, a description of the data, is given, it fills a last column `data`.
     """
@@ -71,8 +73,8 @@ def to_csv(
 
 
 def intro(title: str, about: str, *lines: str) -> str:
-    """The head of a Markdown report: `title`, `about` (a description of the data), and
-    `lines` that introduce the tables."""
+    """Returns the head of a Markdown report: `title`, `about` (a description of the
+    data), and `lines` that introduce the tables."""
     return "\n".join([f"# {title}", "", f"{about} {OTHER_DATA}", *lines, "", ""])
 
 
@@ -83,9 +85,10 @@ def write_tables(
     parts: Sequence[tuple[str, Sequence[Column], Sequence[Row]]],
     about: str,
 ) -> list[Path]:
-    """`name.md` with all parts under their titles and `name.csv` with the first.
+    """Writes `name.md` with all parts under their titles, and `name.csv` with the first
+    part.
 
-    `about` names the data.
+    `about` describes the data.
     """
     text = head
     for title, columns, rows in parts:

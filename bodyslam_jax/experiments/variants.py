@@ -1,4 +1,5 @@
-"""Variants of a joint problem: factors disabled or added, variables held constant."""
+"""Defines variants of a joint problem: factors disabled or added, variables held
+constant."""
 
 import dataclasses
 from collections.abc import Callable
@@ -25,17 +26,17 @@ _SCALE_FACTORS = (
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
 
-OPTIONAL = GraphWeights(upright_sigma=0.1)
-"""Sigmas of factors that are off by default: of an upright trunk, rad."""
+OPTIONAL_WEIGHTS = GraphWeights(upright_sigma=0.1)
+"""Sigmas of factors that are disabled by default: of an upright trunk, rad."""
 _FPS = 30.0
 """Frame rate of the simulated sequences, 1/s."""
 
 
 def without(*kinds: type[graph.Factor]) -> Variant:
-    """The problem without these factors; s is held where none is left that
+    """Returns the variant without these factors; s is held if no remaining factor
     determines it.
 
-    If the problem has no such factors it is returned as it is.
+    A problem that has no such factors is returned unchanged.
     """
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
@@ -53,7 +54,8 @@ def without(*kinds: type[graph.Factor]) -> Variant:
 
 
 def held(*names: str) -> Variant:
-    """The problem with these groups of variables as they are at the start."""
+    """Returns the variant that holds these groups of variables at their start
+    values."""
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
         free = graph.set_constant(problem.free, *names)
@@ -63,15 +65,15 @@ def held(*names: str) -> Variant:
 
 
 def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
-    """The problem without observations of landmarks: landmarks are held, as no factor
-    determines them, and cameras are free."""
+    """Returns the problem without observations of landmarks: landmarks are held, as no
+    factor determines them, and cameras are free."""
     return held("landmarks")(
         *without(graph.Reprojection, graph.LandmarkPrior)(problem, state)
     )
 
 
 def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
-    """β held at the regressor's value."""
+    """Returns the problem with β held at the regressor's value."""
     (prior,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
     valid = jnp.isfinite(prior.sigma)
     count = valid.sum(axis=1, dtype=prior.shape.dtype)
@@ -85,7 +87,7 @@ def beside(
         [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.Factor | None
     ],
 ) -> Variant:
-    """The problem with one more factor, if `make` returns one."""
+    """Returns the variant with an additional factor, if `make` returns one."""
 
     def variant(problem: graph.Problem, state: graph.State) -> Start:
         body, present = _person(problem)
@@ -127,7 +129,9 @@ VARIANTS: dict[str, Variant] = {
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
     "with up direction": beside(
-        lambda body, state, present: upright_factor(state, present, _FPS, OPTIONAL)
+        lambda body, state, present: upright_factor(
+            state, present, _FPS, OPTIONAL_WEIGHTS
+        )
     ),
 }
 """The variants of `ablation`, solved from the start of the full problem."""

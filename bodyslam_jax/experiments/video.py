@@ -1,9 +1,9 @@
-"""Rows of `bodyslam experiment video`: estimates from rendered video.
+"""Computes the rows of `bodyslam experiment video`: estimates from rendered video.
 
 Every sequence is rendered with people in clothes; medium ones have furniture that
-occludes them, difficult ones also a second person and a rolling shutter. Input of the
+occludes them, difficult ones also a second person and a rolling shutter. Inputs of the
 pipeline are the video and camera.json, and: nothing else (`pixels`); simulated
-keypoints (`keypoints`); these and bodies as of a regressor (`bodies`).
+keypoints (`keypoints`); or these and simulated bodies of a regressor (`bodies`).
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, io, pipeline, simulation
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments.detector import detection_figures
-from bodyslam_jax.experiments.jobs import COMPILE, Job, named
+from bodyslam_jax.experiments.jobs import COMPILATION_S, Job, named
 from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.experiments.scoring import leg_of
@@ -32,16 +32,16 @@ FORM: dict[str, Any] = {
     **dict.fromkeys((*FIGURES, "size"), float),
     "status": str,
 }
-"""Fields of a cached row beside its sequence."""
-_SECONDS = 0.6
-"""Processor time of all stages, a frame and input, s."""
-_READOUT = 0.015
+"""Fields of a cached row beside its sequence, and their types (`row_cache.fits`)."""
+_SECONDS_PER_FRAME = 0.6
+"""Processor time of all stages per frame and input, s."""
+_READOUT_S = 0.015
 
 
 def jobs(
     experiment: Experiment, config: Config, stages: Path, sequences: tuple[str, ...]
 ) -> list[Job]:
-    """One row for each sequence and input."""
+    """Returns one row for each sequence and input."""
     if experiment.frames is None:
         experiment = dataclasses.replace(experiment, frames=FRAMES)
     if experiment.family is None:
@@ -52,28 +52,29 @@ def jobs(
         for which in INPUTS:
             label = f"{named(settings)}-{which}"
             form = {"sequence": named(settings), **FORM, "input": which}
-            seconds = COMPILE + _SECONDS * (settings.length or FRAMES)
+            seconds = COMPILATION_S + _SECONDS_PER_FRAME * (settings.length or FRAMES)
             one = functools.partial(video_row, settings, which, config, stages)
             out.append(Job(label, (settings, which, config), seconds, one, form))
     return out
 
 
 def filmed(settings: Simulation) -> Simulation:
-    """The simulation with occluding furniture and further people."""
+    """Returns the simulation with occluding furniture and further people, by its
+    difficulty."""
     level = settings.sequence[0]
     return dataclasses.replace(
         settings,
         render=True,
         hiding=level in "MD",
         people=2 if level == "D" else 1,
-        readout=_READOUT if level == "D" else 0.0,
+        readout=_READOUT_S if level == "D" else 0.0,
     )
 
 
 def video_row(
     settings: Simulation, which: str, config: Config = Config(), stages: Path = Path()
 ) -> Row:
-    """Renders, runs the pipeline on the images, and compares with the truth.
+    """Renders a video, runs the pipeline on it, and compares the result with the truth.
 
     `which` is one of `INPUTS`. The film and finished stages are kept in `stages`.
 

@@ -1,4 +1,5 @@
-"""The report of `bodyslam experiment video`: tables with standard errors of means."""
+"""Writes the report of `bodyslam experiment video`: tables with standard errors of
+means."""
 
 import math
 from collections.abc import Sequence
@@ -40,12 +41,13 @@ _FIGURES = (
     Column("joints' acceleration, m/s²", "joint_acceleration"),
     Column("gravity error, degrees", "gravity_error", _DEGREES, 2),
 )
-_TRUE = {name: f"{name}_of_truth" for name in FIGURES}
-"""Figures that are computed of the truth as well."""
+_TRUTH_FIGURES = {name: f"{name}_of_truth" for name in FIGURES}
+"""Keys of the figures that are computed for the truth as well."""
 
 
 def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """`video.md`, `video.csv`: means, every sequence, the detector's keypoints."""
+    """Writes `video.md` and `video.csv`: means, every sequence, the detector's
+    keypoints."""
     rows = [
         row | {"scale_error": None if row["scale"] is None else abs(1 - row["scale"])}
         for row in rows
@@ -74,14 +76,15 @@ def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     text += f"## The detector's keypoints\n\n{keypoint_table(rows)}"
     write_text(out / "video.md", text)
     columns = [Column("sequence", "sequence"), Column("input", "input"), *_FIGURES]
-    columns += [Column(f"true {c.title}", _TRUE[c.key], c.factor, c.digits)
-                for c in _FIGURES if c.key in _TRUE]  # fmt: skip
+    columns += [Column(f"true {c.title}", _TRUTH_FIGURES[c.key], c.factor, c.digits)
+                for c in _FIGURES if c.key in _TRUTH_FIGURES]  # fmt: skip
     write_text(out / "video.csv", to_csv(columns, rows, about))
     return [out / "video.md", out / "video.csv"]
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """A line for each figure, a column for each input and for the truth."""
+    """Returns a table with a line for each figure, and a column for each input and the
+    truth."""
     columns = [Column("", "what"), *(Column(name, name) for name in INPUTS)]
     columns.append(Column("truth", "truth"))
     lines = []
@@ -89,8 +92,8 @@ def _summary(rows: Sequence[Row]) -> str:
         of = lambda which, f=figure: [r.get(f.key) for r in rows if r["input"] == which]
         line: Row = {"what": figure.title}
         line |= {which: _mean(of(which), figure) for which in INPUTS}
-        if figure.key in _TRUE:
-            once = {r["sequence"]: r[_TRUE[figure.key]] for r in rows}
+        if figure.key in _TRUTH_FIGURES:
+            once = {r["sequence"]: r[_TRUTH_FIGURES[figure.key]] for r in rows}
             line["truth"] = _mean(list(once.values()), figure)
         lines.append(line)
     count = {w: sum(r["input"] == w for r in rows) for w in INPUTS}
@@ -99,7 +102,8 @@ def _summary(rows: Sequence[Row]) -> str:
 
 
 def _mean(values: Sequence[float | None], column: Column) -> str | None:
-    """`43.7 ± 6.7`, and the number of rows that lack the figure, if any."""
+    """Returns text such as `43.7 ± 6.7`, and the number of rows that lack the figure,
+    if any."""
     finite = [v for v in values if v is not None and math.isfinite(v)]
     numbers = np.array(finite, float) * column.factor
     if not len(numbers):
@@ -113,7 +117,7 @@ def _mean(values: Sequence[float | None], column: Column) -> str | None:
 
 
 def keypoint_table(rows: Sequence[Row]) -> str:
-    """Mean offsets of both sides together, % of the stature."""
+    """Returns a table of mean offsets, averaged over both sides, % of the stature."""
     found = [row["keypoints"] for row in rows if row.get("keypoints")]
     if not found:
         return "Nobody was found.\n"

@@ -1,15 +1,16 @@
-"""Weights learnt through the solver, for `bodyslam experiment weights`.
+"""Learns weights through the solver, for `bodyslam experiment weights`.
 
-The solution depends on the weights by the implicit function theorem (`solver.solve`
-has its derivative), so an error after alignment can be minimised by gradient descent
-on training sequences. A weight is the logarithm of a factor on a standard deviation, or
-on a robust loss' scale: λ = σ^-2, so log λ falls by twice as much.
+The solution depends on the weights by the implicit function theorem (`solver.solve` has
+its derivative), so an error after alignment can be minimised by gradient descent on
+training sequences. A weight is the logarithm of a factor on a standard deviation, or on
+the scale of a robust loss: λ = σ^-2, so log λ decreases by twice as much.
 """
 
 import dataclasses
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -43,17 +44,18 @@ WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
     "landmark": (graph.Reprojection, "sigma"),
     "landmark loss": (graph.Reprojection, "loss"),
 }
-"""The field of a factor that each weight multiplies."""
-SCALE_UNIT, JOINT_UNIT = 0.05, 0.05
-"""Units of the training error: of log s, and of J-ATE, m."""
+"""Type and field of the factor that each weight multiplies."""
+SCALE_UNIT, JOINT_UNIT_M = 0.05, 0.05
+"""Units of the training error: of log s, and of J-ATE."""
 SCHEDULE = (solver.Stage(),)
-"""From a solution with other weights no first step is needed."""
-PRIOR = 0.02
-"""Cost of a weight that differs by a factor e: a prior, as sequences are few."""
+"""Single stage, because the start is the solution for similar weights."""
+PRIOR_COST = 0.02
+"""Cost of a weight that differs by a factor e: a prior, because there are few
+sequences."""
 
 
 class Trial(eqx.Module):
-    """One training sequence: a problem, a state near its solution, and ground truth."""
+    """A training sequence: a problem, a state near its solution, and ground truth."""
 
     problem: graph.Problem
     state: graph.State
@@ -64,7 +66,7 @@ class Trial(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """`w` weights after `n` steps on the training sequences."""
+    """Values of `w` weights after `n` steps on the training sequences."""
 
     names: tuple[str, ...]
     log: Float[np.ndarray, " w"]
@@ -76,17 +78,17 @@ class Learned:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """The state of learning after a step, as arrays."""
+    """State of the optimisation after a step, as arrays."""
 
     names: tuple[str, ...]
     standing: tuple[np.ndarray, ...]
-    """Weights, moments of Adam, and the solution of each sequence."""
+    """Weights, moments of Adam, and the current solution of each sequence."""
     history: Float[np.ndarray, " n"]
     path: Float[np.ndarray, "n w"]
 
 
 def make_trial(case: Case, prepared: Prepared, *, hold_cameras: bool) -> Trial:
-    """The problem of a case and its solution with the weights as they are.
+    """Returns the problem of a case with its solution for the current weights.
 
     With `hold_cameras` there are no landmarks, which makes a solve far cheaper.
     """
@@ -99,7 +101,8 @@ def make_trial(case: Case, prepared: Prepared, *, hold_cameras: bool) -> Trial:
 
 
 def names_of(problem: graph.Problem) -> tuple[str, ...]:
-    """Names of the weights (keys of `WEIGHTS`) whose factor the problem has."""
+    """Returns the names of the weights (keys of `WEIGHTS`) whose factors the problem
+    has."""
     kinds = {type(factor) for factor in problem.factors}
     return tuple(name for name, (kind, _) in WEIGHTS.items() if kind in kinds)
 
@@ -107,7 +110,8 @@ def names_of(problem: graph.Problem) -> tuple[str, ...]:
 def reweighted(
     problem: graph.Problem, names: Sequence[str], log: Float[Array, " w"]
 ) -> graph.Problem:
-    """The problem with the standard deviations of its terms times `exp(log)`.
+    """Returns the problem with the standard deviations of its terms multiplied by
+    `exp(log)`.
 
     **Raises:** `InputError` for a name that is not among `WEIGHTS`.
     """
@@ -142,7 +146,7 @@ def outcome(
     log: Float[Array, " w"],
     schedule: tuple[solver.Stage, ...] = SCHEDULE,
 ) -> tuple[graph.State, Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Solution, cost and errors under these weights: pure and differentiable."""
+    """Returns solution, cost and errors for these weights; pure and differentiable."""
     problem = reweighted(trial.problem, names, log)
     solution = solver.solve(problem, trial.state, schedule=schedule)
     motion = problem.motion
@@ -154,18 +158,21 @@ def outcome(
 
 
 def training_error(found: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
-    """`(log s / 0.05)² + J-ATE / 0.05 m`, a smooth function of the solution.
+    """Returns `(log s / 0.05)² + J-ATE / 0.05 m`, a smooth function of the solution.
 
     `s` is the estimated over the true scale; J-ATE is after SE(3) alignment.
     """
-    return (jnp.log(found["scale"]) / SCALE_UNIT) ** 2 + found["j_ate_se3"] / JOINT_UNIT
+    return (jnp.log(found["scale"]) / SCALE_UNIT) ** 2 + found[
+        "j_ate_se3"
+    ] / JOINT_UNIT_M
 
 
 @eqx.filter_jit
 def error_and_gradient(
     trial: Trial, names: tuple[str, ...], log: Float[Array, " w"], state: graph.State
 ) -> tuple[Float[Array, ""], Float[Array, " w"], graph.State]:
-    """The training error, its gradient by the weights, and the solution."""
+    """Returns the training error, its gradient with respect to the weights, and the
+    solution."""
     near = eqx.tree_at(lambda t: t.state, trial, state)
 
     def of(log):
@@ -209,7 +216,7 @@ def learn_weights(
         history.append(error)
         path.append(np.asarray(value))
         log.info("weights: step %d of %d, error %.4g", step + 1, steps, error)
-        # optax takes powers of Python's numbers.
+        # optax raises Python numbers to powers of arrays.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(slope, memory)
         moved = jnp.asarray(optax.apply_updates(value, change))
@@ -230,9 +237,9 @@ def _mean_error(
     value: Float[Array, " w"],
     states: Sequence[graph.State],
 ) -> tuple[float, Float[Array, " w"], list[graph.State]]:
-    """The mean training error, its gradient by the log weights `value` (with the
-    prior's gradient added), and each trial's new solution."""
-    total, slope, found = 0.0, PRIOR * 2 * value, []
+    """Returns the mean training error, its gradient with respect to the log weights
+    `value` (including the prior's), and each trial's new solution."""
+    total, slope, found = 0.0, PRIOR_COST * 2 * value, []
     for k, (trial, state) in enumerate(zip(trials, states, strict=True)):
         error, gradient, state = error_and_gradient(trial, names, value, state)
         total += float(error) / len(trials)
@@ -247,12 +254,15 @@ def _mean_error(
 
 
 def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
-    """The progress of an earlier run; `None` if there is none that can be read."""
+    """Reads the progress of an earlier run; `None` if there is none that can be
+    read."""
     if not progress.exists():
         return None
     try:
         kept = stage_cache.load(progress, Progress)
-    except Exception as error:  # whatever is in it, weights can be learnt again
+    except (
+        Exception
+    ) as error:  # weights can be learnt again, whatever the file contains
         reason = error_line(error)
         log.warning("%s: not readable (%s); learnt from the start", progress, reason)
         return None
@@ -260,3 +270,38 @@ def _read(progress: Path, names: tuple[str, ...]) -> Progress | None:
         raise InputError(f"{progress}: weights {kept.names}, expected {names}.")
     log.info("weights: %d steps taken from an earlier run", len(kept.history))
     return kept
+
+
+def described(learned: Learned) -> dict[str, Any]:
+    """Returns names, logarithms and factors of the weights, and the history of
+    learning."""
+    return {
+        "names": list(learned.names),
+        "log": learned.log.tolist(),
+        "factor": np.exp(learned.log).tolist(),
+        "history": learned.history.tolist(),
+        "path": learned.path.tolist(),
+    }
+
+
+def judge(trial: Trial, learned: Learned) -> dict[str, float]:
+    """Returns the errors with the original and with the learnt weights, by keys such as
+    `before/scale`."""
+    row = {}
+    for when, log in (
+        ("before", np.zeros_like(learned.log)),
+        ("after", learned.log),
+    ):
+        found = _errors_with(trial, learned.names, jnp.asarray(log))
+        row |= {f"{when}/{name}": float(value) for name, value in found.items()}
+    return row
+
+
+@eqx.filter_jit
+def _errors_with(
+    trial: Trial, names: tuple[str, ...], log: Float[Array, " w"]
+) -> dict[str, Float[Array, ""]]:
+    """Returns the errors for these weights, and the training error computed from
+    them."""
+    _, _, found = outcome(trial, names, log)
+    return found | {"error": training_error(found)}

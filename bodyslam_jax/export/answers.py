@@ -1,4 +1,4 @@
-"""The report's first screen: how far, how fast, how tall, how sure."""
+"""Formats the report's first screen: distance, speed, stature and uncertainty."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,11 @@ from bodyslam_jax.diagnostics.reported_status import reported_status
 from bodyslam_jax.export.figures import person_variable
 from bodyslam_jax.types import Result
 
-_MOST_ROWS = 5
-"""People whom a card names; the table of people has all."""
-_VAGUE = 0.1
-"""Relative standard deviation of a way or a speed that is named beside it."""
-_STILL = {"static": "stood still", "rotation": "turned on the spot"}
+_MAX_ROWS = 5
+"""Number of people that a card names at most; the table of people contains all."""
+_MIN_SHOWN_SIGMA = 0.1
+"""Relative standard deviation of a distance or speed from which it is printed."""
+_STATIC_WORDS = {"static": "stood still", "rotation": "turned on the spot"}
 
 
 def answers(
@@ -26,11 +26,11 @@ def answers(
     people: Sequence[statistics.PathStatistics],
     body: BodyModel,
 ) -> str:
-    """Four cards, as one section of HTML."""
+    """Returns four cards as one section of HTML."""
     shown = [h for h, present in enumerate(result.present) if present.any()]
     name = lambda h: "person" if len(people) == 1 else f"person {h}"
     rows = lambda text: [(person_variable(h), name(h), text(h)) for h in shown]
-    kind = _STILL.get(str(summary.get("camera_motion")))
+    kind = _STATIC_WORDS.get(str(summary.get("camera_motion")))
     if shown:
         known = [h for h in shown if reported_status(summary, h).measurable]
         if_known = lambda h, text: text if h in known else "not measurable"
@@ -66,26 +66,27 @@ def _stature(
 
 
 def stature_sigma(summary: Mapping[str, Any], h: int) -> float | None:
-    """Standard deviation of a person's stature, m, as reported."""
+    """Returns the reported standard deviation of a person's stature, m."""
     reported = (summary.get("people") or [])[h : h + 1]
     return reported[0].get("stature_sigma_m") if reported else None
 
 
 def _vague(summary: Mapping[str, Any], h: int, value: float) -> str:
-    """The standard deviation of a person's way or speed, where it is much."""
+    """Returns the standard deviation of a person's distance or speed as text, if it is
+    large."""
     person = (_people(summary)[h : h + 1] or [{}])[0]
     sigma, speed = person.get("speed_sigma_m_s"), person.get("speed_m_s")
     share = sigma / speed if sigma and speed else 0.0
-    return f" ± {share * value:.1f}" if share > _VAGUE else ""
+    return f" ± {share * value:.1f}" if share > _MIN_SHOWN_SIGMA else ""
 
 
 def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
-    """How well lengths are known, in a few words, and notes on it."""
+    """Returns a short text on the uncertainty of lengths, followed by notes."""
     if not result.present.any():
         return ["not in metres", "there are no people to measure by"]
     scale = summary.get("scale") or {}
     sigma = scale.get("sigma")
-    if str(summary.get("camera_motion")) in _STILL:
+    if str(summary.get("camera_motion")) in _STATIC_WORDS:
         return _sizes_of_stature(result, summary)
     reasons = summary.get("reasons") or []
     if any(reason.get("name") == "scale_unknown" for reason in reasons):
@@ -105,8 +106,9 @@ def sizes(result: Result, summary: Mapping[str, Any]) -> list[str]:
 
 
 def _sizes_of_stature(result: Result, summary: Mapping[str, Any]) -> list[str]:
-    """Where the camera's path gives no size, bodies give all of it, but for what
-    follows from the focal length."""
+    """Returns the texts of `sizes` for a camera whose path does not determine the
+    scale: all sizes then follow from the bodies, and distances also from the focal
+    length."""
     known = [stature_sigma(summary, h) for h in range(len(result.present))]
     statures = [(s, p.get("stature_m")) for s, p in zip(known, _people(summary))]
     shares = [s / m for s, m in statures if s and m]
@@ -124,7 +126,7 @@ def _sizes_of_stature(result: Result, summary: Mapping[str, Any]) -> list[str]:
 
 
 def along_view(summary: Mapping[str, Any]) -> float | None:
-    """Relative standard deviation of distances from the camera, as reported."""
+    """Returns the reported relative standard deviation of distances from the camera."""
     far = (summary.get("lengths") or {}).get("along_view_sigma")
     return None if far is None or not np.isfinite(far) else float(far)
 
@@ -152,13 +154,14 @@ def _one_metre(share: float) -> str:
 def _card(
     title: str, rows: Sequence[tuple[str, str, str]], notes: Sequence[str]
 ) -> str:
-    """Rows are colour, name and value; the only one needs no name but the camera's."""
+    """Returns a card; rows are colour, name and value, and an empty name is not
+    shown."""
     lines = []
-    for color, name, value in rows[:_MOST_ROWS]:
+    for color, name, value in rows[:_MAX_ROWS]:
         dot = f'<i style="background: var(--{color})"></i>' if color else ""
         label = f"<span>{dot}{html.escape(name)}</span> " if name else ""
         lines.append(f"<li>{label}<strong>{html.escape(value)}</strong></li>")
-    if len(rows) > _MOST_ROWS:
-        lines.append(f"<li><span>and {len(rows) - _MOST_ROWS} more, below</span></li>")
+    if len(rows) > _MAX_ROWS:
+        lines.append(f"<li><span>and {len(rows) - _MAX_ROWS} more, below</span></li>")
     notes_ = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
     return f'<div class="card"><h2>{title}</h2><ul>{"".join(lines)}</ul>{notes_}</div>'

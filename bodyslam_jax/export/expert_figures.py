@@ -1,4 +1,4 @@
-"""The report's figures for experts: people, lengths, focal length."""
+"""Formats the report's figures for experts: people, lengths, focal length."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,7 +19,8 @@ def people_table(
     people: Sequence[statistics.PathStatistics],
     body: BodyModel,
 ) -> str:
-    """A column for each person who is present at all."""
+    """Returns an HTML table with a column for each person who is present in any
+    frame."""
     shown = [h for h, present in enumerate(result.present) if present.any()]
     columns = []
     for h in shown:
@@ -54,7 +55,8 @@ def people_table(
 
 
 def _not_measured(summary: Mapping[str, Any], h: int) -> str | None:
-    """Limbs with the share of frames in which they were not measured."""
+    """Returns the limbs with the share of frames in which they were not measured, as
+    text."""
     shares = _reported(summary, h).get("not_measured") or {}
     return ", ".join(f"{limb} {100 * x:.0f}" for limb, x in shares.items()) or None
 
@@ -70,7 +72,7 @@ def _reported(summary: Mapping[str, Any], h: int) -> Mapping[str, Any]:
 
 
 def lengths(result: Result, scale: Mapping[str, Any]) -> str:
-    """How well all lengths are known, and by what."""
+    """Returns HTML on the uncertainty of all lengths, and its origin."""
     sigma = scale.get("sigma")
     if sigma is None or not np.isfinite(sigma) or result.scale <= 0:
         return ""
@@ -89,7 +91,8 @@ def lengths(result: Result, scale: Mapping[str, Any]) -> str:
 
 
 def _cues(value: float, scale: Mapping[str, Any]) -> list[str]:
-    """Size by each cue alone and by the ground, relative to the estimate."""
+    """Returns text on the size by each cue alone and by the ground, relative to the
+    estimate."""
     found = []
     for cue, name in (
         ("from_motion", "people's motion"),
@@ -104,7 +107,7 @@ def _cues(value: float, scale: Mapping[str, Any]) -> list[str]:
 
 
 def focal_length(lens: Mapping[str, Any]) -> str:
-    """On a focal length that was guessed."""
+    """Returns HTML on a focal length that was guessed."""
     if not lens.get("guessed"):
         return ""
     guess, sigma = lens["guess_px"], lens.get("focal_sigma_px")

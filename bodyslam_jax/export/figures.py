@@ -1,4 +1,5 @@
-"""Figures of the report as SVG text whose colours follow the page, light or dark."""
+"""Draws the report's figures as SVG text whose colours follow the page, light or
+dark."""
 
 import html
 import io
@@ -18,10 +19,10 @@ from bodyslam_jax.diagnostics.statistics import PathStatistics
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
-# Colours that stand for CSS variables; replaced in the SVG text.
+# Placeholder colours, replaced by CSS variables in the SVG text.
 _INK, _GRID, _POINTS = "#010203", "#040506", "#070809"
-CAMERA = "#0a0b0c"
-_PEOPLE = (
+CAMERA_COLOUR = "#0a0b0c"
+_PERSON_COLOURS = (
     *("#0d0e0f", "#101112", "#131415", "#161718"),
     *("#191a1b", "#1c1d1e", "#1f2021", "#222324"),
 )
@@ -29,11 +30,11 @@ _VARIABLES = {
     _INK: "var(--ink-2)",
     _GRID: "var(--grid)",
     _POINTS: "var(--points)",
-    CAMERA: "var(--camera)",
-    **{color: f"var(--person-{i})" for i, color in enumerate(_PEOPLE)},
+    CAMERA_COLOUR: "var(--camera)",
+    **{color: f"var(--person-{i})" for i, color in enumerate(_PERSON_COLOURS)},
 }
-_WIDTH = 5.4
-"""Of figures, inches: half of a wide page, all of a phone's."""
+_WIDTH_IN = 5.4
+"""Width of figures: half of a wide page, all of a phone's."""
 _STYLE: Any = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -58,20 +59,20 @@ _STYLE: Any = {
 
 
 def person_variable(person: int) -> str:
-    """The name of the CSS variable that is a person's colour."""
-    return f"person-{person % len(_PEOPLE)}"
+    """Returns the name of the CSS variable for a person's colour."""
+    return f"person-{person % len(_PERSON_COLOURS)}"
 
 
 def person_color(person: int) -> str:
-    """The colour of a person in every figure."""
-    return _PEOPLE[person % len(_PEOPLE)]
+    """Returns the colour of a person in every figure."""
+    return _PERSON_COLOURS[person % len(_PERSON_COLOURS)]
 
 
 def trajectories(result: Result) -> tuple[str, str]:
-    """Camera and people from above and from the side, on a metric grid."""
+    """Draws camera and people from above and from the side, on a metric grid."""
     low, high = _extent(result)
     size = np.maximum(high - low, 0.5)
-    width = _WIDTH
+    width = _WIDTH_IN
     with matplotlib.rc_context(_STYLE):
         plan_height = float(np.clip(width * size[2] / size[0], 2.6, 6.0))
         plan = Figure((width, plan_height + 0.6), layout="constrained")
@@ -81,7 +82,7 @@ def trajectories(result: Result) -> tuple[str, str]:
         ax.set_xlabel("← x (left of the first camera), m")
         ax.set_ylabel("z (ahead of the first camera), m")
         _legend(ax, result)
-        ax.invert_xaxis()  # Seen from above, with z up the page, x runs to the left.
+        ax.invert_xaxis()  # From above, with z up the page, x points to the left.
         along = 0 if size[0] >= size[2] else 2
         side_height = float(np.clip(width * size[1] / size[along], 1.2, 5.0))
         side = Figure((width, side_height + 0.6), layout="constrained")
@@ -99,9 +100,9 @@ def over_time(
     curves: Mapping[str, tuple[np.ndarray, str]],
     ylabel: str,
 ) -> str:
-    """Curves `name -> (values, colour)` over time, from zero."""
+    """Draws curves `name -> (values, colour)` over time, from zero."""
     with matplotlib.rc_context(_STYLE):
-        figure = Figure((_WIDTH, 2.6), layout="constrained")
+        figure = Figure((_WIDTH_IN, 2.6), layout="constrained")
         ax = figure.add_subplot()
         for name, (values, color) in curves.items():
             ax.plot(times, values, color=color, label=name, linewidth=1.4)
@@ -120,15 +121,15 @@ def over_time(
 
 
 def costs(stages: Sequence[Mapping[str, Any]]) -> str:
-    """Cost before and after each stage, on a logarithmic axis."""
+    """Draws the cost before and after each stage, on a logarithmic axis."""
     with matplotlib.rc_context(_STYLE):
-        figure = Figure((_WIDTH, 0.8 + 0.45 * len(stages)), layout="constrained")
+        figure = Figure((_WIDTH_IN, 0.8 + 0.45 * len(stages)), layout="constrained")
         ax = figure.add_subplot()
         for row, stage in enumerate(stages):
             before, after = float(stage["cost_before"]), float(stage["cost_after"])
             ax.plot([before, after], [row, row], color=_GRID, linewidth=3)
             ax.plot(before, row, "o", color=_INK, fillstyle="none", markersize=7)
-            ax.plot(after, row, "o", color=CAMERA, markersize=7)
+            ax.plot(after, row, "o", color=CAMERA_COLOUR, markersize=7)
             ax.annotate(
                 f"{after:.4g}", (after, row), (0, 7), textcoords="offset points"
             )
@@ -145,15 +146,16 @@ def costs(stages: Sequence[Mapping[str, Any]]) -> str:
 def speeds(
     result: Result, camera: PathStatistics | None, people: Sequence[PathStatistics]
 ) -> str:
-    """Speed over the ground of people and of a camera that moves."""
-    curves = {} if camera is None else {"camera": (camera.speed, CAMERA)}
+    """Draws the horizontal speed of people and of a moving camera."""
+    curves = {} if camera is None else {"camera": (camera.speed, CAMERA_COLOUR)}
     for person, facts in enumerate(people):
         curves[f"person {person}"] = (facts.speed, person_color(person))
     return over_time(result.timestamps, curves, "speed, m/s")
 
 
 def _extent(result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """Box around camera and people with a margin, which contains heights 0 and 2 m."""
+    """Returns the box around camera and people, with a margin; it contains heights 0
+    and 2 m."""
     points = [
         result.T_WC[:, :3, 3],
         *(
@@ -180,8 +182,8 @@ def _paths(
     if b == 1:
         ax.axhline(0, color=_INK, linewidth=1)
         _stick_figures(ax, result, a)
-    ax.plot(*result.T_WC[:, axes, 3].T, color=CAMERA, label="camera")
-    ax.plot(*result.T_WC[0, axes, 3], "o", color=CAMERA, markersize=6)
+    ax.plot(*result.T_WC[:, axes, 3].T, color=CAMERA_COLOUR, label="camera")
+    ax.plot(*result.T_WC[0, axes, 3], "o", color=CAMERA_COLOUR, markersize=6)
     for person, (joints, present) in enumerate(
         zip(result.joints, result.present, strict=True)
     ):
@@ -233,14 +235,14 @@ def _stick_figures(ax: Axes, result: Result, along: int) -> None:
 
 
 def _view_directions(ax: Axes, result: Result, size: float) -> None:
-    """Arrows of the camera's viewing direction at several frames."""
+    """Draws arrows of the camera's viewing direction at several frames."""
     every = max(1, len(result.T_WC) // 12)
     T_WC = result.T_WC[::every]
     centre, ahead = T_WC[:, [0, 2], 3], T_WC[:, [0, 2], 2]
     ax.quiver(
         *centre.T,
         *(ahead * 0.06 * size).T,
-        color=CAMERA,
+        color=CAMERA_COLOUR,
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -259,7 +261,8 @@ def _legend(ax: Axes, result: Result) -> None:
 
 
 def labelled(svg: str, caption: str) -> str:
-    """A figure with its caption as label for screen readers, and with unique ids."""
+    """Returns a figure with its caption as label for screen readers, and with unique
+    ids."""
     mark = f"f{zlib.crc32(caption.encode()):x}-"
     svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{mark}", svg)
     name = html.escape(caption)

@@ -1,4 +1,4 @@
-"""The run folder: every file of the contract, all of them or none.
+"""Writes the run folder: every file of the contract, all of them or none.
 
 Files are written into a hidden folder inside the run folder and moved out together,
 `summary.json` last. A folder without `summary.json` is not a finished run.
@@ -19,15 +19,22 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 import yaml
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, files, write_body, write_tum
 from bodyslam_jax.types import Result
 
-_LAST = "summary.json"
-_OWN = ("result.npz", "camera.tum", "body_*.npz", "landmarks.ply", _LAST, "config.yaml")
-_OWN += ("report.html", "overlay.webm", "overlay.mp4", "scene.html")
+_SUMMARY_FILE = "summary.json"
+_RUN_FILES = (
+    "result.npz",
+    "camera.tum",
+    "body_*.npz",
+    "landmarks.ply",
+    _SUMMARY_FILE,
+    "config.yaml",
+)
+_RUN_FILES += ("report.html", "overlay.webm", "overlay.mp4", "scene.html")
 
 
 def check_folder(
@@ -35,7 +42,7 @@ def check_folder(
     source: dict[str, Any] | None = None,
     begun_for: dict[str, Any] | None = None,
 ) -> None:
-    """Fails early, before anything is computed, where a run could not be written.
+    """Checks, before anything is computed, that a run could be written to the folder.
 
     Args:
         source: the input of the run, with the keys of `input` in `summary.json`.
@@ -46,7 +53,7 @@ def check_folder(
     """
     owner = begun_for or _finished_for(folder)
     if owner is None:
-        theirs = sorted(file.name for p in _OWN for file in folder.glob(p))
+        theirs = sorted(file.name for p in _RUN_FILES for file in folder.glob(p))
         if theirs:
             raise InputError(
                 f"{folder}: has {', '.join(theirs[:3])}, but is not the folder of a "
@@ -60,13 +67,13 @@ def check_folder(
             "folder, or delete this one."
         )
     with _partial(folder) as partial:
-        (partial / _LAST).write_text("{}")
+        (partial / _SUMMARY_FILE).write_text("{}")
 
 
 def _finished_for(folder: Path) -> dict[str, Any] | None:
-    """The input of the finished run in a folder, `None` if there is none."""
+    """Returns the input of the finished run in a folder, `None` if there is none."""
     try:
-        found = files.read_json(folder / _LAST)["input"]
+        found = files.read_json(folder / _SUMMARY_FILE)["input"]
     except (InputError, LookupError, TypeError):
         return None
     return found if isinstance(found, dict) else None
@@ -74,41 +81,42 @@ def _finished_for(folder: Path) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def run_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder whose files are moved to `folder` when the block succeeds.
+    """Yields a hidden folder whose files are moved to `folder` when the block succeeds.
 
     Files of an earlier run are then removed, others (the stage cache) are kept. If the
-    block raises, what it wrote is deleted and `folder` is as it was.
+    block raises, what it wrote is deleted and `folder` is unchanged.
 
     **Raises:** `InputError` if the folder cannot be written or the disk is full.
     """
     with _partial(folder) as partial:
         yield partial
-        (folder / _LAST).unlink(missing_ok=True)
-        for pattern in _OWN:
+        (folder / _SUMMARY_FILE).unlink(missing_ok=True)
+        for pattern in _RUN_FILES:
             for old in folder.glob(pattern):
                 old.unlink()
-        written = sorted(partial.iterdir(), key=lambda file: file.name == _LAST)
+        written = sorted(partial.iterdir(), key=lambda file: file.name == _SUMMARY_FILE)
         for file in written:
             os.replace(file, folder / file.name)
 
 
 @contextlib.contextmanager
 def _partial(folder: Path) -> Iterator[Path]:
-    """A temporary hidden folder in `folder`; a created `folder` is removed if empty."""
+    """Yields a temporary hidden folder in `folder`; a created `folder` is removed if
+    empty."""
     try:
         with atomic.hidden_folder(folder) as partial:
             yield partial
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             reason = "the disk is full"
-        elif error.errno in _NOT_WRITABLE and str(folder) in str(error.filename):
+        elif error.errno in _NOT_WRITABLE_ERRNOS and str(folder) in str(error.filename):
             reason = f"cannot be written ({os.strerror(error.errno or 0)})"
         else:
             raise
         raise InputError(f"{folder}: {reason}; give a writable folder.") from error
 
 
-_NOT_WRITABLE = (
+_NOT_WRITABLE_ERRNOS = (
     errno.EACCES,
     errno.EPERM,
     errno.EROFS,
@@ -119,16 +127,17 @@ _NOT_WRITABLE = (
 
 
 def clear_run(folder: Path) -> None:
-    """Removes a run's files and stage results, `summary.json` first; keeps others."""
-    (folder / _LAST).unlink(missing_ok=True)
-    for pattern in _OWN:
+    """Removes a run's files and stage results, `summary.json` first; keeps other
+    files."""
+    (folder / _SUMMARY_FILE).unlink(missing_ok=True)
+    for pattern in _RUN_FILES:
         for file in folder.glob(pattern):
             file.unlink()
     shutil.rmtree(folder / ".cache", ignore_errors=True)
 
 
 def clear_partial(folder: Path) -> None:
-    """Removes files that killed processes left incomplete; the caller has the lock."""
+    """Removes incomplete files of killed processes; the caller must hold the lock."""
     for partial in folder.glob(".partial-*"):
         shutil.rmtree(partial, ignore_errors=True)
     for file in folder.glob(".cache/.*.partial*"):
@@ -138,7 +147,7 @@ def clear_partial(folder: Path) -> None:
 def write_run(folder: Path, result: Result, config: Any = None) -> None:
     """Writes the files of the contract that programs read; all or none.
 
-    `config` is the settings as resolved, a dataclass or a dictionary. To add report,
+    `config` are the resolved settings, a dataclass or a dictionary. To add report,
     overlay and scene, use `run_folder` and `write_files`.
     """
     with run_folder(folder) as partial:
@@ -146,7 +155,7 @@ def write_run(folder: Path, result: Result, config: Any = None) -> None:
 
 
 def write_files(folder: Path, result: Result, config: Any = None) -> None:
-    """`write_run` into an existing folder, file by file."""
+    """Writes the files of `write_run` into an existing folder, one by one."""
     arrays = {
         field.name: np.asarray(getattr(result, field.name))
         for field in dataclasses.fields(result)
@@ -171,7 +180,9 @@ def write_files(folder: Path, result: Result, config: Any = None) -> None:
         )
     write_points(folder / "landmarks.ply", result.landmarks)
     (folder / "config.yaml").write_text(to_yaml(config))
-    (folder / _LAST).write_text(json.dumps(plain(result.summary), indent=2) + "\n")
+    (folder / _SUMMARY_FILE).write_text(
+        json.dumps(plain(result.summary), indent=2) + "\n"
+    )
 
 
 def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:
@@ -186,15 +197,29 @@ def write_points(path: Path, points: Float[np.ndarray, "l 3"]) -> None:
     )
 
 
+def write_mesh(
+    path: Path, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> None:
+    """Writes one mesh, m; the suffix is `.glb`, `.obj`, `.ply` or `.stl`.
+
+    **Raises:** `InputError` for another suffix.
+    """
+    suffixes = (".glb", ".obj", ".ply", ".stl")
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: suffix {path.suffix!r}, not one of {suffixes}.")
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+
+
 def to_yaml(config: Any) -> str:
-    """Settings (dataclass or dictionary) as YAML."""
+    """Returns settings (dataclass or dictionary) as YAML."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         config = dataclasses.asdict(config)
     return yaml.safe_dump(plain(config or {}), sort_keys=False)
 
 
 def plain(value: Any) -> Any:
-    """The value in types of JSON and YAML: arrays as lists, paths as text, NaN null."""
+    """Converts a value to types of JSON and YAML: arrays to lists, paths to text, NaN
+    to null."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,10 +1,10 @@
-"""One run at a time writes a run folder.
+"""Locks a run folder, so that only one run at a time writes it.
 
 The lock is a file, `.lock`, that names the process which holds it. On one machine the
-operating system's lock on that file decides, so that a killed process holds nothing.
-On a file system shared by several machines such locks may be invisible to the others:
-there the holder touches the file every `RENEWED` seconds, and a file that does not
-change while another process watches it for `STALE` seconds is abandoned. Its date is
+operating system's lock on that file decides, so that a killed process holds nothing. On
+a file system shared by several machines such locks may be invisible to the others:
+there the holder touches the file every `RENEWAL_PERIOD_S`, and a file that does not
+change while another process watches it for `STALE_AFTER_S` is abandoned. Its date is
 not compared with any clock: clocks of machines and file servers differ, and a date can
 be in the future.
 """
@@ -26,39 +26,39 @@ from bodyslam_jax.config.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # Windows: the file's content and its changes decide
+except ImportError:  # Windows: content and changes of the file decide
     fcntl = None
 
 log = logging.getLogger(__name__)
-_NAME = ".lock"
-RENEWED = 10.0
-"""Period after which the holder touches the file, s."""
-STALE = 3 * RENEWED
-"""Time for which a file of another machine must not change to be abandoned, s."""
-_PAUSE = 0.5
-"""Between two looks at a file that may be abandoned, s."""
+_LOCK_FILE = ".lock"
+RENEWAL_PERIOD_S = 10.0
+"""Period after which the holder touches the file."""
+STALE_AFTER_S = 3 * RENEWAL_PERIOD_S
+"""Time after which an unchanged file of another machine is abandoned."""
+_POLL_PERIOD_S = 0.5
+"""Period at which a file that may be abandoned is checked."""
 _MAX_OWNER_BYTES = 4096
-"""Size of what is read of a lock file; a host name has at most 255 bytes."""
+"""Number of bytes of a lock file that are read; a host name has at most 255."""
 _UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL}
 
 
 class FolderInUse(InputError):
-    """Another process is writing the run folder."""
+    """Raised if another process is writing the run folder."""
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Holds the run folder for this process. A folder that was created for it and stays
-    empty is removed afterwards.
+    """Holds the run folder for this process. A folder that was created for this and
+    stays empty is removed afterwards.
 
-    A lock of a process on another machine is watched for `STALE` seconds first.
+    A lock of a process on another machine is watched for `STALE_AFTER_S` seconds first.
 
     **Raises:** `FolderInUse`, one line that names folder, process and machine, if
     another process holds it; `InputError` if `.lock` is no file.
     """
     existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / _NAME
+    path = folder / _LOCK_FILE
     file = _acquire(path)
     done = threading.Event()
     renewal = threading.Thread(target=_renew, args=(path, done), daemon=True)
@@ -76,7 +76,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _acquire(path: Path) -> int:
-    """The open lock file, with this process as its owner."""
+    """Returns the open lock file, with this process as its owner."""
     while True:
         file = _open(path, os.O_RDWR | os.O_CREAT)
         try:
@@ -104,7 +104,7 @@ def _acquire(path: Path) -> int:
 
 
 def _open(path: Path, flags: int) -> int:
-    """Opens a lock file; never what a link of this name points to."""
+    """Opens a lock file; a symbolic link of this name is not followed."""
     flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         file = os.open(path, flags, 0o666)
@@ -123,7 +123,8 @@ def _no_file(path: Path) -> InputError:
 
 
 def _lock(file: int) -> bool | None:
-    """Whether the system grants the lock; `None` if it does not support locks here."""
+    """Returns whether the system grants the lock; `None` if it does not support locks
+    here."""
     if fcntl is None:
         return None
     try:
@@ -134,7 +135,7 @@ def _lock(file: int) -> bool | None:
 
 
 def _is_still(path: Path, file: int) -> bool:
-    """Whether the path still refers to the open file."""
+    """Returns whether the path still refers to the open file."""
     try:
         on_disk, held = os.stat(path), os.fstat(file)
     except FileNotFoundError:
@@ -143,23 +144,24 @@ def _is_still(path: Path, file: int) -> bool:
 
 
 def _may_hold(owner: dict[str, Any], is_granted: bool | None) -> bool:
-    """Whether the process that a file names may hold it although the system reports no
-    lock."""
+    """Returns whether the process that a file names may hold it although the system
+    reports no lock."""
     if owner.get("host") != socket.gethostname():
         return True
     return is_granted is None and _is_alive(owner.get("pid"))
 
 
 def _changes(path: Path, file: int, owner: dict[str, Any]) -> bool:
-    """Whether a lock file changes, or goes, within `STALE` seconds."""
+    """Returns whether a lock file changes within `STALE_AFTER_S`; False if it is
+    removed."""
     log.info(
         "%s: %s held this run; waiting up to %.0f s to see whether it still does",
-        *(path.parent, _named(owner), STALE),
+        *(path.parent, _named(owner), STALE_AFTER_S),
     )
     first = _state(path)
-    until = time.monotonic() + STALE
+    until = time.monotonic() + STALE_AFTER_S
     while time.monotonic() < until:
-        time.sleep(min(_PAUSE, STALE / 4))
+        time.sleep(min(_POLL_PERIOD_S, STALE_AFTER_S / 4))
         if not _is_still(path, file):
             return False  # released: the caller opens its successor
         if _state(path) != first:
@@ -168,8 +170,10 @@ def _changes(path: Path, file: int, owner: dict[str, Any]) -> bool:
 
 
 def _state(path: Path) -> tuple[Any, ...] | None:
-    """What changes when a holder touches the file. It is opened anew, which makes
-    network file systems ask their server."""
+    """Returns the properties that change when a holder touches the file.
+
+    The file is opened anew, which makes network file systems query their server.
+    """
     try:
         file = _open(path, os.O_RDONLY)
     except OSError:
@@ -194,7 +198,7 @@ def _is_alive(pid: Any) -> bool:
 
 
 def _owner(file: int) -> dict[str, Any] | None:
-    """The process that a lock file names; `None` if it names none."""
+    """Returns the process that a lock file names; `None` if it names none."""
     try:
         found = json.loads(os.pread(file, _MAX_OWNER_BYTES, 0))
     except (OSError, ValueError, RecursionError):
@@ -210,13 +214,13 @@ def _held(path: Path, owner: dict[str, Any] | None) -> FolderInUse:
 
 
 def _named(owner: dict[str, Any]) -> str:
-    """A process in words; a file may name anything as one."""
+    """Returns a process as text; a file may contain anything instead of one."""
     pid, host = (str(owner.get(key))[:80] for key in ("pid", "host"))
     text = f"process {pid} on {host}"
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _renew(path: Path, done: threading.Event) -> None:
-    while not done.wait(RENEWED):
+    while not done.wait(RENEWAL_PERIOD_S):
         with contextlib.suppress(OSError):
             os.utime(path)

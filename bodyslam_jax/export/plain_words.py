@@ -1,9 +1,9 @@
-"""Reasons why a result is in doubt, in words that need no knowledge of the field."""
+"""Words the reasons to doubt a result without technical terms."""
 
 from collections.abc import Mapping
 from typing import Any
 
-_PERSON = {
+_PERSON_SENTENCES = {
     "standing_foot_speed": "The feet of {who} slide over the ground while they stand.",
     "gliding": "{Who} glides: the foot that should stand moves along.",
     "step_short_of_reach": "{Who} steps, but hardly advances.",
@@ -52,7 +52,7 @@ _PERSON = {
     "leg_in_image": "{Who} is too small in the video to be measured.",
     "speed_error": "{Who} is too far away, for too short a time, to be measured.",
 }
-_WHOLE = {
+_WHOLE_SENTENCES = {
     "floors_apart": "People stand at different heights, as if on different floors.",
     "up_against_trunks": "The ground is tilted against the people on it.",
     "up_in_image": "The scene is tilted against the images.",
@@ -83,13 +83,13 @@ _WHOLE = {
 
 
 def in_plain_words(reason: Mapping[str, Any], num_people: int = 1) -> str:
-    """A sentence on an entry of `reasons` in `summary.json`; its own message where
-    there is no plainer one."""
+    """Returns a sentence for an entry of `reasons` in `summary.json`; its own message
+    if there is no plainer one."""
     name = str(reason.get("name"))
-    if name in _WHOLE:
-        return _WHOLE[name]
-    if name not in _PERSON:
+    if name in _WHOLE_SENTENCES:
+        return _WHOLE_SENTENCES[name]
+    if name not in _PERSON_SENTENCES:
         return str(reason.get("message", name))
     number = reason.get("person")
     who = "the person" if number is None or num_people < 2 else f"person {number}"
-    return _PERSON[name].format(who=who, Who=who[0].upper() + who[1:])
+    return _PERSON_SENTENCES[name].format(who=who, Who=who[0].upper() + who[1:])

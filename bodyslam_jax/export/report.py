@@ -1,4 +1,5 @@
-"""The report: one HTML file that opens offline, beside the overlay and the scene."""
+"""Writes the report: one HTML file that opens offline, beside the overlay and the
+scene."""
 
 import base64
 import html
@@ -28,16 +29,17 @@ from bodyslam_jax.types import Result
 def write_report(
     path: Path, result: Result, body: BodyModel, still: bytes | None = None
 ) -> None:
-    """Writes the report of a result: no network, no script, light or dark.
+    """Writes the report of a result: without network or scripts, light or dark.
 
-    Distances and speeds are computed from the result, all else comes from
-    `result.summary` (keys as written by `summary.summarise`); parts that it lacks are
-    left out. The optional key `errors` maps a name of what was evaluated ("cameras
-    alone, arbitrary scale", "joint estimate, in metres") to its errors by the names of
-    `evaluation`; a text in place of a number tells why there is no number.
+    Distances and speeds are computed from the result, everything else is taken from
+    `result.summary` (keys as written by `summary.summarise`); missing parts are left
+    out. The optional key `errors` maps the name of what was evaluated ("cameras alone,
+    arbitrary scale", "joint estimate, in metres") to its errors by the names of
+    `evaluation`; text in place of a number gives the reason for which there is no
+    number.
 
-    Overlay and scene are shown if they lie in the folder of `path`. `still` is one
-    frame of the overlay (JPEG), which is part of the report itself.
+    Overlay and scene are shown if they are in the folder of `path`. `still` is one
+    frame of the overlay (JPEG), which is embedded in the report.
     """
     summary = plain(result.summary)
     camera = camera_statistics(result)
@@ -66,8 +68,9 @@ def write_report(
     )
 
 
-_HARDLY_KNOWN = 0.1
-"""Relative standard deviation of distances that is named beside the status."""
+_MIN_SHOWN_DISTANCE_SIGMA = 0.1
+"""Relative standard deviation of distances from which it is printed beside the
+status."""
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -93,11 +96,11 @@ _PAGE = """<!doctype html>
 
 
 def _status(status: str, along: float | None) -> str:
-    """The badge beside the title; `along` is the relative standard deviation of
+    """Returns the badge beside the title; `along` is the relative standard deviation of
     distances from the camera."""
     good = status == "ok"
     text = "plausible" if good else html.escape(status)
-    if good and along is not None and along > _HARDLY_KNOWN:
+    if good and along is not None and along > _MIN_SHOWN_DISTANCE_SIGMA:
         text += f", distances ± {100 * along:.0f} %"
     return f'<span class="badge {"good" if good else "bad"}">{text}</span>'
 
@@ -120,7 +123,7 @@ def _warnings(warnings: Sequence[str]) -> str:
 
 
 def _in_short(summary: Mapping[str, Any], num_people: int) -> str:
-    """What is in doubt, in a line or two; what to do follows further down."""
+    """Returns a line or two on what is in doubt; advice follows further down."""
     reasons = summary.get("reasons") or []
     if not reasons:
         return ""
@@ -134,13 +137,13 @@ def _in_short(summary: Mapping[str, Any], num_people: int) -> str:
 
 
 def _overlay(folder: Path) -> str | None:
-    """The name of the video with the bodies in it, if the folder has one."""
+    """Returns the name of the overlay video, if the folder has one."""
     names = ("overlay.webm", "overlay.mp4")
     return next((name for name in names if (folder / name).exists()), None)
 
 
 def _where(reason: Mapping[str, Any], overlay: str | None) -> str:
-    """The frames to look at, as a link to their time in the overlay."""
+    """Returns the frames to look at, as a link to their time in the overlay."""
     frames, seconds = reason.get("frames"), reason.get("seconds")
     if not frames:
         return ""
@@ -154,8 +157,8 @@ def _where(reason: Mapping[str, Any], overlay: str | None) -> str:
 
 
 def _reasons(summary: Mapping[str, Any], num_people: int, overlay: str | None) -> str:
-    """Each reason to doubt the result, with its figure, the frames to look at, and what
-    to do about it."""
+    """Returns each reason to doubt the result, with its figure, the frames to look at,
+    and advice."""
     items = "".join(
         f"<li><strong>{html.escape(in_plain_words(reason, num_people))}</strong> "
         f"{_where(reason, overlay)}"
@@ -173,7 +176,8 @@ def _reasons(summary: Mapping[str, Any], num_people: int, overlay: str | None) -
 
 
 def _pictures(folder: Path, still: bytes | None) -> str:
-    """The overlay and the scene of the run, and where they open on their own."""
+    """Returns the overlay and the scene of the run, and links that open them
+    separately."""
     picture = ""
     if still is not None:
         picture = "data:image/jpeg;base64," + base64.b64encode(still).decode()
@@ -217,7 +221,7 @@ def _plots(
     camera: PathStatistics,
     people: Sequence[PathStatistics],
 ) -> str:
-    """Paths from above and from the side, and speeds."""
+    """Returns the paths from above and from the side, and the speeds."""
     above, side = figures.trajectories(result)
     beside = _figure(
         side, "From the side. The floor is at the height of standing feet."
@@ -277,7 +281,7 @@ _CURVES = (
 def _per_frame(result: Result, per_frame: Mapping[str, Sequence[Any]]) -> str:
     drawn = []
     for title, ylabel, names, caption in _CURVES:
-        colors = (figures.CAMERA, figures.person_color(0))
+        colors = (figures.CAMERA_COLOUR, figures.person_color(0))
         curves = {
             label: (np.array(per_frame[key], float), color)
             for (key, label), color in zip(names.items(), colors, strict=True)
@@ -296,7 +300,7 @@ def _details(
     people: Sequence[PathStatistics],
     body: BodyModel,
 ) -> str:
-    """What only experts need, folded away but for errors against a truth."""
+    """Returns the details for experts, folded except for errors against a truth."""
     labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     lens = [
         (label, round(float(value), 5))
@@ -323,7 +327,8 @@ def _details(
 
 
 def _own(summary: Mapping[str, Any]) -> str:
-    """Variables and factors that the joint problem was given from Python."""
+    """Returns the variables and factors that were added to the joint problem from
+    Python."""
     own = summary.get("own") or {}
     variables = [
         (name if len(row["value"]) == 1 else f"{name}[{i}]", *numbers)
@@ -345,7 +350,7 @@ def _own(summary: Mapping[str, Any]) -> str:
 
 
 def _given(summary: Mapping[str, Any]) -> str:
-    """Facts that were given, each with the estimate that was made without it."""
+    """Returns the given facts, each with the estimate that was made without it."""
     rows = [
         [
             str(fact.get("name", "")).removeprefix("given_").replace("_", " ")
@@ -361,7 +366,8 @@ def _given(summary: Mapping[str, Any]) -> str:
 
 
 def _scale_table(result: Result, scale: Mapping[str, Any]) -> str:
-    """The scale of the map and its cues, m per unit of the map before scaling."""
+    """Returns the scale of the map and its cues, m per unit of the map before
+    scaling."""
     rows = [("estimate", result.scale, scale.get("sigma"))]
     for cue, name in (
         ("from_motion", "people's motion alone"),

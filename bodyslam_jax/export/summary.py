@@ -1,4 +1,4 @@
-"""`summary.json`: headline, verdict, inputs, figures, settings, versions of a run."""
+"""Composes `summary.json`: headline, verdict, inputs, figures, settings, versions."""
 
 import dataclasses
 import importlib.metadata
@@ -30,7 +30,8 @@ def summarise(
     verdict: Verdict,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """The content of `summary.json`; `seconds` are the durations of the stages."""
+    """Returns the content of `summary.json`; `seconds` are the durations of the
+    stages."""
     lens = focal_length(sequence, cameras)
     within = cameras.within
     return {
@@ -73,14 +74,14 @@ def summarise(
                 verdict.people, verdict.accuracy.people, strict=True
             )
         ],
-        # The first and the last.
+        # First and last.
         "frames_used": np.flatnonzero(within)[[0, -1]].tolist(),
         "counts": {
             "landmarks": len(result.landmarks),
             "observations": int(cameras.keep.sum()),
             "people": len(verdict.people),
         },
-        # Without bundle adjustment it is a setting, not a measurement.
+        # Without bundle adjustment the value is a setting, not a measurement.
         "pixel_sigma": cameras.pixel_sigma if cameras.kind == "moving" else None,
         "per_frame": verdict.per_frame,
         "stages": list(joint.stages),
@@ -92,7 +93,7 @@ def summarise(
 
 
 def describe(sequence: Sequence) -> dict[str, Any]:
-    """The properties by which an input is recognised as the same one."""
+    """Returns the properties by which two inputs are recognised as the same."""
     return {
         "name": sequence.name,
         "frames": sequence.num_frames,
@@ -112,7 +113,7 @@ def _own_variable(variable: OwnVariable) -> dict[str, Any]:
 
 
 def focal_length(sequence: Sequence, cameras: SfmResult) -> dict[str, Any]:
-    """The focal length used and its origin, px.
+    """Returns the focal length that was used, px, and its origin.
 
     `focal_sigma_px` is `None` unless a guess could be refined.
     """
@@ -127,7 +128,7 @@ def focal_length(sequence: Sequence, cameras: SfmResult) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that results depend on."""
+    """Returns the versions of the packages that results depend on."""
     names = ("bodyslam-jax", "jax", "optimistix", "numpy", "opencv-python-headless")
     return {name: importlib.metadata.version(name) for name in names}
 
@@ -139,7 +140,7 @@ def _headline(
     verdict: Verdict,
     lens: dict[str, Any],
 ) -> list[str]:
-    """A line each for status, camera, people, and a guessed focal length."""
+    """Returns a line each for status, camera, people, and a guessed focal length."""
     way = verdict.camera
     known = _length_error(verdict.scale_sigma / result.scale, cameras)
     lines = [
@@ -163,7 +164,7 @@ def _headline(
 
 
 def _in_a_line(person: PersonVerdict, sure: PersonAccuracy) -> str:
-    """Way, speed and stature, and whether they can be trusted."""
+    """Returns text on distance, speed, stature and status of a person."""
     if person.status == "not_measurable":
         return (
             f"too small or too far away to be measured ({person.frames} frames, legs "
@@ -173,14 +174,14 @@ def _in_a_line(person: PersonVerdict, sure: PersonAccuracy) -> str:
     plus_minus = "" if sigma is None or np.isnan(sigma) else f" ± {100 * sigma:.0f}"
     tall = f"{100 * (person.stature or 0.0):.0f}{plus_minus}"
     way = f"{person.path.distance:.2f} m at {person.path.mean_speed:.2f} m/s"
-    # Of a way whose size is that of all lengths it has been said.
+    # The camera's line states the uncertainty that all lengths share.
     if sure.speed > 1.5 * sure.across:
         way += f" ± {100 * sure.speed:.0f} %"
     return f"{way}, {tall} cm tall ({person.status})"
 
 
 def _length_error(relative: float, cameras: SfmResult) -> str:
-    """The relative standard error of a length, to be appended to it."""
+    """Returns the relative standard error of a length, as text to append to it."""
     if cameras.kind != "moving" or np.isnan(relative):
         return ""
     if relative >= 1:
@@ -189,7 +190,7 @@ def _length_error(relative: float, cameras: SfmResult) -> str:
 
 
 def _lengths(found: Accuracy) -> dict[str, float | None]:
-    """Relative standard deviations of lengths by what they depend on."""
+    """Returns the relative standard deviations of lengths by what they depend on."""
     known = lambda x: float(x) if np.isfinite(x) else None
     return {
         "across_view_sigma": known(found.across),
@@ -199,7 +200,8 @@ def _lengths(found: Accuracy) -> dict[str, float | None]:
 
 
 def _up(up: Upright, found: Accuracy) -> dict[str, float | None]:
-    """How sure the vertical is, its angle to trunks and edges, the ground's slope."""
+    """Returns the uncertainty of the vertical, its angles to trunks and edges, and the
+    slope of the ground."""
     angles = {
         "sigma_degrees": found.up,
         "from_trunks_degrees": up.trunks,
@@ -232,7 +234,7 @@ def _person(person: PersonVerdict, sure: PersonAccuracy) -> dict[str, Any]:
 
 
 def _cues(start: ScaleStart) -> dict[str, list[float] | None]:
-    """Scale and standard error by each cue alone; `None` for a cue that is missing."""
+    """Returns scale and standard error by each cue alone; `None` for a missing cue."""
     cues = {
         "from_motion": [start.motion, start.motion_error],
         "from_ground": [start.ground, start.ground_error],

@@ -1,4 +1,4 @@
-"""Tables of the report, as HTML."""
+"""Formats tables of the report as HTML."""
 
 import html
 import math
@@ -9,11 +9,11 @@ from bodyslam_jax import evaluation
 
 
 def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Errors against the truth, one column per estimate that was evaluated."""
+    """Returns the errors against the truth, with one column per evaluated estimate."""
     if not errors:
         return ""
-    first = [row for row in evaluation.ROWS if row[0] in _FIRST]
-    others = [row for row in evaluation.ROWS if row[0] not in _FIRST]
+    first = [row for row in evaluation.ROWS if row[0] in _MAIN_ERRORS]
+    others = [row for row in evaluation.ROWS if row[0] not in _MAIN_ERRORS]
     return (
         "<section><h2>Error against the truth</h2>"
         "<p>Means over all frames. SE(3) alignment keeps the estimated size; Sim(3) "
@@ -23,8 +23,8 @@ def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
     )
 
 
-_FIRST = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe")
-_FIRST += ("wa_mpjpe", "pa_mpjpe", "rte")
+_MAIN_ERRORS = ("c_ate_se3", "c_ate_sim3", "h_ate_se3", "j_ate_se3", "scale", "w_mpjpe")
+_MAIN_ERRORS += ("wa_mpjpe", "pa_mpjpe", "rte")
 
 
 def _error_table(
@@ -46,7 +46,7 @@ def _error_table(
 
 
 def _error(value: Any, factor: float) -> str:
-    """A number, or a dash with the reason why there is none."""
+    """Returns a number, or a dash with the reason for which there is none."""
     why = f" <small>{html.escape(value)}</small>" if isinstance(value, str) else ""
     return number(value, factor) + why
 

@@ -1,15 +1,15 @@
-"""Simulated scenes, exact or with noise: for tests, demo, notebooks and benchmarks."""
+"""Simulates scenes, exact or with noise, for tests, demo, notebooks and benchmarks."""
 
 from bodyslam_jax.config import Simulation as Simulation
-from bodyslam_jax.simulation.as_types import as_sequence as as_sequence
-from bodyslam_jax.simulation.as_types import as_truth as as_truth
 from bodyslam_jax.simulation.exact_scene import Scene as Scene
 from bodyslam_jax.simulation.exact_scene import look_at as look_at
 from bodyslam_jax.simulation.exact_scene import scene as scene
 from bodyslam_jax.simulation.exact_scene import walk as walk
-from bodyslam_jax.simulation.film import render as render
+from bodyslam_jax.simulation.renderer import render as render
 from bodyslam_jax.simulation.sequences import LENGTH as LENGTH
 from bodyslam_jax.simulation.sequences import SimulatedSequence as SimulatedSequence
+from bodyslam_jax.simulation.sequences import as_sequence as as_sequence
+from bodyslam_jax.simulation.sequences import as_truth as as_truth
 from bodyslam_jax.simulation.sequences import simulate as simulate
 from bodyslam_jax.simulation.writing import check_folder as check_folder
 from bodyslam_jax.simulation.writing import demo_scene as demo_scene

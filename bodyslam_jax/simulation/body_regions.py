@@ -23,7 +23,7 @@ from bodyslam_jax.simulation.posing import Person
 
 
 class Head:
-    """Landmarks of a head of any shape at rest, m."""
+    """Landmarks of the head of one person at rest, m."""
 
     def __init__(self, person: Person):
         at = lambda name: person.skin[person.picks[SURFACE_POINTS.index(name)]]
@@ -37,18 +37,18 @@ class Head:
         self.level = self.eyes[:, 1].mean()
 
     def heights(self, p: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-        """Heights above the eyes, in multiples of `unit`."""
+        """Returns heights above the eyes, in multiples of `unit`."""
         return (p[:, 1] - self.level) / self.unit
 
     def azimuth(self, p: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-        """Azimuth about the head's vertical axis, degrees: 0 in front, 90 at the ears,
-        180 at the back; left and right alike."""
+        """Returns the unsigned azimuth about the head's vertical axis, degrees: 0 in
+        front, 90 at the ears, 180 at the back."""
         return np.degrees(np.arctan2(abs(p[:, 0]), p[:, 2] - self.ears[2]))
 
 
 def parts_of(person: Person, outfit: Outfit) -> Int[np.ndarray, " v"]:
-    """Index into `PARTS` of each vertex, from the joint with the largest skinning
-    weight and the position at rest."""
+    """Returns the index into `PARTS` of each vertex, from the joint with the largest
+    skinning weight and the position at rest."""
     p, rest = person.skin, person.rest
     joint = person.weights.argmax(axis=1)
     part = np.full(len(p), SKIN)

@@ -1,4 +1,4 @@
-"""Paths of people on the floor, and of a hand-held camera that films them.
+"""Generates paths of people on the floor, and of a hand-held camera that films them.
 
 World: y up, floor at y = 0, metres; paths on the floor are (x, z).
 """
@@ -16,7 +16,7 @@ from bodyslam_jax.simulation.exact_scene import look_at
 
 @dataclasses.dataclass(frozen=True)
 class Handling:
-    """Motion of a hand-held camera: easy, medium or difficult."""
+    """Parameters of the motion of a hand-held camera: easy, medium or difficult."""
 
     radius: tuple[float, float]
     """RMS distance of the camera from its mean position in a room, m."""
@@ -29,9 +29,9 @@ class Handling:
     tremble: float
     """RMS of fast rotation, rad per axis."""
     swing: float
-    """RMS change of the side from which a person is followed, rad."""
+    """RMS change of the direction from which a person is followed, rad."""
     track_life: float
-    """Mean time that a point is followed, frames: fast images lose points sooner."""
+    """Mean duration of a track, frames: fast motion ends tracks sooner."""
 
 
 HANDLING = {
@@ -44,7 +44,8 @@ HANDLING = {
 def smooth_noise(
     rng: np.random.Generator, num_frames: int, seconds: float, width: int = 1
 ) -> Float[np.ndarray, "t {width}"]:
-    """Gaussian noise of standard deviation 1 that varies within about `seconds`."""
+    """Returns Gaussian noise of standard deviation 1 that varies within about
+    `seconds`."""
     sigma = seconds * FPS
     pad = int(4 * sigma) + 1
     x = gaussian_filter1d(rng.standard_normal((num_frames + 2 * pad, width)), sigma, 0)
@@ -54,11 +55,12 @@ def smooth_noise(
 def floor_path(
     family: str, around: bool, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "2"]]:
-    """A closed path to walk on, and the place of a camera that stays in a room.
+    """Returns a closed path to walk on, and the place of a camera that stays in a room
+    (m).
 
     In a room the path is a loop in front of the camera at 2.5 to 6 m, or with `around`
-    a larger one around it; to be followed, it is 70 m long. Turned and run through at
-    random.
+    a larger one around it; a path to be followed is 70 m long. Orientation and
+    direction are random.
     """
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     angle = angle * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
@@ -87,7 +89,8 @@ def film_room(
     handling: Handling,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "t 4 4"]:
-    """A camera that stays near `place` and turns to watch the `person`."""
+    """Returns the poses (camera to world) of a camera that stays near `place` and turns
+    towards the `person`."""
     t = len(person)
     radius = rng.uniform(*handling.radius)
     drift = smooth_noise(rng, t, radius / (np.sqrt(2) * handling.speed), 3)
@@ -100,7 +103,8 @@ def film_room(
 def film_following(
     person: Float[np.ndarray, "t 3"], handling: Handling, rng: np.random.Generator
 ) -> Float[np.ndarray, "t 4 4"]:
-    """A camera that goes along, behind or beside, at 3 to 4.5 m."""
+    """Returns the poses (camera to world) of a camera that follows the `person`, behind
+    or beside, at 3 to 4.5 m."""
     t = len(person)
     smooth = gaussian_filter1d(person, 0.6 * FPS, axis=0, mode="nearest")
     heading = np.gradient(gaussian_filter1d(smooth, 1.2 * FPS, axis=0), axis=0)
@@ -126,7 +130,8 @@ def _in_hand(
     handling: Handling,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "t 4 4"]:
-    """Camera poses aimed at the person with delay, offset and tremor, as of a hand."""
+    """Returns camera poses aimed at the person with the delay, offset and tremor of a
+    hand."""
     t = len(person)
     late = np.concatenate([np.repeat(person[:1], 4, axis=0), person])[:t]
     target = gaussian_filter1d(late, 0.25 * FPS, axis=0, mode="nearest")

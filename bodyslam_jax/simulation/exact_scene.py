@@ -1,7 +1,7 @@
-"""Small exact scenes in plain arrays, for tests and benchmarks of the graph.
+"""Generates small exact scenes as plain arrays, for tests and benchmarks of the graph.
 
-Without files and images: a hand-held camera moves beside a walking body and observes
-static landmarks. World: y up, floor at y = 0, metres.
+No files or images are involved: a hand-held camera moves beside a walking body and
+observes static landmarks. World: y up, floor at y = 0, metres.
 """
 
 import dataclasses
@@ -21,15 +21,15 @@ class Scene:
     size: tuple[int, int]
     """Image width and height, px."""
     timestamps: Float[np.ndarray, " t"]
-    """s"""
+    """Times of the frames, s."""
     T_WC: Float[np.ndarray, "t 4 4"]
     """Camera to world, m."""
     landmarks: Float[np.ndarray, "l 3"]
-    """m, world."""
+    """Positions of the landmarks, m, world frame."""
     frame: Int[np.ndarray, " m"]
     landmark: Int[np.ndarray, " m"]
     uv: Float[np.ndarray, "m 2"]
-    """px; exact unless noise was asked for. Sorted by frame."""
+    """Observations, px, sorted by frame; exact unless noise was requested."""
     T_WH: Float[np.ndarray, "t 4 4"]
     """Body root to world; the translation is the pelvis joint, m."""
     body_pose: Float[np.ndarray, "t 23 3"]
@@ -52,9 +52,9 @@ def scene(
     noise: float = 0.0,
     outliers: float = 0.0,
 ) -> Scene:
-    """A scene of `num_frames` at 30 fps in which every landmark is observed.
+    """Returns a scene of `num_frames` at 30 fps in which every landmark is observed.
 
-    Landmarks are born in the image of a random frame, at 2 to 8 m, and stay in view
+    Landmarks are created in the image of a random frame, at 2 to 8 m, and stay in view
     for `track_length` frames on average (fewer where they leave the image). `noise` is
     the standard deviation of the observations (px), `outliers` the share of them that
     is replaced by a uniform pixel. Every landmark has at least two observations if
@@ -101,10 +101,11 @@ def scene(
 def walk(
     timestamps: Float[np.ndarray, " t"], phase: float = 0.0
 ) -> tuple[Float[np.ndarray, "t 4 4"], Float[np.ndarray, "t 23 3"]]:
-    """A schematic gait: `T_WH` and body pose of someone who walks 1.2 m/s along z.
+    """Returns a schematic gait: `T_WH` and body pose of a person who walks 1.2 m/s
+    along z.
 
-    Hips, knees, ankles, shoulders and elbows swing as sines with one period of 1.1 s,
-    which is enough where only smooth, person-like numbers are needed.
+    Hips, knees, ankles, shoulders and elbows follow sines with one period of 1.1 s,
+    which is enough where only smooth motion of human magnitude is needed.
     """
     a = 2 * np.pi * timestamps / 1.1 + phase
     zero = np.zeros_like(a)
@@ -129,7 +130,8 @@ def walk(
 def look_at(
     eye: Float[np.ndarray, "t 3"], target: Float[np.ndarray, "t 3"]
 ) -> Float[np.ndarray, "t 4 4"]:
-    """`T_WC` of upright cameras at `eye` whose optical axis goes through `target`."""
+    """Returns `T_WC` of upright cameras at `eye` whose optical axis passes through
+    `target`."""
     z = target - eye
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
     x = np.cross(z, [0.0, 1.0, 0.0])
@@ -145,7 +147,8 @@ def _beside(
     person: Float[np.ndarray, "t 3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "t 4 4"]:
-    """A camera that goes along at 4 m, swaying by decimetres and degrees."""
+    """Returns a camera path beside the person, at 4 m, swaying by decimetres and
+    degrees."""
     waves = rng.uniform((0.2, 0, 0.5), (0.9, 2 * np.pi, 1.0), (6, 3))
     sway = np.stack(
         [a * np.sin(2 * np.pi * f * timestamps + p) for f, p, a in waves], axis=1

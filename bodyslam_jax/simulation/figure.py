@@ -1,6 +1,7 @@
-"""A dressed person: the body's mesh with clothes, hair, shoes and colours.
+"""Dresses a person: the body's mesh with clothes, hair, shoes and colours.
 
-Cloth stands off the skin and bridges its hollows; colours are drawn by part.
+Cloth stands off the skin and bridges its hollows; colours are drawn at random for each
+part.
 """
 
 import copy
@@ -35,20 +36,20 @@ from bodyslam_jax.simulation.outfit import (
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.raster import Hits, vertex_normals
 
-_TONES = np.array(
+_SKIN_TONES = np.array(
     [
         *((176, 202, 236), (150, 183, 224), (118, 158, 206), (92, 130, 181)),
         *((66, 99, 146), (48, 70, 108), (38, 52, 80)),
     ],
     float,
 )
-"""Skin, BGR, from light to dark."""
-_HAIRS = np.array(
+"""Skin colours, BGR, from light to dark."""
+_HAIR_COLOURS = np.array(
     [(18, 20, 24), (24, 34, 52), (40, 66, 104), (90, 150, 190), (120, 125, 130)], float
 )
-"""Hair, BGR: black, dark and light brown, fair, grey."""
-_FOLD = 0.008
-"""Size of a cell of the noise that folds are made of, m."""
+"""Hair colours, BGR: black, dark and light brown, fair, grey."""
+_FOLD_CELL_M = 0.008
+"""Cell size of the noise that models folds of cloth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,18 +62,18 @@ class Figure:
     part: Int[np.ndarray, " v"]
     """Index into `PARTS` of each vertex."""
     colours: Float[np.ndarray, "v 3"]
-    """BGR under a light of strength 1."""
+    """Colour of each vertex, BGR, under a light of intensity 1."""
     second: Float[np.ndarray, "3"]
-    """Factor on the shirt's colour where its pattern is."""
+    """Factor on the shirt's colour inside its pattern."""
     folds: Float[np.ndarray, "n n n"]
     """Unevenness of cloth in space, about ±1, repeated every `n` cells."""
 
     def albedo(
         self, hits: Hits, size: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "p 3"]:
-        """BGR under a light of strength 1 at the hits.
+        """Returns the colour (BGR) at the hits under a light of intensity 1.
 
-        `size` is that of a pixel on the surface, m; detail smaller than it is left out.
+        `size` is that of a pixel on the surface, m; smaller detail is left out.
         """
         corners = self.person.faces[hits.face]
         mean = lambda x: (x[corners] * hits.weights[..., None]).sum(axis=1)
@@ -84,12 +85,12 @@ class Figure:
         pattern = 0.5 + sharp * (self._pattern(place) - 0.5)
         if self.outfit.pattern != "plain":
             colour = colour * (1 + (self.second - 1) * (pattern * shirt)[:, None])
-        cell = np.floor(place / _FOLD).astype(int) % len(self.folds)
+        cell = np.floor(place / _FOLD_CELL_M).astype(int) % len(self.folds)
         uneven = self.folds[cell[:, 0], cell[:, 1], cell[:, 2]]
         return colour * (1 + (0.03 + 0.13 * cloth) * uneven)[:, None]
 
     def _pattern(self, place: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
-        """1 where the shirt has its second colour, else 0."""
+        """Returns 1 where the shirt has its second colour, else 0."""
         x, y, z = place.T
         odd = lambda value, step: np.floor(value / step) % 2
         if self.outfit.pattern == "stripes":
@@ -135,7 +136,7 @@ def dress(
 def clothed_skin(
     person: Person, outfit: Outfit, part: Int[np.ndarray, " v"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Vertices of the outer surface: cloth, shoes, hair and bare skin, m.
+    """Returns the vertices of the outer surface: cloth, shoes, hair and bare skin, m.
 
     Cloth is the skin smoothed, so that it bridges hollows, and displaced along its
     normals; soles stay on the floor.
@@ -170,7 +171,8 @@ def clothed_skin(
 
 
 def smoother(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_matrix:
-    """Averages over neighbours along the edges of a mesh."""
+    """Returns the matrix that averages values over neighbours along the edges of a
+    mesh."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.sort(edges.astype(np.int64), axis=1), axis=0)
     i, j = np.concatenate([edges, edges[:, ::-1]]).T
@@ -183,8 +185,9 @@ def smoother(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_matrix:
 def vertex_colours(
     person: Person, outfit: Outfit, part: np.ndarray, rng: np.random.Generator
 ) -> Float[np.ndarray, "v 3"]:
-    """BGR of each vertex, by part and with some unevenness of skin and cloth."""
-    tone = _TONES[rng.integers(len(_TONES))] * rng.uniform(0.93, 1.07, 3)
+    """Returns the colour (BGR) of each vertex, by part, with some variation of skin and
+    cloth."""
+    tone = _SKIN_TONES[rng.integers(len(_SKIN_TONES))] * rng.uniform(0.93, 1.07, 3)
     cloth = lambda low, high, spread: np.clip(
         rng.uniform(low, high) + rng.uniform(-spread, spread, 3), 12, 235
     )
@@ -194,7 +197,7 @@ def vertex_colours(
     palette[TROUSERS] = cloth(28, 130, 28)
     palette[SHOES] = cloth(20, 150, 25)
     palette[SOLE] = rng.choice([25.0, 190.0])
-    hair = _HAIRS[rng.integers(len(_HAIRS) if tone[2] > 150 else 2)]
+    hair = _HAIR_COLOURS[rng.integers(len(_HAIR_COLOURS) if tone[2] > 150 else 2)]
     palette[HAIR] = hair * rng.uniform(0.8, 1.2)
     palette[EYE] = (215, 218, 220)
     palette[IRIS] = (35, 38, 42)

@@ -1,10 +1,10 @@
-"""Long walks from short recordings: captured steps, joined and bent along a path.
+"""Synthesises long walks from short recordings that are joined and bent along a path.
 
 Trials are joined where their body poses and velocities agree (same phase of the gait)
 and blended over a third of a second; the body is turned slightly in every frame to
-follow a path. So that feet do not slide, the pelvis is not blended but follows from the
+follow a path. To prevent foot sliding, the pelvis is not blended but computed from the
 feet: the point of the soles in contact with the floor moves exactly as in the
-recording. World: y up, floor at y = 0.
+recording. World: y up, floor at y = 0, metres.
 """
 
 import dataclasses
@@ -20,12 +20,12 @@ from bodyslam_jax.motion import FPS, Clip, resample
 from bodyslam_jax.motion.capture.clips import leg_length, mirror
 from bodyslam_jax.simulation.posing import Person
 
-_BLEND = 10
-"""Frames over which two trials are blended."""
-_PLAYED = 18
-"""Frames of a trial that are played between two blends at least."""
+_BLEND_FRAMES = 10
+"""Duration of the blend of two trials."""
+_MIN_PLAYED_FRAMES = 18
+"""Duration of a trial between two blends at least."""
 _MAX_CLIPS = 40
-_LOOK_AHEAD = 1.2
+_LOOK_AHEAD_M = 1.2
 """Distance of the target point ahead on the path, m."""
 
 
@@ -34,13 +34,14 @@ class Walk:
     """A person's motion over `t` frames at 30 fps."""
 
     poses: Float[np.ndarray, "t 24 3"]
-    """Axis-angle, rad; row 0 takes H to the world."""
+    """Axis-angle, rad; row 0 rotates H to the world."""
     pelvis: Float[np.ndarray, "t 3"]
     """Pelvis joint in the world, m."""
 
 
 def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
-    """The walking trials among `clips` at 30 fps, of validation subjects if any is.
+    """Returns the walking trials among `clips` at 30 fps, those of validation subjects
+    if there are any.
 
     **Raises:** `InputError`, naming `source`, if none is long enough to be joined.
     """
@@ -49,7 +50,7 @@ def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
         for c in clips
         if c.motion == "walk"
         and c.phase == 0
-        and len(c.poses) / c.fps * FPS > 2 * _BLEND + _PLAYED + 4
+        and len(c.poses) / c.fps * FPS > 2 * _BLEND_FRAMES + _MIN_PLAYED_FRAMES + 4
     ]
     kept = [c for c in long if c.split == "val"] or long
     if not kept:
@@ -58,7 +59,9 @@ def walking_clips(clips: Sequence[Clip], source: str) -> tuple[Clip, ...]:
             "walking to make long walks of."
         )
     kept = kept[:_MAX_CLIPS]
-    is_right = all(c.fps == FPS for c in kept)  # clips that ship need no compilation
+    is_right = all(
+        c.fps == FPS for c in kept
+    )  # saves a compilation for the shipped clips
     return tuple(kept) if is_right else resample(kept, FPS)
 
 
@@ -70,7 +73,7 @@ def walk_along(
     rng: np.random.Generator,
     max_turn: float = np.radians(60.0),
 ) -> Walk:
-    """`num_frames` of walking along the closed `path` (x, z in m).
+    """Returns `num_frames` of walking along the closed `path` (x, z in m).
 
     `max_turn` (rad/s) limits how quickly the walk is bent; sharper corners are cut.
     """
@@ -81,7 +84,7 @@ def walk_along(
 
 
 class Soles:
-    """Heel and ball of both feet: the points on which a walker stands."""
+    """Heel and ball of both feet: the points that support a walker."""
 
     def __init__(self, person: Person):
         self.person = person
@@ -96,19 +99,20 @@ class Soles:
     def __call__(
         self, poses: Float[np.ndarray, "t 24 3"], pelvis: Float[np.ndarray, "t 3"]
     ) -> Float[np.ndarray, "t 4 3"]:
-        """Left heel and ball, right heel and ball in the world, m."""
+        """Returns left heel and ball, right heel and ball in the world, m."""
         G, x = self.person.joints(poses, pelvis)
         points = x[:, 7:9, None] + np.einsum("tiab,ikb->tika", G[:, 7:9], self.offset)
         return points.reshape(-1, 4, 3)
 
 
 def _about_y(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Rotation vectors about the vertical."""
+    """Returns rotation vectors about the vertical, rad."""
     return angle[:, None] * [0.0, 1.0, 0.0]
 
 
 class _Library:
-    """Features for joining, and feet, of all frames of all clips."""
+    """All frames of all clips, with features for joining them and the points of the
+    feet."""
 
     def __init__(self, person: Person, clips: Sequence[Clip]):
         self.soles = Soles(person)
@@ -116,8 +120,8 @@ class _Library:
         self.clip = np.repeat(np.arange(len(clips)), [len(c.poses) for c in clips])
         self.poses = np.concatenate([c.poses for c in clips]).astype(float)
         root = so3.exp(self.poses[:, 0])
-        # The path of the middle of the hips in proportion to the legs: captures and
-        # models put the pelvis joint at different heights above the hips.
+        # The path of the midpoint of the hips is scaled by leg length: captures and
+        # models define the pelvis joint at different heights above the hips.
         below = [
             c.offsets[1:3].mean(axis=0)
             if c.offsets is not None
@@ -133,7 +137,7 @@ class _Library:
         sole = self.soles(self.poses, self.pelvis)
         for c in range(len(clips)):
             rows = self.clip == c
-            # One foot is on the floor at any time; captures drift by centimetres
+            # One foot is always on the floor; captured heights drift by centimetres.
             floor = gaussian_filter1d(sole[rows, :, 1].min(axis=1), 5.0)
             sole[rows, :, 1] -= floor[:, None]
             self.pelvis[rows, 1] -= floor
@@ -149,7 +153,8 @@ class _Library:
         self.features = self._features(joints)
 
     def _bend_toes(self, person: Person) -> None:
-        """Bends toes that would penetrate the floor, as captures have rigid toes."""
+        """Bends toes that would penetrate the floor, because toes are rigid in the
+        recordings."""
         G, x = person.joints(self.poses, self.pelvis)
         for ankle, toe in ((7, 10), (8, 11)):
             tips = np.flatnonzero(person.weights[:, toe] > 0.9)
@@ -167,14 +172,15 @@ class _Library:
             self.poses[:, toe] = so3.log(local)
 
     def _differences(self, x: np.ndarray) -> np.ndarray:
-        """Differences to the previous frame; a clip's first repeats the second."""
+        """Returns differences to the previous frame; a clip's first one repeats the
+        second."""
         d = np.diff(x, axis=0, prepend=x[:1])
         first = np.flatnonzero(np.diff(self.clip, prepend=-1))
         d[first] = d[first + 1]
         return d
 
     def _smooth_heading(self) -> np.ndarray:
-        """Direction of the path without the sway, yaw in rad."""
+        """Returns the direction of the path without lateral sway, as yaw in rad."""
         smooth = np.concatenate(
             [
                 gaussian_filter1d(self.step[self.clip == c], 8.0, axis=0)
@@ -184,7 +190,8 @@ class _Library:
         return np.arctan2(smooth[:, 0], smooth[:, 2])
 
     def _features(self, joints: np.ndarray) -> np.ndarray:
-        """Joints and their velocities relative to the heading, m; similar at seams."""
+        """Returns joints and their velocities relative to the heading; clips are joined
+        where these are similar."""
         level = so3.exp(_about_y(-self.yaw))
         joints = np.einsum("tij,tkj->tki", level, joints)
         velocity = self._differences(joints) * FPS
@@ -197,26 +204,30 @@ class _Library:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """For each frame the two library frames that are blended, and how."""
+    """For each frame, the two library frames that are blended, with their weights and
+    yaws."""
 
     frame: Int[np.ndarray, "t 2"]
     share: Float[np.ndarray, "t 2"]
-    """Sums to 1."""
+    """Weights, which sum to 1."""
     yaw: Float[np.ndarray, "t 2"]
-    """Yaw of each so that the parts fit, rad; steering is added."""
+    """Yaw of each that makes the parts continuous, rad; steering is added to it."""
 
 
 def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan:
-    """Chooses trials and seams: the best few by phase, then at random among them."""
-    clip, half = library.clip, _BLEND // 2
+    """Chooses trials and transitions: at random among the three with the best match of
+    phase."""
+    clip, half = library.clip, _BLEND_FRAMES // 2
     count = np.bincount(clip)
     first = np.cumsum(count) - count
     place = np.arange(len(clip)) - first[clip]
     left = count[clip] - place
     squares = (library.features**2).sum(axis=1)
-    ramp = (np.arange(_BLEND) + 0.5) / _BLEND
+    ramp = (np.arange(_BLEND_FRAMES) + 0.5) / _BLEND_FRAMES
     ramp = ramp * ramp * (3 - 2 * ramp)
-    entries = np.flatnonzero((place >= 1) & (left > 2 * _BLEND + _PLAYED + 2))
+    entries = np.flatnonzero(
+        (place >= 1) & (left > 2 * _BLEND_FRAMES + _MIN_PLAYED_FRAMES + 2)
+    )
 
     frames, shares, yaws = [], [], []
 
@@ -228,8 +239,8 @@ def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan
     now = int(rng.choice(entries[place[entries] < 10]))
     yaw, total = 0.0, 0
     while total < num_frames:
-        end = int(first[clip[now]] + count[clip[now]]) - _BLEND
-        leave = np.arange(min(now + _PLAYED, end - 1), end)
+        end = int(first[clip[now]] + count[clip[now]]) - _BLEND_FRAMES
+        leave = np.arange(min(now + _MIN_PLAYED_FRAMES, end - 1), end)
         enter = entries[clip[entries] != clip[now]]
         d = squares[leave + half][:, None] + squares[enter + half]
         d = d - 2 * library.features[leave + half] @ library.features[enter + half].T
@@ -242,12 +253,12 @@ def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan
         a, b = int(leave[d[:, column].argmin()]), int(enter[column])
         alone = np.arange(now, a)
         add(alone, alone, np.zeros(len(alone)), yaw, yaw)
-        turn = library.yaw[a : a + _BLEND] - library.yaw[b : b + _BLEND]
+        turn = library.yaw[a : a + _BLEND_FRAMES] - library.yaw[b : b + _BLEND_FRAMES]
         following = yaw + np.angle(np.exp(1j * turn).mean())
-        k = np.arange(_BLEND)
+        k = np.arange(_BLEND_FRAMES)
         add(a + k, b + k, ramp, yaw, following)
-        total += len(alone) + _BLEND
-        now, yaw = b + _BLEND, following
+        total += len(alone) + _BLEND_FRAMES
+        now, yaw = b + _BLEND_FRAMES, following
     cut = lambda parts: np.concatenate(parts)[:num_frames]
     return _Plan(cut(frames), cut(shares), cut(yaws))
 
@@ -255,7 +266,8 @@ def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan
 def _steer(
     library: _Library, plan: _Plan, path: Float[np.ndarray, "p 2"], max_turn: float
 ) -> Float[np.ndarray, " t"]:
-    """Yaw to add at each frame so that the walk follows the path (pure pursuit)."""
+    """Returns the yaw (rad) to add in each frame so that the walk follows the path
+    (pure pursuit)."""
     along = np.concatenate([path, path[:1]])
     length = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(along, axis=0), axis=1))]
@@ -269,7 +281,7 @@ def _steer(
     x, _, z = np.moveaxis(library.step[plan.frame], 2, 0)
     walked = (np.hypot(x, z) * plan.share).sum(axis=1)
     position, progress, rate = path[0], 0.0, 0.0
-    start = at(_LOOK_AHEAD) - path[0]
+    start = at(_LOOK_AHEAD_M) - path[0]
     yaw = np.empty(len(a))
     previous = np.arctan2(start[0], start[1]) - heading[0]
     limit = max_turn / FPS
@@ -277,7 +289,7 @@ def _steer(
         ahead = progress + np.linspace(0.0, 0.3, 7)
         gaps = [np.linalg.norm(at(s) - position) for s in ahead]
         progress = ahead[int(np.argmin(gaps))]
-        to = at(progress + _LOOK_AHEAD) - position
+        to = at(progress + _LOOK_AHEAD_M) - position
         off = np.arctan2(to[0], to[1]) - heading[k] - previous
         off = (off + np.pi) % (2 * np.pi) - np.pi
         wanted = np.clip(0.2 * off, -limit, limit)
@@ -297,7 +309,7 @@ def _play(
     steering: Float[np.ndarray, " t"],
     start: Float[np.ndarray, "2"],
 ) -> Walk:
-    """Blends the postures, then lets the pelvis follow from the feet."""
+    """Blends the postures, then computes the pelvis from the feet."""
     a, b = plan.frame.T
     yaw_a, yaw_b = (_about_y(y) for y in plan.yaw.T + steering)
     share = plan.share[:, 1]

@@ -1,4 +1,4 @@
-"""Geometry that is added to the body's mesh: skirts, long hair, shoes."""
+"""Generates geometry that is added to the body's mesh: skirts, long hair, shoes."""
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -11,7 +11,12 @@ _RINGS, _SPOKES = 14, 40
 
 
 def skirt_sheet(person: Person, outfit: Outfit):
-    """A cone from the waist down: rings of vertices that follow the nearer thigh."""
+    """Returns a cone from the waist down: rings of vertices that follow the nearer
+    thigh.
+
+    It has positions (rings, spokes, 3), m, skinning weights (rings, spokes, 24), and
+    whether the rings are closed.
+    """
     p, rest = person.skin, person.rest
     hip, knee = rest[[1, 2], 1].mean(), rest[[4, 5], 1].mean()
     ankle = rest[[7, 8], 1].mean()
@@ -51,7 +56,8 @@ def skirt_sheet(person: Person, outfit: Outfit):
 
 
 def hair_sheet(person: Person, outfit: Outfit):
-    """A sheet round the back of the head down to the shoulders, or a tail."""
+    """Returns a sheet round the back of the head down to the shoulders, or a ponytail,
+    in the form of `skirt_sheet`."""
     head, rest = Head(person), person.rest
     if outfit.hair == "tail":
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
@@ -88,7 +94,7 @@ def hair_sheet(person: Person, outfit: Outfit):
 
 
 def with_shoes(mesh, person: Person, outfit: Outfit):
-    """The mesh with the convex hull of each foot, 8 mm thick, over the foot."""
+    """Returns the mesh with shoes: the convex hull of each foot, 8 mm thick."""
     skin, weights, faces, part, colours = mesh
     p, floor = person.skin, person.skin[:, 1].min()
     for ankle, toe, side in ((7, 10, 1), (8, 11, -1)):
@@ -120,7 +126,8 @@ def with_shoes(mesh, person: Person, outfit: Outfit):
 
 
 def with_sheet(mesh, sheet, kind: int):
-    """The mesh with a sheet of rings added, seen from both sides."""
+    """Returns the mesh with a sheet of rings appended that is visible from both
+    sides."""
     skin, weights, faces, part, colours = mesh
     rows, more, closed = sheet
     n, m = rows.shape[:2]
@@ -135,7 +142,9 @@ def with_sheet(mesh, sheet, kind: int):
     out = np.concatenate(
         [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (b, d, c))]
     )
-    twice = np.concatenate([out, out[:, ::-1] + n * m])  # its inside has own normals
+    twice = np.concatenate(
+        [out, out[:, ::-1] + n * m]
+    )  # the inside has normals of its own
     colour = np.median(colours[part == kind], axis=0) if (part == kind).any() else 60.0
     count = 2 * n * m
     return (

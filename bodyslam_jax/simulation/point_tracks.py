@@ -1,4 +1,4 @@
-"""Simulated tracks of static points, with the errors of a feature tracker."""
+"""Simulates tracks of static points, with the errors of a feature tracker."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -7,7 +7,7 @@ from bodyslam_jax.simulation.room import Room, landmarks_on
 from bodyslam_jax.simulation.sensor_noise import Noise, project
 from bodyslam_jax.types import Tracks
 
-_LIMBS = (
+_LIMB_CAPSULES = (
     *((0, 12, 0.19), (12, 15, 0.14), (15, 15, 0.17)),
     *((1, 4, 0.13), (4, 7, 0.10), (7, 10, 0.11), (2, 5, 0.13), (5, 8, 0.10)),
     *((8, 11, 0.11), (10, 10, 0.12), (11, 11, 0.12), (16, 18, 0.09), (18, 20, 0.08)),
@@ -15,12 +15,13 @@ _LIMBS = (
     *((23, 23, 0.13), (16, 17, 0.12), (1, 2, 0.17)),
 )
 """Capsules that cover the body: two joints and a radius, m."""
-_DENSITY = 9.0
+_POINTS_PER_M2 = 9.0
 """Points per m² of all surfaces."""
-_CELLS = (8, 6)
-_TRIED = 700
-"""Candidates in the image of which visible ones are chosen: a bound on run time."""
-_BORDER = 3.0
+_GRID_CELLS = (8, 6)
+_MAX_CANDIDATES = 700
+"""Number of candidate points per image that are tested for visibility at most, to bound
+the run time."""
+_BORDER_PX = 3.0
 """Distance from the image's edge at which tracks end, px."""
 
 
@@ -36,13 +37,14 @@ def track_points(
     life: float,
     wanted: int = 200,
 ) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
-    """About `wanted` tracks a frame, spread over the image, and their true points.
+    """Returns about `wanted` tracks per frame, spread over the image, and their true
+    points (m).
 
     A track ends when its point leaves the image or is occluded by furniture or a
     person, and at random after `life` frames on average; a point observed again starts
     a new track. Tracks of a single frame are dropped.
     """
-    points, normals = landmarks_on(room.faces(), _DENSITY, rng)
+    points, normals = landmarks_on(room.faces(), _POINTS_PER_M2, rng)
     strength = rng.random(len(points))
     frames, ids, pixels, places = [], [], [], []
     alive = np.empty((0, 2), int)  # track, point
@@ -51,13 +53,14 @@ def track_points(
         eye = T[:3, 3]
         p_C = (points - eye) @ T[:3, :3]
         uv = project(p_C, intrinsics)
-        low, high = _BORDER, np.array(size) - 1 - _BORDER
+        low, high = _BORDER_PX, np.array(size) - 1 - _BORDER_PX
         visible = (p_C[:, 2] > 0.3) & ((uv > low) & (uv < high)).all(axis=1)
         visible &= ((eye - points) * normals).sum(axis=1) > 0.12 * p_C[:, 2]
         some = np.flatnonzero(visible)
-        if len(some) > _TRIED:
+        if len(some) > _MAX_CANDIDATES:
             some = np.union1d(
-                rng.choice(some, _TRIED, replace=False), alive[visible[alive[:, 1]], 1]
+                rng.choice(some, _MAX_CANDIDATES, replace=False),
+                alive[visible[alive[:, 1]], 1],
             )
         some = some[~room.is_hidden(eye, points[some])]
         for body in joints_C[:, k]:
@@ -86,12 +89,12 @@ def track_points(
 
 
 def _spread(uv, candidates, strength, taken, size, wanted):
-    """The strongest points of the emptiest cells of a grid."""
-    cell_of = lambda at: (at * _CELLS / size).astype(int) @ [1, _CELLS[0]]
-    filled = np.bincount(cell_of(uv[taken]), minlength=_CELLS[0] * _CELLS[1])
+    """Returns the strongest points of the emptiest cells of a grid."""
+    cell_of = lambda at: (at * _GRID_CELLS / size).astype(int) @ [1, _GRID_CELLS[0]]
+    filled = np.bincount(cell_of(uv[taken]), minlength=_GRID_CELLS[0] * _GRID_CELLS[1])
     order = candidates[np.argsort(-strength[candidates])]
     cell = cell_of(uv[order])
-    # How many a cell would hold by the time this point was added
+    # Number of points that the cell would hold before this one is added.
     by_cell = np.argsort(cell, kind="stable")
     first = np.searchsorted(cell[by_cell], cell[by_cell])
     rank = np.empty(len(order), int)
@@ -104,7 +107,8 @@ def is_behind(
     joints_C: Float[np.ndarray, "t 24 3"],
     intrinsics: Float[np.ndarray, "4"],
 ) -> Bool[np.ndarray, "t n"]:
-    """Whether a person with these joints hides points, all in the camera frame."""
+    """Returns whether a person with these joints hides points, all in the camera frame,
+    m."""
     uv = project(points_C, intrinsics)
     return np.stack(
         [
@@ -115,12 +119,12 @@ def is_behind(
 
 
 def _behind_person(uv, depth, joints_C, intrinsics) -> Bool[np.ndarray, " n"]:
-    """Whether the body hides points; those in front of it are not."""
+    """Returns whether the body hides points that lie behind it."""
     hidden = np.zeros(len(uv), bool)
     if (joints_C[:, 2] < 0.2).any():
         return hidden
     at = project(joints_C, intrinsics)
-    for a, b, radius in _LIMBS:
+    for a, b, radius in _LIMB_CAPSULES:
         way = at[b] - at[a]
         share = np.clip((uv - at[a]) @ way / max(way @ way, 1.0), 0, 1)
         z = joints_C[a, 2] * (1 - share) + joints_C[b, 2] * share
@@ -130,10 +134,10 @@ def _behind_person(uv, depth, joints_C, intrinsics) -> Bool[np.ndarray, " n"]:
 
 
 def _disturb(frame, track, uv, size, noise: Noise, rng):
-    """Adds white noise of a sigma per track, and outliers.
+    """Adds white noise with a standard deviation per track, and outliers.
 
-    Half of the outliers are single wrong matches, half are tracks that drift with
-    something that moves.
+    Half of the outliers are single wrong matches, half are tracks that drift with a
+    moving object.
     """
     count = int(track.max()) + 1
     sigma = rng.uniform(*noise.track, count)
@@ -143,7 +147,7 @@ def _disturb(frame, track, uv, size, noise: Noise, rng):
     length = np.bincount(track, minlength=count)
     start = np.full(count, frame.max() + 1)
     np.minimum.at(start, track, frame)
-    # A stuck track is wrong for half of its life on average
+    # A drifting track is wrong for half of its duration on average.
     stuck = rng.random(count) < noise.track_outliers
     onset = start + (rng.random(count) * length).astype(int)
     drift = rng.normal(0, 2.0, (count, 2))

@@ -1,6 +1,6 @@
-"""The body in NumPy: joints, keypoints and skin without a compiler.
+"""The body model in NumPy: joints, keypoints and skin without compilation.
 
-The same equations as `bodyslam_jax.body`, which a test compares, for bodies without
+The equations are those of `bodyslam_jax.body`, as a test verifies, for bodies without
 pose blend shapes. A simulator evaluates them once per sequence, each of another length,
 so that compiling would take longer than everything else.
 """
@@ -15,7 +15,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 
 
 class Person:
-    """One shape of the body at rest, and how it is posed."""
+    """A person's body: one shape at rest, and functions that pose it."""
 
     def __init__(self, body: BodyModel, shape: Float[np.ndarray, "10"]):
         array = lambda x: np.asarray(x, np.float64)
@@ -37,20 +37,21 @@ class Person:
         self.picks = np.asarray(body.picks)
 
     def of_shape(self, shape: Float[np.ndarray, "10"]) -> "Person":
-        """Another person of the same body model."""
+        """Returns another person of the same body model."""
         return Person(self._body, shape)
 
     def rest_joints(
         self, shape: Float[np.ndarray, "*b 10"]
     ) -> Float[np.ndarray, "*b 24 3"]:
-        """Joints at rest of other shapes of the same body model, m."""
+        """Returns the joints at rest of other shapes of the same body model, m."""
         moved = np.einsum("jab,...b->...ja", self._joint_shape_dirs, shape)
         return self._joint_template + moved
 
     def joints(
         self, poses: Float[np.ndarray, "t 24 3"], pelvis: Float[np.ndarray, "t 3"]
     ) -> tuple[Float[np.ndarray, "t 24 3 3"], Float[np.ndarray, "t 24 3"]]:
-        """Rotations and places of all joints in the frame the root turns into, m."""
+        """Returns the rotations of all joints, and their positions (m), in the frame
+        that the root pose rotates into."""
         return pose_joints(so3.exp(poses), self.rest, pelvis)
 
     def vertices(
@@ -59,7 +60,7 @@ class Person:
         x: Float[np.ndarray, "24 3"],
         which: Int[np.ndarray, " n"] | slice = slice(None),
     ) -> Float[np.ndarray, "n 3"]:
-        """Vertices of one posed frame (linear blend skinning), m."""
+        """Returns the vertices of one posed frame (linear blend skinning), m."""
         move = x - np.einsum("jab,jb->ja", G, self.rest)
         T = np.concatenate([G, move[:, :, None]], axis=2).reshape(24, 12)
         T = (self.weights[which] @ T).reshape(-1, 3, 4)
@@ -71,7 +72,8 @@ class Person:
         x: Float[np.ndarray, "t 24 3"],
         bias: float = 0.0,
     ) -> Float[np.ndarray, "t 25 3"]:
-        """BODY_25 of posed frames, m; `bias` as in `body.local_keypoints`."""
+        """Returns the BODY_25 keypoints of posed frames, m; `bias` as in
+        `body.local_keypoints`."""
         out = np.empty((len(x), 25, 3))
         for k, name in enumerate(KEYPOINT_NAMES["body25"]):
             if name in SURFACE_POINTS:

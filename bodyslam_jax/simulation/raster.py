@@ -1,4 +1,4 @@
-"""Meshes of small triangles through a z-buffer, in NumPy."""
+"""Rasterises meshes of small triangles with a z-buffer, in NumPy."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ class Hits(NamedTuple):
     """The visible surface at `p` distinct pixels."""
 
     pixel: Int[np.ndarray, " p"]
-    """Flat index, row-major."""
+    """Flat pixel index, row-major."""
     face: Int[np.ndarray, " p"]
     weights: Float[np.ndarray, "p 3"]
     """Barycentric weights of the face's three corners; they sum to 1."""
@@ -24,7 +24,7 @@ def rasterise(
     faces: Int[np.ndarray, "f 3"],
     inverse_depth: Float[np.ndarray, "rows cols"],
 ) -> Hits:
-    """The part of a mesh that is in front of a depth buffer.
+    """Returns the part of a mesh that is in front of a depth buffer.
 
     Triangles are small, so each tests all pixels of its bounding box; those of equal
     box size are processed together. Back faces are culled. Weights are interpolated
@@ -37,7 +37,7 @@ def rasterise(
     low = np.ceil(np.minimum(np.minimum(a, b), c)).astype(np.int64)
     high = np.floor(np.maximum(np.maximum(a, b), c)).astype(np.int64)
     low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
-    # Counter-clockwise seen from outside, which an image with y down turns round.
+    # Faces are counter-clockwise from outside, hence clockwise in an image with y down.
     size = high - low + 1
     visible = (area < -1e-12) & (size[:, 0] > 0) & (size[:, 1] > 0)
     extent = np.maximum(size[:, 0], size[:, 1])
@@ -80,7 +80,8 @@ def rasterise(
 def vertex_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Unit normals, the area-weighted mean of those of the faces around."""
+    """Returns the unit normals of vertices: the area-weighted mean of the normals of
+    adjacent faces."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     u, v = b - a, c - a
     of_face = np.stack(

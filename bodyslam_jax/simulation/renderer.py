@@ -1,13 +1,14 @@
-"""A renderer of rooms and people, fast enough for video, in NumPy and OpenCV.
+"""Renders rooms and people, fast enough for video, in NumPy and OpenCV.
 
 Every rectangle is cast against all pixels of its outline's bounding box: inverse depth
 and texture coordinates are linear along each row there, so hidden surfaces and the near
 plane take one comparison, and each row may have a camera of its own (rolling shutter).
-All textures lie, at every resolution, in one image, so that one look-up draws a frame.
-The bodies' small triangles are drawn with a z-buffer.
+All textures are stored, at every resolution, in one image (atlas), so that one look-up
+draws a frame. The bodies' small triangles are drawn with a z-buffer.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -17,33 +18,76 @@ from jaxtyping import Bool, Float, Int, UInt8
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
-from bodyslam_jax.simulation.atlas import LEVELS, pack, pyramid
-from bodyslam_jax.simulation.figure import Figure
+from bodyslam_jax.simulation.figure import Figure, dress
 from bodyslam_jax.simulation.raster import rasterise, vertex_normals
 from bodyslam_jax.simulation.room import Room, Surface, texture_size
-from bodyslam_jax.simulation.shutter import Shutter, cameras_at
+from bodyslam_jax.simulation.sequences import SimulatedSequence
+from bodyslam_jax.simulation.shutter import Shutter, around, cameras_at
 from bodyslam_jax.simulation.texture import make_texture
 
-_NEAR = 0.05
-_SHRINK = np.float32(0.5) ** np.arange(LEVELS, dtype=np.float32)
-"""Of texture coordinates, level by level."""
-_TEXELS = 130.0
-"""Texels a metre: a camera of 525 px sees them one to one from 4 m."""
-_NOISE = 1.5
-"""Standard deviation of the image noise at medium grey, grey levels."""
-_MOST_INSTANTS = 6
-"""Largest number of images that are averaged for motion blur."""
-_BLUR_STEP = 2.0
-"""Motion between two of them that is not visible as a step, px."""
+_NEAR_PLANE_M = 0.05
+_MIPMAP_LEVELS = 7
+"""Number of resolutions of each texture, each half of the previous one."""
+_BORDER_TEXELS = 2
+_LEVEL_SCALES = np.float32(0.5) ** np.arange(_MIPMAP_LEVELS, dtype=np.float32)
+"""Factor on texture coordinates for each level."""
+_TEXELS_PER_METRE = 130.0
+"""Resolution of textures: a camera of 525 px sees texels at a scale of 1 from 4 m."""
+_NOISE_GREY_LEVELS = 1.5
+"""Standard deviation of the image noise at medium grey."""
+_MAX_BLUR_IMAGES = 6
+"""Number of images that are averaged for motion blur at most."""
+_BLUR_STEP_PX = 2.0
+"""Motion between two averaged images that is not visible as a step."""
 
 Moving = tuple[
     Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]
 ]
-"""Vertices at a frame, their first and second difference, as `shutter.around`, m."""
+"""Vertices at a frame, and their first and second difference (`shutter.around`), m."""
+
+
+def render(simulated: SimulatedSequence) -> Iterator[UInt8[np.ndarray, "rows cols 3"]]:
+    """Yields the images (BGR) of a simulated sequence, frame by frame."""
+    for image, _ in render_people(simulated):
+        yield image
+
+
+def render_people(
+    simulated: SimulatedSequence,
+) -> Iterator[tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]]:
+    """Yields the images (BGR), and the person at each pixel: 0 for none, h + 1 for
+    person h."""
+    rng = np.random.default_rng([simulated.seed, 1])
+    actors = simulated.actors
+    figures = [
+        dress(a.person, one)
+        for a, one in zip(actors, rng.spawn(len(actors)), strict=True)
+    ]
+    renderer = Renderer(
+        simulated.room, figures, simulated.intrinsics, simulated.size, rng,
+        Shutter(simulated.settings.exposure, simulated.settings.readout),
+    )  # fmt: skip
+    posed = [
+        f.person.joints(a.walk.poses, a.walk.pelvis)
+        for f, a in zip(figures, actors, strict=True)
+    ]
+    last = simulated.num_frames - 1
+
+    @functools.lru_cache(maxsize=4)
+    def skins(k: int) -> list[Float[np.ndarray, "v 3"]]:
+        return [
+            f.person.vertices(G[k], x[k])
+            for f, (G, x) in zip(figures, posed, strict=True)
+        ]
+
+    for k in range(last + 1):
+        window = [skins(i) for i in range(max(k - 1, 0), min(k + 1, last) + 1)]
+        moving = [around(np.stack(one), min(k, 1)) for one in zip(*window, strict=True)]
+        yield renderer.frame(simulated.T_WC, k, moving)
 
 
 class Renderer:
-    """A room with people, to be rendered from any camera."""
+    """Renders a room with people from any camera."""
 
     def __init__(
         self,
@@ -59,9 +103,9 @@ class Renderer:
         self.size = size
         self.shutter = shutter
         self.surfaces = room.faces()
-        self.extents = [texture_size(s, _TEXELS) for s in self.surfaces]
+        self.extents = [texture_size(s, _TEXELS_PER_METRE) for s in self.surfaces]
         textures = [
-            make_texture(rng, int(h), int(w), s.kind, _TEXELS)
+            make_texture(rng, int(h), int(w), s.kind, _TEXELS_PER_METRE)
             for s, (h, w) in zip(self.surfaces, self.extents, strict=True)
         ]
         azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(45, 75))
@@ -79,18 +123,23 @@ class Renderer:
             _lit(texture, surface, self.light)
             for texture, surface in zip(textures, self.surfaces, strict=True)
         ]
-        self.atlas, self.places = pack([pyramid(t) for t in lit])
-        noise = _NOISE * rng.standard_normal((size[1] + 64, size[0] + 64, 1))
-        noise = noise + 0.4 * _NOISE * rng.standard_normal((*noise.shape[:2], 3))
+        self.atlas, self.places = _pack([_pyramid(t) for t in lit])
+        noise = _NOISE_GREY_LEVELS * rng.standard_normal(
+            (size[1] + 64, size[0] + 64, 1)
+        )
+        noise = noise + 0.4 * _NOISE_GREY_LEVELS * rng.standard_normal(
+            (*noise.shape[:2], 3)
+        )
         self.noise = noise.astype(np.float32)
         self.rng = rng
 
     def frame(
         self, T_WC: Float[np.ndarray, "t 4 4"], k: int, people: Sequence[Moving]
     ) -> tuple[UInt8[np.ndarray, "rows cols 3"], Int[np.ndarray, "rows cols"]]:
-        """Image `k` (BGR) of a camera's path, and the visible person at each pixel.
+        """Returns image `k` (BGR) of a camera's path, and the visible person at each
+        pixel.
 
-        The second value is 0 for none and h + 1 for person h, in the middle of the
+        The second array is 0 for nobody and h + 1 for person h, in the middle of the
         exposure.
         """
         count = self._instants(T_WC, k, people)
@@ -114,12 +163,12 @@ class Renderer:
         y, x = self.rng.integers(0, 64, 2)
         width, height = self.size
         noise = self.noise[y : y + height, x : x + width]
-        # Shot noise: its deviation grows with the root of the intensity.
+        # Shot noise: its standard deviation grows with the root of the intensity.
         image += noise * np.sqrt(np.maximum(image + 20, 0) / 148)
         return np.clip(image, 0, 255).astype(np.uint8), who
 
     def _instants(self, T_WC, k: int, people: Sequence[Moving]) -> int:
-        """Number of images to average for this exposure."""
+        """Returns the number of images to average for this exposure."""
         span = self.shutter.exposure
         if span == 0:
             return 1
@@ -133,13 +182,14 @@ class Renderer:
                 self._project(cameras[i : i + 1], ends[i : i + 1], sample)
                 for i in range(2)
             ]
-            near = (uv[0][:, 2] > _NEAR) & (uv[1][:, 2] > _NEAR)
+            near = (uv[0][:, 2] > _NEAR_PLANE_M) & (uv[1][:, 2] > _NEAR_PLANE_M)
             way = np.linalg.norm(uv[1][near, :2] - uv[0][near, :2], axis=1)
             moved.append(np.percentile(way, 90) if len(way) else 0.0)
-        return int(np.clip(np.ceil(max(moved) / _BLUR_STEP), 1, _MOST_INSTANTS))
+        return int(np.clip(np.ceil(max(moved) / _BLUR_STEP_PX), 1, _MAX_BLUR_IMAGES))
 
     def _instant(self, T, when, people, normals):
-        """A noise-free image; `T` has one camera per row, or one for all rows."""
+        """Returns a noise-free image and the person at each pixel; `T` has one camera
+        per row, or one for all rows."""
         inverse_depth, image, floor = self.render_room(T)
         for moving in people:
             self._shadow(image, floor, T, when, moving)
@@ -156,7 +206,8 @@ class Renderer:
         when: Float[np.ndarray, " n"],
         moving: Moving,
     ) -> Float[np.ndarray, "v 3"]:
-        """Pixel and depth of moving points, at the exposure time of their own row."""
+        """Returns pixel and depth of moving points, each at the exposure time of its
+        own row."""
         position, first, second = moving
         at = lambda tau: position + tau * first + tau**2 / 2 * second
         focal, centre = self.intrinsics[:2], self.intrinsics[2:]
@@ -165,7 +216,7 @@ class Renderer:
         R, eye = T[middle, :3, :3], T[middle, :3, 3]
         p = (at(FPS * when[middle]) - eye) @ R
         uv = p[:, :2] / depth(p) * focal + centre
-        for _ in range(2 if len(T) > 1 else 0):  # A row's share of the motion is small.
+        for _ in range(2 if len(T) > 1 else 0):  # The motion during a row is small.
             row = np.clip(uv[:, 1], 0, len(T) - 1)
             low = np.minimum(row.astype(int), len(T) - 2)
             share = (row - low)[:, None]
@@ -178,7 +229,7 @@ class Renderer:
         return np.concatenate([uv, p[:, 2:]], axis=1)
 
     def render_room(self, T):
-        """Inverse depth, colours, and a mask of the floor."""
+        """Returns inverse depth (1/m), colours, and a mask of the floor."""
         width, height = self.size
         best = np.full((height, width), 1e-3, np.float32)
         map_x = np.zeros((height, width), np.float32)
@@ -221,13 +272,13 @@ class Renderer:
                 continue
             within = np.flatnonzero(hit)
             z, u, v = (part.take(within) for part in (z, u, v))
-            # A pixel has `texels z^3` of them; a level further down has a quarter.
+            # A pixel covers `texels z^3` texels, a quarter of that on each next level.
             middle = len(T) // 2
             texels = abs(np.linalg.det(np.stack([a, b, c])[:, middle]))
             level = np.zeros(len(z), np.intp)
-            for k in range(1, LEVELS):
+            for k in range(1, _MIPMAP_LEVELS):
                 level += z > (4.0 ** (k - 1) / texels) ** (1 / 3)
-            shrink = _SHRINK.take(level)
+            shrink = _LEVEL_SCALES.take(level)
             place_x, place_y = self.places[i].T
             row, column = np.divmod(within, right - left)
             pixel = (row + top) * width + (column + left)
@@ -239,9 +290,10 @@ class Renderer:
         return best, image.astype(np.float32), floor
 
     def _outline(self, surface: Surface, T):
-        """Bounding box, px, of the part in front of the near plane, or `None`.
+        """Returns the bounding box, px, of the part in front of the near plane, or
+        `None`.
 
-        With a camera per row it covers all of them, with a margin.
+        With a camera per row it covers the boxes of several of them, with a margin.
         """
         corners = np.array(
             [surface.origin + a * surface.edge_u + b * surface.edge_v
@@ -251,10 +303,10 @@ class Renderer:
         for camera in T[:: max(1, (len(T) - 1) // 2)]:
             p = (corners - camera[:3, 3]) @ camera[:3, :3]
             for start, end in zip(p, np.roll(p, -1, axis=0), strict=True):
-                if start[2] > _NEAR:
+                if start[2] > _NEAR_PLANE_M:
                     kept.append(start)
-                if (start[2] > _NEAR) != (end[2] > _NEAR):
-                    cut = (_NEAR - start[2]) / (end[2] - start[2])
+                if (start[2] > _NEAR_PLANE_M) != (end[2] > _NEAR_PLANE_M):
+                    cut = (_NEAR_PLANE_M - start[2]) / (end[2] - start[2])
                     kept.append(start + (end - start) * cut)
         if not kept:
             return None
@@ -266,12 +318,12 @@ class Renderer:
         return None if (high <= low).any() else (*low, *high)
 
     def _shadow(self, image, floor, T, when, moving: Moving) -> None:
-        """Darkens the floor where the lamp's light does not reach."""
+        """Darkens the floor where a person blocks the lamp."""
         flat = np.eye(3) - np.outer([0, 1, 0], self.light / self.light[1])
         uv = self._project(T, when, _each(moving, lambda term: term[::7] @ flat))
         if uv[:, 2].min() < 0.2:
             return
-        # A shadow is made of discs that overlap: about 7 cm on the floor
+        # The shadow consists of overlapping discs, about 7 cm wide on the floor.
         spot = int(np.clip(0.07 * self.intrinsics[0] / np.median(uv[:, 2]), 3, 41)) | 1
         pixel = uv[:, :2].round().astype(int) + spot
         width, height = self.size
@@ -291,10 +343,10 @@ class Renderer:
         image[part] *= (1 - (0.55 / 255) * share)[:, :, None]
 
     def _body(self, image, inverse_depth, who, T, when, h, moving, normal) -> None:
-        """Draws a person with smooth shading, by the depth buffer."""
+        """Draws a person with smooth shading, using the depth buffer."""
         figure = self.figures[h]
         uv = self._project(T, when, moving)
-        if uv[:, 2].min() < _NEAR:
+        if uv[:, 2].min() < _NEAR_PLANE_M:
             return
         hits = rasterise(uv[:, :2], 1 / uv[:, 2], figure.person.faces, inverse_depth)
         if not len(hits.pixel):
@@ -309,8 +361,54 @@ class Renderer:
         who.reshape(-1)[hits.pixel] = h + 1
 
 
+def _pyramid(texture: UInt8[np.ndarray, "h w 3"]) -> list[np.ndarray]:
+    levels = [texture]
+    while len(levels) < _MIPMAP_LEVELS:
+        h, w = levels[-1].shape[:2]
+        size = (max(w // 2, 1), max(h // 2, 1))
+        levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))
+    return levels
+
+
+def _pack(
+    pyramids: list[list[np.ndarray]],
+) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "n levels 2"]]:
+    """Packs all images into one; returns it, and the origin (x, y) of each in it,
+    px."""
+    padded = [
+        (i, k, _bordered(image))
+        for i, levels in enumerate(pyramids)
+        for k, image in enumerate(levels)
+    ]
+    padded.sort(key=lambda item: -item[2].shape[0])
+    # The image is kept square: OpenCV remaps images of up to 32767 rows and columns.
+    texels = sum(image.shape[0] * image.shape[1] for _, _, image in padded)
+    width = max(*(image.shape[1] for _, _, image in padded), int(texels**0.5))
+    places = np.zeros((len(pyramids), _MIPMAP_LEVELS, 2), np.float32)
+    x = y = shelf = 0
+    where = []
+    for i, k, image in padded:
+        h, w = image.shape[:2]
+        if x + w > width:
+            x, y, shelf = 0, y + shelf, 0
+        where.append((x, y))
+        places[i, k] = x + _BORDER_TEXELS, y + _BORDER_TEXELS
+        x, shelf = x + w, max(shelf, h)
+    atlas = np.zeros((y + shelf, width, 3), np.uint8)
+    for (x, y), (_, _, image) in zip(where, padded, strict=True):
+        atlas[y : y + image.shape[0], x : x + image.shape[1]] = image
+    return atlas, places
+
+
+def _bordered(image: np.ndarray) -> np.ndarray:
+    """Returns the image with its edge repeated, so that bilinear look-up does not
+    bleed."""
+    b = _BORDER_TEXELS
+    return cv2.copyMakeBorder(image, b, b, b, b, cv2.BORDER_REPLICATE)
+
+
 def _each(moving: Moving, change: Callable[[np.ndarray], np.ndarray]) -> Moving:
-    """A linear `change` of the vertices, and of their differences."""
+    """Applies a linear `change` to the vertices and to their differences."""
     position, first, second = moving
     return change(position), change(first), change(second)
 
@@ -334,7 +432,7 @@ def _soften(image: Float[np.ndarray, "r c 3"], mask: Bool[np.ndarray, "r c"]) ->
 def _lit(
     texture: UInt8[np.ndarray, "h w 3"], surface: Surface, to_light: np.ndarray
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The texture under a lamp: sides differ in brightness."""
+    """Returns the texture under a lamp: faces differ in brightness."""
     light = {"floor": 1.0, "ceiling": 0.85}.get(surface.kind)
     if light is None:
         light = 0.8 + 0.25 * float(surface.normal @ to_light)
@@ -347,7 +445,7 @@ def write_video(
     fps: float,
     size: tuple[int, int],
 ) -> None:
-    """Writes frames (BGR) to an .mp4, whole or not at all.
+    """Writes frames (BGR) to an .mp4 file, atomically.
 
     **Raises:** `InputError` if OpenCV cannot write one.
     """

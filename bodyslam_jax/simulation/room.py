@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_CLEARANCE = 0.35
-"""Free space that furniture leaves around people and camera, m."""
+_CLEARANCE_M = 0.35
+"""Free space that furniture leaves around people and camera."""
 
-_CUPBOARD = ((0.25, 0.3, 0.2), (0.5, 0.42, 0.3))
-_PILLAR = ((0.12, 0.9, 0.12), (0.25, 1.1, 0.25))
-"""Half of the least and the largest width, height and depth, m."""
+_CUPBOARD_HALF_SIZES_M = ((0.25, 0.3, 0.2), (0.5, 0.42, 0.3))
+_PILLAR_HALF_SIZES_M = ((0.12, 0.9, 0.12), (0.25, 1.1, 0.25))
+"""Half of the least and of the largest width, height and depth of cupboards and
+pillars."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Surface:
     origin: Float[np.ndarray, "3"]
     edge_u: Float[np.ndarray, "3"]
     edge_v: Float[np.ndarray, "3"]
-    """Along the texture's columns, downwards on walls, m."""
+    """Edge along the texture's columns, downwards on walls, m."""
     normal: Float[np.ndarray, "3"]
     """Unit vector to the visible side."""
     kind: str
@@ -33,22 +34,22 @@ class Surface:
 
 @dataclasses.dataclass(frozen=True)
 class Box:
-    """A box that is turned about the vertical only."""
+    """A box that is rotated about the vertical only."""
 
     centre: Float[np.ndarray, "3"]
     half: Float[np.ndarray, "3"]
     """Half of its width, height and depth, m."""
     yaw: float
-    """rad"""
+    """Rotation about the vertical, rad."""
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:
-        """Columns: its width, height and depth directions in the world."""
+        """Directions of its width, height and depth in the world, as columns."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
     def side(self, axis: int, sign: int, inwards: bool, kind: str) -> Surface:
-        """The face whose outer normal is `sign` times direction `axis`."""
+        """Returns the face whose outer normal is `sign` times direction `axis`."""
         u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
         axes = self.axes
         edges = 2 * self.half * axes
@@ -61,13 +62,13 @@ class Box:
 
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """The inside of a box, with boxes in it that stand on its floor."""
+    """The inside of a box, with boxes that stand on its floor."""
 
     walls: Box
     boxes: tuple[Box, ...]
 
     def faces(self) -> tuple[Surface, ...]:
-        """All rectangles that can be seen from inside."""
+        """Returns all rectangles that can be seen from inside."""
         kinds = {(1, -1): "floor", (1, 1): "ceiling"}
         room = [
             self.walls.side(axis, sign, True, kinds.get((axis, sign), "wall"))
@@ -79,14 +80,14 @@ class Room:
             for box in self.boxes
             for axis in range(3)
             for sign in (-1, 1)
-            if (axis, sign) != (1, -1)  # what stands on the floor hides its own
+            if (axis, sign) != (1, -1)  # bottoms are hidden
         ]
         return (*room, *furniture)
 
     def is_hidden(
         self, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "l 3"]
     ) -> Bool[np.ndarray, " l"]:
-        """Whether furniture is between `eye` and each point (slab test)."""
+        """Returns whether furniture is between `eye` and each point (slab test)."""
         hidden = np.zeros(len(points), bool)
         if not len(points):
             return hidden
@@ -113,9 +114,11 @@ def furnish(
     *,
     is_hall: bool = False,
 ) -> Room:
-    """A room around two paths, whose furniture neither blocks nor occludes anybody.
+    """Returns a room around two paths, whose furniture neither blocks nor occludes
+    anybody.
 
-    Walls are 1.2 to 2.5 m from the paths; a hall is higher and has more in its middle.
+    Walls are 1.2 to 2.5 m from the paths; a hall is higher and has more furniture in
+    its middle.
     """
     both = np.concatenate([person, camera])
     low = both.min(axis=0) - rng.uniform(1.2, 2.5, 3)
@@ -140,7 +143,7 @@ def furnish(
             at[axis] = ((low + half), (high - half))[side][axis]
         at[1] = half[1]
         box = Box(at, half, yaw)
-        if _gap(box, ways) < _CLEARANCE or _gap(box, views) < 0.1:
+        if _gap(box, ways) < _CLEARANCE_M or _gap(box, views) < 0.1:
             continue
         radius = np.hypot(half[0], half[2])
         to_wall = np.minimum(at - low, high - at)[[0, 2]].min()
@@ -159,11 +162,11 @@ def put_in_the_way(
     *,
     most_hidden: float = 0.35,
 ) -> Room:
-    """The room with up to three more pieces that occlude people temporarily.
+    """Returns the room with up to three more objects that occlude people temporarily.
 
     They are low cupboards, which occlude legs, and pillars. They stand between the
-    camera and the first person, off both paths, and occlude that person's feet for no
-    more than a share `most_hidden` of the time.
+    camera and the first person, off both paths, and occlude that person's feet for a
+    share of at most `most_hidden` of the time.
     """
     ways = np.concatenate([*people, camera])[::3, [0, 2]]
     pelvis = people[0]
@@ -171,11 +174,15 @@ def put_in_the_way(
     for _ in range(400):
         k = int(rng.integers(len(camera)))
         at = camera[k] + rng.uniform(0.4, 0.85) * (pelvis[k] - camera[k])
-        low, high = _CUPBOARD if rng.random() < 0.6 else _PILLAR
+        low, high = (
+            _CUPBOARD_HALF_SIZES_M if rng.random() < 0.6 else _PILLAR_HALF_SIZES_M
+        )
         half = rng.uniform(low, high)
         at[1] = half[1]
         box = Box(at, half, rng.uniform(0, np.pi))
-        if _gap(box, ways) < _CLEARANCE or not all(_apart(box, b) for b in room.boxes):
+        if _gap(box, ways) < _CLEARANCE_M or not all(
+            _apart(box, b) for b in room.boxes
+        ):
             continue
         more = Room(room.walls, (*room.boxes, box))
         feet = pelvis[::3] * [1, 0, 1] + [0, 0.1, 0]
@@ -192,14 +199,16 @@ def put_in_the_way(
 
 
 def _gap(box: Box, points: Float[np.ndarray, "l 2"]) -> float:
-    """Smallest distance on the floor from a box to points, along its own axes, m."""
+    """Returns the smallest distance on the floor from a box to points, along its own
+    axes, m."""
     c, s = np.cos(box.yaw), np.sin(box.yaw)
     local = (points - box.centre[[0, 2]]) @ np.array([[c, s], [-s, c]])
     return float((np.abs(local) - box.half[[0, 2]]).max(axis=1).min())
 
 
 def _apart(a: Box, b: Box) -> bool:
-    """Whether two boxes surely do not touch, by their circles on the floor or sides."""
+    """Returns whether two boxes are certain not to touch, by their circumscribed
+    circles on the floor or by their sides."""
     way = np.abs(a.centre - b.centre)[[0, 2]]
     if a.yaw == b.yaw == 0.0:
         return bool((way > a.half[[0, 2]] + b.half[[0, 2]] + 0.03).any())
@@ -210,7 +219,7 @@ def _apart(a: Box, b: Box) -> bool:
 def landmarks_on(
     faces: tuple[Surface, ...], density: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "l 3"], Float[np.ndarray, "l 3"]]:
-    """Points on all faces, `density` a square metre, and the normals there.
+    """Returns points on all faces, `density` per square metre, and the normals there.
 
     Furniture, being nearer, has twice as many; the ceiling, being plain, half.
     """
@@ -226,6 +235,7 @@ def landmarks_on(
 
 
 def texture_size(surface: Surface, per_metre: float) -> Int[np.ndarray, "2"]:
-    """Height and width of a surface's texture at `per_metre` texels a metre."""
+    """Returns height and width of a surface's texture at `per_metre` texels per
+    metre."""
     edges = np.linalg.norm([surface.edge_v, surface.edge_u], axis=1)
     return np.maximum(np.round(per_metre * edges), 8).astype(np.int64)

@@ -1,14 +1,9 @@
-"""Measurement noise of detectors, regressors and trackers, correlated over time.
+"""Simulates noise of detectors, regressors and trackers that is correlated over time.
 
 Magnitudes follow published errors. HMR-class networks have errors of about 60 mm after
 Procrustes alignment and of 18 to 20 m/s² in acceleration, so that most of their error
 varies slowly; errors of keypoints are a share of the disagreement of annotators (COCO's
-σ), also slowly varying. White noise would make smoothing look far too good.
-
-The published accelerations could be explained by 9 mm of white noise. Here they come
-from AR(1) noise on joint rotations, beside a constant bias: its innovations cause 18.7
-of 19.2 m/s². The white part (`posture_white`) moves joints by 2 mm, too little to show
-in a variogram over frames.
+σ), and also vary slowly. With white noise, smoothing would look far too effective.
 """
 
 import dataclasses
@@ -25,41 +20,42 @@ from bodyslam_jax.simulation.posing import Person
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Magnitudes of the errors of measurements; rates are shares of all frames."""
+    """Magnitudes of measurement errors; rates are shares of all frames."""
 
     keypoint_share: float
-    """Sigma of keypoints over the disagreement of annotators."""
+    """Standard deviation of keypoints relative to the disagreement of annotators."""
     keypoint_correlation: float
-    """AR(1) coefficient of its slow part, per frame."""
+    """AR(1) coefficient of the slow part of keypoint noise, per frame."""
     outlier_rate: float
     """Share of keypoints that are outliers."""
     swap_rate: float
     """Share of frames in which left and right are exchanged."""
     gap_rate: float
-    """Share of frames in which the person is not found."""
+    """Share of frames in which the person is not detected."""
     posture_bias: float
-    """Joint rotations, constant part of the error, rad per axis."""
+    """Constant error of joint rotations, rad per axis."""
     posture_drift: float
-    """Joint rotations, slow part, rad per axis."""
+    """Slowly varying error of joint rotations, rad per axis."""
     posture_correlation: float
     posture_white: float
-    """Joint rotations, white part, rad per axis; small beside the slow part."""
+    """White error of joint rotations, rad per axis; small compared with the slow
+    one."""
     root_drift: float
-    """Orientation, slow part, rad per axis."""
+    """Slowly varying error of the orientation, rad per axis."""
     root_white: float
     shape_shrink: tuple[float, float]
-    """Factor on the true β, drawn between these."""
+    """Range of the factor on the true β."""
     shape_white: float
     """Standard deviation added to each β, constant in time."""
     depth: tuple[float, float]
-    """Relative error of depth, its standard deviation drawn between these; 70 % of it
-    is constant."""
+    """Range of the standard deviation of the relative depth error, 70 % of which
+    (variance) is constant in time."""
     depth_white: float
-    """Relative error of depth, white part."""
+    """White part of the relative depth error."""
     offset: float
     """Error of the pelvis in the image, px."""
     track: tuple[float, float]
-    """Standard deviation of a track's pixels, drawn between these, px."""
+    """Range of the standard deviation of a track's pixels, px."""
     track_outliers: float
     """Share of observations of tracks that are outliers."""
 
@@ -82,7 +78,7 @@ NOISE = {
 
 
 def noise_of_keypoints(settings: Simulation) -> Noise:
-    """The noise of keypoints under these settings."""
+    """Returns the noise of keypoints under these settings."""
     noise = NOISE[settings.keypoint_noise or settings.noise]
     share = settings.keypoint_errors * noise.keypoint_share
     rates = {"outlier_rate": settings.outliers, "swap_rate": settings.exchanged}
@@ -91,7 +87,7 @@ def noise_of_keypoints(settings: Simulation) -> Noise:
 
 
 def noise_of_bodies(settings: Simulation) -> Noise:
-    """The noise of regressed bodies under these settings.
+    """Returns the noise of regressed bodies under these settings.
 
     Second differences of AR(1) noise of unit variance have variance (1 - ρ)(6 - 2ρ),
     those of white noise 6: less jitter means a larger ρ, more means added white noise.
@@ -119,10 +115,11 @@ _HANDS_FEET = np.isin(np.arange(24), (*ANKLES, *FEET, *WRISTS, *HANDS))
 def ar1(
     rng: np.random.Generator, shape: tuple[int, ...], correlation: float
 ) -> Float[np.ndarray, "t ..."]:
-    """Stationary first-order autoregressive noise along the first axis, deviation 1."""
+    """Returns stationary first-order autoregressive noise along the first axis, with
+    standard deviation 1."""
     x = rng.standard_normal(shape)
     x[1:] *= np.sqrt(1 - correlation**2)
-    # By hand: `scipy.signal` is slow to import, and every command would wait for it.
+    # A loop, because importing `scipy.signal` would delay every command.
     for k in range(1, len(x)):
         x[k] += correlation * x[k - 1]
     return x
@@ -131,7 +128,8 @@ def ar1(
 def project(
     p_C: Float[np.ndarray, "*b 3"], intrinsics: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "*b 2"]:
-    """Pinhole projection, px; points behind the camera are projected far away."""
+    """Projects points by a pinhole camera, px; points behind the camera project far
+    away."""
     z = np.maximum(p_C[..., 2:], 1e-3)
     return p_C[..., :2] / z * intrinsics[:2] + intrinsics[2:]
 
@@ -145,11 +143,12 @@ def detect_keypoints(
     rng: np.random.Generator,
     hidden_by_others: Bool[np.ndarray, "t 25"] | None = None,
 ) -> tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]:
-    """Pixels and confidences of BODY_25 keypoints at `p_C` in the camera frame.
+    """Returns measured pixels and confidences of BODY_25 keypoints at `p_C` (m, camera
+    frame).
 
-    Confidence decreases with the expected error: occluded joints and bad moments have
-    larger errors and lower confidence. Missing keypoints are 0 0 0, as are those hidden
-    by furniture or another person.
+    Confidence decreases with the expected error: occluded joints and temporary
+    disturbances have larger errors and lower confidence. Missing keypoints are 0 0 0,
+    as are those hidden by furniture or another person.
     """
     t = len(p_C)
     exact = project(p_C, intrinsics)
@@ -157,7 +156,7 @@ def detect_keypoints(
     scale = np.sqrt(extent.prod(axis=1).clip(100.0))[:, None]
     sigma = noise.keypoint_share * np.array(KEYPOINT_SPREAD["body25"]) * scale
     hidden = _self_occlusion(p_C, joints_C, intrinsics)
-    # A slowly varying factor on the error, which confidence follows in part
+    # A slowly varying factor on the error, which is correlated with confidence.
     trouble = np.exp(0.4 * ar1(rng, (t, 25), 0.95)) * (1 + 0.9 * hidden)
     slow = ar1(rng, (t, 25, 2), noise.keypoint_correlation)
     white = rng.standard_normal((t, 25, 2))
@@ -192,7 +191,7 @@ def detect_keypoints(
 
 
 def _self_occlusion(p_C, joints_C, intrinsics) -> Bool[np.ndarray, "t 25"]:
-    """Whether trunk, thigh or head is in front of a keypoint."""
+    """Returns whether trunk, thigh or head is in front of a keypoint."""
     bones = ((0, 12, 0.13), (1, 4, 0.07), (2, 5, 0.07), (12, 15, 0.10))
     uv, at = project(p_C, intrinsics), project(joints_C, intrinsics)
     hidden = np.zeros(p_C.shape[:2], bool)
@@ -209,7 +208,8 @@ def _self_occlusion(p_C, joints_C, intrinsics) -> Bool[np.ndarray, "t 25"]:
 
 
 def _episodes(rng, shape, rate: float, length: float) -> Bool[np.ndarray, "t n"]:
-    """Runs of about `length` frames that together fill a share `rate` of all frames."""
+    """Returns runs of about `length` frames that together fill a share `rate` of all
+    frames."""
     state = rng.random(shape[1:]) < rate
     out = np.empty(shape, bool)
     start = rate / max((1 - rate) * length, 1e-9)
@@ -228,11 +228,11 @@ class Regressed:
     """Axis-angle, rad; the root turns the body into the camera frame."""
     shapes: Float[np.ndarray, "m 10"]
     trans: Float[np.ndarray, "m 3"]
-    """m, camera frame: the pelvis is at `J_0(β) + trans`."""
+    """Translation, m, camera frame: the pelvis is at `J_0(β) + trans`."""
     box: Float[np.ndarray, "m 3"]
-    """The crop that the network took: centre and side, px."""
+    """Crop that the network used: centre and side, px."""
     camera: Float[np.ndarray, "m 3"]
-    """The same as weak perspective `s tx ty` in that crop."""
+    """Weak perspective camera `s tx ty` in that crop that is equivalent to `trans`."""
     poses_crop: Float[np.ndarray, "m 72"]
     """`poses` with the root relative to the crop's ray."""
 
@@ -246,7 +246,8 @@ def regress_bodies(
     noise: Noise,
     rng: np.random.Generator,
 ) -> Regressed:
-    """Bodies regressed for a `person` with these true poses in the camera frame.
+    """Returns bodies as regressed for a `person` with these true poses in the camera
+    frame.
 
     Crops are around `keypoints`; frames without enough of them are left out.
     """
@@ -268,7 +269,7 @@ def regress_bodies(
     flicker = 0.1 * noise.shape_white * ar1(rng, (t, 10), 0.9)
     shapes = shape + flicker
     visible = person.rest_joints(shape)
-    # Size and depth are ambiguous: a taller estimate is farther in proportion.
+    # Size and depth are ambiguous: a taller estimate is proportionally farther.
     taller = np.ptp(visible[:, 1]) / np.ptp(person.rest[:, 1])
     sigma = rng.uniform(*noise.depth)
     depth = 1 + sigma * np.sqrt(0.7) * np.clip(rng.standard_normal(), -1.5, 1.5)
@@ -306,7 +307,7 @@ def regress_bodies(
 def crop_boxes(
     uv: Float[np.ndarray, "t 25 2"], confidence: Float[np.ndarray, "t 25"]
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
-    """Square crops about people, as SPIN makes them.
+    """Returns square crops around people, as SPIN makes them.
 
     **Returns:** in each frame the crop's centre (u, v; mean of the keypoints of
     confidence above 0.2) and side (1.2 times their larger extent), px; and whether

@@ -1,8 +1,8 @@
-"""The ten named sequences: walk, camera, room, and measurements of them."""
+"""Simulates the ten named sequences: walk, camera, room, and measurements of them."""
 
 import dataclasses
 import zlib
-from collections.abc import Sequence
+from collections.abc import Sequence as Many
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,14 @@ from bodyslam_jax.simulation.sensor_noise import (
     noise_of_keypoints,
     regress_bodies,
 )
-from bodyslam_jax.types import Tracks
+from bodyslam_jax.types import (
+    Bodies,
+    Intrinsics,
+    Keypoints,
+    Result,
+    Sequence,
+    Tracks,
+)
 
 ASSETS = Path(__file__).parent / "assets"
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
@@ -42,10 +49,10 @@ LENGTH = {
     **{"E1": 600, "E2": 700, "E3": 800, "M1": 700, "M2": 800, "M3": 900, "M4": 1000},
     **{"D1": 600, "D2": 800, "D3": 1000},
 }
-"""Frames of each sequence at 30 fps."""
-_MOST_PEOPLE = 3
-_AROUND = ("E3", "M2", "M4", "D2")
-"""Sequences in which the person walks round the camera; else in front of it."""
+"""Number of frames of each sequence, at 30 fps."""
+_MAX_PEOPLE = 3
+_SEQUENCES_AROUND_CAMERA = ("E3", "M2", "M4", "D2")
+"""Sequences in which the person walks around the camera instead of in front of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +64,7 @@ class Actor:
     walk: Walk
     """The true motion."""
     joints: Float[np.ndarray, "t 24 3"]
-    """True joints, world."""
+    """True joints, m, world frame."""
     keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
     """Measured pixels and confidences, BODY_25; missing points are 0 0 0."""
     bodies: Regressed
@@ -82,19 +89,19 @@ class SimulatedSequence:
     name: str
     settings: Simulation
     timestamps: Float[np.ndarray, " t"]
-    """s"""
+    """Times of the frames, s."""
     intrinsics: Float[np.ndarray, "4"]
     """`fx fy cx cy`, px."""
     size: tuple[int, int]
     """Width and height of the image, px."""
     T_WC: Float[np.ndarray, "t 4 4"]
-    """True cameras, camera to world."""
+    """True cameras, camera to world, m."""
     person: Person
     """The true body at rest."""
     walk: Walk
     """The true motion."""
     joints: Float[np.ndarray, "t 24 3"]
-    """True joints, world."""
+    """True joints, m, world frame."""
     room: Room
     keypoints: tuple[Float[np.ndarray, "t 25 2"], Float[np.ndarray, "t 25"]]
     """Measured pixels and confidences, BODY_25; missing points are 0 0 0."""
@@ -109,7 +116,7 @@ class SimulatedSequence:
 
     @property
     def seed(self) -> int:
-        """The seed of all random numbers."""
+        """Seed of all random numbers."""
         return _seed_of(self.settings)
 
     @property
@@ -143,10 +150,10 @@ def simulate(
     - `settings`: which sequence, family, length, seed, motion and noise.
     - `body`: the body model, whose pose blend shapes are ignored; the default without.
 
-    **Raises:** `InputError`, naming the file, if the motion
-    cannot be read or holds no walking; `ValueError` if there are fewer than 2 frames,
-    for a negative seed, a bias that is no number, a number of people that is not
-    between 1 and 3, or an exposure or readout that is not between 0 and a frame.
+    **Raises:** `InputError`, naming the file, if the motion cannot be read or holds no
+    walking; `ValueError` if there are fewer than 2 frames, for a negative seed, a bias
+    that is no number, a number of people that is not between 1 and 3, or an exposure or
+    readout that is not between 0 and a frame.
     """
     length = settings.length
     num_frames = LENGTH[settings.sequence] if length is None else length
@@ -164,9 +171,9 @@ def simulate(
         raise InputError(
             f"detector bias {settings.detector_bias}: expected a finite number."
         )
-    if not 1 <= settings.people <= _MOST_PEOPLE:
+    if not 1 <= settings.people <= _MAX_PEOPLE:
         raise InputError(
-            f"people {settings.people}: expected 1 to {_MOST_PEOPLE} walkers."
+            f"people {settings.people}: expected 1 to {_MAX_PEOPLE} walkers."
         )
     for what in ("exposure", "readout"):
         value = getattr(settings, what)
@@ -174,7 +181,7 @@ def simulate(
             raise InputError(f"{what} {value}: expected 0 to {1 / FPS:.4f} s, a frame.")
     name = f"{settings.sequence}-{settings.family}"
     seed = _seed_of(settings)
-    # One stream each, so that the noise level does not change the truth
+    # Separate streams, so that the noise level does not change the truth.
     truth, key, reg, pts = np.random.default_rng(seed).spawn(4)
     source = settings.motion or str(ASSETS / "walking.npz")
     clips = walking_clips(read_motion(source), source)
@@ -182,7 +189,7 @@ def simulate(
     shape = np.clip(truth.standard_normal(10), -2.0, 2.0)
     person = Person(body or load_body_model(), shape)
     handling = HANDLING[settings.sequence[0]]
-    around = settings.sequence in _AROUND
+    around = settings.sequence in _SEQUENCES_AROUND_CAMERA
     path, place = floor_path(settings.family, around, truth)
     walk = walk_along(person, clips, path, num_frames, truth)
     if settings.family == "room":
@@ -220,7 +227,7 @@ def _other(
     clips: tuple[Clip, ...],
     num_frames: int,
 ) -> tuple[Person, Walk]:
-    """Person `h`, of another shape, on a path beside the first person's.
+    """Returns shape and walk of person `h`, on a path beside the first person's.
 
     In a room it is a smaller or larger loop, shifted by up to an eighth of it; in a
     hall a parallel path, shifted by up to 2.5 m.
@@ -250,10 +257,13 @@ def measure(
     T_WC: Float[np.ndarray, "t 4 4"],
     room: Room,
     streams: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
-    others: Sequence[tuple[Person, Walk]] = (),
+    others: Many[tuple[Person, Walk]] = (),
 ) -> SimulatedSequence:
-    """Adds measurements; `streams` are for keypoints, bodies and tracks of the first
-    person, `others` have their own."""
+    """Simulates the measurements of a sequence.
+
+    `streams` are the random numbers for keypoints, bodies and tracks of the first
+    person; `others` have their own.
+    """
     R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
     to_camera = lambda x: np.einsum("tab,tjb->tja", R_CW, x - centre[:, None])
     everyone = [(person, walk), *others]
@@ -308,3 +318,49 @@ def measure(
         landmarks=landmarks,
         others=tuple(actors[1:]),
     )
+
+
+def as_sequence(simulated: SimulatedSequence) -> Sequence:
+    """Returns the measurements as the readers would return them, without a video."""
+    actors, t = simulated.actors, simulated.num_frames
+    present = np.zeros((len(actors), t), bool)
+    poses, shapes = np.zeros((len(actors), t, 72)), np.zeros((len(actors), t, 10))
+    trans = np.zeros((len(actors), t, 3))
+    for h, actor in enumerate(actors):
+        bodies = actor.bodies
+        present[h, bodies.frame] = True
+        poses[h, bodies.frame] = bodies.poses
+        shapes[h, bodies.frame] = bodies.shapes
+        trans[h, bodies.frame] = bodies.trans
+    uv, confidence = (np.stack([a.keypoints[i] for a in actors]) for i in range(2))
+    return Sequence(
+        name=simulated.name,
+        frames=None,
+        timestamps=simulated.timestamps,
+        intrinsics=Intrinsics(simulated.intrinsics, *simulated.size),
+        keypoints=Keypoints(uv, confidence),
+        bodies=Bodies(present, poses, shapes, trans, shapes_regressed(simulated)),
+        tracks=simulated.tracks,
+    )
+
+
+def as_truth(simulated: SimulatedSequence) -> Result:
+    """Returns the truth as a result that an estimate can be compared with."""
+    return Result(
+        timestamps=simulated.timestamps,
+        T_WC=simulated.T_WC,
+        scale=1.0,
+        intrinsics=simulated.intrinsics,
+        landmarks=simulated.landmarks,
+        poses=np.stack([a.poses for a in simulated.actors]),
+        trans=np.stack([a.trans for a in simulated.actors]),
+        betas=np.stack([a.person.shape for a in simulated.actors]),
+        joints=np.stack([a.joints for a in simulated.actors]),
+        present=np.ones((len(simulated.actors), simulated.num_frames), bool),
+    )
+
+
+def shapes_regressed(simulated: SimulatedSequence) -> bool:
+    """Returns whether shapes have the errors of a regressor."""
+    settings = simulated.settings
+    return (settings.body_noise or settings.noise) != "none"

@@ -1,8 +1,8 @@
-"""When a pixel is exposed: the camera and the people around the time of a frame.
+"""Models the exposure of each pixel: camera and people around the time of a frame.
 
-Between frames everything moves quadratically in time through three frames. A frame's
-time is the middle of the exposure of its middle row, so that neither a long exposure
-nor a rolling shutter shifts the image in time on average.
+Between frames all motion is quadratic in time, through three frames. A frame's time is
+the middle of the exposure of its middle row, so that neither a long exposure nor a
+rolling shutter shifts the image in time on average.
 """
 
 import dataclasses
@@ -21,16 +21,17 @@ class Shutter:
     """
 
     exposure: float = 0.0
-    """s"""
+    """Exposure time of a row, s."""
     readout: float = 0.0
-    """s"""
+    """Delay between the first and the last row, s."""
 
     def row_times(self, rows: int) -> Float[np.ndarray, " rows"]:
-        """Middle of each row's exposure relative to the frame's time, s."""
+        """Returns the middle of each row's exposure relative to the frame's time, s."""
         return self.readout * ((np.arange(rows) + 0.5) / rows - 0.5)
 
     def instants(self, count: int) -> Float[np.ndarray, " {count}"]:
-        """Times within the exposure that are averaged, evenly spaced, s."""
+        """Returns evenly spaced times within the exposure, s, whose images are
+        averaged."""
         return self.exposure * ((np.arange(count) + 0.5) / count - 0.5)
 
 
@@ -39,7 +40,7 @@ def around(
 ) -> tuple[
     Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]
 ]:
-    """Value, first and second difference of a series at frame `k`, a frame apart.
+    """Returns value, first and second difference (per frame) of a series at frame `k`.
 
     At the ends the motion is extrapolated with constant velocity.
     """
@@ -53,7 +54,7 @@ def around(
 def cameras_at(
     T_WC: Float[np.ndarray, "t 4 4"], k: int, when: Float[np.ndarray, " n"], fps: float
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Camera poses at times `when` (s) relative to frame `k`.
+    """Returns the camera poses at times `when` (s) relative to frame `k`.
 
     The rotation is that of frame `k` times the exponential of a quadratic.
     """

@@ -1,10 +1,10 @@
-"""Textures with detail at every scale: stains, tiles, shapes, letters."""
+"""Generates textures with detail at every scale: stains, tiles, shapes, letters."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import zoom
 
-_BASE = {
+_BASE_COLOURS = {
     "floor": (105, 125, 150),
     "ceiling": (185, 190, 190),
     "wall": (160, 165, 165),
@@ -16,11 +16,13 @@ _BASE = {
 def make_texture(
     rng: np.random.Generator, height: int, width: int, kind: str, per_metre: float
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """A texture of `per_metre` texels a metre for a floor, wall, ceiling or furniture.
+    """Returns a texture for a floor, wall, ceiling or furniture, with `per_metre`
+    texels per metre.
 
-    BRISK finds corners in it from half a metre to ten, and no part of it repeats.
+    BRISK finds corners in it at distances from half a metre to ten, and no part of it
+    repeats.
     """
-    base = np.array(_BASE[kind], np.float32) * rng.uniform(0.8, 1.15)
+    base = np.array(_BASE_COLOURS[kind], np.float32) * rng.uniform(0.8, 1.15)
     base = base * rng.uniform(0.9, 1.1, 3)
     image = base * (1 + 0.22 * _clouds(rng, height, width))[:, :, None]
     if kind in ("floor", "ceiling"):
@@ -39,7 +41,8 @@ def make_texture(
 def _clouds(
     rng: np.random.Generator, height: int, width: int
 ) -> Float[np.ndarray, "{height} {width}"]:
-    """Noise of all sizes from the whole texture down to four texels, about ±1."""
+    """Returns noise of all sizes from the whole texture down to four texels, about
+    ±1."""
     total = np.zeros((height, width), np.float32)
     cell, weight = 128, 1.0
     while cell >= 4:
@@ -51,7 +54,7 @@ def _clouds(
 
 
 def _tile(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
-    """Tiles or boards, each a little brighter or darker, with dark joints."""
+    """Draws tiles or boards, each a little brighter or darker, with dark joints."""
     height, width = image.shape[:2]
     rows = np.append(np.arange(0, height, max(size, 4)), height).astype(int)
     columns = np.append(np.arange(0, width, max(size, 4)), width).astype(int)
@@ -63,13 +66,14 @@ def _tile(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
 
 
 def _grain(rng: np.random.Generator, image: np.ndarray) -> None:
-    """Streaks along the rows, as of wood."""
+    """Draws streaks along the rows, as of wood."""
     lines = rng.standard_normal((image.shape[0], 1, 1)).astype(np.float32)
     image *= 1 + 0.08 * lines
 
 
 def _shape(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
-    """A disc, a ring, a rectangle or a frame, darker or brighter than its ground."""
+    """Draws a disc, a ring, a rectangle or a frame, darker or brighter than the
+    background."""
     h, w = np.maximum(2, size * rng.uniform(0.5, 1.0, 2)).astype(int)
     top = int(rng.integers(0, max(1, image.shape[0] - h)))
     left = int(rng.integers(0, max(1, image.shape[1] - w)))
@@ -85,7 +89,7 @@ def _shape(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
 
 
 def _letters(rng: np.random.Generator, image: np.ndarray, dot: int) -> None:
-    """A word of random letters of 5 by 7 dots."""
+    """Draws a word of random letters of 5 by 7 dots."""
     count = int(rng.integers(2, 7))
     dots = rng.random((7, 6 * count)) < 0.5
     dots[:, 5::6] = False

@@ -1,4 +1,4 @@
-"""Simulated sequences as folders, with their ground truth."""
+"""Writes simulated sequences as folders, with their ground truth."""
 
 import contextlib
 import dataclasses
@@ -16,18 +16,20 @@ from bodyslam_jax.config import Simulation
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
 from bodyslam_jax.io.files import read_json
-from bodyslam_jax.simulation.as_types import shapes_regressed
 from bodyslam_jax.simulation.camera_paths import FPS
-from bodyslam_jax.simulation.film import render
-from bodyslam_jax.simulation.renderer import write_video
+from bodyslam_jax.simulation.renderer import render, write_video
 from bodyslam_jax.simulation.sensor_noise import Regressed
-from bodyslam_jax.simulation.sequences import SimulatedSequence, simulate
+from bodyslam_jax.simulation.sequences import (
+    SimulatedSequence,
+    shapes_regressed,
+    simulate,
+)
 
-_MARK = "simulation.json"
-"""Settings of the simulation; a folder with it may be written again."""
-_PARTIAL = ".simulation-"
-_FILM = "video.mp4"
-_OWN = (
+_MARKER_FILE = "simulation.json"
+"""File with the settings of the simulation; a folder that has it may be overwritten."""
+_PARTIAL_PREFIX = ".simulation-"
+_VIDEO_FILE = "video.mp4"
+_SIMULATION_FILES = (
     "groundtruth/camera.txt",
     "groundtruth/landmarks.npy",
     "groundtruth/body.npz",
@@ -37,10 +39,11 @@ _OWN = (
     "bodies_weak_perspective.npz",
     "keypoints/[EMD][1-4]-*_keypoints.json",
     "tracks.npz",
-    _FILM,
+    _VIDEO_FILE,
 )
-"""Files of a simulation. They are written in this order and removed in the reverse, so
-that an incomplete folder has neither tracks nor frames and is refused by readers."""
+"""Files of a simulation. They are written in this order and removed in the reverse
+order, so that an incomplete folder has neither tracks nor frames and is refused by
+readers."""
 _DEMO_FRAMES = 105
 
 
@@ -51,7 +54,7 @@ def write_sequence(
     tracks: bool = True,
     people: bool = True,
 ) -> Path:
-    """Writes a sequence folder with its ground truth, whole or not at all.
+    """Writes a sequence folder with its ground truth, atomically.
 
     A video is rendered if the settings say so. `bodies_weak_perspective.npz` holds the
     same bodies as `bodies.npz`, as weak perspective in the crops they were seen in.
@@ -74,7 +77,8 @@ def write_sequence(
 
 
 def check_folder(folder: Path, settings: Simulation) -> None:
-    """Fails early, before anything is simulated; leaves `folder` as it is.
+    """Checks that `folder` can be written, before anything is simulated; leaves it
+    unchanged.
 
     **Raises:** as `write_sequence`.
     """
@@ -83,7 +87,7 @@ def check_folder(folder: Path, settings: Simulation) -> None:
 
 
 def demo_settings(seed: int = 0) -> Simulation:
-    """Settings of the demo: 3.5 s in which the camera follows a walker."""
+    """Returns the settings of the demo: 3.5 s in which the camera follows a walker."""
     return Simulation(
         sequence="M1", family="follow", length=_DEMO_FRAMES, seed=seed, render=True
     )
@@ -98,10 +102,10 @@ def demo_scene(
 ) -> Path:
     """Renders the demo: a walker whom a moving camera follows.
 
-    Writes a sequence folder without tracks, so that they come from the video. A
-    scene of the same seed is kept. `simulated` is the demo's scene of that seed, if
-    it was simulated already. Without `people` there are neither keypoints nor bodies,
-    so that people come from the video, too.
+    Writes a sequence folder without tracks, so that they are computed from the video.
+    An existing scene of the same seed is kept. `simulated` is the demo's scene of that
+    seed, if it was simulated already. Without `people` there are neither keypoints nor
+    bodies, so that people are detected in the video, too.
     """
     settings = demo_settings(seed)
     if _earlier(Path(folder)) == _mark(settings, False, people):
@@ -112,8 +116,8 @@ def demo_scene(
 
 
 def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
-    """Renders a sequence to a folder with the video and the camera's calibration only,
-    so that people and tracks have to be found in the images; with the ground truth.
+    """Renders a sequence to a folder with the video, the camera's calibration and the
+    ground truth only, so that people and tracks must be found in the images.
 
     An existing film of the same settings is kept.
 
@@ -128,13 +132,14 @@ def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:
 
 @contextlib.contextmanager
 def _partial(folder: Path, settings: Simulation) -> Iterator[Path]:
-    """A temporary hidden folder in `folder`; on failure created folders are removed."""
+    """Yields a temporary hidden folder in `folder`; on failure, created folders are
+    removed."""
     try:
         _check(folder, settings)
         home = Path(os.path.realpath(folder))
-        for killed in home.glob(f"{_PARTIAL}????????"):
+        for killed in home.glob(f"{_PARTIAL_PREFIX}????????"):
             shutil.rmtree(killed, ignore_errors=True)
-        with atomic.hidden_folder(home, _PARTIAL) as partial:
+        with atomic.hidden_folder(home, _PARTIAL_PREFIX) as partial:
             yield partial
     except OSError as error:
         reason = error.strerror or error
@@ -148,22 +153,29 @@ def _check(folder: Path, settings: Simulation) -> None:
         return
     earlier = _earlier(folder)
     if earlier is None:
-        if any(not entry.name.startswith(_PARTIAL) for entry in folder.iterdir()):
+        if any(
+            not entry.name.startswith(_PARTIAL_PREFIX) for entry in folder.iterdir()
+        ):
             raise InputError(
                 f"{folder}: not empty and not a simulation; choose another."
             )
-    elif settings.render and not earlier.get("render") and (folder / _FILM).exists():
+    elif (
+        settings.render
+        and not earlier.get("render")
+        and (folder / _VIDEO_FILE).exists()
+    ):
         raise InputError(
-            f"{folder}: has {_FILM}, which no simulation wrote; choose another folder."
+            f"{folder}: has {_VIDEO_FILE}, which no simulation wrote; choose "
+            "another folder."
         )
 
 
 def _earlier(folder: Path) -> dict[str, Any] | None:
-    """Settings of the simulation in a folder; `None` if there is none."""
-    if not (folder / _MARK).exists():
+    """Returns the settings of the simulation in a folder; `None` if there is none."""
+    if not (folder / _MARKER_FILE).exists():
         return None
     try:
-        found = read_json(folder / _MARK)
+        found = read_json(folder / _MARKER_FILE)
     except InputError:
         return {}
     return found if isinstance(found, dict) else {}
@@ -176,22 +188,22 @@ def _move(partial: Path, folder: Path, settings: Simulation) -> None:
     # An interruption from here on leaves a folder marked as unfinished.
     mark = {"unfinished": True, "render": was_rendered or settings.render}
     (partial / "mark").write_text(json.dumps(mark))
-    os.replace(partial / "mark", folder / _MARK)
+    os.replace(partial / "mark", folder / _MARKER_FILE)
     for name in ("keypoints", "groundtruth"):
         if (folder / name).is_symlink():  # its target belongs to somebody else
             (folder / name).unlink()
-    for pattern in reversed(_OWN):
-        if pattern != _FILM or was_rendered:
+    for pattern in reversed(_SIMULATION_FILES):
+        if pattern != _VIDEO_FILE or was_rendered:
             for old in folder.glob(pattern):
                 old.unlink()
     with contextlib.suppress(OSError):  # absent, or with other files in it
         (folder / "keypoints").rmdir()
-    for pattern in _OWN:
+    for pattern in _SIMULATION_FILES:
         for new in sorted(partial.glob(pattern)):
             place = folder / new.relative_to(partial)
             place.parent.mkdir(exist_ok=True)
             os.replace(new, place)
-    os.replace(partial / _MARK, folder / _MARK)
+    os.replace(partial / _MARKER_FILE, folder / _MARKER_FILE)
 
 
 def _write(
@@ -229,19 +241,20 @@ def _write(
             joints=actor.joints,
         )
     if simulated.settings.render:
-        write_video(folder / _FILM, render(simulated), FPS, simulated.size)
+        write_video(folder / _VIDEO_FILE, render(simulated), FPS, simulated.size)
     mark = _mark(simulated.settings, tracks, people)
-    (folder / _MARK).write_text(json.dumps(mark, indent=1))
+    (folder / _MARKER_FILE).write_text(json.dumps(mark, indent=1))
 
 
 def _mark(settings: Simulation, tracks: bool, people: bool) -> dict[str, Any]:
-    """The mark of a folder: settings, and which measurements it holds."""
+    """Returns the content of the marker file: settings, and which measurements are
+    written."""
     measured = {"tracks": tracks, "people": people}
     return {**dataclasses.asdict(settings), "measured": measured}
 
 
 def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
-    """Keypoints and bodies as they are measured."""
+    """Writes the measured keypoints and bodies."""
     _write_keypoints(folder / "keypoints", simulated)
     bodies, person = _stacked([actor.bodies for actor in simulated.actors])
     np.savez_compressed(
@@ -268,7 +281,8 @@ def _write_people(folder: Path, simulated: SimulatedSequence) -> None:
 def _stacked(
     people: list[Regressed],
 ) -> tuple[Regressed, Int[np.ndarray, " m"]]:
-    """Bodies of all people one after the other, and whose each is."""
+    """Returns the bodies of all people concatenated, and the index of each body's
+    person."""
     names = [field.name for field in dataclasses.fields(Regressed)]
     joined = {n: np.concatenate([getattr(p, n) for p in people]) for n in names}
     count = [len(one.frame) for one in people]
@@ -276,7 +290,8 @@ def _stacked(
 
 
 def _write_keypoints(folder: Path, simulated: SimulatedSequence) -> None:
-    """One file per frame in OpenPose's layout, without a person where none is found."""
+    """Writes one file per frame in OpenPose's layout; undetected people are left
+    out."""
     folder.mkdir()
     for k in range(simulated.num_frames):
         people = []

@@ -1,3 +1,3 @@
-"""Whether keypoints, bodies and camera are of one video."""
+"""Checks whether keypoints, bodies and camera belong to the same video."""
 
 from bodyslam_jax.diagnostics.agreement.reconcile import reconcile as reconcile

@@ -1,5 +1,5 @@
-"""Identities that a tracker exchanged for a while, in keypoints or in bodies: where
-people cross or occlude each other."""
+"""Undoes temporary exchanges of identities between two people, in keypoints or in
+bodies: trackers make them where people cross or occlude each other."""
 
 import dataclasses
 import itertools
@@ -17,20 +17,26 @@ from bodyslam_jax.diagnostics.agreement.image_points import (
 )
 from bodyslam_jax.types import Sequence
 
-_CLEAR = 0.1
-"""Distance, in sizes of a person, by which the exchange has to fit better."""
-_FEWEST = 5
-_WINDOW = 9
-"""Frames over which one is an outlier."""
-_JUMP = 1.5
-"""Ratio of jumps from which the kind that jumps further is the exchanged one."""
+_MIN_EXCHANGE_GAIN = 0.1
+"""Decrease of the distance, in sizes of a person, from which an exchange is
+accepted."""
+_MIN_EXCHANGED_FRAMES = 5
+_MEDIAN_WINDOW_FRAMES = 9
+"""Window of the median filter that removes outliers of single frames."""
+_MIN_JUMP_RATIO = 1.5
+"""Ratio of the jumps of keypoints and bodies from which the kind that jumps further is
+considered the exchanged one."""
 
 
 def put_back_exchanges(
     sequence: Sequence, people: People, warn: Callable[[str], None]
 ) -> Sequence:
-    """The sequence with keypoints and bodies of the same person in the same row, in all
-    frames. Where neither kind jumps, bodies are changed to follow the keypoints."""
+    """Returns the sequence with keypoints and bodies of the same person in the same row
+    in all frames.
+
+    Where neither kind jumps clearly further, bodies are changed to follow the
+    keypoints.
+    """
     projected = project(people.camera, people.bodies)
     apart = distances(people.keypoints, projected)
     rows = range(min(apart.shape[1:]))
@@ -43,8 +49,8 @@ def put_back_exchanges(
         jumps = [
             _jump(points[:, [i, j]], at) for points in (people.keypoints, projected)
         ]
-        what = "keypoints" if jumps[0] > _JUMP * jumps[1] else "bodies"
-        sure = max(jumps) > _JUMP * min(jumps)
+        what = "keypoints" if jumps[0] > _MIN_JUMP_RATIO * jumps[1] else "bodies"
+        sure = max(jumps) > _MIN_JUMP_RATIO * min(jumps)
         sequence = _exchanged(sequence, what, (i, j), at)
         frames = np.flatnonzero(at)
         warn(
@@ -58,13 +64,14 @@ def put_back_exchanges(
 def _stretches(
     apart: Float[np.ndarray, "t 2 2"],
 ) -> Iterator[tuple[int, int]]:
-    """First and last frames of the stretches that fit better exchanged."""
+    """Yields the first and last frames of the stretches that fit better after an
+    exchange."""
     gain = apart[:, 0, 0] + apart[:, 1, 1] - apart[:, 0, 1] - apart[:, 1, 0]
     (comparable,) = np.nonzero(np.isfinite(gain))
-    if len(comparable) < _FEWEST:
+    if len(comparable) < _MIN_EXCHANGED_FRAMES:
         return
-    smooth = median_filter(gain[comparable], _WINDOW, mode="nearest")
-    decided = np.abs(smooth) > _CLEAR
+    smooth = median_filter(gain[comparable], _MEDIAN_WINDOW_FRAMES, mode="nearest")
+    decided = np.abs(smooth) > _MIN_EXCHANGE_GAIN
     if not decided.any():
         return
     # Where both fit, as people cross, the last decision is kept.
@@ -74,7 +81,7 @@ def _stretches(
     starts: Int[np.ndarray, " n"] = np.flatnonzero(edges == 1)
     ends = np.flatnonzero(edges == -1) - 1
     for first, last in zip(starts.tolist(), ends.tolist(), strict=True):
-        if last - first + 1 >= _FEWEST:
+        if last - first + 1 >= _MIN_EXCHANGED_FRAMES:
             begin = 0 if first == 0 else int(comparable[first])
             end = (
                 len(apart) - 1 if last == len(comparable) - 1 else int(comparable[last])
@@ -83,7 +90,8 @@ def _stretches(
 
 
 def _jump(points: Float[np.ndarray, "t 2 14 2"], at: Bool[np.ndarray, " t"]) -> float:
-    """Largest motion of either person, in sizes, where stretches begin and end."""
+    """Returns the largest displacement of either person, in sizes, across the start or
+    end of a stretch."""
     middle, radius = centred(points)
     largest = 0.0
     for frame in np.flatnonzero(np.diff(at.astype(int))):

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.diagnostics.agreement.image_points import (
-    SWAPPED,
+    MIRRORED_POINTS,
     People,
     centred,
     distances,
@@ -29,27 +29,28 @@ from bodyslam_jax.diagnostics.agreement.image_points import (
 
 Forecast = Callable[[Float[np.ndarray, "t b 14 3"]], Float[np.ndarray, "t b 14 2"]]
 
-_PLACE, _SIZE = 0.04, 0.12
-"""Relative tolerances to a common ratio: of ratios measured by positions in the image,
-and by sizes, in which regressors have larger errors."""
-_SIMPLE = (1 / 4, 1 / 3, 3 / 8, 4 / 9, 1 / 2, 2 / 3, 3 / 4, 4 / 5)
-"""Ratios of common video formats: 2160, 1440, 1080, 960, 720, 540, 480 lines."""
+_POSITION_RATIO_TOLERANCE, _SIZE_RATIO_TOLERANCE = 0.04, 0.12
+"""Relative tolerances to a common ratio, for ratios measured by positions in the image
+and by sizes; regressors have larger errors in sizes."""
+_COMMON_RESIZE_RATIOS = (1 / 4, 1 / 3, 3 / 8, 4 / 9, 1 / 2, 2 / 3, 3 / 4, 4 / 5)
+"""Ratios between common video formats: 2160, 1440, 1080, 960, 720, 540, 480 lines."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageMap:
-    """`q = A p + b`: pixels of the video -> pixels of the image of the keypoints."""
+    """Affine map `q = A p + b` from pixels of the video to pixels of the keypoints'
+    image."""
 
     A: Float[np.ndarray, "2 2"]
     b: Float[np.ndarray, " 2"]
     swap: bool = False
-    """Whether left and right are exchanged."""
+    """Whether the map exchanges left and right."""
 
     def __call__(
         self, uv: Float[np.ndarray, "*n 14 2"]
     ) -> Float[np.ndarray, "*n 14 2"]:
         moved = uv @ self.A.T + self.b
-        return moved[..., SWAPPED, :] if self.swap else moved
+        return moved[..., MIRRORED_POINTS, :] if self.swap else moved
 
     def inverse(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """`A^-1 (q - b)`: pixels of the image of the keypoints -> pixels of the video.
@@ -69,18 +70,21 @@ class Explanation:
     forecast: Forecast
     image: ImageMap = ImageMap(np.eye(2), np.zeros(2))
     R: Float[np.ndarray, "3 3"] = dataclasses.field(default_factory=lambda: np.eye(3))
-    """Rotates given bodies into the camera frame."""
+    """Rotation of the given bodies into the camera frame."""
     factor: float = 1.0
-    """Factor of resizing; the bodies' focal length over the camera's; units per m."""
+    """Depending on `kind`: factor of resizing; the bodies' focal length over the
+    camera's; or units of `trans` per metre."""
     name: str = ""
     reason: bool = True
-    """Whether `factor` is a common one, such as 1/2 or 1000, not the measured one."""
+    """Whether `factor` is a common one, such as 1/2 or 1000, rather than a measured
+    one."""
 
 
 def disagreement(
     detected: Float[np.ndarray, "t k 14 2"], projected: Float[np.ndarray, "t b 14 2"]
 ) -> float:
-    """How far detected keypoints and projected bodies are apart, in sizes of a person.
+    """Returns the distance between detected keypoints and projected bodies, in sizes of
+    a person.
 
     For each detected person and frame the distance to the nearest projected body is
     taken, and vice versa; the result is the smaller of the two medians over people and
@@ -101,14 +105,14 @@ def disagreement(
 
 
 def explanations(people: People) -> Iterator[Explanation]:
-    """Generates all explanations; the first is that keypoints and bodies agree.
+    """Yields all explanations; the first is that keypoints and bodies agree.
 
     `people` should hold a few frames only, as each explanation is evaluated on all.
     """
     camera = people.camera
     plain = lambda p: project(camera, p)
     yield Explanation("agree", plain)
-    yield Explanation("sides", lambda p: plain(p)[..., SWAPPED, :])
+    yield Explanation("sides", lambda p: plain(p)[..., MIRRORED_POINTS, :])
     projected = plain(people.bodies)
     ratios = _ratios(people.keypoints, projected)
     for name, image in _symmetries(camera.width, camera.height):
@@ -116,7 +120,9 @@ def explanations(people: People) -> Iterator[Explanation]:
             yield _of_image(plain, image, name)
         places = _ratios(people.keypoints, image(projected), about_corner=True)
         places = [p for p in places if any(abs(np.log(p / r)) < 0.2 for r in ratios)]
-        for scale, reason in _likely(places, _SIMPLE, _PLACE):
+        for scale, reason in _likely(
+            places, _COMMON_RESIZE_RATIOS, _POSITION_RATIO_TOLERANCE
+        ):
             resized = ImageMap(scale * image.A, scale * image.b, image.swap)
             yield _of_image(plain, resized, name, scale, reason)
     yield from _other_bodies(people, ratios)
@@ -142,7 +148,9 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
     usual = np.array(
         [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
     )
-    for factor, reason in _likely(ratios, usual / fx, _SIZE, inverse=False):
+    for factor, reason in _likely(
+        ratios, usual / fx, _SIZE_RATIO_TOLERANCE, inverse=False
+    ):
         # The size of people nearby is not quite proportional to the focal length.
         for by in (1.0,) if reason else (0.85, 0.92, 1.0, 1.08, 1.17):
             value = by * factor
@@ -150,15 +158,17 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
             name = "" if by == 1 else "of people nearby"
             yield Explanation("focal", forecast, factor=value, name=name, reason=reason)
     # Bodies that are `factor` times too far look as small: mm, cm, dm, feet.
-    for factor, reason in _likely(ratios, (10.0, 100.0, 1000.0, 1 / 0.3048), _SIZE):
+    for factor, reason in _likely(
+        ratios, (10.0, 100.0, 1000.0, 1 / 0.3048), _SIZE_RATIO_TOLERANCE
+    ):
         yield Explanation(
             "unit", _of_unit(camera, factor), factor=factor, reason=reason
         )
 
 
 def _of_unit(camera, factor):
-    """Forecast if `trans` is in units of `1 / factor` m: the pelvis position is divided
-    by `factor`, while the body keeps the size of the body model."""
+    """Returns the forecast for `trans` in units of `1 / factor` m: the pelvis position
+    is divided by `factor`, while the body keeps the size of the body model."""
 
     def forecast(p):
         pelvis = p[..., 7:8, :]
@@ -168,8 +178,8 @@ def _of_unit(camera, factor):
 
 
 def _moved(detected, projected, ratios, plain) -> Iterator[Explanation]:
-    """Explanations by a constant shift in the image (median of the residual shift), at
-    the same size (a crop) or resized by one of `ratios` (a copy)."""
+    """Yields explanations by a constant shift in the image (the median residual shift),
+    at the same size (a crop) or resized by one of `ratios` (a copy)."""
     middles = [
         [centred(uv)[0] for uv in in_common(detected[:, k], projected[:, b])]
         for k, b in _pairs(detected, projected)
@@ -185,15 +195,16 @@ def _moved(detected, projected, ratios, plain) -> Iterator[Explanation]:
 
 
 def _pairs(detected, projected) -> list[tuple[int, int]]:
-    """Up to 24 pairs (row of keypoints, row of bodies) that may be one person, those of
-    low and equal row numbers first."""
+    """Returns up to 24 pairs (row of keypoints, row of bodies) that may be one person,
+    pairs of low and equal row numbers first."""
     rows = itertools.product(range(detected.shape[1]), range(projected.shape[1]))
     return sorted(rows, key=lambda pair: (sum(pair), abs(pair[0] - pair[1])))[:24]
 
 
 def _ratios(detected, projected, about_corner: bool = False) -> list[float]:
-    """Distinct ratios, other than 1, of a person's size in the keypoints to that in the
-    projected bodies; with `about_corner`, of the distance from the image's corner.
+    """Returns the distinct ratios, other than 1, of a person's size in the keypoints to
+    that in the projected bodies; with `about_corner`, of the distances from the image's
+    corner.
 
     Each ratio is the median over the frames of one pair of rows.
     """
@@ -217,8 +228,8 @@ def _ratios(detected, projected, about_corner: bool = False) -> list[float]:
 
 
 def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, bool]]:
-    """The common ratios within `tolerance` (relative) of each measured ratio, with
-    `True`, then the measured ratio itself, with `False`.
+    """Yields the common ratios within `tolerance` (relative) of each measured ratio,
+    with `True`, then the measured ratio itself, with `False`.
 
     With `inverse`, reciprocals of `reasons` are common ratios too.
     """
@@ -231,7 +242,8 @@ def _likely(ratios, reasons, tolerance, inverse=True) -> Iterator[tuple[float, b
 
 
 def _symmetries(width: int, height: int) -> Iterator[tuple[str, ImageMap]]:
-    """Rotations and reflections of an image of that size, identity first."""
+    """Yields the rotations and reflections of an image of that size, the identity
+    first."""
     w, h = width - 1.0, height - 1.0
     matrix = lambda *rows: np.array(rows, dtype=np.float64)
     yield "", ImageMap(np.eye(2), np.zeros(2))
@@ -260,7 +272,7 @@ def _symmetries(width: int, height: int) -> Iterator[tuple[str, ImageMap]]:
 
 
 def _axes() -> Iterator[Float[np.ndarray, "3 3"]]:
-    """The rotations that permute axes, without the identity."""
+    """Yields the rotations that permute the axes, except the identity."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             R = np.zeros((3, 3))
@@ -270,7 +282,7 @@ def _axes() -> Iterator[Float[np.ndarray, "3 3"]]:
 
 
 def _axes_name(R: Float[np.ndarray, "3 3"]) -> str:
-    """Names of the camera's x, y, z among the given axes."""
+    """Returns text that names the camera's x, y and z axes among the given axes."""
     letters = [
         ("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in R
     ]
@@ -279,8 +291,9 @@ def _axes_name(R: Float[np.ndarray, "3 3"]) -> str:
 
 
 def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> People:
-    """Pairs the keypoints of `frames` with the bodies of `bodies_at`, to test a shift
-    in time between them. Bodies are NaN where `bodies_at` is outside the video."""
+    """Returns the keypoints of `frames` paired with the bodies of `bodies_at`, to test
+    a shift in time between them. Bodies are NaN where `bodies_at` is outside the
+    video."""
     inside = (bodies_at >= 0) & (bodies_at < len(people.bodies))
     projected = people.bodies[np.where(inside, bodies_at, 0)]
     projected = np.where(inside[:, None, None, None], projected, np.nan)
@@ -288,7 +301,7 @@ def of_frames(people: People, frames: np.ndarray, bodies_at: np.ndarray) -> Peop
 
 
 def some_frames(people: People, most: int) -> np.ndarray:
-    """Up to `most` evenly spaced frames with both keypoints and bodies."""
+    """Returns up to `most` evenly spaced frames that have both keypoints and bodies."""
     (where,) = np.nonzero(people.both)
     return evenly(where, most)
 

@@ -13,17 +13,19 @@ from bodyslam_jax.diagnostics.agreement.image_points import (
     R_SHOULDER,
 )
 
-_LYING = 55.0
-"""Angle from the image's vertical beyond which a trunk is lying, degrees."""
-_WIDE = 0.15
-"""Width of hips and shoulders over the length of the trunk above which front and back
-are distinguishable."""
+_MAX_UPRIGHT_ANGLE_DEG = 55.0
+"""Angle between trunk and image vertical beyond which a person lies."""
+_MIN_WIDTH_RATIO = 0.15
+"""Ratio of the width of hips and shoulders to the length of the trunk from which front
+and back are distinguishable."""
 
 
 def trunk_directions(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
-    """Direction from neck to hips, rad: 0 points down, positive to the image's right.
+    """Returns the direction from neck to hips, rad: 0 points down, positive to the
+    right of the image.
 
-    NaN where visible legs point another way, as of people who bend or sit.
+    NaN where visible legs point in another direction, as those of people who bend or
+    sit.
     """
     trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
     ankles = uv[..., ANKLES, :]
@@ -42,23 +44,23 @@ def trunk_directions(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"
 def shares(
     directions: Float[np.ndarray, "*n"],
 ) -> tuple[int, dict[str, float]]:
-    """Number of people in all frames, and the shares of those who are upright, upside
-    down, or whose heads point to the left or to the right."""
+    """Returns the number of people in all frames with a known direction, and the shares
+    of those who are upright, upside down, or lie with the head to the left or right."""
     angle = np.degrees(directions[np.isfinite(directions)])
     if not len(angle):
         return 0, dict.fromkeys(("upright", "upside down", "left", "right"), 0.0)
-    lying = np.abs(np.abs(angle) - 90) < 90 - _LYING
+    lying = np.abs(np.abs(angle) - 90) < 90 - _MAX_UPRIGHT_ANGLE_DEG
     return len(angle), {
-        "upright": float((np.abs(angle) <= _LYING).mean()),
-        "upside down": float((np.abs(angle) >= 180 - _LYING).mean()),
+        "upright": float((np.abs(angle) <= _MAX_UPRIGHT_ANGLE_DEG).mean()),
+        "upside down": float((np.abs(angle) >= 180 - _MAX_UPRIGHT_ANGLE_DEG).mean()),
         "left": float((lying & (angle > 0)).mean()),
         "right": float((lying & (angle < 0)).mean()),
     }
 
 
 def facings(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
-    """Signed width of shoulders and hips over the trunk's length: positive from behind,
-    negative from the front; NaN if unknown."""
+    """Returns the signed width of shoulders and hips over the trunk's length: positive
+    from behind, negative from the front, NaN if unknown."""
     trunk = uv[..., MID_HIP, :] - uv[..., NECK, :]
     across = (
         uv[..., R_SHOULDER, :]
@@ -73,7 +75,10 @@ def facings(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
 def opposed(
     detected: Float[np.ndarray, "*n 14 2"], projected: Float[np.ndarray, "*n 14 2"]
 ) -> tuple[Bool[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-    """Where the facing is distinguishable in both, and where both contradict."""
+    """Returns where both facings are distinguishable, and where they also contradict
+    each other."""
     a, b = facings(detected), facings(projected)
-    shown = (np.abs(np.nan_to_num(a)) > _WIDE) & (np.abs(np.nan_to_num(b)) > _WIDE)
+    shown = (np.abs(np.nan_to_num(a)) > _MIN_WIDTH_RATIO) & (
+        np.abs(np.nan_to_num(b)) > _MIN_WIDTH_RATIO
+    )
     return shown, shown & (np.nan_to_num(a) * np.nan_to_num(b) < 0)

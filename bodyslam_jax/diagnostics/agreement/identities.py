@@ -1,4 +1,4 @@
-"""Identities of people in keypoints and bodies: one row per person.
+"""Assigns rows of keypoints and bodies to people: one row per person.
 
 Trackers lose people and find them again under another number, or follow one person
 twice. As keypoints and bodies usually come from different programs, each kind shows
@@ -26,24 +26,28 @@ from bodyslam_jax.diagnostics.agreement.person_rows import (
 )
 from bodyslam_jax.types import Sequence
 
-_SAME = 0.3
-"""Distance of keypoints and bodies, in sizes of a person, within one person."""
-_TWICE = 0.15
-"""Distance of two rows of one kind below which they follow the same person."""
-_OVERLAP = 0.15
-"""Share of frames that two rows of one person may have in common."""
-_MOST = 0.8
-_FEWEST = 3
-_SOON = 5
-"""Frames after which a person without keypoints is still recognised by position."""
-_HABIT = 0.05
-"""Distance by which other keypoints have to be nearer than those of the same row."""
+_MAX_PAIR_DISTANCE = 0.3
+"""Distance, in sizes of a person, up to which keypoints and bodies belong to one
+person."""
+_MAX_DUPLICATE_DISTANCE = 0.15
+"""Distance, in sizes of a person, below which two rows of one kind follow the same
+person."""
+_MAX_OVERLAP_SHARE = 0.15
+"""Share of the frames that two rows of one person may have in common."""
+_MIN_COINCIDENT_SHARE = 0.8
+_MIN_SHARED_FRAMES = 3
+_MAX_GAP_FRAMES = 5
+"""Gap, in frames, up to which a person without keypoints is recognised by position."""
+_SAME_ROW_BONUS = 0.05
+"""Distance, in sizes of a person, by which other keypoints must be nearer than those of
+the same row."""
 
 Warn = Callable[[str], None]
 
 
 def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
-    """The sequence with one row per person; unchanged if it has that already."""
+    """Returns the sequence with one row per person; unchanged if it has that
+    already."""
     people = people_of(sequence, body)
     projected = project(people.camera, people.bodies)
     present = have_any(sequence)
@@ -60,7 +64,8 @@ def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequen
 
 
 def _pair(apart, present) -> list[Person]:
-    """People with keypoints, with the bodies that fit them best, then the others.
+    """Returns the people with keypoints, with the bodies that fit them best, then those
+    with bodies only.
 
     Rows of the same number stay together unless other keypoints fit clearly better.
     """
@@ -69,13 +74,18 @@ def _pair(apart, present) -> list[Person]:
     persons = [Person((int(k),), ()) for k in np.flatnonzero(seen_at.any(1))]
     free = set(np.flatnonzero(posed_at.any(1)).tolist())
     own = np.eye(*middle.shape, dtype=bool)
-    cost = np.where(count >= _FEWEST, middle, np.inf) - _HABIT * own
+    cost = np.where(count >= _MIN_SHARED_FRAMES, middle, np.inf) - _SAME_ROW_BONUS * own
     # Rows that share no frame do not contradict each other.
-    cost = np.where(own & (count == 0), _SAME - 0.01, cost)
+    cost = np.where(own & (count == 0), _MAX_PAIR_DISTANCE - 0.01, cost)
     paired: dict[int, int] = {}
     for at in np.argsort(cost, axis=None, kind="stable"):
         k, b = (int(i) for i in np.unravel_index(at, cost.shape))
-        if cost[k, b] < _SAME and b in free and k not in paired and seen_at[k].any():
+        if (
+            cost[k, b] < _MAX_PAIR_DISTANCE
+            and b in free
+            and k not in paired
+            and seen_at[k].any()
+        ):
             paired[k] = b
             free.remove(b)
     persons = [
@@ -88,12 +98,13 @@ def _pair(apart, present) -> list[Person]:
 
 
 def _joined(persons, apart, points, present) -> list[Person]:
-    """People joined whose keypoints and bodies coincide, unless at two places."""
+    """Merges people whose keypoints or bodies coincide, unless they are at two places
+    at once."""
     middle, count = _medians(apart)
     # Rows of a frame or two count with all their frames.
     detected, projected = (at.sum(1) for at in present)
-    enough = np.minimum(_FEWEST, np.minimum(detected[:, None], projected))
-    fits = (count >= np.maximum(enough, 1)) & (middle < _SAME)
+    enough = np.minimum(_MIN_SHARED_FRAMES, np.minimum(detected[:, None], projected))
+    fits = (count >= np.maximum(enough, 1)) & (middle < _MAX_PAIR_DISTANCE)
 
     @functools.cache
     def same_place(kind: int, rows_a, rows_b) -> bool:
@@ -107,7 +118,7 @@ def _joined(persons, apart, points, present) -> list[Person]:
         if not rows_a or not rows_b:
             return False
         a, b = (present[kind][list(rows)].any(0) for rows in (rows_a, rows_b))
-        if (a & b).sum() <= _OVERLAP * min(a.sum(), b.sum()):
+        if (a & b).sum() <= _MAX_OVERLAP_SHARE * min(a.sum(), b.sum()):
             return False
         return not same_place(kind, rows_a, rows_b)
 
@@ -136,7 +147,7 @@ def _joined(persons, apart, points, present) -> list[Person]:
 
 
 def _attached(persons, apart, projected, posed_at) -> list[Person]:
-    """Bodies in frames without keypoints, joined to the rows that they continue."""
+    """Merges bodies in frames without keypoints into the rows that they continue."""
     shape = centred(projected)
     lone = [
         p
@@ -156,7 +167,7 @@ def _attached(persons, apart, projected, posed_at) -> list[Person]:
                 links.append(((own[-1], person.bodies), (after[0], other.bodies)))
             apart_in_time = not np.isin(own, theirs).any()
             if apart_in_time and any(
-                start[0] - end[0] <= _SOON and _goes_on(*shape, end, start)
+                start[0] - end[0] <= _MAX_GAP_FRAMES and _goes_on(*shape, end, start)
                 for end, start in links
             ):
                 kept.remove(other)
@@ -173,7 +184,8 @@ def _frames(posed_at, person: Person) -> np.ndarray:
 
 
 def _joined_by_place(persons, projected, posed_at, warn: Warn) -> list[Person]:
-    """Without keypoints: joins a body that begins where another has just ended."""
+    """Merges, where there are no keypoints, each body that begins where another has
+    just ended."""
     middle, radius = centred(projected)
     ends = lambda p: _frames(posed_at, p)[[0, -1]]
     done: list[Person] = []
@@ -186,7 +198,7 @@ def _joined_by_place(persons, projected, posed_at, warn: Warn) -> list[Person]:
             goes_on = _goes_on(
                 middle, radius, (last, earlier.bodies), (first, person.bodies)
             )
-            if goes_on and first - last <= _SOON:
+            if goes_on and first - last <= _MAX_GAP_FRAMES:
                 done.remove(earlier)
                 person = Person((), (*earlier.bodies, *person.bodies))
             else:
@@ -199,7 +211,8 @@ def _joined_by_place(persons, projected, posed_at, warn: Warn) -> list[Person]:
 
 
 def _goes_on(middle, radius, end, start) -> bool:
-    """Whether position and size at the end of one row fit the start of another."""
+    """Returns whether the start of one row fits the end of another in position and
+    size."""
     (last, before), (first, after) = end, start
     a = next((r for r in before if np.isfinite(radius[last, r])), None)
     b = next((r for r in after if np.isfinite(radius[first, r])), None)
@@ -211,18 +224,21 @@ def _goes_on(middle, radius, end, start) -> bool:
 
 
 def _same_place(points, rows_a, rows_b, present) -> bool:
-    """Whether two people coincide in most of the frames that they share."""
+    """Returns whether two people coincide in most of the frames that they share."""
     shared = present[list(rows_a)].any(0) & present[list(rows_b)].any(0)
     fewest = min(present[list(rows)].any(0).sum() for rows in (rows_a, rows_b))
-    if shared.sum() <= max(_FEWEST, _OVERLAP * fewest):
+    if shared.sum() <= max(_MIN_SHARED_FRAMES, _MAX_OVERLAP_SHARE * fewest):
         return False
     both = points[shared]
     gap = distances(both[:, list(rows_a)], both[:, list(rows_b)])
-    near = (np.where(np.isfinite(gap), gap, np.inf) < _TWICE).any((1, 2))
-    return bool(near.mean() >= _MOST)
+    near = (np.where(np.isfinite(gap), gap, np.inf) < _MAX_DUPLICATE_DISTANCE).any(
+        (1, 2)
+    )
+    return bool(near.mean() >= _MIN_COINCIDENT_SHARE)
 
 
 def _say_who_is_one(persons, present, warn: Warn) -> None:
+    """Warns of people whose keypoints or bodies are distributed over several rows."""
     for person in persons:
         kinds = ("keypoints", person.keypoints), ("bodies", person.bodies)
         for (what, rows), at in zip(kinds, present, strict=True):
@@ -237,7 +253,7 @@ def _say_who_is_one(persons, present, warn: Warn) -> None:
 
 
 def _worth_keeping(persons, sequence, projected, apart, present, warn) -> list[Person]:
-    """Without people who have no data, or are outside the image."""
+    """Removes people who have no data or are outside the image, with a warning."""
     width, height = sequence.intrinsics.width, sequence.intrinsics.height
     seen_at, posed_at = present
     for row in range(max(len(seen_at), len(posed_at))):
@@ -276,7 +292,8 @@ def _worth_keeping(persons, sequence, projected, apart, present, warn) -> list[P
 
 
 def _medians(apart: Float[np.ndarray, "t k b"]):
-    """Median distance and the number of frames in which there is one."""
+    """Returns the median distance of each pair of rows over frames, and the number of
+    frames in which they can be compared."""
     count = np.isfinite(apart).sum(0)
     if not len(apart):
         return np.full(count.shape, np.inf), count

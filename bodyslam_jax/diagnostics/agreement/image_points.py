@@ -1,4 +1,4 @@
-"""Keypoints and bodies as the same 14 image points, for comparison.
+"""Represents keypoints and bodies by the same 14 image points, for comparison.
 
 NumPy only, as this runs before anything is compiled. The points are those of BODY_25
 that are joints of SMPL: neck, shoulders, elbows, wrists, hips, knees, ankles; neck and
@@ -15,29 +15,29 @@ from bodyslam_jax.people import joints_of
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, Sequence
 
 POINTS = slice(1, 15)
-"""Of BODY_25: the points that are compared."""
+"""The keypoints of BODY_25 that are compared."""
 NECK, R_SHOULDER, L_SHOULDER, MID_HIP, R_HIP, L_HIP = 0, 1, 4, 7, 8, 11
 ANKLES = (10, 13)
-SWAPPED = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
-"""The point on the other side of the body."""
+MIRRORED_POINTS = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
+"""Index of each point's counterpart on the other side of the body."""
 
-_JOINT = np.array([-1, 17, 19, 21, 16, 18, 20, -1, 2, 5, 8, 1, 4, 7])
-"""SMPL's joint of each point; -1 are midpoints."""
-_BEHIND = 1e6
-"""Pixel of points behind the camera, far from everything."""
-_FEWEST = 5
-"""Points in common from which two people are compared."""
-_FARTHEST = 3.0
+_SMPL_JOINTS = np.array([-1, 17, 19, 21, 16, 18, 20, -1, 2, 5, 8, 1, 4, 7])
+"""SMPL's joint of each point; -1 for midpoints."""
+_PIXEL_BEHIND_CAMERA = 1e6
+"""Pixel coordinate assigned to points behind the camera, far from all others."""
+_MIN_COMMON_POINTS = 5
+"""Number of common points from which two people are compared."""
+_MAX_DISTANCE_SIZES = 3.0
 """Distances are clipped to this, in sizes of a person."""
-_SURE = 0.25
-"""Least confidence of a keypoint, relative to the person's usual best."""
-_SMALLEST = 10.0
+_MIN_CONFIDENCE_RATIO = 0.25
+"""Least confidence of a keypoint, relative to the 90 % quantile of the person's."""
+_MIN_SIZE_PX = 10.0
 """Lower bound on sizes in denominators, px."""
 
 
 @dataclasses.dataclass(frozen=True)
 class People:
-    """People in each of `t` frames, by either kind of input."""
+    """People in each of `t` frames, from keypoints and from bodies."""
 
     keypoints: Float[np.ndarray, "t k 14 2"]
     """px"""
@@ -47,14 +47,15 @@ class People:
 
     @property
     def both(self) -> Bool[np.ndarray, " t"]:
-        """Frames with people of both kinds."""
+        """Frames with both keypoints and bodies."""
         return np.logical_and(
             have_points(self.keypoints).any(1), have_points(self.bodies).any(1)
         )
 
 
 def people_of(sequence: Sequence, body: BodyModel) -> People:
-    """All people, in the order of the sequence; a missing kind is empty."""
+    """Returns all people in the order of the sequence; arrays of a missing kind are
+    empty."""
     t = sequence.num_frames
     detected, projected = np.zeros((t, 0, 14, 2)), np.zeros((t, 0, 14, 3))
     if sequence.keypoints is not None:
@@ -65,18 +66,19 @@ def people_of(sequence: Sequence, body: BodyModel) -> People:
 
 
 def sure_points(keypoints: Keypoints) -> Float[np.ndarray, "h t 14 2"]:
-    """Keypoints of high confidence, px; NaN for others."""
+    """Returns the keypoints of high confidence, px; NaN for others."""
     confidence = keypoints.confidence[..., POINTS]
     best = [np.quantile(c[c > 0], 0.9) if (c > 0).any() else 1.0 for c in confidence]
-    least = _SURE * np.reshape(best, (-1, 1, 1))
+    least = _MIN_CONFIDENCE_RATIO * np.reshape(best, (-1, 1, 1))
     sure = (confidence > 0) & (confidence >= least)
     return np.where(sure[..., None], keypoints.uv[:, :, POINTS], np.nan)
 
 
 def body_points(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "h t 14 3"]:
-    """Joints of bodies in the camera frame, m."""
+    """Returns the joints of bodies that correspond to the points, in the camera frame,
+    m."""
     at = bodies.present
-    points = joints_of(bodies, body)[:, _JOINT]
+    points = joints_of(bodies, body)[:, _SMPL_JOINTS]
     points[:, NECK] = (points[:, R_SHOULDER] + points[:, L_SHOULDER]) / 2
     points[:, MID_HIP] = (points[:, R_HIP] + points[:, L_HIP]) / 2
     out = np.full((*at.shape, 14, 3), np.nan)
@@ -87,7 +89,10 @@ def body_points(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "h t 14 3"
 def project(
     camera: Intrinsics, p_C: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Pixels (px); far away where a point is behind the camera, NaN where missing."""
+    """Projects points of the camera frame (m) to pixels (px).
+
+    Points behind the camera get a pixel far away; missing points stay NaN.
+    """
     fx, fy, cx, cy = camera.params[:4]
     missing, front = np.isnan(p_C[..., 2]), p_C[..., 2] > 0.05
     z = np.where(front, p_C[..., 2], 1.0)
@@ -104,43 +109,46 @@ def project(
             y * radial + fade * (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y),
         )
     uv = np.stack([fx * x + cx, fy * y + cy], axis=-1)
-    uv = np.where(front[..., None], uv, _BEHIND)
+    uv = np.where(front[..., None], uv, _PIXEL_BEHIND_CAMERA)
     return np.where(missing[..., None], np.nan, uv)
 
 
 def have_points(points: Float[np.ndarray, "*n 14 c"]) -> Bool[np.ndarray, "*n"]:
-    """Whether enough of a person's points are valid for a comparison."""
-    return np.isfinite(points[..., 0]).sum(-1) >= _FEWEST
+    """Returns whether enough of a person's points are valid for a comparison."""
+    return np.isfinite(points[..., 0]).sum(-1) >= _MIN_COMMON_POINTS
 
 
 def sizes(uv: Float[np.ndarray, "*n 14 2"]) -> Float[np.ndarray, "*n"]:
-    """Longer side of the box around each person, px; NaN for an absent person."""
+    """Returns the longer side of the box around each person, px; NaN for an absent
+    person."""
     valid = np.isfinite(uv)
     low = np.where(valid, uv, np.inf).min(-2)
     high = np.where(valid, uv, -np.inf).max(-2)
     size = np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0)
-    return np.where(have_points(uv), size.max(-1).clip(_SMALLEST), np.nan)
+    return np.where(have_points(uv), size.max(-1).clip(_MIN_SIZE_PX), np.nan)
 
 
 def distances(
     detected: Float[np.ndarray, "t k 14 2"], projected: Float[np.ndarray, "t b 14 2"]
 ) -> Float[np.ndarray, "t k b"]:
-    """Mean distance of the points of two people, in sizes of the first; NaN where they
-    share too few."""
+    """Returns the mean distance of the points of two people, in sizes of the first; NaN
+    where they share too few."""
     apart = np.hypot(*np.moveaxis(detected[:, :, None] - projected[:, None], -1, 0))
     valid = np.isfinite(apart)
     size = sizes(detected)[:, :, None]
-    limit = _FARTHEST * np.where(np.isfinite(size), size, 1.0)
+    limit = _MAX_DISTANCE_SIZES * np.where(np.isfinite(size), size, 1.0)
     total = np.where(valid, np.minimum(apart, limit[..., None]), 0.0).sum(-1)
     count = valid.sum(-1)
-    return np.where(count >= _FEWEST, total / np.maximum(count, 1) / size, np.nan)
+    return np.where(
+        count >= _MIN_COMMON_POINTS, total / np.maximum(count, 1) / size, np.nan
+    )
 
 
 def centred(
     uv: Float[np.ndarray, "*n 14 2"],
 ) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
-    """Median of each person's points, and the mean distance from it of the three
-    quarters that are nearest, px."""
+    """Returns the median of each person's points, and the mean distance from it of the
+    nearest three quarters of the points, px."""
     middle = _median(uv, -2)
     away = np.sort(np.hypot(*np.moveaxis(uv - middle[..., None, :], -1, 0)), -1)
     count = np.isfinite(away).sum(-1)
@@ -154,13 +162,13 @@ def centred(
 def in_common(
     a: Float[np.ndarray, "*n 14 2"], b: Float[np.ndarray, "*n 14 2"]
 ) -> tuple[Float[np.ndarray, "*n 14 2"], Float[np.ndarray, "*n 14 2"]]:
-    """Two people with the points that both have."""
+    """Returns the points of two people, NaN where either lacks the point."""
     valid = np.isfinite(a) & np.isfinite(b)
     return np.where(valid, a, np.nan), np.where(valid, b, np.nan)
 
 
 def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m"]:
-    """The median without NaN; NaN if there is nothing else."""
+    """Returns the median that ignores NaN; NaN if all values are."""
     count = np.isfinite(values).sum(axis, keepdims=True)
     ordered = np.sort(values, axis=axis)  # NaN last
     at = lambda i: np.take_along_axis(ordered, np.maximum(i, 0), axis=axis)
@@ -168,7 +176,8 @@ def _median(values: Float[np.ndarray, "*n"], axis: int) -> Float[np.ndarray, "*m
 
 
 def compact(points: Float[np.ndarray, "t h 14 c"], most: int):
-    """The first `most` people of each frame; a row need not be one person."""
+    """Returns the first `most` people of each frame; a row need not stay with one
+    person."""
     valid = have_points(points)
     order = np.argsort(~valid, axis=1, kind="stable")
     width = min(most, int(valid.sum(1).max(initial=0)))

@@ -1,4 +1,4 @@
-"""Warnings of unusual people in the image, without one clear explanation."""
+"""Warns of unusual observations that no single hypothesis explains."""
 
 from collections.abc import Callable
 
@@ -20,25 +20,27 @@ from bodyslam_jax.diagnostics.agreement.image_points import (
 from bodyslam_jax.diagnostics.agreement.undo import with_keypoints_mapped_back
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
-_FEWEST = 10
-"""Least number of frames for a statement about most of them."""
-_MOST = 0.8
-_OPPOSED = 0.6
-_ELSEWHERE, _SOME = 0.6, 0.1
-"""Distance from which a body is not its person's, and the share of frames to warn."""
-_RATIO = 0.12
-"""Difference in size (relative) beyond a regressor's usual error."""
-_OUTSIDE = 0.02
-"""Share of points outside the image that proves the other orientation."""
+_MIN_FRAMES = 10
+"""Number of frames from which a statement about most of them is made."""
+_MAJORITY_SHARE = 0.8
+_MIN_OPPOSED_SHARE = 0.6
+_MIN_MISPLACED_DISTANCE_SIZES, _MIN_MISPLACED_SHARE = 0.6, 0.1
+"""Distance, in sizes of a person, from which a body probably belongs to somebody else,
+and the share of frames from which that is a warning."""
+_MIN_SIZE_DIFFERENCE = 0.12
+"""Relative difference in size that exceeds a regressor's usual error."""
+_MIN_OUTSIDE_SHARE = 0.02
+"""Share of points outside the image from which the image must have been rotated."""
 
 
 def warn_of_oddities(
     sequence: Sequence, people: People, warn: Callable[[str], None], *, sides: bool
 ) -> Sequence:
-    """The sequence, with keypoints turned back if they do not fit into the image.
+    """Warns of unusual people, and returns the sequence, with keypoints rotated back if
+    they do not fit into the image.
 
     Args:
-        sides: whether to warn of left and right sides that contradict.
+        sides: whether to warn of left and right sides that contradict each other.
 
     **Raises:** `InputError` if most bodies are outside the image.
     """
@@ -59,7 +61,7 @@ def warn_of_oddities(
 
 def _warn_of_sides(h: int, detected, projected, warn) -> None:
     shown, against = opposed(detected, projected)
-    if shown.sum() >= _FEWEST and against.sum() > _OPPOSED * shown.sum():
+    if shown.sum() >= _MIN_FRAMES and against.sum() > _MIN_OPPOSED_SHARE * shown.sum():
         warn(
             f"person {h}: left and right of the keypoints contradict the bodies in "
             f"{100 * against.sum() / shown.sum():.0f} % of the frames in which it "
@@ -72,26 +74,30 @@ def _warn_of_sides(h: int, detected, projected, warn) -> None:
 def _warn_of_person(h: int, detected, projected, people: People, warn) -> None:
     apart = distances(detected[:, None], projected[:, None])[:, 0, 0]
     both = np.isfinite(apart)
-    if both.sum() < _FEWEST:
+    if both.sum() < _MIN_FRAMES:
         return
-    away = both & (apart > _ELSEWHERE)
-    if _SOME * both.sum() < away.sum() < (1 - _SOME) * both.sum():
+    away = both & (apart > _MIN_MISPLACED_DISTANCE_SIZES)
+    if (
+        _MIN_MISPLACED_SHARE * both.sum()
+        < away.sum()
+        < (1 - _MIN_MISPLACED_SHARE) * both.sum()
+    ):
         first, last = np.flatnonzero(away)[[0, -1]]
         warn(
             f"person {h}: in {100 * away.sum() / both.sum():.0f} % of the frames, "
-            "between "
-            f"{first} and {last}, the bodies are more than {_ELSEWHERE:g} of the "
-            "person's size from the keypoints: of somebody else there?"
+            f"between {first} and {last}, the bodies are more than "
+            f"{_MIN_MISPLACED_DISTANCE_SIZES:g} of the person's size from the "
+            "keypoints: of somebody else there?"
         )
     near = both & ~away
     big, small = (centred(uv[near])[1] for uv in in_common(detected, projected))
     ratio = big / np.maximum(small, 1e-3)
     ratio = ratio[np.isfinite(ratio)]
-    if len(ratio) < _FEWEST:
+    if len(ratio) < _MIN_FRAMES:
         return
     low, middle, high = np.quantile(ratio, [0.1, 0.5, 0.9])
-    if (low > 1 + _RATIO / 2 and middle > 1 + _RATIO) or (
-        high < 1 - _RATIO / 2 and middle < 1 - _RATIO
+    if (low > 1 + _MIN_SIZE_DIFFERENCE / 2 and middle > 1 + _MIN_SIZE_DIFFERENCE) or (
+        high < 1 - _MIN_SIZE_DIFFERENCE / 2 and middle < 1 - _MIN_SIZE_DIFFERENCE
     ):
         focal = float(people.camera.params[0])
         warn(
@@ -105,7 +111,8 @@ def _warn_of_person(h: int, detected, projected, people: People, warn) -> None:
 
 
 def _upright(sequence: Sequence, people: People, warn) -> Sequence:
-    """Warns of people who lie or are upside down nearly all the time."""
+    """Warns of people who lie or are upside down in nearly all frames, and rotates
+    keypoints back if they exceed the image."""
     width, height = sequence.intrinsics.width, sequence.intrinsics.height
     kind = "keypoints" if have_points(people.keypoints).any() else "bodies"
     points = people.keypoints
@@ -113,7 +120,7 @@ def _upright(sequence: Sequence, people: People, warn) -> Sequence:
         points = project(people.camera, people.bodies)
     count, share = shares(trunk_directions(points))
     worst = max(("upside down", "left", "right"), key=lambda name: share[name])
-    if count < _FEWEST or share[worst] < _MOST:
+    if count < _MIN_FRAMES or share[worst] < _MAJORITY_SHARE:
         return sequence
     percent = f"{100 * share[worst]:.0f} %"
     if worst == "upside down":
@@ -161,11 +168,12 @@ def _exceeds(keypoints: Keypoints | None, width: int, height: int) -> bool:
         return False
     margin = 0.02 * max(width, height)
     beyond = (uv < -margin) | (uv > np.array([width, height]) + margin)
-    return bool(beyond.any(-1).mean() > _OUTSIDE)
+    return bool(beyond.any(-1).mean() > _MIN_OUTSIDE_SHARE)
 
 
 def _check_bodies_alone(people: People, projected, warn) -> None:
-    """Bodies without keypoints: in the image, and in a camera's frame."""
+    """Checks, for bodies without keypoints, that they are in the image and in a camera
+    frame."""
     width, height = people.camera.width, people.camera.height
     present = have_points(people.bodies)
     if not present.any():
@@ -184,7 +192,7 @@ def _check_bodies_alone(people: People, projected, warn) -> None:
         warn(f"bodies are outside the image in {share:.0f} % of their frames.")
     trunk = (people.bodies[..., NECK, :] - people.bodies[..., MID_HIP, :])[present]
     away = trunk[:, 2] > 0.8 * np.linalg.norm(trunk, axis=-1)
-    if len(away) >= _FEWEST and away.mean() > _MOST:
+    if len(away) >= _MIN_FRAMES and away.mean() > _MAJORITY_SHARE:
         warn(
             f"bodies: heads point away from the camera in {100 * away.mean():.0f} % of "
             "all frames: z up, as in a world? Expected the camera's frame, x right, y "
@@ -193,11 +201,16 @@ def _check_bodies_alone(people: People, projected, warn) -> None:
 
 
 def _warn_of_renumbering(keypoints: Keypoints, warn) -> None:
-    """Warns of keypoints that end where every n-th frame, renumbered, would."""
+    """Warns of keypoints whose last frame suggests that only every n-th frame was
+    processed and renumbered."""
     detected = np.any(keypoints.confidence > 0, axis=(0, 2))
     t, count = len(detected), int(np.flatnonzero(detected)[-1]) + 1
     for n in (2, 3, 4, 5, 6, 10):
-        if count == -(-t // n) and count >= _FEWEST and detected[:count].mean() > _MOST:
+        if (
+            count == -(-t // n)
+            and count >= _MIN_FRAMES
+            and detected[:count].mean() > _MAJORITY_SHARE
+        ):
             warn(
                 f"keypoints only in frames 0 to {count - 1} of {t}, one frame in {n}: "
                 f"taken as they are numbered; if only one frame in {n} was looked at, "
@@ -206,13 +219,13 @@ def _warn_of_renumbering(keypoints: Keypoints, warn) -> None:
 
 
 def _warn_of_a_corner(keypoints: Keypoints, camera: Intrinsics, warn) -> None:
-    """Warns of keypoints in the upper left quarter only, as of a copy of half the size:
-    people on the ground before a level camera are not all there."""
+    """Warns of keypoints that lie in the upper left quarter only, as on a copy of half
+    the size."""
     size = np.array([camera.width, camera.height])
     uv = keypoints.uv[keypoints.confidence > 0]
     high = np.quantile(uv, 0.99, axis=0) if len(uv) else size
     frames = int((keypoints.confidence > 0).any((0, 2)).sum())
-    if frames >= _FEWEST and (high < 0.5 * size).all():
+    if frames >= _MIN_FRAMES and (high < 0.5 * size).all():
         warn(
             f"keypoints reach ({high[0]:.0f}, {high[1]:.0f}) px only, of {size[0]}x"
             f"{size[1]}: all in the upper left quarter; if people are elsewhere in the "

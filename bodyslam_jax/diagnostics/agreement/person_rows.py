@@ -19,8 +19,8 @@ class Person:
 def have_any(
     sequence: Sequence,
 ) -> tuple[Bool[np.ndarray, "k t"], Bool[np.ndarray, "b t"]]:
-    """For each row of keypoints, and for each row of bodies, the frames it is present
-    in."""
+    """Returns for each row of keypoints, and for each row of bodies, the frames in
+    which it is present."""
     nobody = np.zeros((0, sequence.num_frames), bool)
     keypoints, bodies = sequence.keypoints, sequence.bodies
     return (
@@ -30,7 +30,7 @@ def have_any(
 
 
 def in_words(present: Bool[np.ndarray, "h t"], rows) -> str:
-    """First and last frame of each of `rows` as text, for warnings."""
+    """Returns the first and last frame of each of `rows` as text for warnings."""
     ends = sorted(tuple(np.flatnonzero(present[row])[[0, -1]].tolist()) for row in rows)
     spans = ", ".join(f"{first}-{last}" for first, last in ends[:6])
     more = f" and {len(ends) - 6} more" if len(ends) > 6 else ""
@@ -40,7 +40,8 @@ def in_words(present: Bool[np.ndarray, "h t"], rows) -> str:
 def gathered(
     sequence: Sequence, persons: list[Person], apart: Float[np.ndarray, "t k b"]
 ) -> Sequence:
-    """The sequence with one row of keypoints and of bodies for each of `persons`.
+    """Returns the sequence with one row of keypoints and one of bodies for each of
+    `persons`.
 
     If this changes nothing, the sequence itself is returned.
 

@@ -1,4 +1,4 @@
-"""Agreement of keypoints, bodies and camera, checked before anything is estimated.
+"""Checks that keypoints, bodies and camera agree, before anything is estimated.
 
 Bodies are projected and compared with the keypoints, frame by frame. If they disagree,
 hypotheses of what was done to one of them are tested (`explanations`, `timing`):
@@ -46,39 +46,40 @@ from bodyslam_jax.types import Sequence
 
 _log = logging.getLogger(__name__)
 
-_BELIEVED = 0.2
-"""Largest distance under an explanation that is accepted."""
-_BETTER = 0.7
-"""Largest distance under it, relative to that without it."""
-_COPY, _MUCH_BETTER = 0.15, 0.5
-"""The same for a copy of arbitrary shift and size."""
-_GAIN = 0.03
-"""Least decrease of the distance."""
-_BETTER_TIME, _GAIN_TIME = 0.87, 0.012
-"""The same for another timing, which has a smaller effect."""
-_HINT, _MORE = 0.95, 0.6
-"""The same for a warning only, and the share of frames that must improve."""
-_CONTRADICTION, _DOUBT = 0.35, 0.25
-"""Distances from which bodies and keypoints contradict each other; are doubtful."""
-_SAMPLE = 40
-"""Frames that are compared for each explanation."""
-_CROWD = 12
-"""Largest number of people of each kind and frame that are compared."""
+_MAX_EXPLAINED_DISTANCE = 0.2
+"""Distance, in sizes of a person, up to which an explanation is accepted."""
+_MAX_DISTANCE_RATIO = 0.7
+"""Ratio of the distance with an explanation to that without, up to which it is
+accepted."""
+_MAX_COPY_DISTANCE, _MAX_COPY_DISTANCE_RATIO = 0.15, 0.5
+"""The same two limits for a copy of arbitrary shift and size."""
+_MIN_GAIN = 0.03
+"""Decrease of the distance from which an explanation is accepted."""
+_MAX_TIMING_RATIO, _MIN_TIMING_GAIN = 0.87, 0.012
+"""Limits of ratio and gain for another timing, which has a smaller effect."""
+_MAX_HINT_RATIO, _MIN_HINT_FRAMES_SHARE = 0.95, 0.6
+"""Limit of the ratio for a mere warning, and the share of frames that must improve."""
+_CONTRADICTION_DISTANCE, _DOUBT_DISTANCE = 0.35, 0.25
+"""Distances, in sizes of a person, from which bodies and keypoints contradict each
+other, and from which a warning is given."""
+_SAMPLE_FRAMES = 40
+"""Number of frames that are compared for each explanation."""
+_MAX_PEOPLE = 12
+"""Number of people of each kind and frame that are compared at most."""
 
 Warn = Callable[[str], None]
 
 
 def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
-    """The sequence with its parts in agreement; unchanged if they agree already.
+    """Returns the sequence with its parts in agreement; unchanged if they agree
+    already.
 
-    Limbs whose left and right a detector exchanged in some frames have their names
-    again, so that all that follows has the same keypoints.
-
-    Uses keypoints, bodies and camera, not the images. New warnings name what was undone
-    and what is unusual.
+    Left and right are corrected in frames in which a detector exchanged the limbs, so
+    that all later stages use the same keypoints. Keypoints, bodies and camera are used,
+    not the images. New warnings name what was corrected and what is unusual.
 
     Args:
-        body: the model whose joints are compared; any of a person's size is adequate.
+        body: model whose joints are compared; any model of human size is adequate.
 
     **Raises:** `InputError`, one line with both sides and the figure, where they
     contradict each other and it is ambiguous which is right.
@@ -105,7 +106,9 @@ def reconcile(sequence: Sequence, body: BodyModel) -> Sequence:
 def _settle(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
     people = people_of(sequence, body)
     crowd = People(
-        compact(people.keypoints, _CROWD), compact(people.bodies, _CROWD), people.camera
+        compact(people.keypoints, _MAX_PEOPLE),
+        compact(people.bodies, _MAX_PEOPLE),
+        people.camera,
     )
     exchanged = False
     if crowd.keypoints.shape[1] and crowd.bodies.shape[1]:
@@ -121,21 +124,29 @@ def _settle(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequence:
 def _made_to_meet(
     sequence: Sequence, body: BodyModel, crowd: People, warn: Warn
 ) -> tuple[Sequence, bool]:
-    """The sequence with bodies and keypoints at the same place and time, and whether
-    their left and right sides contradict each other."""
+    """Returns the sequence with bodies and keypoints at the same place and time, and
+    whether their left and right sides contradict each other."""
     pairs = crowd.keypoints.shape[1] * crowd.bodies.shape[1]
-    frames = some_frames(crowd, max(_SAMPLE // 3, min(_SAMPLE, 4 * _SAMPLE // pairs)))
+    frames = some_frames(
+        crowd,
+        max(_SAMPLE_FRAMES // 3, min(_SAMPLE_FRAMES, 4 * _SAMPLE_FRAMES // pairs)),
+    )
     given, chosen, best = _best_explanation(of_frames(crowd, frames, frames))
     as_timed, timing = best_timing(crowd)
     if timing.rate != 1 or abs(timing.shift) > 1:
         gain = as_timed.disagreement - timing.disagreement
         left = timing.disagreement / as_timed.disagreement
-        believed = timing.disagreement < _BELIEVED and (
+        believed = timing.disagreement < _MAX_EXPLAINED_DISTANCE and (
             chosen is None or timing.disagreement < 0.9 * best
         )
-        if believed and left < _BETTER_TIME and gain > _GAIN_TIME:
+        if believed and left < _MAX_TIMING_RATIO and gain > _MIN_TIMING_GAIN:
             return settle_times(sequence, as_timed, timing, warn), False
-        if believed and chosen is None and left < _HINT and timing.better > _MORE:
+        if (
+            believed
+            and chosen is None
+            and left < _MAX_HINT_RATIO
+            and timing.better > _MIN_HINT_FRAMES_SHARE
+        ):
             warn(
                 f"bodies fit keypoints {abs(timing.shift)} frames "
                 f"{'earlier' if timing.shift > 0 else 'later'} a little better than "
@@ -145,16 +156,16 @@ def _made_to_meet(
     if chosen is not None:
         sequence = undone(sequence, body, crowd, chosen, given, best, warn)
         return sequence, chosen.kind == "sides"
-    if given > _CONTRADICTION:
+    if given > _CONTRADICTION_DISTANCE:
         raise InputError(_apart(crowd, given))
-    if given > _DOUBT:
+    if given > _DOUBT_DISTANCE:
         warn(f"bodies lie {given:.2f} of a person's size from the keypoints (median).")
     return sequence, False
 
 
 def _best_explanation(people: People) -> tuple[float, Explanation | None, float]:
-    """Distance as given (NaN if unknown), the accepted explanation, if any, and the
-    distance under it."""
+    """Returns the distance as given (NaN if unknown), the accepted explanation, if any,
+    and the distance under it."""
     tried = [
         (disagreement(people.keypoints, e.forecast(people.bodies)), e)
         for e in explanations(people)
@@ -164,20 +175,25 @@ def _best_explanation(people: People) -> tuple[float, Explanation | None, float]
     if not np.isfinite(given) or not fine:
         return given, None, np.nan
     best = min(d for d, _ in fine)
-    if not (best < min(_BELIEVED, _BETTER * given) and given - best > _GAIN):
+    if not (
+        best < min(_MAX_EXPLAINED_DISTANCE, _MAX_DISTANCE_RATIO * given)
+        and given - best > _MIN_GAIN
+    ):
         return given, None, best
     distance, chosen = min(
         fine,
         key=lambda pair: pair[0] + _complexity(pair[1]) + _oddness(pair[1], people),
     )
-    if chosen.kind == "copy" and distance > min(_COPY, _MUCH_BETTER * given):
+    if chosen.kind == "copy" and distance > min(
+        _MAX_COPY_DISTANCE, _MAX_COPY_DISTANCE_RATIO * given
+    ):
         return given, None, distance
     return given, chosen, distance
 
 
 def _complexity(explanation: Explanation) -> float:
-    """Penalty, as a distance, on explanations with more free parameters: a measured
-    factor in place of a common one, a crop, a crop of any size."""
+    """Returns a penalty, as a distance, on explanations with more free parameters: a
+    measured instead of a common factor, a crop, or a resized crop."""
     measured = {"keypoints": 0.012, "focal": 0.02, "unit": 0.04}
     free = {"crop": 0.03, "copy": 0.04}
     if explanation.kind in free:
@@ -188,26 +204,31 @@ def _complexity(explanation: Explanation) -> float:
 
 
 def _oddness(explanation: Explanation, people: People) -> float:
-    """Penalty, as a distance, on image rotations after which people are not upright."""
+    """Returns a penalty, as a distance, on image rotations that do not make people
+    upright."""
     upright = lambda uv: shares(trunk_directions(uv))[1]["upright"]
     detected = people.keypoints
     if explanation.kind == "keypoints" and explanation.name:
         righted = explanation.image.inverse(detected)
-        return 0.0 if upright(righted) > max(0.5, upright(detected)) else _GAIN
+        return 0.0 if upright(righted) > max(0.5, upright(detected)) else _MIN_GAIN
     if explanation.kind == "axes" and explanation.R[2, 2] == 1:
-        return 0.0 if upright(detected) > 0.5 else _GAIN
+        return 0.0 if upright(detected) > 0.5 else _MIN_GAIN
     return 0.0
 
 
 def _apart(crowd: People, given: float) -> str:
-    """The message for bodies and keypoints that are not of the same people."""
+    """Returns the error message for bodies and keypoints that show different people."""
     posed = project(crowd.camera, crowd.bodies)
     nearest = distances(crowd.keypoints, posed)
     nearest = np.where(np.isfinite(nearest), nearest, np.inf).min(
         (1, 2), initial=np.inf
     )
     nearest = nearest[np.isfinite(nearest)]
-    share = 100 * float((nearest > _CONTRADICTION).mean()) if len(nearest) else 100.0
+    share = (
+        100 * float((nearest > _CONTRADICTION_DISTANCE).mean())
+        if len(nearest)
+        else 100.0
+    )
     behind = crowd.bodies[..., 7, 2]
     behind = 100 * float((behind[np.isfinite(behind)] < 0).mean())
     where = f", {behind:.0f} % of them behind the camera" if behind > 5 else ""

@@ -1,4 +1,4 @@
-"""Undoes a renumbering of the frames of keypoints or bodies."""
+"""Undoes renumberings of the frames of keypoints or bodies."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,17 +11,16 @@ from bodyslam_jax.diagnostics.agreement.timing import Timing
 from bodyslam_jax.diagnostics.agreement.undo import retimed
 from bodyslam_jax.types import Sequence
 
-_CLEAR = 3
-"""Shift, in frames, from which an input is refused if the shift cannot be undone."""
+_MIN_REFUSED_SHIFT_FRAMES = 3
+"""Shift from which the input is refused if the shift cannot be undone."""
 
 
 def settle_times(
     sequence: Sequence, given: Timing, found: Timing, warn: Callable[[str], None]
 ) -> Sequence:
-    """The sequence with keypoints or bodies moved to the frames that they are of.
+    """Returns the sequence with keypoints or bodies moved to the frames they belong to.
 
-    A shift is undone if it can be of one kind only, as it would move the other out of
-    the video.
+    A shift is undone if only one of the two kinds can be shifted within the video.
 
     **Raises:** `InputError` if it is ambiguous which of the two was renumbered.
     """
@@ -76,15 +75,16 @@ def _shifted_back(
         f"of {t} frames, bodies are numbered {frames} than the keypoints that they fit "
         f"({figures}); expected both numbered by the frames of the video"
     )
-    if abs(shift) >= _CLEAR:
+    if abs(shift) >= _MIN_REFUSED_SHIFT_FRAMES:
         raise InputError(f"{text}.")
     warn(f"{text}.")
     return sequence
 
 
 def _mover(with_keypoints, with_bodies, shift: int) -> tuple[str, int, bool] | None:
-    """The only kind that `shift` keeps within the video, its shift in frames, and
-    whether it then reaches the first or the last frame; `None` if not unique."""
+    """Returns the only kind that `shift` keeps within the video, its shift in frames,
+    and whether it then reaches the first or the last frame; `None` if that is not
+    unique."""
     t, found = len(with_keypoints), []
     for what, present, by in (
         ("keypoints", with_keypoints, shift),

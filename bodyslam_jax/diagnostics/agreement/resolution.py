@@ -1,4 +1,5 @@
-"""The consequence of an accepted explanation: undone, a warning, or a refusal."""
+"""Applies the consequence of an accepted explanation: a correction, a warning, or a
+refusal."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,13 +17,14 @@ from bodyslam_jax.diagnostics.agreement.undo import (
 )
 from bodyslam_jax.types import Sequence
 
-_TOO_FAR = 1.6
-"""Largest factor by which a regressor may misjudge all depths."""
-_OFF_CENTRE = 0.1
-"""Distance of a principal point from the middle, of the image's longer side, that no
-camera has whose images were not cropped."""
-_ASIDE = 0.2
-"""Largest common shift by a regressor, in sizes of a person."""
+_MAX_DEPTH_FACTOR = 1.6
+"""Factor by which a regressor may misjudge all depths."""
+_MIN_CENTRE_OFFSET_SHARE = 0.1
+"""Distance of a principal point from the image centre, as a share of the image's longer
+side, that occurs only in cropped images."""
+_MAX_SHIFT_SIZES = 0.2
+"""Common shift in the image up to which it may be a regressor's error, sizes of a
+person."""
 
 Warn = Callable[[str], None]
 
@@ -36,7 +38,12 @@ def undone(
     best: float,
     warn: Warn,
 ) -> Sequence:
-    """The sequence with the effect of the explanation undone, where that is safe.
+    """Returns the sequence with the effect of the explanation undone, where that is
+    safe.
+
+    Args:
+        given: distance as given, in sizes of a person.
+        best: distance under the explanation.
 
     **Raises:** `InputError` if it is ambiguous which side is right.
     """
@@ -56,7 +63,7 @@ def undone(
         return _refocused(sequence, body, found.factor, figures, warn)
     if found.kind == "unit":
         if not found.reason:
-            if abs(np.log(found.factor)) < np.log(_TOO_FAR):
+            if abs(np.log(found.factor)) < np.log(_MAX_DEPTH_FACTOR):
                 return sequence  # a warning follows
             raise InputError(
                 f"people are {found.factor:.2f} times as large in the keypoints as in "
@@ -85,8 +92,11 @@ def _refocused(sequence, body, factor: float, figures: str, warn: Warn) -> Seque
 
 
 def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence:
-    """A crop is not undone, as it is measured to some pixels only; another principal
-    point is, if it is the middle of the image, which most tools assume."""
+    """Corrects a principal point, warns of a small shift, and refuses a crop.
+
+    A crop is not undone, because it is measured to some pixels only. Another principal
+    point is, if it is the image centre, which most tools assume.
+    """
     camera = sequence.intrinsics
     fx, fy, cx, cy = camera.params[:4]
     to_middle = np.array([(camera.width - 1) / 2 - cx, (camera.height - 1) / 2 - cy])
@@ -100,7 +110,9 @@ def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence
         )
         move = lambda p: p + p[:, 2:] * np.array([*(to_middle / [fx, fy]), 0.0])
         moved = with_bodies_moved(sequence, body, move)
-        if np.linalg.norm(to_middle) < _OFF_CENTRE * max(camera.width, camera.height):
+        if np.linalg.norm(to_middle) < _MIN_CENTRE_OFFSET_SHARE * max(
+            camera.width, camera.height
+        ):
             return moved
         text = (
             f"the camera file has its principal point at ({cx:.0f}, {cy:.0f}) px, "
@@ -110,7 +122,7 @@ def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence
         )
         contradictions = (*sequence.contradictions, text)
         return dataclasses.replace(moved, contradictions=contradictions)
-    if found.kind == "crop" and np.linalg.norm(shift) < _ASIDE * size:
+    if found.kind == "crop" and np.linalg.norm(shift) < _MAX_SHIFT_SIZES * size:
         warn(
             f"keypoints lie ({shift[0]:.0f}, {shift[1]:.0f}) px from the bodies in all "
             f"frames ({figures})."
@@ -129,7 +141,8 @@ def _shifted(sequence, body, crowd, found, figures: str, warn: Warn) -> Sequence
 def _turned_back(
     sequence, body, crowd: People, found: Explanation, figures: str, warn: Warn
 ) -> Sequence:
-    """Turned, mirrored or resized images, and other axes of the camera."""
+    """Undoes rotated or resized images and other camera axes, and refuses mirrored
+    images."""
     upright = shares(trunk_directions(crowd.keypoints))[1]["upright"]
     if found.kind == "axes":
         about_sight = found.R[2, 2] == 1

@@ -1,4 +1,4 @@
-"""Undoes a transformation that keypoints or bodies have when they are given.
+"""Undoes a transformation of given keypoints or bodies.
 
 It is a map of the image, a rigid motion of the bodies, or a shift of frame numbers.
 """
@@ -17,8 +17,8 @@ from bodyslam_jax.types import Bodies, Keypoints, Sequence
 
 
 def with_keypoints_mapped_back(sequence: Sequence, image: ImageMap) -> Sequence:
-    """The sequence with its keypoints, if any, mapped by the inverse of `image`, to
-    pixels of the video."""
+    """Returns the sequence with its keypoints, if any, mapped by the inverse of
+    `image`, to pixels of the video."""
     keypoints = sequence.keypoints
     if keypoints is None:
         return sequence
@@ -36,8 +36,9 @@ def with_bodies_moved(
     place: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 3"]],
     R: Float[np.ndarray, "3 3"] | None = None,
 ) -> Sequence:
-    """The sequence with the pelvis positions (m, camera frame) of its bodies, if any,
-    mapped by `place`, and each body rotated about its pelvis by `R`, if given."""
+    """Returns the sequence with the pelvis positions (m, camera frame) of its bodies,
+    if any, mapped by `place`, and each body rotated about its pelvis by `R`, if
+    given."""
     bodies = sequence.bodies
     if bodies is None:
         return sequence

@@ -1,10 +1,10 @@
-"""Public data sets turned into sequence folders with ground truth.
+"""Converts public data sets to sequence folders with ground truth.
 
-Layouts as their authors document them: EMDB (Kaufmann et al., ICCV 2023), 3DPW (von
+Layouts are as their authors document them: EMDB (Kaufmann et al., ICCV 2023), 3DPW (von
 Marcard et al., ECCV 2018), RICH (Huang et al., CVPR 2022), and pairs of a TUM
 trajectory and an AMASS file. Everything is read and checked before anything is written.
-True joints are of the gendered body that a data set was made with. Images are linked,
-not copied. Pickles pass through the restricted reader only.
+True joints are those of the gendered body that a data set was made with. Images are
+linked, not copied. Pickles are read by the restricted reader only.
 """
 
 from bodyslam_jax.evaluation.datasets.emdb import convert_emdb as convert_emdb

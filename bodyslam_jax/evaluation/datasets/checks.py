@@ -10,7 +10,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.safe_pickle import restricted_load
 
-_HOME = {
+_WEBSITES = {
     "EMDB": "https://emdb.ait.ethz.ch",
     "3DPW": "https://virtualhumans.mpi-inf.mpg.de/3DPW",
     "RICH": "https://rich.is.tue.mpg.de",
@@ -20,20 +20,27 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
 def not_there(path: Path, dataset: str) -> InputError:
-    """The error for a missing file, with the address where to register."""
+    """Returns the error for a missing file, with the address at which to register."""
     return InputError(
         f"{path}: not there; {dataset} is given to researchers who register at "
-        f"{_HOME[dataset]}."
+        f"{_WEBSITES[dataset]}."
     )
 
 
 def dictionary(file: Path, needed: tuple[str, ...]) -> dict[str, Any]:
-    """A pickled dictionary with all names in `needed`."""
+    """Reads a pickled dictionary that has all keys in `needed`.
+
+    **Raises:** `InputError` if it is no such dictionary.
+    """
     return fields(file, "", restricted_load(file), needed)
 
 
 def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[str, Any]:
-    """`data`, called `name` in `file`, if it is a dictionary with the keys `needed`."""
+    """Returns `data`, called `name` in `file`, if it is a dictionary with the keys
+    `needed`.
+
+    **Raises:** `InputError` otherwise.
+    """
     where = f"{file}: {name + ' is ' if name else ''}"
     if not isinstance(data, dict):
         raise InputError(f"{where}a {type(data).__name__}, not a dictionary.")
@@ -44,7 +51,10 @@ def fields(file: Path, name: str, data: Any, needed: tuple[str, ...]) -> dict[st
 
 
 def entries(file: Path, name: str, data: Any, count: int | None = None) -> list[Any]:
-    """The entries of `name`, one for each of `count` people; at least one."""
+    """Returns the entries of `name`, one for each of `count` people; at least one.
+
+    **Raises:** `InputError` for another number.
+    """
     is_list = isinstance(data, list | tuple)
     if not is_list and not (isinstance(data, np.ndarray) and data.ndim):
         raise InputError(f"{file}: {name}: a {type(data).__name__}, not a list.")
@@ -57,7 +67,10 @@ def entries(file: Path, name: str, data: Any, count: int | None = None) -> list[
 def array(
     file: Path, name: str, values: Any, shape: tuple[int | None, ...]
 ) -> np.ndarray:
-    """`values` as finite float64 of this shape; `None` is any length but 0."""
+    """Returns `values` as finite float64 of this shape; `None` is any length but 0.
+
+    **Raises:** `InputError` if they are not.
+    """
     try:
         found = np.asarray(values, np.float64)
     except (TypeError, ValueError, OverflowError, MemoryError):
@@ -78,16 +91,19 @@ def array(
 
 
 def first(file: Path, name: str, values: Any, count: int) -> np.ndarray:
-    """The first `count` of `values`, whatever their shape."""
+    """Returns the first `count` of the flattened `values`, checked by `array`."""
     try:
         flat = np.ravel(values)[:count]
-    except ValueError:  # lists of unlike lengths
+    except ValueError:  # lists of different lengths
         flat = values
     return array(file, name, flat, (count,))
 
 
 def whole(file: Path, name: str, value: Any) -> int:
-    """A whole number above 0."""
+    """Returns a value that must be a whole number above 0.
+
+    **Raises:** `InputError` if it is not.
+    """
     number = float(array(file, name, value, ()))
     if number < 1 or number != round(number):
         raise InputError(f"{file}: {name}: {number:g}, not a whole number above 0.")
@@ -95,7 +111,10 @@ def whole(file: Path, name: str, value: Any) -> int:
 
 
 def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarray:
-    """World-to-camera matrices: rigid motions."""
+    """Returns world-to-camera matrices, checked to be rigid motions.
+
+    **Raises:** `InputError` if they are not.
+    """
     found = array(file, name, values, (num, 4, 4))
     R = np.clip(found[:, :3, :3], -10, 10)
     away = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(initial=0)
@@ -106,10 +125,12 @@ def extrinsics(file: Path, name: str, values: Any, num: int | None) -> np.ndarra
 
 
 def images(folder: Path, num: int = 1) -> list[Path]:
-    """The images of a folder, by name; at least `num`.
+    """Returns the images of a folder, sorted by name; at least `num`.
 
-    Fewer images than frames are an incomplete download, whose images would be assigned
+    Fewer images than frames mean an incomplete download, whose images would be assigned
     to wrong frames.
+
+    **Raises:** `InputError` if there are fewer.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of images.")
@@ -123,6 +144,6 @@ def images(folder: Path, num: int = 1) -> list[Path]:
 
 
 def image_size(folder: Path) -> tuple[int, int]:
-    """Width and height of the first image, px."""
+    """Returns width and height of the first image, px."""
     image = next(io.frames(folder))
     return image.shape[1], image.shape[0]

@@ -1,4 +1,4 @@
-"""EMDB: one person, a moving camera."""
+"""Converts EMDB: one person, a moving camera."""
 
 from pathlib import Path
 
@@ -11,13 +11,14 @@ from bodyslam_jax.evaluation.readers import posed_joints
 
 
 def convert_emdb(source: Path, out: Path, body_model: Path | None = None) -> Path:
-    """Turns one EMDB sequence (a folder with `*_data.pkl` and `images/`) into `out`.
+    """Converts one EMDB sequence (a folder with `*_data.pkl` and `images/`) to `out`.
 
-    `body_model` is SMPL of the gender that the file names, or a folder with it: it
-    makes the true joints. The person is present in the file's good frames.
+    `body_model` is SMPL of the gender that the file names, or a folder with it; the
+    true joints are posed with it. The person is present in the frames that the file
+    marks good.
 
-    **Raises:** `InputError` that says where to register, or names the file and
-    what is wrong with it.
+    **Raises:** `InputError` that says where to register, or names the file and what is
+    wrong with it.
     """
     found = sorted(source.glob("*_data.pkl")) if source.is_dir() else []
     if not found:

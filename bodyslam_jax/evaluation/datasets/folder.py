@@ -1,4 +1,4 @@
-"""Sequence folders, written whole or not at all."""
+"""Writes sequence folders atomically."""
 
 import contextlib
 import json
@@ -15,16 +15,17 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, write_body, write_tum
 
 FPS = 30.0
-"""Of all three data sets."""
-_MARK = "conversion.json"
-"""Source of a converted sequence; a folder with this file may be overwritten."""
+"""Frame rate of all three data sets, 1/s."""
+_MARKER_FILE = "conversion.json"
+"""File with the source of a converted sequence; a folder that has it may be
+overwritten."""
 
 
 @contextlib.contextmanager
 def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
-    """A hidden folder whose content appears in `out` when the block ends well.
+    """Yields a hidden folder whose content is moved to `out` when the block succeeds.
 
-    It replaces what an earlier conversion wrote; other files in `out` stay. If the
+    It replaces what an earlier conversion wrote; other files in `out` are kept. If the
     block raises, `out` is unchanged.
 
     **Raises:** `InputError` if `out` cannot be written, or has files of the same names
@@ -36,7 +37,7 @@ def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
         with atomic.hidden_folder(out.resolve().parent, ".conversion-") as partial:
             yield partial
             mark = {"dataset": dataset, "source": str(source.resolve())}
-            (partial / _MARK).write_text(json.dumps(mark) + "\n")
+            (partial / _MARKER_FILE).write_text(json.dumps(mark) + "\n")
             partial.chmod(0o755)
             _move(partial, out)
     except OSError as error:
@@ -47,9 +48,9 @@ def _move(partial: Path, out: Path) -> None:
     if not out.exists():
         os.replace(partial, out)
         return
-    written = sorted(partial.iterdir(), key=lambda entry: entry.name == _MARK)
+    written = sorted(partial.iterdir(), key=lambda entry: entry.name == _MARKER_FILE)
     theirs = [e.name for e in written if os.path.lexists(out / e.name)]
-    if theirs and not (out / _MARK).exists():
+    if theirs and not (out / _MARKER_FILE).exists():
         raise InputError(
             f"{out}: has {', '.join(theirs)}, which no conversion wrote; choose "
             "another folder."
@@ -66,7 +67,7 @@ def _move(partial: Path, out: Path) -> None:
 def write_truth(
     folder: Path, T_CW: Float[np.ndarray, "t 4 4"], people: list[dict[str, Any]]
 ) -> None:
-    """The trajectory, camera to world, and a file for each person."""
+    """Writes the trajectory, camera to world, and a file for each person."""
     truth = folder / "groundtruth"
     truth.mkdir()
     write_tum(truth / "camera.txt", np.arange(len(T_CW)) / FPS, np.linalg.inv(T_CW))
@@ -81,7 +82,7 @@ def write_camera(
     size: tuple[int, int],
     distortion: tuple[float, ...] = (),
 ) -> None:
-    """`camera.json`, with `k1 k2 p1 p2` if there is any distortion."""
+    """Writes `camera.json`, with `k1 k2 p1 p2` if there is any distortion."""
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     model = "PINHOLE"
     if any(distortion):
@@ -92,7 +93,7 @@ def write_camera(
 
 
 def link_images(folder: Path, images: Path) -> None:
-    """Links the images, as data sets are large."""
+    """Links the images instead of copying them, as data sets are large."""
     link = folder / "images"
     link.symlink_to(images.resolve(), target_is_directory=True)
 
@@ -100,7 +101,8 @@ def link_images(folder: Path, images: Path) -> None:
 def write_keypoints(
     folder: Path, name: str, people: list[Float[np.ndarray, "t 18 3"]]
 ) -> None:
-    """OpenPose's own files, COCO-18; a person who was not detected is left out."""
+    """Writes keypoints in OpenPose's format, COCO-18; people who were not detected in a
+    frame are left out."""
     keypoints = folder / "keypoints"
     keypoints.mkdir()
     for k in range(len(people[0])):

@@ -1,7 +1,8 @@
-"""The body model that true parameters belong to, by kind and gender.
+"""Finds the body model, by kind and gender, that true parameters belong to.
 
-The same β are another shape in another model: ground truths are posed with the gendered
-SMPL that they were made with, as in the evaluations of EMDB, WHAM and TRAM.
+The same β yield different shapes in different models, so ground truths are posed with
+the gendered SMPL that they were made with, as in the evaluations of EMDB, WHAM and
+TRAM.
 """
 
 import dataclasses
@@ -21,25 +22,25 @@ from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
 
-_NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
-_NAMES["default"] = "the free body that ships with the package"
-_KINDS = {156: ("smplh", "smpl"), 165: ("smplx",)}
-"""By the number of pose parameters: kinds of body that they fit, best first."""
-_STEMS: dict[str, tuple[str, ...]] = {
+_BODY_NAMES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
+_BODY_NAMES["default"] = "the free body that ships with the package"
+_KINDS_BY_POSE_SIZE = {156: ("smplh", "smpl"), 165: ("smplx",)}
+"""Kinds of body by the number of pose parameters, best first."""
+_FILE_STEMS: dict[str, tuple[str, ...]] = {
     "smpl": ("smpl_", "basicmodel"),
     "smplh": ("smplh_", "model"),
     "smplx": ("smplx_",),
 }
-"""Beginnings of the usual names of files."""
+"""Beginnings of the usual file names."""
 
 
 def body_for(
     file: Path, gender: str, kind: str, body_model: Path | None = None
 ) -> BodyModel:
-    """The body of one kind and gender, for the parameters in `file`.
+    """Loads the body of one kind and gender, for the parameters in `file`.
 
-    `body_model` is a file, or a folder with a file for each gender, and for other kinds
-    too; without it one is looked for where `load_body_model` does.
+    `body_model` is a file, or a folder with a file for each gender and kind; without it
+    the body is searched for where `load_body_model` does.
 
     **Raises:** `InputError` if there is no such body.
     """
@@ -48,14 +49,15 @@ def body_for(
     body, wrong = _load(place, gender, gender, (kind,))
     if wrong:
         raise InputError(
-            f"{file}: its joints need {_NAMES[kind]}, {gender}, not {wrong}; name its "
-            "file or folder with --body-model."
+            f"{file}: its joints need {_BODY_NAMES[kind]}, {gender}, not {wrong}; "
+            "name its file or folder with --body-model."
         )
     return body
 
 
 def read_truth(path: Path, body_model: Path | None = None) -> Result:
-    """`read_groundtruth`, posing each body without joints with a body of its gender.
+    """Reads a ground truth as `read_groundtruth` does, and poses each body without
+    joints with a body of its gender.
 
     Warns if the body that is used is not the one that the parameters belong to.
 
@@ -67,7 +69,7 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
     needs = [None if "joints" in x else _needed(x) for x in files]
     wanted = sorted({need for need in needs if need})
     if not wanted:
-        return read_groundtruth(path, load_body_model(DEFAULT))  # poses nobody
+        return read_groundtruth(path, load_body_model(DEFAULT))  # poses no body
     bodies = {need: _body_at_hand(body_model, *need) for need in wanted}
     for file, need in zip((x.path for x in files), needs, strict=True):
         if need and (wrong := bodies[need][1]):
@@ -75,7 +77,7 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
                 "%s: no joints in it; its parameters are of %s, %s, but posed with %s, "
                 "which makes another person of them; name the right body with "
                 "--body-model.",
-                *(file, _NAMES[need[1][0]], need[0], wrong),
+                *(file, _BODY_NAMES[need[1][0]], need[0], wrong),
             )
     read = {need: read_groundtruth(path, body) for need, (body, _) in bodies.items()}
     of = [need or wanted[0] for need in needs]
@@ -84,7 +86,7 @@ def read_truth(path: Path, body_model: Path | None = None) -> Result:
 
 
 def _bodies(path: Path) -> list[Archive]:
-    """The body files of a ground truth in the order of its people."""
+    """Opens the body files of a ground truth in the order of its people."""
     if not path.is_dir():
         files = [path] if path.is_file() and path.suffix == ".npz" else []
     elif not (path / "groundtruth").is_dir() and (path / "result.npz").exists():
@@ -96,9 +98,10 @@ def _bodies(path: Path) -> list[Archive]:
 
 
 def _needed(person: Archive) -> tuple[str, tuple[str, ...]]:
-    """Gender of an AMASS file, and which kinds of body it fits; the best first."""
+    """Returns the gender of an AMASS file, and the kinds of body that fit it, best
+    first."""
     width = person.header("poses")[0][-1:] if "poses" in person else ()
-    kinds = _KINDS.get(width[0] if width else 0, ("smpl", "smplh"))
+    kinds = _KINDS_BY_POSE_SIZE.get(width[0] if width else 0, ("smpl", "smplh"))
     has_text = "gender" in person and person.header("gender")[1].kind in "SU"
     gender = gender_of(person.text("gender")) if has_text else None
     return gender or "neutral", kinds
@@ -111,7 +114,8 @@ def _is_installed(gender: str) -> bool:
 def _body_at_hand(
     body_model: Path | None, gender: str, kinds: tuple[str, ...]
 ) -> tuple[BodyModel, str | None]:
-    """The body of the gender; the neutral one if none is named or installed."""
+    """Loads the body of the gender, or the neutral one if none is named or installed;
+    returns it with the description of a mismatch, if any."""
     available = gender if body_model or _is_installed(gender) else "neutral"
     return _load(body_model, available, gender, kinds)
 
@@ -119,9 +123,10 @@ def _body_at_hand(
 def _load(
     place: Path | None, available: str, gender: str, kinds: tuple[str, ...]
 ) -> tuple[BodyModel, str | None]:
-    """A body of one of `kinds`, best first, among the files of gender `available`.
+    """Loads a body of one of `kinds`, best first, among the files of gender
+    `available`.
 
-    Falls back to another body, and returns what that is, for a warning.
+    Falls back to another body, and returns its description, for a warning.
     """
     named = place or os.environ.get(PATH_VARIABLE) or Path()
     files = candidates(place, available) if place else search_paths(available)
@@ -136,21 +141,22 @@ def _load(
         found.append((body, wrong))
     if found:
         return found[0]
-    body = load_body_model(place, available)  # the free one, or an error
+    body = load_body_model(place, available)  # the default body, or an error
     return body, _mismatch(body, DEFAULT, gender, kinds)
 
 
 def _rank(file: Path, kinds: tuple[str, ...]) -> int:
-    """Index among `kinds` of a file's kind, by its name; it may be wrong."""
-    fits = [file.stem.lower().startswith(_STEMS[kind]) for kind in kinds]
+    """Returns the index among `kinds` of a file's kind, guessed from its name."""
+    fits = [file.stem.lower().startswith(_FILE_STEMS[kind]) for kind in kinds]
     return [*fits, True].index(True)
 
 
 def _mismatch(
     body: BodyModel, file: Path, gender: str, kinds: tuple[str, ...]
 ) -> str | None:
-    """What a body is, if it is not of the kinds and gender wanted; gender by name."""
-    name = _NAMES[body.kind]
+    """Returns the description of a body that is not of the wanted kinds and gender (by
+    file name), else `None`."""
+    name = _BODY_NAMES[body.kind]
     if body.kind == "default":
         return name
     of = named_gender(file)

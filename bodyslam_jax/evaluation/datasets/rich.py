@@ -1,4 +1,4 @@
-"""RICH: several people, of whom one still camera is taken."""
+"""Converts RICH: several people, seen by one static camera."""
 
 import re
 from pathlib import Path
@@ -13,8 +13,8 @@ from bodyslam_jax.evaluation.datasets.gender import body_for, gender_of
 from bodyslam_jax.evaluation.readers import posed_joints
 from bodyslam_jax.io.files import read_json, read_text, reading
 
-_PARTS = {"global_orient": 3, "body_pose": 63, "betas": 10, "transl": 3}
-_GENDERS_FROM = "https://github.com/paulchhuang/rich_toolkit, resource/gender.json"
+_PART_SIZES = {"global_orient": 3, "body_pose": 63, "betas": 10, "transl": 3}
+_GENDERS_SOURCE = "https://github.com/paulchhuang/rich_toolkit, resource/gender.json"
 
 
 def convert_rich(
@@ -26,14 +26,15 @@ def convert_rich(
     body_model: Path | None = None,
     genders: Path | None = None,
 ) -> Path:
-    """Turns one still camera's view of a RICH sequence into `out`.
+    """Converts the view of one static camera of a RICH sequence to `out`.
 
     `root` holds `bodies/<split>/<sequence>/<frame>/<subject>.pkl`,
     `images/<split>/<sequence>/cam_<camera>/` and
     `scan_calibration/<scene>/calibration/<camera>.xml`. `body_model` is a folder with
-    SMPL-X of the subjects' genders, or one file if they are all of one: it makes the
-    true joints. `genders` is the toolkit's `gender.json`; without it that is looked for
-    in `root`, its `resource/` and `resource/` beside it, where the toolkit has it.
+    SMPL-X of the subjects' genders, or one file if all have the same; the true joints
+    are posed with it. `genders` is the toolkit's `gender.json`; by default it is
+    searched for in `root`, its `resource/` and `resource/` beside it, where the toolkit
+    has it.
 
     **Raises:** as `convert_emdb`.
     """
@@ -69,7 +70,7 @@ def convert_rich(
 
 
 def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, str]:
-    """Gender by subject, from a table `{"3": "male", ...}`."""
+    """Returns the gender by subject, from a table `{"3": "male", ...}`."""
     root = root.resolve()
     folders = [root, root / "resource", root.parent / "resource"]
     paths = [folder / "gender.json" for folder in folders] if file is None else [file]
@@ -77,7 +78,7 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
     if file is None:
         raise InputError(
             f"{paths[0]}: not there, and RICH's own files do not name genders; it is "
-            f"in {_GENDERS_FROM}, and can be named with --genders."
+            f"in {_GENDERS_SOURCE}, and can be named with --genders."
         )
     table = checks.fields(file, "", read_json(file, "RICH's gender.json"), ())
     found = {}
@@ -94,14 +95,16 @@ def _genders(root: Path, file: Path | None, subjects: list[str]) -> dict[str, st
 
 
 def _person(files: list[Path], row: dict[int, int], num: int) -> dict[str, Any]:
-    """One subject's files, a frame each, at the rows of their frames."""
+    """Reads the files of one subject, one per frame, into the rows of their frames."""
     poses, trans = np.zeros((num, 72)), np.zeros((num, 3))
     betas, present = np.zeros((num, 10)), np.zeros(num, bool)
     for file in files:
         if (k := row.get(_number(file, file.parent.name))) is None:
             continue
-        data = checks.dictionary(file, (*_PARTS,))
-        found = {n: checks.first(file, n, data[n], size) for n, size in _PARTS.items()}
+        data = checks.dictionary(file, (*_PART_SIZES,))
+        found = {
+            n: checks.first(file, n, data[n], size) for n, size in _PART_SIZES.items()
+        }
         poses[k, :3], poses[k, 3:66] = found["global_orient"], found["body_pose"]
         trans[k], betas[k] = found["transl"], found["betas"]
         present[k] = True
@@ -110,7 +113,7 @@ def _person(files: list[Path], row: dict[int, int], num: int) -> dict[str, Any]:
 
 
 def _number(file: Path, name: str) -> int:
-    """The number that a name begins with."""
+    """Returns the number that a name begins with."""
     found = re.match(r"\d{1,12}(?!\d)", name)
     if found is None:
         raise InputError(f"{file}: {name!r} does not begin with a number.")
@@ -118,7 +121,7 @@ def _number(file: Path, name: str) -> int:
 
 
 def _camera(xml: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
-    """World to camera, calibration matrix and `k1 k2 p1 p2`, from OpenCV's XML."""
+    """Reads world to camera, calibration matrix and `k1 k2 p1 p2` from OpenCV's XML."""
     what = "a calibration with CameraMatrix, Intrinsics and Distortion"
     text = read_text(xml, what)
     if "<!" in text.replace("<!--", ""):  # an entity may stand for gigabytes

@@ -1,4 +1,4 @@
-"""3DPW: one or two people, a moving camera, joints in the file."""
+"""Converts 3DPW: one or two people, a moving camera, joints in the file."""
 
 import re
 from pathlib import Path
@@ -8,12 +8,12 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.datasets import checks, folder
 from bodyslam_jax.evaluation.datasets.gender import gender_of
 
-_NEEDED = ("sequence", "poses", "trans", "betas", "cam_poses", "cam_intrinsics")
-_NEEDED += ("campose_valid", "jointPositions")
+_REQUIRED_KEYS = ("sequence", "poses", "trans", "betas", "cam_poses", "cam_intrinsics")
+_REQUIRED_KEYS += ("campose_valid", "jointPositions")
 
 
 def convert_3dpw(source: Path, out: Path) -> Path:
-    """Turns one 3DPW sequence into `out`, with its 2D detections as keypoints.
+    """Converts one 3DPW sequence to `out`, with its 2D detections as keypoints.
 
     `source` is `sequenceFiles/<split>/<name>.pkl`; the images are looked for in
     `imageFiles/<name>` beside `sequenceFiles`. Joints are the file's own. A person is
@@ -23,9 +23,9 @@ def convert_3dpw(source: Path, out: Path) -> Path:
     """
     if not source.is_file():
         raise checks.not_there(source, "3DPW")
-    data = checks.dictionary(source, _NEEDED)
+    data = checks.dictionary(source, _REQUIRED_KEYS)
     name = data["sequence"]
-    # It names files, and must not lead elsewhere.
+    # The name becomes part of paths, and must not leave the folder.
     if not isinstance(name, str) or not re.fullmatch(r"\w[\w.+ -]{0,119}", name):
         found = f"{str(name)[:80]!r}"
         raise InputError(f"{source}: sequence: {found}, not the name of a folder.")
@@ -38,7 +38,7 @@ def convert_3dpw(source: Path, out: Path) -> Path:
             checks.array(source, "poses2d", x, (len(T_CW), 3, 18)).transpose(0, 2, 1)
             for x in checks.entries(source, "poses2d", data["poses2d"], len(people))
         ]
-    # Resolved: the file may be given by its name alone, from within its folder.
+    # The path is resolved because it may be a bare file name.
     images = source.resolve().parent.parent.parent / "imageFiles" / name
     checks.images(images, len(T_CW))
     size = checks.image_size(images)

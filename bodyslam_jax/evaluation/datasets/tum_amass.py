@@ -1,4 +1,4 @@
-"""A camera's trajectory and a person's motion, from wherever they come."""
+"""Combines a camera trajectory and a person's motion of any origin."""
 
 import shutil
 from pathlib import Path
@@ -11,16 +11,17 @@ from bodyslam_jax.evaluation.readers import read_body, read_tum
 def convert_tum_amass(
     trajectory: Path, motion: Path, out: Path, images: Path | None = None
 ) -> Path:
-    """Puts a TUM trajectory and an AMASS file, and images if any, into `out`.
+    """Combines a TUM trajectory, an AMASS file, and images if any, in `out`.
 
-    The files are copied as they are; `read_groundtruth` brings their rates together.
+    The files are copied as they are; `read_groundtruth` resamples them to a common
+    rate.
 
     **Raises:** as `convert_emdb`.
     """
     read_tum(trajectory)
     if not motion.is_file():
         raise checks.not_there(motion, "AMASS")
-    # Whether it can be read, which does not depend on whose joints it is posed with.
+    # Checks that the file can be read; the body model is irrelevant for that.
     read_body(motion, load_body_model(DEFAULT))
     if images is not None:
         checks.images(images)

@@ -1,7 +1,8 @@
-"""A result as other programs read it: one module a format, all in one table.
+"""Exports a result to files of other programs: one module per format, and a table of
+all.
 
-The metric world is that of the run (`docs/conventions.md`); `up="z"` turns it so that z
-is up. Everything that is written from one result shares that world.
+The metric world is that of the run (`docs/conventions.md`); `up="z"` rotates it so that
+z is up. All files that are written from one result share that world.
 """
 
 from bodyslam_jax.export.formats.files import export as export

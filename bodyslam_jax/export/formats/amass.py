@@ -1,8 +1,9 @@
-"""AMASS (Mahmood et al., ICCV 2019): one person's pose parameters as SMPL-H `.npz`.
+"""Writes AMASS (Mahmood et al., ICCV 2019): one person's pose parameters as SMPL-H
+`.npz`.
 
-SMPL-H's poses are SMPL's first 22 joints and 30 of the hands, which are left at rest;
-the turns of SMPL's two hand joints move no other joint. The rate stands under both
-names that AMASS has for it.
+SMPL-H's poses consist of SMPL's first 22 joints and 30 joints of the hands, which are
+left at rest; rotations of SMPL's two hand joints move no other joint. The rate is
+written under both names that AMASS uses.
 """
 
 from pathlib import Path
@@ -11,25 +12,25 @@ import numpy as np
 
 from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 
-_BODY, _SMPLH = 66, 156
-"""Numbers of a pose: of SMPL-H's body, and with hands."""
+_NUM_BODY_PARAMETERS, _NUM_SMPLH_PARAMETERS = 66, 156
+"""Numbers of pose parameters: of SMPL-H's body, and including hands."""
 _NUM_BETAS, _NUM_DMPLS = 16, 8
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Writes the only person of a scene, one row a frame of the video.
+    """Writes the only person of a scene, one row per frame of the video.
 
-    Frames without the person repeat the last pose; `present` marks them. `betas` are
-    those of the body model of the run, which `body_model` names: only with that model
-    do they mean the person's shape.
+    Frames without the person repeat the last pose; `present` marks the others. `betas`
+    are those of the body model of the run, which `body_model` names; they represent the
+    person's shape with that model only.
     """
     scene = at_constant_rate(scene).with_held_poses()
     result = scene.result
     num = len(result.timestamps)
-    poses = np.zeros((num, _SMPLH))
-    poses[:, :_BODY] = result.poses[0, :, :_BODY]
+    poses = np.zeros((num, _NUM_SMPLH_PARAMETERS))
+    poses[:, :_NUM_BODY_PARAMETERS] = result.poses[0, :, :_NUM_BODY_PARAMETERS]
     rate = np.array(result.fps)
-    # Through a file: `savez` would add a suffix to the name of a temporary file.
+    # An open file, because `savez` would add a suffix to a temporary file's name.
     with path.open("wb") as file:
         np.savez_compressed(
             file,

@@ -1,4 +1,4 @@
-"""BVH: one person's motion on SMPL's skeleton, under the names of Mixamo's.
+"""Writes BVH: one person's motion on SMPL's skeleton, with Mixamo's joint names.
 
 Retargeting tools (Rokoko, Auto-Rig Pro, MotionBuilder) recognise these names and the
 T-pose: arms along x, legs down, facing z. Lengths are cm, as in Mixamo's own files.
@@ -22,7 +22,7 @@ MIXAMO_NAMES: tuple[str, ...] = (
     *("LeftForeArm", "RightForeArm", "LeftHand", "RightHand"),
     *("LeftHandMiddle1", "RightHandMiddle1"),
 )
-"""In the order of SMPL's joints."""
+"""Mixamo's names in the order of SMPL's joints."""
 
 
 def write_bvh(
@@ -42,7 +42,7 @@ def write_bvh(
 
 
 def write(path: Path, scene: Scene, names: Sequence[str] = MIXAMO_NAMES) -> None:
-    """`write_bvh` of the only person of a scene."""
+    """Writes the only person of a scene by `write_bvh`."""
     scene = at_constant_rate(scene).with_held_poses()
     result = scene.result
     offsets, rest = 100 * scene.offsets[0], 100 * scene.rest[0]
@@ -71,7 +71,7 @@ def write(path: Path, scene: Scene, names: Sequence[str] = MIXAMO_NAMES) -> None
     num = len(result.timestamps)
     turns = result.poses[0].reshape(num, 24, 3)
     degrees = np.degrees(so3.euler(turns, "ZXY"))[:, order]
-    # Without jumps by a whole turn, between which programs would interpolate.
+    # Jumps by 360 degrees are removed, because programs would interpolate them.
     degrees = np.unwrap(degrees, axis=0, period=360.0)
     table = np.concatenate([100 * scene.pelvis[0], degrees.reshape(num, 72)], axis=1)
     lines += ["MOTION", f"Frames: {num}", f"Frame Time: {1 / result.fps:.8f}"]

@@ -1,7 +1,8 @@
-"""C3D (C3D.org, user guide): one person's joint centres as points, mm.
+"""Writes C3D (C3D.org, user guide): one person's joint centres as points, mm.
 
-Little-endian floats; a file is a header, groups of parameters, and for each frame four
-numbers a point: x, y, z and a residual, which is -1 where the point is missing.
+Numbers are little-endian; a file consists of a header, groups of parameters, and four
+floats for each frame and point: x, y, z and a residual, which is -1 where the point is
+missing.
 """
 
 import math
@@ -15,11 +16,11 @@ from bodyslam_jax.body import JOINT_NAMES
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 
-_BLOCK = 512
-_HEADER_WORDS = _BLOCK // 2
-_KEY, _INTEL = 0x50, 84
-_LONGEST = 65535
-"""Frames that the header's 16 bits can count."""
+_BLOCK_BYTES = 512
+_HEADER_WORDS = _BLOCK_BYTES // 2
+_PARAMETER_KEY, _INTEL_PROCESSOR = 0x50, 84
+_MAX_FRAMES = 65535
+"""Number of frames that the header's 16 bits can count."""
 _CHAR, _INT, _FLOAT = -1, 2, 4
 """Types of parameters."""
 
@@ -32,25 +33,25 @@ def write(path: Path, scene: Scene) -> None:
     scene = at_constant_rate(scene)
     result = scene.result
     num, rate = len(result.timestamps), result.fps
-    if num > _LONGEST:
-        raise InputError(f"--to c3d: {num} frames, expected at most {_LONGEST}.")
+    if num > _MAX_FRAMES:
+        raise InputError(f"--to c3d: {num} frames, expected at most {_MAX_FRAMES}.")
     points = np.zeros((num, 24, 4), "<f4")
     points[..., :3] = 1000 * result.joints[0]
     points[~result.present[0]] = [0, 0, 0, -1]
-    # The parameters tell where data begins, which depends on their own length.
-    blocks = math.ceil(len(_parameters(num, rate, scene.up, 0)) / _BLOCK)
+    # The parameters contain the start of the data, which depends on their own length.
+    blocks = math.ceil(len(_parameters(num, rate, scene.up, 0)) / _BLOCK_BYTES)
     parameters = _parameters(num, rate, scene.up, 2 + blocks)
     parameters = parameters[:2] + bytes([blocks]) + parameters[3:]
-    parameters += b"\0" * (blocks * _BLOCK - len(parameters))
+    parameters += b"\0" * (blocks * _BLOCK_BYTES - len(parameters))
     header = struct.pack(
         "<BBHHHHHfHHf",
-        *(2, _KEY, 24, 0, 1, num, 10, -1.0, 2 + blocks, 0, rate),
+        *(2, _PARAMETER_KEY, 24, 0, 1, num, 10, -1.0, 2 + blocks, 0, rate),
     )
     data = points.tobytes()
     with path.open("wb") as file:
-        file.write(header.ljust(_BLOCK, b"\0"))
+        file.write(header.ljust(_BLOCK_BYTES, b"\0"))
         file.write(parameters)
-        file.write(data + b"\0" * (-len(data) % _BLOCK))
+        file.write(data + b"\0" * (-len(data) % _BLOCK_BYTES))
 
 
 def _parameters(num: int, rate: float, up: str, data_start: int) -> bytes:
@@ -81,7 +82,7 @@ def _parameters(num: int, rate: float, up: str, data_start: int) -> bytes:
             ("CAMERA_RATE", _FLOAT, rate),
         ],
     }
-    found = bytearray([1, _KEY, 0, _INTEL])
+    found = bytearray([1, _PARAMETER_KEY, 0, _INTEL_PROCESSOR])
     for number, (name, rows) in enumerate(groups.items(), 1):
         found += _entry(name, -number, b"")
         for key, kind, value in rows:
@@ -90,14 +91,14 @@ def _parameters(num: int, rate: float, up: str, data_start: int) -> bytes:
 
 
 def _entry(name: str, group: int, data: bytes) -> bytes:
-    """A group (negative number) or a parameter, without a description."""
+    """Returns a group (negative number) or a parameter, without a description."""
     rest = data + b"\0"
     head = struct.pack("<bb", len(name), group) + name.encode()
     return head + struct.pack("<h", len(rest) + 2) + rest
 
 
 def _value(kind: int, value: Any) -> bytes:
-    """Type, dimensions and values of a parameter: a text, texts or numbers."""
+    """Returns type, dimensions and values of a parameter: a text, texts or numbers."""
     if kind == _CHAR:
         words = [value] if isinstance(value, str) else list(value)
         width = max(map(len, words))

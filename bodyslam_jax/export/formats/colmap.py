@@ -1,8 +1,8 @@
-"""COLMAP's sparse model, as text and binary, in metres.
+"""Writes COLMAP's sparse model, as text and binary, in metres.
 
 COLMAP, `src/colmap/scene/reconstruction_io`: poses are world to camera, quaternions
-wxyz; pixel coordinates count from the corner of the image. The folder is laid out as
-Gaussian-splatting tools expect it: `sparse/0` and, where a video is given, `images`.
+wxyz; pixel coordinates count from the corner of the image. The folder has the layout
+that Gaussian-splatting tools expect: `sparse/0` and, if a video is given, `images`.
 """
 
 import dataclasses
@@ -15,17 +15,17 @@ from jaxtyping import Float, Int, UInt8
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.export.formats.views import (
-    HALF,
+    PIXEL_CENTRE_OFFSET_PX,
     Views,
     reprojection_errors,
     views_of,
 )
 from bodyslam_jax.geometry import so3_numpy as so3
 
-_NUMBERS = {"PINHOLE": 1, "OPENCV": 4}
+_MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4}
 """COLMAP's numbers of camera models."""
-_GREY = 128
-_NO_ERROR = -1.0
+_GREY_LEVEL = 128
+_MISSING_ERROR_PX = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,37 +35,37 @@ class _Model:
     views: Views
     size: tuple[int, int]
     q_CW: Float[np.ndarray, "n 4"]
-    """wxyz"""
+    """Quaternions world to camera, wxyz."""
     t_CW: Float[np.ndarray, "n 3"]
     points: Float[np.ndarray, "l 3"]
     colors: UInt8[np.ndarray, "l 3"]
     errors: Float[np.ndarray, " l"]
     """Mean reprojection error, px; -1 without observations."""
     image: Int[np.ndarray, " m"]
-    """For each observation the image it is in, from 0; sorted."""
+    """Index of the image of each observation, from 0; sorted."""
     index: Int[np.ndarray, " m"]
-    """Its place among those of the image."""
+    """Index of each observation among those of its image."""
     point: Int[np.ndarray, " m"]
     uv: Float[np.ndarray, "m 2"]
 
     def camera(self, k: int) -> int:
-        """Number of image k's camera."""
+        """Returns the number of image k's camera."""
         return k + 1 if self.views.zooms else 1
 
     def of_images(self) -> list[np.ndarray]:
-        """Observations of each image."""
+        """Returns the indices of the observations of each image."""
         return _grouped(self.image, len(self.views.frames))
 
     def of_points(self) -> list[np.ndarray]:
-        """Observations of each point."""
+        """Returns the indices of the observations of each point."""
         return _grouped(self.point, len(self.points))
 
 
 def write(path: Path, scene: Scene) -> None:
     """Writes `sparse/0` into a folder, and `images` if the scene has a video.
 
-    Images that the scene has no video for are named `frame_000000.jpg`, counted from 0.
-    Without observations, points are written that no image refers to.
+    Without a video, images are named `frame_000000.jpg`, counted from 0. Without
+    observations, points are written that no image refers to.
 
     **Raises:** `ValueError` if the video is not the one of the result.
     """
@@ -105,24 +105,24 @@ def _model(scene: Scene, views: Views) -> _Model:
     error = reprojection_errors(scene, seen)
     count = np.bincount(seen.landmark, minlength=len(points))
     total = np.bincount(seen.landmark, error, len(points))
-    mean = np.where(count > 0, total / np.maximum(count, 1), _NO_ERROR)
+    mean = np.where(count > 0, total / np.maximum(count, 1), _MISSING_ERROR_PX)
     return _Model(
         views=views,
         size=scene.size,
         q_CW=quaternion,
         t_CW=T_CW[:, :3, 3],
         points=points,
-        colors=np.full((len(points), 3), _GREY, np.uint8),
+        colors=np.full((len(points), 3), _GREY_LEVEL, np.uint8),
         errors=mean,
         image=image,
         index=index,
         point=seen.landmark,
-        uv=seen.uv + HALF,
+        uv=seen.uv + PIXEL_CENTRE_OFFSET_PX,
     )
 
 
 def _grouped(key: np.ndarray, num: int) -> list[np.ndarray]:
-    """Indices of the rows with each key from 0 to num - 1."""
+    """Returns the indices of the rows with each key from 0 to num - 1."""
     order = np.argsort(key, kind="stable")
     return np.split(order, np.searchsorted(key[order], np.arange(1, num)))[:num]
 
@@ -170,7 +170,7 @@ def _cameras_binary(model: _Model) -> bytes:
     views = model.views
     data = bytearray(struct.pack("<Q", len(views.intrinsics)))
     for k, params in enumerate(views.intrinsics):
-        data += struct.pack("<iiQQ", k + 1, _NUMBERS[views.model], *model.size)
+        data += struct.pack("<iiQQ", k + 1, _MODEL_IDS[views.model], *model.size)
         data += params.astype("<f8").tobytes()
     return bytes(data)
 

@@ -1,14 +1,14 @@
-"""CSV for those who measure people: joints, angles, speeds and how sure each joint is.
+"""Writes CSV for biomechanics: joints, angles, speeds and the joints' uncertainties.
 
-Angles are those that the International Society of Biomechanics recommends where the
+Angles are those recommended by the International Society of Biomechanics, where the
 body model has the joint (Wu et al., J. Biomech. 35, 2002, and 38, 2005). A segment's
 axes are x forward, y up, z to the right at rest, where legs are straight and parallel,
 so that zero is SMPL's rest pose, not an anatomical calibration. Hip, knee and ankle are
 the Cardan angles of the distal segment in the proximal one about z, then x, then y
 (flexion, adduction, internal rotation), with the signs of a right limb on both sides.
-The shoulder is the elevation of the upper arm from the trunk's axis alone, elbow the
-angle between upper arm and forearm; trunk and pelvis are of their segments in the
-world.
+The shoulder angle is the elevation of the upper arm from the trunk's axis alone, the
+elbow angle that between upper arm and forearm; angles of trunk and pelvis are those of
+their segments in the world.
 """
 
 from pathlib import Path
@@ -22,15 +22,24 @@ from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.markup import csv_table
 
+<<<<<<< HEAD
 SMPL_TO_ISB = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """From SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
 _LEG = {"hip": 1, "knee": 4, "ankle": 7}
 """Joint of the left side by name; that of the right side follows it."""
 _ARM = {"shoulder": 16, "elbow": 18, "wrist": 20}
+=======
+_ISB_FROM_SMPL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+"""Rotation from SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
+_LEG_JOINTS = {"hip": 1, "knee": 4, "ankle": 7}
+"""Index of the left joint by name; that of the right one is the next."""
+_ARM_JOINTS = {"shoulder": 16, "elbow": 18, "wrist": 20}
+>>>>>>> words3
 
 
 def write(path: Path, scene: Scene) -> None:
-    """A row a frame of the only person of a scene; absent frames are empty."""
+    """Writes one row per frame for the only person of a scene; absent frames are
+    empty."""
     result = scene.result
     joints, present = result.joints[0], result.present[0]
     columns = {}
@@ -56,11 +65,19 @@ def angles(
     joints: Float[np.ndarray, "t 24 3"],
     vertical: Float[np.ndarray, " 3"],
 ) -> dict[str, Float[np.ndarray, " t"]]:
-    """Joint angles by name, degrees: of SMPL's joint rotations, the first of which is
-    the pelvis' in the world, and of joints (m) in that world."""
+    """Returns joint angles by name, degrees.
+
+    They are computed from SMPL's joint rotations, of which the first is the pelvis' in
+    the world, and from joint positions (m) in that world.
+    """
     found = {}
+<<<<<<< HEAD
     in_isb = SMPL_TO_ISB @ turns @ SMPL_TO_ISB.T
     for name, left in _LEG.items():
+=======
+    in_isb = _ISB_FROM_SMPL @ turns @ _ISB_FROM_SMPL.T
+    for name, left in _LEG_JOINTS.items():
+>>>>>>> words3
         for side, joint, sign in (("left", left, -1.0), ("right", left + 1, 1.0)):
             flexion, adduction, rotation = cardan_zxy(in_isb[:, joint])
             bend = {"knee": "flexion", "ankle": "dorsiflexion"}.get(name, "flexion")
@@ -69,7 +86,7 @@ def angles(
             found[f"{side}_{name}_internal_rotation_deg"] = sign * rotation
     trunk = joints[:, NECK] - joints[:, PELVIS]
     for side, shift in (("left", 0), ("right", 1)):
-        shoulder, elbow, wrist = (joints[:, k + shift] for k in _ARM.values())
+        shoulder, elbow, wrist = (joints[:, k + shift] for k in _ARM_JOINTS.values())
         found[f"{side}_shoulder_elevation_deg"] = between(elbow - shoulder, -trunk)
         found[f"{side}_elbow_flexion_deg"] = between(wrist - elbow, elbow - shoulder)
     along = np.broadcast_to(vertical, trunk.shape)
@@ -81,7 +98,7 @@ def angles(
 def cardan_zxy(
     turns: Float[np.ndarray, "t 3 3"],
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
-    """Angles about z, then x, then y of rotations `Rz Rx Ry`, degrees."""
+    """Returns the angles about z, then x, then y of rotations `Rz Rx Ry`, degrees."""
     about_x = np.arcsin(np.clip(turns[:, 2, 1], -1.0, 1.0))
     about_z = np.arctan2(-turns[:, 0, 1], turns[:, 1, 1])
     about_y = np.arctan2(-turns[:, 2, 0], turns[:, 2, 2])
@@ -91,7 +108,7 @@ def cardan_zxy(
 def between(
     a: Float[np.ndarray, "t 3"], b: Float[np.ndarray, "t 3"]
 ) -> Float[np.ndarray, " t"]:
-    """Angle between vectors, degrees."""
+    """Returns the angle between vectors, degrees."""
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.degrees(np.arctan2(sine, (a * b).sum(axis=-1)))
 
@@ -102,8 +119,12 @@ def speeds(
     times: Float[np.ndarray, " t"],
     vertical: Float[np.ndarray, " 3"],
 ) -> dict[str, Float[np.ndarray, " t"]]:
-    """Speed of the pelvis over the ground, and of hands and feet in the world, m/s, by
-    differences of the frames before and after; NaN where one of them is missing."""
+    """Returns the horizontal speed of the pelvis, and the speeds of hands and feet in
+    the world, m/s.
+
+    They are central differences, NaN where the person is missing in the frame before or
+    after.
+    """
     points = {"pelvis": PELVIS, "left_wrist": 20, "right_wrist": 21}
     points |= {"left_foot": 10, "right_foot": 11}
     found = {}

@@ -1,4 +1,5 @@
-"""A result into files of other programs, all complete or none."""
+"""Exports a result to files of other programs; all files appear complete or not at
+all."""
 
 import dataclasses
 import importlib
@@ -20,7 +21,7 @@ from bodyslam_jax.types import Result
 
 log = logging.getLogger(__name__)
 
-_MARK = "bodyslam_export.json"
+_MARKER_FILE = "bodyslam_export.json"
 _MORE_SUFFIXES = {".usd": "usd", ".usda": "usd"}
 
 
@@ -35,22 +36,25 @@ def export(
     observations: Observations | None = None,
     video: Path | None = None,
 ) -> list[Path]:
-    """Writes a result in one or more formats; all files appear complete or not at all.
+    """Writes a result in one or more formats, and returns the files and folders
+    written.
+
+    All files appear complete or not at all.
 
     Args:
-        path: File, for one format, or a folder that exists; for several formats, and
-            for those that are folders (COLMAP, nerfstudio), a folder. Where each person
-            has a file, several people's get the person's number before the suffix.
-        to: Names of `FORMATS`; without it what the suffix of `path` says.
-        up: Axis of the world that points up.
-        person: Number of the only person to write, or of several; without it everybody.
-        body: The body model of the result; without it the one that this machine has;
-            a file that the result names is not opened.
-        observations: Of landmarks, for COLMAP; see `read_observations`.
-        video: Video or folder of images, whose frames are written beside COLMAP's and
-            nerfstudio's files.
-
-    Returns the files and folders that were written.
+        path: file, for one format, or an existing folder; for several formats, and for
+            those that are folders (COLMAP, nerfstudio), a folder. Formats with one file
+            per person get the person's number before the suffix if there are several
+            people.
+        to: names of `FORMATS`; by default the suffix of `path` decides.
+        up: axis of the world that points up.
+        person: number of the only person to write, or numbers of several; by default
+            everybody.
+        body: body model of the result; by default the one of this machine. A file that
+            the result names is not opened.
+        observations: observations of landmarks, for COLMAP (`read_observations`).
+        video: video or folder of images, whose frames are written beside the files of
+            COLMAP and nerfstudio.
 
     **Raises:** `InputError`, in one line, for unknown formats, missing extras, nobody
     to write, another body model, or a folder whose content is no earlier export.
@@ -77,21 +81,23 @@ def export(
             _check_target(format, target)
             jobs.append((format, write, target, part))
     with atomic.hidden_folder(path if inside else path.parent) as partial:
-        # In a folder each, under its own name: some formats have that in their header.
+        # Each in its own folder, with its final name, which some formats contain.
         places = [partial / str(k) / job[2].name for k, job in enumerate(jobs)]
         for place, (format, write, _, part) in zip(places, jobs, strict=True):
             place.parent.mkdir()
             write(place, part)
             if not format.suffix:
-                (place / _MARK).write_text(json.dumps(_origin(format, part)) + "\n")
+                (place / _MARKER_FILE).write_text(
+                    json.dumps(_origin(format, part)) + "\n"
+                )
         for place, (_, _, target, _) in zip(places, jobs, strict=True):
             _move(place, target)
     return [job[2] for job in jobs]
 
 
 def _move(place: Path, target: Path) -> None:
-    """Files and folders that were there before under the same names are replaced, what
-    somebody added to an earlier export's folder is kept."""
+    """Replaces files and folders of the same names; others in the folder of an earlier
+    export are kept."""
     if not target.is_dir():
         os.replace(place, target)
         return
@@ -102,19 +108,23 @@ def _move(place: Path, target: Path) -> None:
 
 
 def _origin(format: Format, scene: Scene) -> dict[str, str]:
-    """What a folder holds, in a file that also tells it from a user's own folder."""
+    """Returns the content of the file that describes an exported folder, and
+    distinguishes it from a user's own folder."""
     return {"format": format.name, "input": scene.name, "up": scene.up, "unit": "m"}
 
 
 def _check_target(format: Format, target: Path) -> None:
-    """**Raises:** `InputError` if something that is no earlier export would be lost."""
+    """Checks that nothing but an earlier export would be replaced.
+
+    **Raises:** `InputError` otherwise.
+    """
     if format.suffix and target.is_dir():
         raise InputError(f"{target}: a folder, expected a file ({format.suffix}).")
     if format.suffix or not target.exists():
         return
     if not target.is_dir():
         raise InputError(f"{target}: a file, expected a folder for {format.name}.")
-    if any(target.iterdir()) and not (target / _MARK).exists():
+    if any(target.iterdir()) and not (target / _MARKER_FILE).exists():
         raise InputError(
             f"{target}: has files in it that are no earlier export, expected a new "
             "folder; give another one."
@@ -141,7 +151,10 @@ def _names(path: Path, to: str | tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def _writer(format: Format) -> Callable[[Path, Scene], None]:
-    """**Raises:** `InputError` that says how to get what is not installed."""
+    """Returns the function that writes the format.
+
+    **Raises:** `InputError` that says how to install a missing extra.
+    """
     module = importlib.import_module(format.module)
     if format.extra is not None and not module.is_installed():
         raise InputError(
@@ -152,7 +165,7 @@ def _writer(format: Format) -> Callable[[Path, Scene], None]:
 
 
 def _parts(format: Format, base: Path, scene: Scene) -> list[tuple[Path, Scene]]:
-    """Files of a format, and what is in each."""
+    """Returns the files of a format, each with the scene to write into it."""
     if not format.per_person:
         return [(base, scene)]
     if not scene.people:

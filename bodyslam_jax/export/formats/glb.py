@@ -1,9 +1,10 @@
-"""GLB (glTF 2.0, Khronos, 2021): skinned animated bodies, camera, map and ground.
+"""Writes GLB (glTF 2.0, Khronos, 2021): skinned animated bodies, camera, map and
+ground.
 
-y is up and metres are the unit, as the specification has it. A body's skin is SMPL's
-linear blend skinning of the shaped rest mesh; pose blend shapes, which the body that
-ships has none of, are left out. A vertex follows its four strongest joints, as many as
-every viewer supports.
+The specification prescribes y up, and metres. A body's skin is SMPL's linear blend
+skinning of the shaped rest mesh; pose blend shapes, which the default body lacks, are
+left out. Each vertex follows its four strongest joints, the number that every viewer
+supports.
 """
 
 import logging
@@ -21,10 +22,11 @@ from bodyslam_jax.geometry import so3_numpy as so3
 
 log = logging.getLogger(__name__)
 
-OPENGL = np.diag([1.0, -1.0, -1.0])
-"""Turns OpenCV's camera axes (y down, z forward) into glTF's (y up, z back)."""
-_INFLUENCES = 4
-_POINTS, _LINES = 0, 1
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+"""Rotation between OpenCV's camera axes (y down, z forward) and glTF's (y up, z
+back)."""
+_MAX_INFLUENCES = 4
+_POINTS_MODE, _LINES_MODE = 0, 1
 """Primitive modes; triangles are the default."""
 
 
@@ -41,13 +43,13 @@ def write(path: Path, scene: Scene) -> None:
     _add_camera(document, scene)
     if len(scene.result.landmarks):
         points = {"POSITION": document.positions(scene.result.landmarks)}
-        document.add_mesh("map", points, (0.35, 0.35, 0.35), mode=_POINTS)
+        document.add_mesh("map", points, (0.35, 0.35, 0.35), mode=_POINTS_MODE)
     _add_ground(document, scene)
     document.write(path, scene.name)
 
 
 class _Document:
-    """Lists of a glTF document that refer to each other by index."""
+    """Lists of a glTF document, whose entries refer to each other by index."""
 
     def __init__(self) -> None:
         self.buffer = Buffer()
@@ -79,7 +81,8 @@ class _Document:
         faces: Int[np.ndarray, "f 3"] | None = None,
         skin: int | None = None,
     ) -> None:
-        """A node of its own at the origin; `color` is linear RGB, or RGBA."""
+        """Adds a mesh with a node of its own at the origin; `color` is linear RGB, or
+        RGBA."""
         material: dict[str, Any] = {
             "name": name,
             "pbrMetallicRoughness": {
@@ -171,7 +174,7 @@ def _add_person(document: _Document, scene: Scene, h: int) -> None:
     )
     skin = scene.vertices(h)
     faces = np.asarray(scene.body.faces)
-    joint, weight = strongest(scene, _INFLUENCES)
+    joint, weight = strongest(scene, _MAX_INFLUENCES)
     attributes = {
         "POSITION": document.positions(skin),
         "NORMAL": document.buffer.add(normals(skin, faces), VERTICES),
@@ -196,8 +199,8 @@ def _add_person(document: _Document, scene: Scene, h: int) -> None:
 
 
 def _add_camera(document: _Document, scene: Scene) -> None:
-    """A camera with the video's field of view; its principal point is the middle, as
-    core glTF knows no other."""
+    """Adds a camera with the video's field of view and a centred principal point, the
+    only one that core glTF supports."""
     result, (width, height) = scene.result, scene.size
     at = np.flatnonzero(result.located)
     if not len(at):
@@ -217,7 +220,7 @@ def _add_camera(document: _Document, scene: Scene) -> None:
             },
         }
     )
-    turns = so3.log(result.T_WC[at, :3, :3] @ OPENGL)
+    turns = so3.log(result.T_WC[at, :3, :3] @ OPENGL_FROM_OPENCV)
     places, turns = result.T_WC[at, :3, 3], quaternions(turns)
     node = document.add_node(
         {
@@ -241,18 +244,18 @@ def _add_ground(document: _Document, scene: Scene) -> None:
     surface = {"POSITION": document.positions(corners)}
     document.add_mesh("ground", surface, (0.6, 0.6, 0.6, 0.3), faces=faces)
     lines = {"POSITION": document.positions(scene.grid.reshape(-1, 3))}
-    document.add_mesh("ground_grid", lines, (0.3, 0.3, 0.3), mode=_LINES)
+    document.add_mesh("ground_grid", lines, (0.3, 0.3, 0.3), mode=_LINES_MODE)
 
 
 def color_of(person: int) -> tuple[float, ...]:
-    """A person's colour in report and overlay, as linear RGB from 0 to 1."""
+    """Returns a person's colour in report and overlay, as linear RGB from 0 to 1."""
     color = np.array(COLORS[person % len(COLORS)]) / 255
     return tuple(float(x) for x in color**2.2)
 
 
 def quaternions(turns: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 4"]:
-    """Unit quaternions xyzw of axis-angle vectors, each in the hemisphere of the one
-    before, so that interpolation takes the short way."""
+    """Returns the unit quaternions xyzw of axis-angle vectors (rad), each in the
+    hemisphere of the previous one, so that interpolation takes the short way."""
     q = so3.quaternion(turns)
     flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0))
     q[1:] *= flips[:, None]
@@ -262,7 +265,8 @@ def quaternions(turns: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 4"]:
 def strongest(
     scene: Scene, most: int
 ) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
-    """The joints that move each vertex most, and their weights, which sum to 1."""
+    """Returns the joints that move each vertex most, and their weights, which sum to
+    1."""
     joint = np.asarray(scene.body.skin_joint)
     weight = np.asarray(scene.body.skin_weight, np.float64)
     order = np.argsort(-weight, axis=1, kind="stable")[:, :most]
@@ -270,14 +274,15 @@ def strongest(
     weight = np.maximum(weight, 0.0)
     missing = [(0, 0), (0, max(0, most - weight.shape[1]))]
     joint, weight = np.pad(joint, missing), np.pad(weight, missing)
-    joint = np.where(weight > 0, joint, 0)  # what padding refers to is joint 0
+    joint = np.where(weight > 0, joint, 0)  # padding refers to joint 0
     return joint, weight / weight.sum(axis=1, keepdims=True)
 
 
 def normals(
     points: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> np.ndarray:
-    """Unit normals of vertices, (v, 3) float32: area-weighted means of the faces'."""
+    """Returns the unit normals of vertices, (v, 3) float32: area-weighted means of the
+    faces'."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     total = np.zeros_like(points)
     for corner in range(3):

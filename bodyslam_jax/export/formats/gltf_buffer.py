@@ -1,4 +1,5 @@
-"""The container of glTF 2.0: arrays packed into one binary buffer, and the `.glb`."""
+"""The container of glTF 2.0: arrays packed into one binary buffer, and the `.glb`
+file."""
 
 import json
 import struct
@@ -30,12 +31,13 @@ class Buffer:
         bounds: bool = False,
         normalized: bool = False,
     ) -> int:
-        """Appends an array (n,) or (n, components); returns its accessor's index.
+        """Appends an array (n,) or (n, components), and returns its accessor's index.
 
         Args:
+            target: `VERTICES`, `INDICES`, or `None` for other data.
             bounds: writes the smallest and largest values, which the specification
-                asks for with positions and times.
-            normalized: integers stand for 0 to 1.
+                requires for positions and times.
+            normalized: integers represent 0 to 1.
         """
         array = np.ascontiguousarray(array)
         width = 1 if array.ndim == 1 else array.shape[1]

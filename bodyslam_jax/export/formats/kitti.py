@@ -1,4 +1,5 @@
-"""KITTI odometry (Geiger et al., CVPR 2012): a camera-to-world 3x4 matrix a line."""
+"""Writes KITTI odometry (Geiger et al., CVPR 2012): one camera-to-world 3x4 matrix per
+line."""
 
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from bodyslam_jax.export.formats.scene import Scene
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Writes the poses of the frames in which the camera is located, m, row by row.
+    """Writes the poses of the frames with a located camera, m, one row per frame.
 
     The format has no timestamps: line k is the k-th located frame.
     """

@@ -1,8 +1,8 @@
-"""nerfstudio's `transforms.json` (Tancik et al., 2023), in metres.
+"""Writes nerfstudio's `transforms.json` (Tancik et al., 2023), in metres.
 
 Poses are camera to world with OpenGL's camera axes (x right, y up, z back); pixel
-coordinates count from the corner of the image. nerfstudio rescales and recentres what
-it reads unless it is told otherwise: see `docs/export.md`.
+coordinates count from the corner of the image. nerfstudio rescales and recentres its
+input unless told otherwise: see `docs/export.md`.
 """
 
 import json
@@ -15,13 +15,14 @@ from bodyslam_jax.export.folder import write_points
 from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.export.formats.views import views_of
 
-_POINTS = "points.ply"
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_POINTS_FILE = "points.ply"
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Writes `transforms.json`, the map as `points.ply`, images if there is a video,
-    else they are only named, `images/frame_000000.jpg`, counted from 0.
+    """Writes `transforms.json`, the map as `points.ply`, and the images of the video.
+
+    Without a video images are only named, `images/frame_000000.jpg`, counted from 0.
 
     **Raises:** `ValueError` if the video is not the one of the result.
     """
@@ -34,7 +35,7 @@ def write(path: Path, scene: Scene) -> None:
     data["frames"] = [
         {
             "file_path": f"images/{name}",
-            "transform_matrix": (T_WC @ _OPENGL).tolist(),
+            "transform_matrix": (T_WC @ _OPENGL_FROM_OPENCV).tolist(),
             "time": float(scene.seconds[frame]),
         }
         for name, T_WC, frame in zip(views.names, views.T_WC, views.frames, strict=True)
@@ -43,8 +44,8 @@ def write(path: Path, scene: Scene) -> None:
         for row, params in zip(data["frames"], views.intrinsics, strict=True):
             row |= _intrinsics(params)
     if len(scene.result.landmarks):
-        data["ply_file_path"] = _POINTS
-        write_points(path / _POINTS, scene.result.landmarks)
+        data["ply_file_path"] = _POINTS_FILE
+        write_points(path / _POINTS_FILE, scene.result.landmarks)
     (path / "transforms.json").write_text(json.dumps(data, indent=1) + "\n")
 
 

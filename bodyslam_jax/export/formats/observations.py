@@ -1,4 +1,4 @@
-"""Pixel observations of a run's landmarks, read from the stage results it keeps."""
+"""Reads the pixel observations of a run's landmarks from its cached stage results."""
 
 import dataclasses
 from pathlib import Path
@@ -10,30 +10,30 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.types import Result
 
-_ZOOM = ".zoom"
-_MAX_ZOOM = 10.0
-"""Logarithm of a factor on the focal length that no lens has."""
+_ZOOM_KEY = ".zoom"
+_MAX_LOG_ZOOM = 10.0
+"""Logarithm of a factor on the focal length that exceeds any lens."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Observations:
-    """`m` inlier observations of a result's landmarks."""
+    """Inlier observations of a result's landmarks, `m` in all."""
 
     frame: Int[np.ndarray, " m"]
     landmark: Int[np.ndarray, " m"]
     """Index into `Result.landmarks`."""
     uv: Float[np.ndarray, "m 2"]
-    """px of the video's images; pixel centres are whole numbers."""
+    """Pixels in the video's images, px; pixel centres have integer coordinates."""
     zoom: Float[np.ndarray, " t"] | None = None
-    """Focal length of each frame over that of `Result.intrinsics`; `None` where the
-    camera does not zoom."""
+    """Focal length of each frame relative to `Result.intrinsics`; `None` if the camera
+    does not zoom."""
 
 
 def read_observations(run: Path, result: Result) -> Observations | None:
-    """Observations from the stage results in the `.cache` of a run folder.
+    """Reads the observations from the stage results in the `.cache` of a run folder.
 
-    `None` where the folder keeps none, or none that belong to `result`: a result can
-    then still be written, with landmarks that no image refers to.
+    Returns `None` if the folder has none that belong to `result`: the result can then
+    still be exported, with landmarks that no image refers to.
     """
     found = sorted((run / ".cache").glob("cameras-*.npz"))
     if len(found) != 1 or not len(result.landmarks):
@@ -49,8 +49,10 @@ def read_observations(run: Path, result: Result) -> Observations | None:
         uv = archive.array(".tracks.uv", ("m", 2))
         keep = archive.array(".keep", ("m",), kind="boolean")
         zoom = None
-        if _ZOOM in archive:
-            zoom = archive.array(_ZOOM, (t,), low=-_MAX_ZOOM, high=_MAX_ZOOM)
+        if _ZOOM_KEY in archive:
+            zoom = archive.array(
+                _ZOOM_KEY, (t,), low=-_MAX_LOG_ZOOM, high=_MAX_LOG_ZOOM
+            )
     except InputError:
         return None
     frame, landmark, uv = frame[keep], landmark[keep], uv[keep]

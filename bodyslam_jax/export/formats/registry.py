@@ -1,4 +1,5 @@
-"""The formats: what each holds, in which axes and units, and who reads it."""
+"""Lists the formats: what each contains, in which axes and units, and which programs
+read it."""
 
 import dataclasses
 
@@ -9,7 +10,7 @@ class Format:
 
     name: str
     suffix: str
-    """Of the file; empty for a folder."""
+    """Suffix of the file; empty for a folder."""
     content: str
     axes: str
     unit: str
@@ -17,11 +18,11 @@ class Format:
     skeleton: str
     opens_in: str
     file: str
-    """Name of the file in a folder; `{}` stands for the person's number."""
+    """Name of the file in a folder; `{}` is replaced by the person's number."""
     extra: str | None = None
-    """The extra of this package that has to be installed."""
+    """Extra of this package that must be installed."""
     turns: bool = True
-    """Whether `up` turns the axes; else the format prescribes them."""
+    """Whether `up` rotates the axes; otherwise the format prescribes them."""
 
     @property
     def per_person(self) -> bool:
@@ -30,7 +31,7 @@ class Format:
 
     @property
     def module(self) -> str:
-        """Where its `write(path, scene)` is."""
+        """Module with the function `write(path, scene)`."""
         return f"bodyslam_jax.export.formats.{self.name}"
 
 
@@ -192,7 +193,7 @@ FORMATS: dict[str, Format] = {
 
 
 def table() -> str:
-    """The table of `docs/export.md`, Markdown."""
+    """Returns the table of `docs/export.md` as Markdown."""
     rows = [["`--to`", "suffix", "content", "axes", "unit", "rate", "skeleton"]]
     rows[0] += ["opens in", "extra"]
     for f in FORMATS.values():

@@ -1,7 +1,7 @@
-"""rerun's recording (`.rrd`): bodies, skeletons, camera and map over time.
+"""Writes rerun's recording (`.rrd`): bodies, skeletons, camera and map over time.
 
-Needs the extra `rerun`. Bodies are a coarser mesh, posed in every frame: rerun has no
-skinning.
+It needs the extra `rerun`. Bodies are coarse meshes that are posed in every frame,
+because rerun does not support skinning.
 """
 
 import importlib
@@ -20,19 +20,20 @@ from bodyslam_jax.export.formats.glb import normals
 from bodyslam_jax.export.formats.scene import COLORS, Scene
 
 _TIMELINE = "time"
-_CELL = 0.025
-"""Size of the cells in which vertices are merged, m: a quarter of them is left."""
-_CHUNK = 64
-"""Frames whose vertices are computed together."""
+_CELL_SIZE_M = 0.025
+"""Size of the cells in which vertices are merged; a quarter of the vertices remains."""
+_CHUNK_FRAMES = 64
+"""Number of frames whose vertices are computed together."""
 
 
 def is_installed() -> bool:
-    """Whether rerun-sdk is."""
+    """Returns whether rerun-sdk is installed."""
     return importlib.util.find_spec("rerun") is not None
 
 
 def _rerun() -> Any:
-    """The package, by name: type checkers take `import rerun` for this module."""
+    """Returns the package, imported by name: type checkers resolve `import rerun` to
+    this module."""
     return importlib.import_module("rerun")
 
 
@@ -85,14 +86,14 @@ def _log_person(recording: Any, scene: Scene, h: int) -> None:
     number = scene.people[h]
     status = reported_status(scene.result.summary, number)
     color = COLORS[number % len(COLORS)]
-    if status.words:  # Pale, the more so the less is measured.
+    if status.words:  # the paler, the less is measured
         white = 0.4 if status.measurable else 0.75
         color = tuple(round((1 - white) * c + white * 255) for c in color)
     base = f"world/person_{number}"
     kept, faces = _coarse(scene)
     bones = [(k, PARENTS[k]) for k in range(1, 24)]
     present = result.present[h]
-    # Once: frames replace what moves alone.
+    # Logged once: later frames replace the moving parts only.
     surface = rerun.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=color)
     marks = rerun.Points3D.from_fields(
         colors=color, labels=list(JOINT_NAMES), show_labels=False
@@ -121,9 +122,9 @@ def _log_person(recording: Any, scene: Scene, h: int) -> None:
 def _coarse(
     scene: Scene,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "f 3"]]:
-    """One vertex of those in each cell of a grid over the rest pose, and the faces that
-    are left between these."""
-    cells = np.floor(np.asarray(scene.body.template) / _CELL).astype(np.int64)
+    """Returns one vertex of those in each cell of a grid over the rest pose, and the
+    faces that remain between them."""
+    cells = np.floor(np.asarray(scene.body.template) / _CELL_SIZE_M).astype(np.int64)
     _, kept, cluster = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     faces = cluster.reshape(-1)[np.asarray(scene.body.faces)]
     a, b, c = faces.T
@@ -133,13 +134,13 @@ def _coarse(
 def _skins(
     scene: Scene, kept: Int[np.ndarray, " k"], h: int
 ) -> Iterator[Float[np.ndarray, "k 3"]]:
-    """These vertices of a person in each frame, m."""
+    """Yields the kept vertices of a person in each frame, m."""
     result, body = scene.result, scene.body
     num = len(result.timestamps)
     cast = lambda x: jnp.asarray(x, body.dtype)
-    for start in range(0, num, _CHUNK):
-        # Padded, so that there is one compilation.
-        at = np.minimum(np.arange(start, start + _CHUNK), num - 1)
+    for start in range(0, num, _CHUNK_FRAMES):
+        # The last chunk is padded, so that there is one compilation.
+        at = np.minimum(np.arange(start, start + _CHUNK_FRAMES), num - 1)
         found = vertices(
             body,
             cast(result.poses[h, at]),

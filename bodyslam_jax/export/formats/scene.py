@@ -1,4 +1,4 @@
-"""What every format is written from: a result in the world that was asked for."""
+"""The scene that every format is written from: a result in the requested world."""
 
 import dataclasses
 import functools
@@ -20,33 +20,35 @@ Up = Literal["y", "z"]
 Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from the run's world (y up) to one whose z axis is up: z becomes -y."""
 COLORS = ((232, 110, 36), (40, 170, 115), (150, 90, 200), (200, 160, 20))
-"""Of people, sRGB, as in report and overlay."""
-_LARGE = 100.0
-"""Length of the ground, m, up to which its grid has a line each metre."""
-_UNEVEN = 0.25
-"""Share of a frame's duration by which timestamps may be off a constant rate."""
+"""Colours of people, sRGB, as in report and overlay."""
+_MAX_FINE_GRID_M = 100.0
+"""Length of the ground up to which its grid has a line per metre."""
+_MAX_TIMING_ERROR_FRAMES = 0.25
+"""Deviation of timestamps from a constant rate, in frame intervals, up to which the
+rate counts as constant."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A result with all that a writer needs besides."""
+    """A result, and the further data that writers need."""
 
     result: Result
-    """In the world whose axis `up` is up; only the people who are written."""
+    """Result in the world with the axis `up`; contains only the people to be
+    written."""
     body: BodyModel
     people: tuple[int, ...]
-    """Their numbers in the run, in the order of the arrays of `result`."""
+    """Numbers of the people in the run, in the order of the arrays of `result`."""
     up: Up
     size: tuple[int, int]
     """Width and height of the images, px."""
     observations: Observations | None = None
     video: Path | None = None
-    """Video or folder of images whose frames are written beside COLMAP's and
-    nerfstudio's files; `None` writes names only."""
+    """Video or folder of images whose frames are written beside the files of COLMAP and
+    nerfstudio; with `None` only their names are."""
 
     @property
     def name(self) -> str:
-        """What the run calls its input."""
+        """Name of the run's input."""
         return str(_input(self.result).get("name", "bodyslam"))
 
     @functools.cached_property
@@ -69,7 +71,7 @@ class Scene:
 
     @property
     def focal_factor(self) -> Float[np.ndarray, " t"]:
-        """Focal length of each frame over that of the result's intrinsics."""
+        """Focal length of each frame relative to the result's intrinsics."""
         zoom = None if self.observations is None else self.observations.zoom
         return np.ones(len(self.result.timestamps)) if zoom is None else zoom
 
@@ -95,8 +97,8 @@ class Scene:
 
     @property
     def grid(self) -> Float[np.ndarray, "n 2 3"]:
-        """Segments of a grid on the ground, one each metre, each ten where it is large;
-        none without a ground."""
+        """Segments of a grid on the ground, m, at intervals of 1 m, or 10 m on a large
+        ground; empty without a ground."""
         corners = self.ground
         if corners is None:
             return np.zeros((0, 2, 3))
@@ -104,14 +106,15 @@ class Scene:
         lines = []
         for start, along, across in ((a, b - a, d - a), (a, d - a, b - a)):
             length = np.linalg.norm(along)
-            step = 1.0 if length <= _LARGE else 10.0
+            step = 1.0 if length <= _MAX_FINE_GRID_M else 10.0
             for s in np.arange(0.0, length + 1e-6, step):
                 foot = start + s / length * along
                 lines.append([foot, foot + across])
         return np.array(lines)
 
     def with_held_poses(self) -> "Scene":
-        """Frames without the person repeat the last pose before them, or the first."""
+        """Returns the scene with frames without the person filled: they repeat the last
+        pose before them, or the first one."""
         r = self.result
         at = np.stack([held(there) for there in r.present]) if len(r.present) else None
         if at is None:
@@ -121,7 +124,7 @@ class Scene:
         return dataclasses.replace(self, result=dataclasses.replace(r, **fields))
 
     def vertices(self, h: int) -> Float[np.ndarray, "v 3"]:
-        """The skin of a person's rest pose, m."""
+        """Returns the vertices of a person's rest pose, m."""
         template, dirs = (
             np.asarray(x, np.float64)
             for x in (self.body.template, self.body.shape_dirs)
@@ -137,7 +140,8 @@ def make_scene(
     observations: Observations | None = None,
     video: Path | None = None,
 ) -> Scene:
-    """The people asked for (all who are present at all), in a world with that axis up.
+    """Returns a scene of the requested people (by default all who are present in any
+    frame), in a world with the axis `up` up.
 
     **Raises:** `InputError` if there is no such person, or if `body` is not the body
     model of the result.
@@ -169,7 +173,7 @@ def make_scene(
 
 
 def of_people(result: Result, people: Any) -> Result:
-    """The result with these people only: an index of arrays."""
+    """Returns the result with these people only; `people` is an index of arrays."""
     fields = ["poses", "trans", "betas", "joints", "present"]
     if result.joint_sigma is not None:
         fields.append("joint_sigma")
@@ -179,7 +183,7 @@ def of_people(result: Result, people: Any) -> Result:
 
 
 def turned(result: Result, body: BodyModel, R: Float[np.ndarray, "3 3"]) -> Result:
-    """The same result in a world whose points are `R x`."""
+    """Returns the result in a world whose points are `R x`."""
     T_WC = result.T_WC.copy()
     T_WC[:, :3] = R @ T_WC[:, :3]
     pelvis = np.asarray(rest_joints(body, jnp.asarray(result.betas, body.dtype)))
@@ -197,16 +201,17 @@ def turned(result: Result, body: BodyModel, R: Float[np.ndarray, "3 3"]) -> Resu
 
 
 def at_constant_rate(scene: Scene) -> Scene:
-    """The scene for formats that have a frame rate and no timestamps.
+    """Returns the scene resampled to a constant frame rate, for formats without
+    timestamps.
 
-    Timestamps that are off a constant rate, as of a video with gaps, are resampled to
-    their median rate: rotations along the shortest way, positions linearly; a person is
-    present between two frames where present in both.
+    Timestamps that deviate from a constant rate, such as those of a video with gaps,
+    are resampled at their median interval: rotations along the shortest path, positions
+    linearly. A person is present between two frames if present in both.
     """
     r = scene.result
     t = r.timestamps
     even = t[0] + np.arange(len(t)) / r.fps
-    if len(t) < 2 or np.abs(t - even).max() < _UNEVEN / r.fps:
+    if len(t) < 2 or np.abs(t - even).max() < _MAX_TIMING_ERROR_FRAMES / r.fps:
         return scene
     step = float(np.median(np.diff(t)))
     times = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
@@ -244,12 +249,13 @@ def at_constant_rate(scene: Scene) -> Scene:
 
 
 def held(present: Bool[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
-    """For each frame the last one with the person, before the first the first."""
+    """Returns, for each frame, the last frame with the person, or the first one if
+    there is none before."""
     frames = np.where(present, np.arange(len(present)), -1)
     return np.maximum(np.maximum.accumulate(frames), int(present.argmax()))
 
 
 def _input(result: Result) -> dict[str, Any]:
-    """What the summary says of the video; empty where there is no summary."""
+    """Returns the summary's entry on the video; empty without a summary."""
     found = result.summary.get("input")
     return found if isinstance(found, dict) else {}

@@ -1,7 +1,7 @@
-"""USD (UsdSkel, UsdGeom): skinned animated bodies, camera, map and ground.
+"""Writes USD (UsdSkel, UsdGeom): skinned animated bodies, camera, map and ground.
 
-Needs the extra `usd`. Time codes are frames of the video's mean rate, so that time code
-divided by `timeCodesPerSecond` is the time from the first frame.
+It needs the extra `usd`. Time codes count frames at the video's mean rate, so that time
+code divided by `timeCodesPerSecond` is the time from the first frame.
 """
 
 import importlib.util
@@ -11,16 +11,21 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS
-from bodyslam_jax.export.formats.glb import OPENGL, color_of, quaternions, strongest
+from bodyslam_jax.export.formats.glb import (
+    OPENGL_FROM_OPENCV,
+    color_of,
+    quaternions,
+    strongest,
+)
 from bodyslam_jax.export.formats.scene import Scene
 
-_APERTURE = 36.0
-"""Width of the film back, tenths of a world unit: only its ratio to the focal length
-has a meaning here."""
+_APERTURE_WIDTH = 36.0
+"""Width of the film back, tenths of a world unit; only its ratio to the focal length
+matters here."""
 
 
 def is_installed() -> bool:
-    """Whether usd-core is."""
+    """Returns whether usd-core is installed."""
     return importlib.util.find_spec("pxr") is not None
 
 
@@ -124,12 +129,14 @@ def _add_camera(stage: Any, scene: Scene, codes: np.ndarray) -> None:
     result, (width, height) = scene.result, scene.size
     fx, fy, cx, cy = result.intrinsics[:4].tolist()
     camera = UsdGeom.Camera.Define(stage, "/World/camera")
-    focal = _APERTURE * fx / width
+    focal = _APERTURE_WIDTH * fx / width
     tall = focal * height / fy
-    camera.CreateHorizontalApertureAttr(_APERTURE)
+    camera.CreateHorizontalApertureAttr(_APERTURE_WIDTH)
     camera.CreateVerticalApertureAttr(tall)
-    # The film back is shifted to where the principal point is not in the middle.
-    camera.CreateHorizontalApertureOffsetAttr(_APERTURE * (0.5 - (cx + 0.5) / width))
+    # The film back is shifted by the offset of the principal point.
+    camera.CreateHorizontalApertureOffsetAttr(
+        _APERTURE_WIDTH * (0.5 - (cx + 0.5) / width)
+    )
     camera.CreateVerticalApertureOffsetAttr(tall * ((cy + 0.5) / height - 0.5))
     camera.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
     length = camera.CreateFocalLengthAttr(focal)
@@ -137,7 +144,9 @@ def _add_camera(stage: Any, scene: Scene, codes: np.ndarray) -> None:
     zooms = bool(np.ptp(scene.focal_factor) > 0)
     for k in np.flatnonzero(result.located):
         matrix = np.eye(4)
-        matrix[:3, :3] = (result.T_WC[k, :3, :3] @ OPENGL).T  # rows are axes
+        matrix[:3, :3] = (
+            result.T_WC[k, :3, :3] @ OPENGL_FROM_OPENCV
+        ).T  # rows are axes
         matrix[3, :3] = result.T_WC[k, :3, 3]
         pose.Set(Gf.Matrix4d(matrix.tolist()), float(codes[k]))
         if zooms:
@@ -145,6 +154,6 @@ def _add_camera(stage: Any, scene: Scene, codes: np.ndarray) -> None:
 
 
 def _path_of(joint: int) -> str:
-    """A joint with those above it, `pelvis/left_hip/left_knee`."""
+    """Returns a joint with its ancestors, such as `pelvis/left_hip/left_knee`."""
     name = JOINT_NAMES[joint]
     return name if joint == 0 else f"{_path_of(PARENTS[joint])}/{name}"

@@ -1,5 +1,5 @@
-"""Cameras, images and points as photogrammetry has them: what COLMAP's and
-nerfstudio's files share."""
+"""Cameras, images and points in the conventions of photogrammetry, which the files of
+COLMAP and nerfstudio share."""
 
 import dataclasses
 from pathlib import Path
@@ -13,21 +13,22 @@ from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.io.extract_frames import extract_frames, frame_name
 
-HALF = 0.5
-"""px from the pixel coordinates of pixel centres to those of the image's corner."""
+PIXEL_CENTRE_OFFSET_PX = 0.5
+"""Offset from coordinates with integer pixel centres to those with the origin at the
+image's corner."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Views:
-    """`n` located frames and the intrinsics of each."""
+    """Located frames, `n` in all, with the intrinsics of each."""
 
     frames: Int[np.ndarray, " n"]
-    """Of the result, increasing."""
+    """Indices of the result's frames, increasing."""
     names: list[str]
-    """Of their images."""
+    """Names of their images."""
     T_WC: Float[np.ndarray, "n 4 4"]
     model: str
-    """COLMAP's: `PINHOLE` or `OPENCV`."""
+    """COLMAP's name of the camera model: `PINHOLE` or `OPENCV`."""
     intrinsics: Float[np.ndarray, "c i"]
     """`fx fy cx cy`, with `k1 k2 p1 p2` for `OPENCV`; px from the image's corner. One
     row, or one for each view of a camera that zooms."""
@@ -38,7 +39,8 @@ class Views:
 
 
 def views_of(scene: Scene, images: Path) -> Views:
-    """The located frames; images are written into a folder where there is a video.
+    """Returns the located frames; their images are written into a folder if there is a
+    video.
 
     **Raises:** `ValueError` if the video is not the one of the result.
     """
@@ -52,13 +54,14 @@ def views_of(scene: Scene, images: Path) -> Views:
     factor = factor if len(factor) and np.ptp(factor) > 0 else factor[:1]
     intrinsics = np.tile(result.intrinsics, (len(factor), 1)).astype(np.float64)
     intrinsics[:, :2] *= factor[:, None]
-    intrinsics[:, 2:4] += HALF
+    intrinsics[:, 2:4] += PIXEL_CENTRE_OFFSET_PX
     model = "PINHOLE" if intrinsics.shape[1] == 4 else "OPENCV"
     return Views(frames, names, result.T_WC[frames], model, intrinsics)
 
 
 def reprojection_errors(scene: Scene, seen: Observations) -> Float[np.ndarray, " m"]:
-    """Distance between each observation and its landmark's projection, px."""
+    """Returns the distance between each observation and its landmark's projection,
+    px."""
     result = scene.result
     T = result.T_WC[seen.frame]
     offset = result.landmarks[seen.landmark] - T[:, :3, 3]
