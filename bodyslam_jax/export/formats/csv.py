@@ -22,19 +22,11 @@ from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.markup import csv_table
 
-<<<<<<< HEAD
 SMPL_TO_ISB = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""From SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
-_LEG = {"hip": 1, "knee": 4, "ankle": 7}
-"""Joint of the left side by name; that of the right side follows it."""
-_ARM = {"shoulder": 16, "elbow": 18, "wrist": 20}
-=======
-_ISB_FROM_SMPL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Rotation from SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
 _LEG_JOINTS = {"hip": 1, "knee": 4, "ankle": 7}
 """Index of the left joint by name; that of the right one is the next."""
 _ARM_JOINTS = {"shoulder": 16, "elbow": 18, "wrist": 20}
->>>>>>> words3
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -71,13 +63,8 @@ def angles(
     the world, and from joint positions (m) in that world.
     """
     found = {}
-<<<<<<< HEAD
     in_isb = SMPL_TO_ISB @ turns @ SMPL_TO_ISB.T
-    for name, left in _LEG.items():
-=======
-    in_isb = _ISB_FROM_SMPL @ turns @ _ISB_FROM_SMPL.T
     for name, left in _LEG_JOINTS.items():
->>>>>>> words3
         for side, joint, sign in (("left", left, -1.0), ("right", left + 1, 1.0)):
             flexion, adduction, rotation = cardan_zxy(in_isb[:, joint])
             bend = {"knee": "flexion", "ankle": "dorsiflexion"}.get(name, "flexion")
