@@ -113,3 +113,34 @@ def test_a_truth_without_cameras_judges_people_only():
     assert list(found) == [before_after.JOINT_ESTIMATE]
     (line,) = before_after.headline(found)
     assert "C-ATE" not in line and "H-ATE" in line
+
+
+@pytest.mark.parametrize("has_camera", [True, False])
+def test_the_truth_lies_beside_the_estimate(has_camera):
+    """In another world, whose people are as tall as the body model makes them."""
+    result = _result(_path(0.0))
+    turn = Rotation.from_euler("xyz", [0.3, -1.0, 0.2]).as_matrix()
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn, [3.0, -2.0, 5.0]
+    truth = dataclasses.replace(
+        result,
+        T_WC=T @ result.T_WC,
+        joints=result.joints @ turn.T + T[:3, 3],
+        summary={"has_camera": has_camera},
+    )
+    found = before_after.beside(result, truth, BODY)
+    if has_camera:
+        np.testing.assert_allclose(found.cameras, result.T_WC[:, :3, 3], atol=1e-6)
+    pelvis = np.where(result.present[..., None], result.joints[:, :, 0], np.nan)
+    np.testing.assert_allclose(found.pelvises, pelvis, atol=1e-6)
+
+
+def test_the_height_alone_says_how_long_a_metre_is():
+    """Somebody who is taken to be shorter by 10 %, as everything is."""
+    beside = before_after.TruthBeside(
+        np.zeros((0, 3)), np.zeros((0, 0, 3)), {0: (2.0, 1.8)}
+    )
+    errors = {before_after.JOINT_ESTIMATE: {"scale": 1 / 0.9, "h_ate_se3": 0.1}}
+    _, tall, lengths = before_after.headline(errors, beside)
+    assert tall == "person 0: 180 cm, in truth 200 cm"
+    assert "off by -10.0 %" in lengths and lengths.endswith("by +0.0 %")

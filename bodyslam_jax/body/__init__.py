@@ -28,4 +28,5 @@ from bodyslam_jax.body.skeleton import KEYPOINT_SPREAD as KEYPOINT_SPREAD
 from bodyslam_jax.body.skeleton import MIRRORED as MIRRORED
 from bodyslam_jax.body.skeleton import PARENTS as PARENTS
 from bodyslam_jax.body.skeleton import SURFACE_POINTS as SURFACE_POINTS
+from bodyslam_jax.body.skinning import stature as stature
 from bodyslam_jax.body.skinning import vertices as vertices

@@ -133,3 +133,11 @@ def _by_chunks(function, chunk, *arrays):
     if whole < n:
         out = jnp.concatenate([out, function(*[a[whole:] for a in arrays])])
     return out
+
+
+def stature(body: BodyModel, betas: Float[np.ndarray, " 10"]) -> float:
+    """Returns the height of the body's mesh at rest for SMPL β, m."""
+    up = 1  # y
+    template = np.asarray(body.template, np.float64)[:, up]
+    heights = template + np.asarray(body.shape_dirs, np.float64)[:, up] @ betas
+    return float(heights.max() - heights.min())

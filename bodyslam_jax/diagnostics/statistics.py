@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body import BodyModel
+from bodyslam_jax.body import stature as stature
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
@@ -110,13 +111,6 @@ def distance_to_camera(result: Result, person: int) -> tuple[float, float]:
     gap = result.joints[person, present, 0] - result.T_WC[present, :3, 3]
     length = np.linalg.norm(gap, axis=1)
     return float(length.min()), float(length.max())
-
-
-def stature(body: BodyModel, betas: Float[np.ndarray, " 10"]) -> float:
-    """Returns the height of the body's mesh at rest for SMPL β, m."""
-    template = np.asarray(body.template, np.float64)[:, _UP_AXIS]
-    tall = template + np.asarray(body.shape_dirs, np.float64)[:, _UP_AXIS] @ betas
-    return float(tall.max() - tall.min())
 
 
 def stature_and_sigma(

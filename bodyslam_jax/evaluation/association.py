@@ -34,6 +34,9 @@ from bodyslam_jax.evaluation.resampling import (
 )
 from bodyslam_jax.types import Result
 
+_BODY_FEET = "toes and heels"
+"""Kind of the foot points of a body model."""
+
 
 def evaluate(
     result: Result | Trajectories,
@@ -138,6 +141,17 @@ def associate(
     """
     pair = _associate(result, truth, body, offset)
     return pair.estimate.trajectories(pair.fps), pair.truth.trajectories(pair.fps)
+
+
+def associate_with_people(
+    result: Result, truth: Result, body: BodyModel
+) -> tuple[Trajectories, Trajectories, list[tuple[int, int]], bool]:
+    """Returns what `associate` does, the people of each pair (in the result and in the
+    truth), and whether the joints of both are those of `body`."""
+    pair = _associate(result, truth, body, 0.0)
+    people = [(p.estimate, p.truth) for p in pair.scope.people if p.estimate != NOBODY]
+    found, true = (side.trajectories(pair.fps) for side in (pair.estimate, pair.truth))
+    return found, true, people, pair.feet == _BODY_FEET
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,7 +302,7 @@ def _feet(
     if body is not None:
         feet, true_feet = (_feet_of(x, body) for x in (result, truth))
         if feet is not None and true_feet is not None:
-            return feet, true_feet, "toes and heels"
+            return feet, true_feet, _BODY_FEET
     feet, true_feet = (x.joints[:, :, ANKLES_AND_FEET] for x in (result, truth))
     return feet, true_feet, "ankle and foot joints"
 

@@ -9,6 +9,7 @@ import numpy as np
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.diagnostics import statistics
 from bodyslam_jax.diagnostics.reported_status import reported_status
+from bodyslam_jax.evaluation.before_after import TruthBeside
 from bodyslam_jax.export.figures import person_variable
 from bodyslam_jax.types import Result
 
@@ -25,6 +26,7 @@ def answers(
     camera: statistics.PathStatistics,
     people: Sequence[statistics.PathStatistics],
     body: BodyModel,
+    truth: TruthBeside | None = None,
 ) -> str:
     """Returns four cards as one section of HTML."""
     shown = [h for h, present in enumerate(result.present) if present.any()]
@@ -50,10 +52,18 @@ def answers(
     cards = (
         _card("How far?", [*far, *of_camera(moved)], [span]),
         _card("How fast?", [*fast, *([] if kind else of_camera(pace))], walk),
-        _card("How tall?", tall, ["barefoot"] if shown else []),
+        _card("How tall?", tall, _barefoot(truth) if shown else []),
         _card("How sure?", [("", "", sure)], notes),
     )
     return f'<section class="cards">{"".join(cards)}</section>'
+
+
+def _barefoot(truth: TruthBeside | None) -> list[str]:
+    """Returns the note below the statures, with those of the truth."""
+    if truth is None or not truth.statures:
+        return ["barefoot"]
+    true = ", ".join(f"{100 * tall:.0f} cm" for tall, _ in truth.statures.values())
+    return [f"barefoot; in truth {true}"]
 
 
 def _stature(

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from bodyslam_jax.diagnostics.statistics import PathStatistics
+from bodyslam_jax.evaluation.before_after import TruthBeside
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
 
@@ -68,9 +69,10 @@ def person_color(person: int) -> str:
     return _PERSON_COLOURS[person % len(_PERSON_COLOURS)]
 
 
-def trajectories(result: Result) -> tuple[str, str]:
-    """Draws camera and people from above and from the side, on a metric grid."""
-    low, high = _extent(result)
+def trajectories(result: Result, truth: TruthBeside | None = None) -> tuple[str, str]:
+    """Draws camera and people from above and from the side, on a metric grid, and the
+    true paths dashed."""
+    low, high = _extent(result, truth)
     size = np.maximum(high - low, 0.5)
     width = _WIDTH_IN
     with matplotlib.rc_context(_STYLE):
@@ -78,16 +80,18 @@ def trajectories(result: Result) -> tuple[str, str]:
         plan = Figure((width, plan_height + 0.6), layout="constrained")
         ax = plan.add_subplot()
         _paths(ax, result, (0, 2), low, high)
+        _true_paths(ax, truth, (0, 2))
         _view_directions(ax, result, float(max(size[0], size[2])))
         ax.set_xlabel("← x (left of the first camera), m")
         ax.set_ylabel("z (ahead of the first camera), m")
-        _legend(ax, result)
+        _legend(ax, result, truth)
         ax.invert_xaxis()  # From above, with z up the page, x points to the left.
         along = 0 if size[0] >= size[2] else 2
         side_height = float(np.clip(width * size[1] / size[along], 1.2, 5.0))
         side = Figure((width, side_height + 0.6), layout="constrained")
         ax = side.add_subplot()
         _paths(ax, result, (along, 1), low, high)
+        _true_paths(ax, truth, (along, 1))
         if along == 0:
             ax.invert_xaxis()
         ax.set_xlabel("← x, m" if along == 0 else "z, m")
@@ -153,7 +157,7 @@ def speeds(
     return over_time(result.timestamps, curves, "speed, m/s")
 
 
-def _extent(result: Result) -> tuple[np.ndarray, np.ndarray]:
+def _extent(result: Result, truth: TruthBeside | None) -> tuple[np.ndarray, np.ndarray]:
     """Returns the box around camera and people, with a margin; it contains heights 0
     and 2 m."""
     points = [
@@ -163,6 +167,9 @@ def _extent(result: Result) -> tuple[np.ndarray, np.ndarray]:
             for joints, present in zip(result.joints, result.present, strict=True)
         ),
     ]
+    if truth is not None:
+        known = truth.pelvises.reshape(-1, 3)
+        points += [truth.cameras, known[np.isfinite(known).all(axis=1)]]
     every = np.concatenate(points)
     low, high = every.min(0), every.max(0)
     margin = 0.08 * max(float((high - low).max()), 1.0)
@@ -234,6 +241,12 @@ def _stick_figures(ax: Axes, result: Result, along: int) -> None:
                 )
 
 
+def _true_paths(ax: Axes, truth: TruthBeside | None, axes: tuple[int, int]) -> None:
+    """Draws the true paths of camera and pelvises, dashed."""
+    for path in [] if truth is None else (truth.cameras, *truth.pelvises):
+        ax.plot(*path[:, axes].T, "--", color=_INK, linewidth=1.2)
+
+
 def _view_directions(ax: Axes, result: Result, size: float) -> None:
     """Draws arrows of the camera's viewing direction at several frames."""
     every = max(1, len(result.T_WC) // 12)
@@ -251,10 +264,12 @@ def _view_directions(ax: Axes, result: Result, size: float) -> None:
     )
 
 
-def _legend(ax: Axes, result: Result) -> None:
+def _legend(ax: Axes, result: Result, truth: TruthBeside | None) -> None:
     for person in range(min(len(result.present), 8)):
         ax.plot([], [], color=person_color(person), label=f"person {person}")
     ax.plot([], [], "o", color=_INK, label="start", markersize=5)
+    if truth is not None:
+        ax.plot([], [], "--", color=_INK, label="truth", linewidth=1.2)
     if len(result.landmarks):
         ax.scatter([], [], 6, _POINTS, label="map")
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, columnspacing=1)

@@ -17,6 +17,7 @@ from bodyslam_jax.diagnostics.statistics import (
     camera_statistics,
     person_statistics,
 )
+from bodyslam_jax.evaluation.before_after import TruthBeside
 from bodyslam_jax.export import figures
 from bodyslam_jax.export.answers import along_view, answers
 from bodyslam_jax.export.expert_figures import focal_length, lengths, people_table
@@ -27,7 +28,11 @@ from bodyslam_jax.types import Result
 
 
 def write_report(
-    path: Path, result: Result, body: BodyModel, still: bytes | None = None
+    path: Path,
+    result: Result,
+    body: BodyModel,
+    still: bytes | None = None,
+    truth: TruthBeside | None = None,
 ) -> None:
     """Writes the report of a result: without network or scripts, light or dark.
 
@@ -39,7 +44,8 @@ def write_report(
     number.
 
     Overlay and scene are shown if they are in the folder of `path`. `still` is one
-    frame of the overlay (JPEG), which is embedded in the report.
+    frame of the overlay (JPEG), which is embedded in the report. The paths and statures
+    of `truth` are shown beside the estimate's.
     """
     summary = plain(result.summary)
     camera = camera_statistics(result)
@@ -47,11 +53,11 @@ def write_report(
     source = summary.get("input") or {}
     name = source.get("name") if isinstance(source, dict) else str(source)
     sections = [
-        answers(result, summary, camera, people, body),
+        answers(result, summary, camera, people, body, truth),
         _in_short(summary, len(people)),
         _pictures(path.parent, still),
         _reasons(summary, len(people), _overlay(path.parent)),
-        _plots(result, summary, camera, people),
+        _plots(result, summary, camera, people, truth),
         _warnings(summary.get("warnings") or []),
         _details(result, summary, people, body),
     ]
@@ -220,9 +226,10 @@ def _plots(
     summary: Mapping[str, Any],
     camera: PathStatistics,
     people: Sequence[PathStatistics],
+    truth: TruthBeside | None,
 ) -> str:
     """Returns the paths from above and from the side, and the speeds."""
-    above, side = figures.trajectories(result)
+    above, side = figures.trajectories(result, truth)
     beside = _figure(
         side, "From the side. The floor is at the height of standing feet."
     )
@@ -236,7 +243,8 @@ def _plots(
         + _figure(
             above,
             "From above, with z, ahead of the first camera, up the page: x grows to "
-            "the left. Arrows: where the camera looks.",
+            "the left. Arrows: where the camera looks."
+            + (" Dashed: the truth." if truth is not None else ""),
         )
         + f"<div>{beside}</div></div></section>"
     )

@@ -52,17 +52,19 @@ def run_in_locked_folder(
     export.clear_partial(out)
     body = load_body_model(config.body_model)
     result, cameras, measured = run_stages(sequence, config, cache)
+    beside = None
     if sequence.groundtruth is not None:
         truth = evaluation.read_groundtruth(sequence.groundtruth, body)
         errors = before_after.errors(result, cameras, truth, body)
         result.summary["errors"] = errors
-        result.summary["headline"] += before_after.headline(errors)
+        beside = before_after.beside(result, truth, body)
+        result.summary["headline"] += before_after.headline(errors, beside)
     watch = Stopwatch()
     with export.run_folder(out) as partial:
         still = write_pictures(partial, measured, cameras, result, body, config, watch)
         result.summary["durations_s"] |= watch.seconds
         export.write_files(partial, result, config)
-        export.write_report(partial / "report.html", result, body, still)
+        export.write_report(partial / "report.html", result, body, still, beside)
     return result
 
 
