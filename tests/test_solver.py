@@ -29,7 +29,7 @@ from bodyslam_jax.solver import (
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import sizes_of
 from bodyslam_jax.solver.compilation import quick_options
-from bodyslam_jax.solver.gmres import RESTART, gmres
+from bodyslam_jax.solver.gmres import MAX_DIRECTIONS, gmres
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad
@@ -693,7 +693,7 @@ def test_gradient_of_a_solution_is_that_of_solving_again():
 
 def test_a_linear_system_is_solved_or_its_solution_is_nan():
     rng = np.random.default_rng(0)
-    n = RESTART + 10
+    n = MAX_DIRECTIONS + 10
     matrix = np.eye(n) + 0.5 * rng.standard_normal((n, n)) / np.sqrt(n)
     right = jnp.asarray(rng.standard_normal(n))
     solved = jax.jit(

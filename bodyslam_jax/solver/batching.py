@@ -1,4 +1,4 @@
-"""Many problems: one after another on a CPU, and a share of them on every device.
+"""Batches of problems: in turn on a CPU, and shared out among several devices.
 
 A core is busy with one problem. Mapped at once, small products become batches of small
 products, branches that one problem skips are taken for all, and memory grows with the
@@ -23,7 +23,7 @@ from bodyslam_jax.solver.compilation import quick_jit
 def sequential_vmap(
     function: Callable[..., Any], alone: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:
-    """The same function of pytrees; on a CPU it is mapped one after another.
+    """Returns the function of pytrees such that `vmap` maps it in turn on a CPU.
 
     Within `jit` that is a loop in one program. Otherwise `alone`, the function as a
     compiled program, is called for each, so that mapping compiles nothing more.
@@ -69,7 +69,8 @@ def sequential_vmap(
     return call
 
 
-AXIS = "device"
+DEVICE_AXIS = "device"
+"""Name of the mesh axis over devices."""
 
 
 def vmap_over_devices(
@@ -106,7 +107,9 @@ def vmap_over_devices(
         devices = tuple(jax.local_devices())[:batch]
         if is_traced(args) or not is_alone():
             return program(args, axes, devices, batch)
-        everywhere = NamedSharding(Mesh(np.array(devices), AXIS), PartitionSpec())
+        everywhere = NamedSharding(
+            Mesh(np.array(devices), DEVICE_AXIS), PartitionSpec()
+        )
         found = compiled()(_placed(args, everywhere), axes, devices, batch)
         return _placed(found, devices[0])
 
@@ -155,9 +158,9 @@ def _shared_out(function, args, axes, devices, batch):
     row = np.minimum(turn, batch - 1)
     fill = lambda tree, axis: tree if axis is None else jax.tree.map(_rows(row), tree)
     arrays = tuple(fill(a, axis) for a, axis in zip(arrays, axes, strict=True))
-    part, whole = PartitionSpec(AXIS), PartitionSpec()
+    part, whole = PartitionSpec(DEVICE_AXIS), PartitionSpec()
     specs = tuple(part if axis == 0 else whole for axis in axes)
-    mesh = Mesh(np.array(devices), AXIS)
+    mesh = Mesh(np.array(devices), DEVICE_AXIS)
     spread = jax.shard_map(
         mapped,
         mesh=mesh,

@@ -1,8 +1,8 @@
 """Factorises the system of chunks, from one end to the other.
 
-Before a chunk is factorised, all that the chunks before it leave on it is taken from it
-at once ("left-looking"): nothing is carried along but the factors themselves. Chunks
-are taken as they stand: in the order of time, or of what they see (`Layout.order`).
+Before a chunk is factorised, the updates of all chunks before it are subtracted from it
+at once ("left-looking"): only the factors themselves are carried along. Chunks are
+taken as they stand: in the order of time, or in that of `Layout.order`.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from bodyslam_jax.solver.triangular import half_of
 
 
 class Factor(eqx.Module):
-    """Each chunk, factorised, and what is left of the arrow."""
+    """Cholesky factors of all chunks, and the Schur complement of the arrow."""
 
     half: Float[Array, "n q q"]
     """`L^-1` of each pivot."""
@@ -29,7 +29,7 @@ class Factor(eqx.Module):
 
 
 def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
-    """One chunk after another, less what those before it left on it.
+    """Factorises one chunk after another, left-looking.
 
     Only chunks in use are factorised, over the bandwidth in use.
     """
@@ -96,14 +96,14 @@ def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
 
 
 def _without(rows, first, count):
-    """All rows but `count` of them."""
+    """Returns the rows without `count` of them from `first` on."""
     return jnp.concatenate([rows[:first], rows[first + count :]]) if count else rows
 
 
 def back_substitute(
     factor: Factor, sizes: Sizes
 ) -> tuple[Float[Array, "n q"], Float[Array, " a"]]:
-    """Steps of all chunks, as they stand, and of the arrow."""
+    """Returns the steps of all chunks, as they stand, and of the arrow."""
     n, r, q = factor.side.shape
     g = sizes.arrow
     head = q - CAMERAS
