@@ -65,7 +65,7 @@ def last(monkeypatch, count):
     own_sizes(monkeypatch)
     longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
     monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
-    monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", count // 2)
+    monkeypatch.setattr("bodyslam_jax.graph.layout._GROUP_LANDMARKS", count // 2)
 
 
 @pytest.mark.parametrize(
@@ -566,7 +566,7 @@ def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
     in_time, state, _ = make(9, frames=63, people=2, landmarks=80)
     assert in_time.layout.order is None
     order = np.array([3, 0, 5, 1, 6, 2, 4])
-    monkeypatch.setattr("bodyslam_jax.graph.ordering._GAIN", np.inf)
+    monkeypatch.setattr("bodyslam_jax.graph.ordering._MAX_COST_RATIO", np.inf)
     monkeypatch.setattr("bodyslam_jax.graph.ordering._spectral", lambda *_: order)
     problem = g.make_problem(in_time.factors, state)
     assert problem.layout.order.tolist() == order.tolist()
