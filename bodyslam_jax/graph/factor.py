@@ -42,12 +42,18 @@ class Frame(eqx.Module):
 
     @property
     def root(self) -> Float[Array, "*b 4 4"]:
-        """T_CH; `ValueError` in a factor without a variable of a person in `keys`."""
+        """Returns T_CH.
+
+        **Raises:** `ValueError` in a factor without a variable of a person in `keys`.
+        """
         return _of_person(self.person_root, "root")
 
     @property
     def pose(self) -> Float[Array, "*b 23 3"]:
-        """Joint rotations (axis-angle, rad); `ValueError` as for `root`."""
+        """Returns the joint rotations (axis-angle, rad).
+
+        **Raises:** `ValueError` as `root` does.
+        """
         return _of_person(self.person_pose, "pose")
 
 
@@ -78,7 +84,10 @@ class Shared(eqx.Module):
 
     @property
     def shape(self) -> Float[Array, " 10"]:
-        """SMPL β; `ValueError` in a factor without a variable of a person in `keys`."""
+        """Returns SMPL β.
+
+        **Raises:** `ValueError` in a factor without a variable of a person in `keys`.
+        """
         return _of_person(self.person_shape, "shape")
 
 

@@ -26,7 +26,7 @@ class Loss(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
-        """The derivative of `rho`: (nearly) 1 at 0, and never negative."""
+        """Returns the derivative of `rho`: (nearly) 1 at 0, and never negative."""
 
 
 class Squared(Loss):
@@ -97,7 +97,7 @@ class BlakeZisserman(Loss):
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         never = -(self.scale**2) / 2
         far = jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never)
-        # The same without cancellation, where the logarithms are nearly equal.
+        # An equal expression without cancellation, where the logarithms are close.
         less = jnp.expm1(-jnp.minimum(s, 1) / 2)
         near = -jnp.log1p(less * jax.nn.sigmoid(-never))
         return 2 * jnp.where(s < 1, near, far)

@@ -46,7 +46,7 @@ def order_chunks(
     count: int,
     num_people: int,
 ) -> Ordering:
-    """The order of time of `count` chunks, unless another costs clearly less.
+    """Returns the order of time of `count` chunks, unless another costs much less.
 
     `landmark` and `chunk` are `p` distinct pairs of a landmark and a chunk that
     observes it, sorted by landmark.
@@ -73,7 +73,7 @@ def order_chunks(
 
 
 def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
-    # One landmark widens the band as much as a hundred do.
+    # The logarithm, as one landmark widens the band as much as a hundred.
     shared = np.log1p(_shared(landmark, chunk, begin, count))
     k = np.arange(count - 1)
     # Neighbours in time are always connected: people couple them, and the graph must

@@ -89,7 +89,7 @@ def _mean_inverse_variance(factor: Factor) -> Float[Array, ""] | None:
         present = variances > 0
     elif sigma is not None:
         present = jnp.isfinite(sigma)
-        # Infinite means missing; its derivative is not a number.
+        # An infinite sigma is missing, and its derivative would be NaN.
         variances = jnp.where(present, 1 / jnp.where(present, sigma, 1.0) ** 2, 0.0)
     else:
         return None
@@ -107,7 +107,7 @@ def _weighted(name: str, factor: Factor, value: Any) -> Factor:
             f"weights.{name}: {type(factor).__name__} has no field `sigma` or "
             "`whitening`, expected one of them."
         )
-    # Where nothing is measured, nothing changes.
+    # A term without measurements stays as it is.
     empty = before == 0
     ratio = jnp.asarray(value, before.dtype) / jnp.where(empty, 1.0, before)
     root = jnp.sqrt(jnp.where(empty, 1.0, ratio))

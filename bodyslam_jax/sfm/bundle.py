@@ -124,7 +124,7 @@ def _in_camera(scene: Scene, views: Views) -> np.ndarray:
 
 
 def _cost(scene: Scene, views: Views, loss: float) -> float:
-    # Behind the camera counts as a large, bounded error: the loss must stay finite.
+    # A point behind the camera has a large, bounded error: the loss must stay finite.
     error = np.minimum(errors(scene, views), 10.0) / loss
     return float(np.log1p(error**2).sum())
 

@@ -330,7 +330,7 @@ def _errors_of_best_points(
     `scale`).
     """
     num, most = use.shape
-    # The view nearest to the middle of those that are used.
+    # The anchor is the middle one of the used views.
     rank = np.cumsum(use, axis=1) * use
     anchor = np.argmin(np.abs(rank - (use.sum(1)[:, None] + 1) // 2), axis=1)
     row = np.arange(num)

@@ -247,7 +247,7 @@ class _Search:
             for step in (0.25, 0.1):
                 at = offset + step * self.period * np.arange(-4, 5)
                 offset, sigma = _minimum(at, self.profile(times, at), one[:9])
-        # Below a hundredth of a frame exposures and read-out matter.
+        # Exposure and readout limit the accuracy to a hundredth of a frame.
         return offset, max(sigma, 0.01 * self.period)
 
     def _is_noisy(self, times: Float[np.ndarray, " n"]) -> bool:

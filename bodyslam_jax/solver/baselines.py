@@ -179,10 +179,10 @@ def jaxopt_lm(problem, state, stage):
         solver="cholesky",
         materialize_jac=True,
     )
-    # jaxopt multiplies truth values and numbers.
+    # jaxopt multiplies booleans and numbers.
     with jax.numpy_dtype_promotion("standard"):
         found = method.run(start, arrays)
-    # Where rounding lets no step lower the cost, it tries ever shorter ones.
+    # Where rounding hides any decrease, it tries ever shorter steps: converged, too.
     last = found.state
     least = 1e-12 * jnp.diag(jnp.max(jnp.diag(last.jtj)) * jnp.ones_like(start))
     step = jnp.linalg.solve(last.jtj + least, last.gradient)
@@ -238,7 +238,7 @@ def _adam(flat, start, rate, count, decays):
         cost, gradient = jax.value_and_grad(flat.cost)(step)
         good = jnp.isfinite(cost)
         known = jax.tree.map(lambda new, old: jnp.where(good, new, old), step, known)
-        # optax takes powers of Python's numbers.
+        # optax mixes arrays with Python numbers of other types.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(gradient, memory)
             length = rate * falls(k) if decays else rate

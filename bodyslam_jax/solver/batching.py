@@ -76,16 +76,17 @@ DEVICE_AXIS = "device"
 def vmap_over_devices(
     function: Callable[..., Any], in_axes: int | tuple[int | None, ...] = 0
 ) -> Callable[..., Any]:
-    """`jax.vmap(function, in_axes)`, compiled, a share of the batch on each device.
+    """Returns a compiled `jax.vmap(function, in_axes)` with the
+    batch shared among devices.
 
     On a CPU a core can be a device: `jax.config.update("jax_num_cpu_devices", 2)`
-    before anything else is asked of JAX. Six solves of 300 frames then take 0.6 of the
-    time that they take one after another. Of one device it is `jax.vmap`.
+    before any other use of JAX. Six solves of 300 frames then take 0.6 of the time that
+    they take one after another. With one device it is `jax.vmap`.
 
-    `in_axes` has 0 for arguments with a leading axis of the batch, `None` for those
-    that all share, as one number or one for each. Keep what this returns: calling it
-    again does not compile again. Batches of any size; results are on the first device,
-    what is no array in them is as the function gives it.
+    `in_axes` is 0 for arguments with a leading batch axis and `None` for shared ones,
+    as one value for all arguments or one for each. Keep the returned function: calling
+    it again does not compile again. Batches may have any size; results are on the first
+    device, and their leaves that are no arrays are those of the function.
 
     **Raises:** `ValueError` if no argument is mapped, or their leading axes differ.
     """
@@ -151,9 +152,9 @@ def _shared_out(function, args, axes, devices, batch):
     mapped = jax.vmap(one, in_axes=axes)
     if len(devices) == 1:
         return eqx.combine(mapped(*arrays), form)
-    # The last problem fills up what does not divide: its device would wait otherwise.
+    # The last problem is repeated to fill all devices, which would wait otherwise.
     each = -(-batch // len(devices))
-    # Dealt out one by one: neighbours, such as scales in order, take as many steps.
+    # Problems are dealt out one by one, as neighbours take about as many steps.
     turn = np.arange(each * len(devices)).reshape(each, len(devices)).T.ravel()
     row = np.minimum(turn, batch - 1)
     fill = lambda tree, axis: tree if axis is None else jax.tree.map(_rows(row), tree)

@@ -80,8 +80,8 @@ def best_scale(
         return state.scale, none
     grid = jnp.asarray(() if is_quadratic(problem) else _SCALE_GRID, none.dtype)
     eps = float(jnp.finfo(none.dtype).eps)
-    # The start, the grid, and what Newton's steps lead to from the best of these: one
-    # loop, so that the model stands in the program once.
+    # The start, the grid, and Newton's steps from the best of these are one loop, so
+    # that the model is compiled once.
     known = 1 + len(grid)
 
     def goes_on(search: _Search):

@@ -43,13 +43,13 @@ def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
     def step(sides, chunk):
         k, pivot, coupling = chunk
         people, later, common = coupling[:near], coupling[near:-tail], coupling[-tail:]
-        # What lies before the first chunk is not written yet: zeros.
+        # Sides before the first chunk wrap around to rows not yet written: zeros.
         side_of = lambda back: row_of(sides, jax.lax.rem(k - back + n, np.int32(n)))
         for back in range(1, with_people + 1):
             before = side_of(back)
             first, start = (back - 1) * head, near + (back - 1) * CAMERAS
             rows = jnp.concatenate([before[first:near], before[start:]])
-            # Of people and of cameras this chunk's come first.
+            # Rows of this chunk come first, both among people and among cameras.
             beside = near - first - head
             width = head + CAMERAS
             own = _without(rows[: width + beside], head, beside)
@@ -114,7 +114,7 @@ def back_substitute(
 
     def step(following, chunk):
         half, side = chunk
-        # -1 for the right-hand side: the whole table, without a copy of a part.
+        # A factor of -1 for the right-hand side saves copying a part of the table.
         known = jnp.concatenate([following, common, -jnp.ones_like(common[:1])])
         here = -half.T @ (known @ side)
         people, cameras = following[: near - head], following[near:-CAMERAS]

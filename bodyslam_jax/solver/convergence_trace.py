@@ -99,7 +99,7 @@ def clock(
     damping: float = 1e-4,
     mixed_precision: bool = False,
 ) -> tuple[Solution, tuple[np.ndarray, ...]]:
-    """`solve` with the wall time of each iteration, s, for each stage.
+    """Solves as `solve` does, and returns the wall time of each iteration, s, by stage.
 
     `solve` itself is one compiled loop in which no clock can be read: a call back to
     Python would wait for each step, and its program could be neither mapped nor cached

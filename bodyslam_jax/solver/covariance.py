@@ -155,7 +155,7 @@ def _bent(
     tried = jax.lax.stop_gradient(bent)
     factor = eliminate(problem, tried, sizes, _damping(tried, sizes)).factor
     sound = jnp.all(jnp.isfinite(factor.half))
-    # A sum, not a choice of factorisations: that which fails would spread its NaN.
+    # A masked sum, as the gradient of a choice between factorisations would be NaN.
     mixed = lambda a, b: a + jnp.where(sound, b - a, 0.0).astype(a.dtype)
     return jax.tree.map(
         lambda a, b: mixed(a, b) if eqx.is_inexact_array(a) else a, lin, bent
@@ -302,7 +302,7 @@ def _from_cameras(bucket, table, damp, windows, sizes):
         chunk, cross, side, inverse = group
         known = windows[chunk][index[:, None], index[None, :]]
         count = cross.shape[-1]
-        # Neither the scale nor named globals move a landmark: rows of zeros for them.
+        # Landmarks do not couple with the scale or named globals: rows of zeros.
         still = lambda rows: jnp.zeros((rows, 3, count), cross.dtype)
         w = jnp.concatenate(
             [cross.reshape(width, 3, count), still(1), side, still(sizes.named)]

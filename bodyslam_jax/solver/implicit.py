@@ -102,7 +102,7 @@ def _cotangent_of_problem(problem, state, cotangent):
     def left_of(scaled, share):
         x = unravel(scaled * scale)
         product, _ = transpose(step_of(problem, masked(x)))
-        # A held coordinate is its own equation.
+        # The equation of a held coordinate is the identity.
         image = jax.tree.map(
             lambda b, m, p, x: share * b - jnp.where(m > 0, m * p, x),
             *(right, mask, coordinates_of(problem, product), x),
@@ -221,7 +221,7 @@ def _with_gradient(
     elif "camera" in gradient:
         gradient["camera"] = gradient["camera"].at[0].set(step.cameras)
     common = globals_of(step, sizes)
-    # Padding points at a row of zeros, so that groups are filled by plain gathering.
+    # Indices of padding are those of a row of zeros, so that a plain gather suffices.
     tables = tuple(
         eqx.tree_at(
             lambda t: t.gradient,

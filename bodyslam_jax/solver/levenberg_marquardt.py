@@ -78,7 +78,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         dtype = y.scale.dtype
         s, n, k = len(self.limit), self.length, len(args.factors)
         observations = gather(args)
-        # Filled in by the first step: each part is compiled once.
+        # Empty until the first step, so that each part is compiled once.
         struct = eqx.filter_eval_shape(_first, args, observations, y, self.dtype)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
         stage = self._after(jnp.array(-1))
@@ -173,13 +173,14 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
         over = done | stuck | broken | spent
         following = jnp.where(over, self._after(at), state.stage)
-        # Away from a minimum the curvature may have no inverse: then without it.
+        # Away from a minimum the second-order term may leave the Hessian indefinite:
+        # then it is factorised without the term.
         sound = ~state.bent | jnp.isfinite(trial.predicted)
         share = next_share(state.share, accept, known - before, known)
         share = jnp.where(self.damping > 0, share, 0.0)  # Gauss-Newton knows none
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
-        # Where the last stage ended, the motion is predicted anew.
+        # The final cost is that with the motion predicted at the final state.
         ended = jnp.max(jnp.where(state.steps > 0, jnp.arange(len(steps)), -1))
         ended = jnp.where(last & (ended >= 0), ended, len(steps))
         end = lambda rows, value: rows.at[ended, state.steps[ended]].set(
@@ -241,7 +242,7 @@ def _is_done(
     trial: Trial, known: Float[Array, ""], enough: Float[Array, ""]
 ) -> Bool[Array, ""]:
     """Returns True if a step would lower the cost by less than the tolerance."""
-    # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
+    # Decreases below the rounding of the cost, or of residuals near 0, are invisible.
     eps = float(jnp.finfo(known.dtype).eps)
     floor = 8 * eps * known + eps**1.25
     small = trial.predicted <= jnp.maximum(enough, floor)
@@ -294,5 +295,5 @@ def _linearise_anew(problem, observations, state, dtype, begins, ends):
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:
-    """Lifted residuals of all factors, as a stock solver sees them."""
+    """Returns the lifted residuals of all factors, as a stock solver sees them."""
     return [robustify(f.loss, residual_of(f, state)) for f in problem.factors]

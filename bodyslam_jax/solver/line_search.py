@@ -36,9 +36,9 @@ def search(problem, state, move, slope, predicted, terms):
         rejected = jnp.where(better, off, rejected)
         full = jnp.where(jnp.isnan(full), cost, full)
         # cost(a) = known - slope a + bend a^2, through the full step
-        add_second_order = full - known + slope
-        vertex = slope / jnp.where(add_second_order > 0, 2 * add_second_order, 1.0)
-        vertex = jnp.where(add_second_order > 0, vertex, 2.0)
+        bend = full - known + slope
+        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
+        vertex = jnp.where(bend > 0, vertex, 2.0)
         share = jnp.clip(vertex, 0.1, 2.0)
         return (share, place, rejected, best, best_terms, full), None
 
@@ -65,7 +65,7 @@ def _settle(
     keep = jnp.zeros(len(state.landmarks), bool)
     of_tracks = jnp.zeros_like(state.scale)
     if tracks is not None:
-        # One map over both: cameras are gathered once for all observations.
+        # One `vmap` over both, so that cameras are gathered once for all observations.
         both = jnp.stack([state.landmarks, moved.landmarks])
         at = lambda x: eqx.tree_at(lambda s: s.landmarks, moved, x)
         found = jax.vmap(lambda x: cost_by_landmark(problem, tracks, at(x)))(both)

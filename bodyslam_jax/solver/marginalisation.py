@@ -375,7 +375,7 @@ def _trailing(
             own.insert(0, rows(damping["pose"], 1, CHUNK - 1, 1)[:, 0])
         kept.insert(0, jnp.concatenate(own, axis=1).reshape(-1))
     added = jnp.concatenate([*kept, damping["globals"]])
-    # What stays is not damped.
+    # The damping of the remaining variables is removed.
     return _Trailing(
         matrix[:-1, :-1] - jnp.diag(added),
         -matrix[:-1, -1],

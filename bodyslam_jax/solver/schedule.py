@@ -26,7 +26,7 @@ class Stage:
         if self.max_steps < 0:
             raise ValueError(f"max_steps: {self.max_steps}, expected 0 or more.")
         for name in ("rtol", "atol"):
-            # Not a NaN either, which no decrease is below.
+            # This refuses NaN as well.
             if not getattr(self, name) >= 0:
                 found = getattr(self, name)
                 raise ValueError(f"{name}: {found}, expected 0 or more.")

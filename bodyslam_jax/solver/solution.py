@@ -68,7 +68,7 @@ def outcome(start, best, result, stats) -> tuple[Solution, Final]:
     """Converts the result of the loop; the start, if no cost was finite."""
     better = jnp.isfinite(stats["cost"]) & is_finite(best)
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old), best, start)
-    # A number that no measurement sees may be NaN from the start, and the cost not.
+    # A coordinate that no measurement sees may be NaN while the cost is finite.
     result = optx.RESULTS.where(is_finite(best), result, optx.RESULTS.nonfinite)
     stages = range(len(stats["steps"]))
     histories = tuple(jax.tree.map(lambda x: x[i], stats["history"]) for i in stages)

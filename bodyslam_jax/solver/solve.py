@@ -180,13 +180,13 @@ def _backward(
         found,
         is_leaf=lambda x: x is None,
     )
-    # A stage without steps has moved nothing.
+    # The last stage with steps decides which variables were free.
     taken = [stage for stage in schedule if stage.max_steps] or schedule
     now = restrict(problem, taken[-1].free)
     given = cotangent_of_problem(now, found, full)
     given = dataclasses.replace(given, variables=problem.variables)
     if cotangent.cost is not None:
-        # At a minimum the state's own share of the cost's derivative is 0.
+        # At a minimum the derivative of the cost by the state is 0.
         arrays, static = eqx.partition(problem, eqx.is_inexact_array)
         by_cost = jax.grad(lambda a: eqx.combine(a, static).cost(found))
         more = by_cost(arrays)

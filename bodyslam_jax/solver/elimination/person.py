@@ -179,7 +179,7 @@ def substitute_people(
         "roots": steps[..., pose:],
         "old_cameras": old_cameras,
         "cameras": of_chunks,
-        # -1 for the right-hand side: whole tables, without a copy of a part.
+        # A factor of -1 for the right-hand side saves copying parts of the tables.
         "common": jnp.concatenate([common, -jnp.ones_like(common[..., :1])], axis=-1),
     }
     border = jnp.concatenate([values[name] for name in border_of(window)], axis=-1)

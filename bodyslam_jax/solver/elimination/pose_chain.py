@@ -144,7 +144,7 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> Float[Array, "g b
         for lag in (-1, 0, 1):
             block = blocks.get(("pose", name, lag))
             if block is not None:
-                # Frame k against frame k - lag.
+                # The block couples frame k with frame k - lag.
                 place = jnp.eye(CHUNK, CHUNK + reach, k=reach - lag, dtype=dtype)
                 place = row_of(place, k)
                 wide = at(block).swapaxes(-1, -2)[:, None] * place[:, None, None]

@@ -130,7 +130,7 @@ def substitute_landmarks(
             continue
         step = cameras[frames_of(bucket.first_chunk, bucket.width)]
         n, g = len(step), table.own.shape[-1]
-        # In the order that the tables have: `einsum` would have them in another first.
+        # A product in the order of the tables, which `einsum` would transpose first.
         taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
         right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)

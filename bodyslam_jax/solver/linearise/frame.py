@@ -50,7 +50,7 @@ def linearise_frames(
     if not factor.of_people:
         residual, root_weight = residual[None], root_weight[None]
         parts = {touch: part[None] for touch, part in parts.items()}
-    # The rows of a frame in one axis.
+    # All residuals of a frame are flattened to one axis of rows.
     lead = residual.shape[:2]
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
@@ -151,7 +151,7 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         slope = gram[..., -1, :]
     else:
         slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
-    # A term of frame k about frame k - lag.
+    # Blocks of row k that belong to a variable of frame k - lag are moved there.
     shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])

@@ -123,7 +123,7 @@ def _add_cameras(
     sizes, point = sums.sizes, pixels.point
     chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
     belongs = chunk == seen.chunk
-    # As a product: a scatter would take its pieces one by one.
+    # A matrix product: a scatter would add its pieces one by one.
     of_frames = lambda x: (belongs.astype(x.dtype) @ x.reshape(len(x), -1)).reshape(
         -1, *x.shape[2:]
     )
