@@ -24,7 +24,7 @@ class Sizes(eqx.Module):
     chunks: int = eqx.field(static=True)
     bandwidth: int = eqx.field(static=True)
     reach: int = eqx.field(static=True)
-    """Places between a chunk and the next in time, at most."""
+    """Largest distance, in the order of elimination, of chunks adjacent in time."""
     intrinsics: int = eqx.field(static=True)
     """Number of intrinsics; 0 where they are held."""
     named: int = eqx.field(static=True)
